@@ -1,0 +1,8 @@
+"""starcat: guide-star databases for star trackers, built from star catalogs.
+
+The rooms follow the data: ``catalog`` reads archives and selects guide stars, ``products``
+computes what a tracker looks up, ``artifact`` writes and reads the released directory,
+``matcher`` identifies stars with it and ``evaluation`` measures how well.
+"""
+
+__version__ = "0.1.0"

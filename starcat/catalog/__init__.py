@@ -1,0 +1,1 @@
+"""Room 1: archive files become one star table, then guide stars and rejected stars."""

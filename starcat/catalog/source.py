@@ -1,0 +1,318 @@
+"""What an archive is: the TOML files in ``data_sources``, read and checked.
+
+A source has one or more files, each with a record layout: the columns byte by byte (fixed
+width), in order (delimited) or as a packed structure (binary). The readers run on these
+tables; nothing about a layout is written down anywhere else. This module reads no star.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from starcat.errors import ConfigError
+from starcat.resources import resource_folder
+
+UNITS = frozenset(
+    "deg rad h min s arcmin arcsec mas cas darcsec mag mmag yr d mas/yr arcsec/yr s/yr "
+    "cas/yr pix ct km/s".split()
+)
+"""Units that a column may name; ``cas`` is 10 mas, ``darcsec`` is 0.1 arcsec."""
+
+_FORMAT = re.compile(r"^(?:(?P<text>A)\d*|(?P<int>I)\d*|(?P<float>[FDE])(?:\d+\.(?P<dec>\d+))?)$")
+_BINARY = re.compile(r"^<[if][1248]$")
+
+
+class _Model(BaseModel):
+    """Frozen, and refuses keys that it does not know."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Column(_Model):
+    """One column of a record.
+
+    Attributes
+    ----------
+    name : str
+        The archive's own label, in snake_case.
+    bytes : tuple of int, optional
+        First and last byte in the record, 1-based inclusive (fixed width and binary).
+    format : str
+        As the archive's ReadMe prints it (``I6``, ``F9.6``, ``A3``); a little-endian numpy
+        code such as ``<f8`` for binary records.
+    unit : str, optional
+        One of ``UNITS``.
+    null : tuple of str
+        Texts that mean "no value", beside a blank field.
+    required : bool
+        A record whose field is blank is malformed.
+    description : str
+        Meaning, in a few words.
+    """
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
+    bytes: tuple[int, int] | None = None
+    format: str
+    unit: str | None = None
+    null: tuple[str, ...] = ()
+    required: bool = False
+    description: str = ""
+
+    @model_validator(mode="after")
+    def _check(self) -> Column:
+        if not (_FORMAT.match(self.format) or _BINARY.match(self.format)):
+            raise ValueError(f"column {self.name}: format {self.format!r} is not like I6, F9.6, A3")
+        if self.unit is not None and self.unit not in UNITS:
+            raise ValueError(
+                f"column {self.name}: unknown unit {self.unit!r}; known: {', '.join(sorted(UNITS))}"
+            )
+        if self.bytes is not None and not 1 <= self.bytes[0] <= self.bytes[1]:
+            raise ValueError(f"column {self.name}: bytes {self.bytes} are not first <= last")
+        return self
+
+    @property
+    def is_text(self) -> bool:
+        """Whether the field is kept as text."""
+        return self.format.startswith("A")
+
+    @property
+    def is_integer(self) -> bool:
+        """Whether the field holds a whole number."""
+        return self.format.startswith("I") or self.format.startswith("<i")
+
+    @property
+    def decimals(self) -> int | None:
+        """Digits after the point that the format promises; None where it does not say."""
+        match = _FORMAT.match(self.format)
+        if match is None or match["text"]:
+            return None
+        if match["int"]:
+            return 0
+        return int(match["dec"]) if match["dec"] else None
+
+
+class RecordFile(_Model):
+    """One file of a source, or one file in several parts, and its record layout.
+
+    Attributes
+    ----------
+    name : str
+        Layout name; the quirk module branches on it.
+    file_names : tuple of str
+        Accepted names without ``.gz``, most usual first; ``{part}`` stands for a part.
+    parts : tuple of str
+        Values of ``{part}`` in order; empty for a single file.
+    optional : bool
+        The source is usable without this file.
+    layout : {"fixed_width", "delimited", "binary"}
+        Which reader.
+    record_bytes : int, optional
+        Length of a record without its line end (fixed width, binary).
+    header_bytes : int
+        Bytes before the first record (binary).
+    magic : str
+        Text that a binary file begins with.
+    delimiter : str
+        Between fields of a delimited record.
+    comment : str
+        Lines that begin with it are not records.
+    literals : dict of str to str
+        Byte position (1-based) to the character that every record has there.
+    rows : int, optional
+        Records in the whole archive file.
+    sha256 : str, optional
+        Digest of the file as published, where it is known.
+    urls : tuple of str
+        Addresses, the preferred first; ``{part}`` stands for a part.
+    columns : tuple of Column
+        The record, in order.
+    """
+
+    name: str
+    file_names: tuple[str, ...] = Field(min_length=1)
+    parts: tuple[str, ...] = ()
+    optional: bool = False
+    layout: Literal["fixed_width", "delimited", "binary"]
+    record_bytes: int | None = None
+    header_bytes: int = 0
+    magic: str = ""
+    delimiter: str = "|"
+    comment: str = ""
+    literals: dict[str, str] = {}
+    rows: int | None = None
+    sha256: str | None = None
+    urls: tuple[str, ...] = ()
+    columns: tuple[Column, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _check(self) -> RecordFile:
+        names = [column.name for column in self.columns]
+        repeated = {name for name in names if names.count(name) > 1}
+        if repeated:
+            raise ValueError(f"file {self.name}: columns named twice: {sorted(repeated)}")
+        if self.layout == "delimited":
+            return self
+        if self.record_bytes is None:
+            raise ValueError(f"file {self.name}: {self.layout} records need record_bytes")
+        for column in self.columns:
+            if column.bytes is None or column.bytes[1] > self.record_bytes:
+                raise ValueError(
+                    f"file {self.name}: column {column.name} has bytes {column.bytes}; "
+                    f"expected a range within 1-{self.record_bytes}"
+                )
+        return self
+
+    def column(self, name: str) -> Column:
+        """Return the column called ``name``.
+
+        Parameters
+        ----------
+        name : str
+            Column name.
+
+        Returns
+        -------
+        Column
+            The column.
+
+        Raises
+        ------
+        KeyError
+            If the layout has no such column.
+        """
+        for column in self.columns:
+            if column.name == name:
+                return column
+        raise KeyError(name)
+
+
+class DataSource(_Model):
+    """An archive as ``data_sources/<name>.toml`` describes it.
+
+    Attributes
+    ----------
+    name : str
+        How commands call it.
+    title, identifier, citation, licence, reference : str
+        What it is, where it is catalogued, how to cite it, under which terms it comes and
+        which document the layout was taken from.
+    kind : {"stars", "variability"}
+        A star catalog, or a table joined to one.
+    frame : {"ICRS", "FK5", "none"}
+        Axes of the positions.
+    epoch_jyear : float, optional
+        Julian year of the positions, where all records share it.
+    bands : tuple of str
+        Magnitude bands that can be asked for, the default first.
+    urls_retrieved : str
+        When and how the addresses were last tried.
+    files : tuple of RecordFile
+        The files, in reading order.
+    """
+
+    name: str
+    title: str
+    identifier: str
+    citation: str
+    licence: str
+    reference: str = ""
+    kind: Literal["stars", "variability"] = "stars"
+    frame: Literal["ICRS", "FK5", "none"]
+    epoch_jyear: float | None = None
+    bands: tuple[str, ...] = ()
+    urls_retrieved: str
+    files: tuple[RecordFile, ...] = Field(min_length=1)
+
+    @property
+    def rows(self) -> int | None:
+        """Records in the whole archive, where every file states its own."""
+        counts = [file.rows for file in self.files]
+        return None if None in counts else sum(count for count in counts if count is not None)
+
+
+def read_source(path: Path) -> DataSource:
+    """Read one data-source file.
+
+    Parameters
+    ----------
+    path : Path
+        A TOML file.
+
+    Returns
+    -------
+    DataSource
+        The checked content.
+
+    Raises
+    ------
+    ConfigError
+        If the file is not TOML, or a key, unit, format or byte range is wrong.
+    """
+    try:
+        return DataSource.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path.name} is not a TOML file: {error}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise ConfigError(f"{path.name}: {key}: {first['msg']}", key=key) from error
+
+
+@cache
+def source_names() -> tuple[str, ...]:
+    """Return the names of all data sources that ship with starcat, sorted.
+
+    Returns
+    -------
+    tuple of str
+        Names.
+
+    Examples
+    --------
+    >>> "sao" in source_names()
+    True
+    """
+    return tuple(sorted(path.stem for path in resource_folder("data_sources").glob("*.toml")))
+
+
+@cache
+def data_source(name: str) -> DataSource:
+    """Return the data source called ``name``.
+
+    Parameters
+    ----------
+    name : str
+        One of `source_names`.
+
+    Returns
+    -------
+    DataSource
+        The checked content of its TOML file.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such source, naming the nearest.
+
+    Examples
+    --------
+    >>> data_source("sao").rows
+    258997
+    """
+    if name not in source_names():
+        from difflib import get_close_matches
+
+        near = get_close_matches(name, source_names(), 1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise ConfigError(
+            f"unknown source {name!r}{hint} Known sources: {', '.join(source_names())}",
+            key="source",
+            value=name,
+        )
+    return read_source(resource_folder("data_sources") / f"{name}.toml")

@@ -1,0 +1,168 @@
+"""The exception tree: every error that starcat raises on purpose.
+
+Each class carries the facts as attributes; its message says what was found, what was
+expected and what to do next. ``exit_code`` is what the command line returns for it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class StarcatError(Exception):
+    """Base of all errors that starcat raises on purpose."""
+
+    exit_code = 1
+
+
+class ConfigError(StarcatError, ValueError):
+    """A build spec, preset, option or data-source file that cannot be used.
+
+    Parameters
+    ----------
+    message : str
+        What was found, what is allowed, what to do.
+    key : str, optional
+        Dotted name of the offending key.
+    value : object, optional
+        The value found.
+    """
+
+    exit_code = 2
+
+    def __init__(self, message: str, *, key: str | None = None, value: object = None) -> None:
+        super().__init__(message)
+        self.key = key
+        self.value = value
+
+
+class SourceError(StarcatError):
+    """A catalog file that is missing, damaged or not what it should be.
+
+    Parameters
+    ----------
+    message : str
+        What was found, what was expected, what to do.
+    source : str, optional
+        Name of the data source, as in ``data_sources/<source>.toml``.
+    path : Path, optional
+        The file or folder.
+    """
+
+    exit_code = 3
+
+    def __init__(
+        self, message: str, *, source: str | None = None, path: Path | None = None
+    ) -> None:
+        super().__init__(message)
+        self.source = source
+        self.path = path
+
+
+class SourceMissing(SourceError):  # noqa: N818 - the name reads as the fact
+    """No file of the source was found in any of the places searched."""
+
+
+class ChecksumMismatch(SourceError):  # noqa: N818
+    """A file whose digest is not the one recorded for it."""
+
+
+class ParseError(SourceError):
+    """A file whose content does not follow the source's record layout.
+
+    Parameters
+    ----------
+    message : str
+        What was found, what was expected, what to do.
+    source : str, optional
+        Name of the data source.
+    path : Path, optional
+        The file.
+    line : int, optional
+        1-based line in the file.
+    byte_range : tuple of int, optional
+        First and last byte of the field in its record, 1-based inclusive.
+    field : str, optional
+        Name of the column.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        source: str | None = None,
+        path: Path | None = None,
+        line: int | None = None,
+        byte_range: tuple[int, int] | None = None,
+        field: str | None = None,
+    ) -> None:
+        super().__init__(message, source=source, path=path)
+        self.line = line
+        self.byte_range = byte_range
+        self.field = field
+
+
+class DownloadError(SourceError):
+    """A file that could not be fetched from any of its addresses."""
+
+
+class BuildError(StarcatError):
+    """A build that ran but has no usable result: no stars left, or a failed self-test."""
+
+
+class OutputError(StarcatError):
+    """A place that cannot be written to, or already holds something else."""
+
+    def __init__(self, message: str, *, path: Path | None = None) -> None:
+        super().__init__(message)
+        self.path = path
+
+
+class SchemaError(StarcatError):
+    """A table or artifact that does not follow the schema of its product.
+
+    Parameters
+    ----------
+    message : str
+        What was found, what was expected, what to do.
+    product : str, optional
+        Name of the product.
+    field : str, optional
+        Name of the column.
+    found, expected : object, optional
+        The two sides of the disagreement.
+    """
+
+    exit_code = 4
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        product: str | None = None,
+        field: str | None = None,
+        found: object = None,
+        expected: object = None,
+    ) -> None:
+        super().__init__(message)
+        self.product = product
+        self.field = field
+        self.found = found
+        self.expected = expected
+
+
+class SchemaVersionError(SchemaError):
+    """A product written with a schema version that this reader does not know."""
+
+
+class ProductError(StarcatError):
+    """A product or artifact that is corrupt, incomplete or does not match its manifest."""
+
+    exit_code = 5
+
+    def __init__(
+        self, message: str, *, product: str | None = None, path: Path | None = None
+    ) -> None:
+        super().__init__(message)
+        self.product = product
+        self.path = path

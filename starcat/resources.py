@@ -1,0 +1,38 @@
+"""Where the files that ship with starcat are: schemas, data sources and presets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def resource_folder(name: str) -> Path:
+    """Return the folder ``schemas``, ``data_sources`` or ``presets``.
+
+    A wheel carries the folders inside the package; a checkout has the first two beside it.
+
+    Parameters
+    ----------
+    name : {"schemas", "data_sources", "presets"}
+        Which folder.
+
+    Returns
+    -------
+    Path
+        An existing folder.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the installation is incomplete.
+
+    Examples
+    --------
+    >>> resource_folder("schemas").name
+    'schemas'
+    """
+    for folder in (_PACKAGE / name, _PACKAGE.parent / name):
+        if folder.is_dir():
+            return folder
+    raise FileNotFoundError(f"starcat is installed without its folder {name!r}: reinstall it")
