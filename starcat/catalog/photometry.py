@@ -1,0 +1,130 @@
+"""Magnitudes in the band that a build asks for, from those that an archive has."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.errors import ConfigError
+
+Array = NDArray[np.float64]
+
+JOHNSON_COLOUR_RANGE_MAG = (-0.2, 1.8)
+"""BT - VT between which the Johnson formula holds (ESA SP-1200, vol. 1, p. 57)."""
+
+_TERM = re.compile(r"^(?:(\d*\.?\d+)\*)?(J|H|Ks)$")
+
+
+@dataclass(frozen=True)
+class JohnsonV:
+    """Johnson V of Tycho stars.
+
+    Attributes
+    ----------
+    mag : ndarray of float64, shape (N,)
+        V; NaN where neither magnitude is known.
+    is_estimated : ndarray of bool, shape (N,)
+        VT or BT is missing, so no colour correction was possible.
+    is_out_of_range : ndarray of bool, shape (N,)
+        The colour lies outside the formula's range; it was held at the range's end.
+    """
+
+    mag: Array
+    is_estimated: NDArray[np.bool_]
+    is_out_of_range: NDArray[np.bool_]
+
+
+def johnson_v(bt_mag: Array, vt_mag: Array) -> JohnsonV:
+    """Return Johnson V from Tycho BT and VT.
+
+    Parameters
+    ----------
+    bt_mag, vt_mag : ndarray of float64, shape (N,)
+        Magnitudes; NaN where missing.
+
+    Returns
+    -------
+    JohnsonV
+        ``V = VT - 0.090 (BT - VT)``. Without BT, V is VT; without VT, V is BT, a star at least
+        as bright as that in V for all but the bluest.
+
+    References
+    ----------
+    Hog et al. 2000, ReadMe of I/259, note 7.
+    """
+    colour = bt_mag - vt_mag
+    low, high = JOHNSON_COLOUR_RANGE_MAG
+    mag = vt_mag - 0.090 * np.clip(colour, low, high)
+    missing = np.isnan(mag)
+    mag = np.where(missing, np.where(np.isnan(vt_mag), bt_mag, vt_mag), mag)
+    out_of_range = (colour < low) | (colour > high)
+    return JohnsonV(mag, missing & ~np.isnan(mag), out_of_range)
+
+
+def blend_weights(band: str) -> dict[str, float]:
+    """Return the weights of J, H and Ks in a band of 2MASS.
+
+    Parameters
+    ----------
+    band : str
+        ``J``, ``H``, ``Ks``, ``(J+H)/2``, or a weighted sum such as ``0.6*J+0.4*H``.
+
+    Returns
+    -------
+    dict of str to float
+        Weights of the bands that take part; they sum to 1.
+
+    Raises
+    ------
+    ConfigError
+        If the text is none of these, or the weights do not sum to 1.
+
+    Examples
+    --------
+    >>> blend_weights("(J+H)/2")
+    {'J': 0.5, 'H': 0.5}
+    """
+    compact = band.replace(" ", "")
+    mean = re.fullmatch(r"\((.+)\)/(\d+)", compact)
+    terms = [_TERM.match(term) for term in (mean[1] if mean else compact).split("+")]
+    divisor = float(mean[2]) if mean else 1.0
+    weights: dict[str, float] = {}
+    for term in terms:
+        if term is None or term[2] in weights:
+            raise ConfigError(_blend_message(band), key="band", value=band)
+        weights[term[2]] = float(term[1] or 1.0) / divisor
+    if abs(sum(weights.values()) - 1.0) > 1e-9:
+        raise ConfigError(_blend_message(band), key="band", value=band)
+    return weights
+
+
+def _blend_message(band: str) -> str:
+    return (
+        f"unknown band {band!r} of 2mass; use J, H, Ks, (J+H)/2 or a weighted sum whose weights "
+        "add up to 1, such as 0.6*J+0.4*H"
+    )
+
+
+def combined_magnitude(mags: Array) -> float:
+    """Return the magnitude of several stars seen as one.
+
+    Parameters
+    ----------
+    mags : ndarray of float64, shape (N,)
+        Magnitudes in one band.
+
+    Returns
+    -------
+    float
+        Magnitude of the summed flux.
+
+    Examples
+    --------
+    >>> round(combined_magnitude(np.array([5.0, 5.0])), 4)
+    4.2474
+    """
+    brightest = float(np.min(mags))
+    return float(brightest - 2.5 * np.log10(np.sum(10.0 ** (-0.4 * (mags - brightest)))))

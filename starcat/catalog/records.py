@@ -1,0 +1,205 @@
+"""Records of an archive file: the arrays that a reader returns, and the rows it could not read.
+
+A reader takes a block of whole lines and returns ``Records``: one array a column, and one
+``Problem`` for each line that does not follow the layout. Numbers are float64 with NaN where
+the field is blank; text is fixed-width bytes. No catalog's meaning is known here.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.catalog.source import Column, RecordFile
+
+_NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?")
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Why one line is not a record.
+
+    Attributes
+    ----------
+    line : int
+        1-based line in its file (record number in a binary file).
+    field : str
+        Column, or ``"record"`` where the line as a whole is wrong.
+    byte_range : tuple of int, optional
+        First and last byte of the field, 1-based inclusive.
+    found, expected : str
+        The two sides of the disagreement.
+    """
+
+    line: int
+    field: str
+    byte_range: tuple[int, int] | None
+    found: str
+    expected: str
+
+    def __str__(self) -> str:
+        where = f" bytes {self.byte_range[0]}-{self.byte_range[1]}" if self.byte_range else ""
+        return f"line {self.line}{where}, {self.field}: found {self.found}; expected {self.expected}"
+
+
+@dataclass(frozen=True)
+class Records:
+    """Columns of the good records of a block, in file order.
+
+    Attributes
+    ----------
+    layout : str
+        Name of the record layout (``RecordFile.name``).
+    line : ndarray of int64, shape (N,)
+        1-based line of each record in its file.
+    columns : dict of str to ndarray, shape (N,)
+        float64 with NaN for "no value" (int64 for binary integers), or fixed-width bytes.
+    problems : list of Problem
+        Lines left out, in file order.
+    """
+
+    layout: str
+    line: NDArray[np.int64]
+    columns: dict[str, NDArray[Any]]
+    problems: list[Problem] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.line)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        return self.columns[name]
+
+    def integers(self, name: str) -> NDArray[np.int64]:
+        """Return a required column as int64.
+
+        Parameters
+        ----------
+        name : str
+            A column without blanks.
+
+        Returns
+        -------
+        ndarray of int64, shape (N,)
+            The values.
+        """
+        return self.columns[name].astype(np.int64)
+
+    def is_blank(self, name: str) -> NDArray[np.bool_]:
+        """Return where a text column is blank.
+
+        Parameters
+        ----------
+        name : str
+            A text column.
+
+        Returns
+        -------
+        ndarray of bool, shape (N,)
+            True where the field holds only spaces.
+        """
+        text = self.columns[name]
+        chars = text.view(np.uint8).reshape(len(text), text.dtype.itemsize)
+        return np.asarray((chars <= 32).all(axis=1))
+
+    def without(self, bad: NDArray[np.bool_], problems: Sequence[Problem]) -> Records:
+        """Return the records that are not bad, with more problems listed.
+
+        Parameters
+        ----------
+        bad : ndarray of bool, shape (N,)
+            Rows to leave out.
+        problems : sequence of Problem
+            Why; merged with the earlier ones in line order.
+
+        Returns
+        -------
+        Records
+            The rest.
+        """
+        merged = sorted([*self.problems, *problems], key=lambda problem: problem.line)
+        if not bad.any():
+            return replace(self, problems=merged)
+        keep = ~bad
+        columns = {name: values[keep] for name, values in self.columns.items()}
+        return Records(self.layout, self.line[keep], columns, merged)
+
+
+def number_from_text(text: bytes) -> float:
+    """Return the number that a field holds.
+
+    Parameters
+    ----------
+    text : bytes
+        The field, with or without blanks around it.
+
+    Returns
+    -------
+    float
+        The value; NaN for a blank field.
+
+    Raises
+    ------
+    ValueError
+        If the text is neither blank nor a decimal number.
+    """
+    stripped = text.strip()
+    if not stripped:
+        return float("nan")
+    if not _NUMBER.fullmatch(stripped):
+        raise ValueError(text)
+    return float(stripped.replace(b"D", b"E").replace(b"d", b"e"))
+
+
+def apply_nulls(values: NDArray[np.float64], column: Column) -> None:
+    """Set the numbers that stand for "no value" to NaN, in place.
+
+    Parameters
+    ----------
+    values : ndarray of float64, shape (N,)
+        Numbers of the column.
+    column : Column
+        Its description; ``null`` lists the texts.
+    """
+    for text in column.null:
+        if _NUMBER.fullmatch(text.encode()):
+            values[values == float(text)] = np.nan
+
+
+def reject_required_blanks(records: Records, layout: RecordFile) -> Records:
+    """Leave out the records in which a required field is blank.
+
+    Parameters
+    ----------
+    records : Records
+        What a reader has parsed.
+    layout : RecordFile
+        The layout; its columns say which are required.
+
+    Returns
+    -------
+    Records
+        The records with all that they need, and a problem for each of the others.
+    """
+    bad = np.zeros(len(records), dtype=bool)
+    problems: list[Problem] = []
+    for column in layout.columns:
+        if not column.required or column.name not in records.columns:
+            continue
+        values = records[column.name]
+        if values.dtype.kind == "f":
+            blank = np.isnan(values)
+        elif values.dtype.kind == "S":
+            blank = records.is_blank(column.name)
+        else:
+            continue
+        problems += [
+            Problem(int(line), column.name, column.bytes, "a blank field", "a value")
+            for line in records.line[blank & ~bad]
+        ]
+        bad |= blank
+    return records.without(bad, problems)

@@ -1,0 +1,297 @@
+"""Selection: which stars of a table become guide stars, and why the others do not.
+
+Filters are tried in a fixed order (magnitude, doubles, variables, count) and the first that
+applies is the verdict. Doubles are judged by separation and magnitude difference at the
+sensor's resolution and variables by amplitude; a bare flag of an archive is only one input.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from starcat.catalog.ingest import reject_rows
+from starcat.catalog.photometry import combined_magnitude
+from starcat.catalog.quality import Quality
+from starcat.catalog.stars import directions_of, floats_of
+from starcat.catalog.verdict import Reason, Verdicts
+from starcat.proximity import pairs_within
+from starcat.spec import Doubles, Selection, Variables
+from starcat.sphere import radec_from_directions
+
+Flags = NDArray[np.bool_]
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Step:
+    """The stars that are left after one filter.
+
+    Attributes
+    ----------
+    name : str
+        What was filtered.
+    directions : ndarray of float64, shape (N, 3)
+        Of the stars left.
+    """
+
+    name: str
+    directions: Array
+
+
+@dataclass(frozen=True)
+class Selected:
+    """Guide stars, and every other star with its reason.
+
+    Attributes
+    ----------
+    guide_stars : pyarrow.Table
+        Of the stars schema, by star_id.
+    rejected : pyarrow.Table
+        Of the rejected schema, by star_id.
+    steps : tuple of Step
+        What was left after each filter, in order.
+    """
+
+    guide_stars: pa.Table
+    rejected: pa.Table
+    steps: tuple[Step, ...]
+
+
+def select_guide_stars(stars: pa.Table, selection: Selection) -> Selected:
+    """Select guide stars from a star table.
+
+    Parameters
+    ----------
+    stars : pyarrow.Table
+        Of the stars schema, by star_id.
+    selection : Selection
+        Limits and rules.
+
+    Returns
+    -------
+    Selected
+        Every row of ``stars`` is in one of its two tables.
+    """
+    verdicts = Verdicts(len(stars))
+    steps: list[Step] = []
+
+    def note(name: str) -> None:
+        steps.append(Step(name, directions_of(stars)[verdicts.is_kept]))
+
+    mag = floats_of(stars, "mag")
+    verdicts.reject(np.isnan(mag), Reason.no_magnitude)
+    if selection.doubles.action == "merge":
+        stars = merge_doubles(stars, selection, verdicts)
+        mag = floats_of(stars, "mag")
+    with np.errstate(invalid="ignore"):
+        verdicts.reject(mag < selection.bright_limit_mag, Reason.too_bright)
+        verdicts.reject(mag > selection.faint_limit_mag, Reason.too_faint)
+    note("magnitude")
+    if selection.doubles.action == "remove":
+        verdicts.reject(has_companion(stars, selection), Reason.double)
+    is_flagged = is_unresolved_double(stars, selection.doubles)
+    verdicts.reject(is_flagged, Reason.flagged_double)
+    note("doubles")
+    reject_variables(stars, selection.variables, verdicts)
+    note("variables")
+    if selection.max_stars is not None:
+        verdicts.reject(
+            beyond_brightest(stars, verdicts.is_kept, selection.max_stars), Reason.beyond_count
+        )
+        note("count")
+    kept = pa.array(verdicts.is_kept)
+    return Selected(
+        stars.filter(kept).combine_chunks(),
+        reject_rows(stars.filter(pa.array(~verdicts.is_kept)), verdicts.reasons),
+        tuple(steps),
+    )
+
+
+def _companion_pairs(stars: pa.Table, selection: Selection) -> tuple[NDArray[np.int64], Array]:
+    """Close pairs among the stars that count as companions, and the magnitudes of all."""
+    doubles = selection.doubles
+    limit = doubles.companion_limit_mag
+    mag = floats_of(stars, "mag")
+    with np.errstate(invalid="ignore"):
+        pool = np.flatnonzero(mag <= (selection.faint_limit_mag if limit is None else limit))
+    pairs, _ = pairs_within(directions_of(stars)[pool], np.radians(doubles.min_separation_deg))
+    return pool[pairs], mag
+
+
+def has_companion(stars: pa.Table, selection: Selection) -> Flags:
+    """Return which stars have a companion that the sensor cannot tell apart.
+
+    Parameters
+    ----------
+    stars : pyarrow.Table
+        Of the stars schema.
+    selection : Selection
+        ``doubles.min_separation_deg``, ``doubles.max_delta_mag`` and the companions' limit.
+
+    Returns
+    -------
+    ndarray of bool, shape (N,)
+        True where another star lies within the separation and is not fainter by more than
+        ``max_delta_mag``.
+    """
+    pairs, mag = _companion_pairs(stars, selection)
+    most = selection.doubles.max_delta_mag
+    found = np.zeros(len(stars), dtype=bool)
+    for star, companion in ((0, 1), (1, 0)):
+        delta = mag[pairs[:, companion]] - mag[pairs[:, star]]
+        counts = np.ones(len(pairs), dtype=bool) if most is None else delta <= most
+        found[pairs[counts, star]] = True
+    return found
+
+
+def merge_doubles(stars: pa.Table, selection: Selection, verdicts: Verdicts) -> pa.Table:
+    """Merge groups of close stars into one star each, at their photocentre.
+
+    Parameters
+    ----------
+    stars : pyarrow.Table
+        Of the stars schema.
+    selection : Selection
+        As for `has_companion`; groups are chains of such pairs.
+    verdicts : Verdicts
+        Members other than the brightest are rejected here, as merged.
+
+    Returns
+    -------
+    pyarrow.Table
+        The same rows; the brightest of each group has the combined magnitude and the
+        flux-weighted direction.
+    """
+    pairs, mag = _companion_pairs(stars, selection)
+    if selection.doubles.max_delta_mag is not None:
+        delta = np.abs(mag[pairs[:, 0]] - mag[pairs[:, 1]])
+        pairs = pairs[delta <= selection.doubles.max_delta_mag]
+    if not len(pairs):
+        return stars
+    number = stars["star_id"].to_numpy()
+    directions, flags = directions_of(stars), np.array(stars["quality_flags"])
+    absorbed = np.zeros(len(stars), dtype=bool)
+    for members in _groups(pairs, len(stars)):
+        ranked = members[np.lexsort((number[members], mag[members]))]
+        flux = 10.0 ** (-0.4 * (mag[members] - mag[ranked[0]]))
+        centre = flux @ directions[members]
+        total = combined_magnitude(mag[members])
+        directions[ranked[0]] = centre / np.sqrt(centre @ centre)
+        mag[ranked[0]] = total
+        flags[ranked[0]] |= int(Quality.MERGED | Quality.PHOTOCENTRE)
+        absorbed[ranked[1:]] = True
+    verdicts.reject(absorbed, Reason.merged)
+    return _with_photocentres(stars, directions, mag, flags)
+
+
+def _groups(pairs: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
+    """Return the rows of each connected group of pairs, in order of the first row."""
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    _, label = connected_components(graph, directed=False)
+    rows = np.unique(pairs)
+    order = np.argsort(label[rows], kind="stable")
+    cuts = np.flatnonzero(np.diff(label[rows][order])) + 1
+    return sorted(np.split(rows[order], cuts), key=lambda members: int(members[0]))
+
+
+def _with_photocentres(
+    stars: pa.Table, directions: Array, mag: Array, flags: NDArray[np.int32]
+) -> pa.Table:
+    merged = (flags & int(Quality.MERGED)) > 0
+    ra, dec = radec_from_directions(directions)
+    columns = {
+        "ra_deg": np.where(merged, ra, stars["ra_deg"].to_numpy()),
+        "dec_deg": np.where(merged, dec, stars["dec_deg"].to_numpy()),
+        "x": directions[:, 0],
+        "y": directions[:, 1],
+        "z": directions[:, 2],
+        "mag": mag,
+        "quality_flags": flags,
+    }
+    for name, values in columns.items():
+        place = stars.schema.get_field_index(name)
+        array = pa.array(values, mask=np.isnan(values) if name == "mag" else None)
+        stars = stars.set_column(place, stars.schema.field(place), array)
+    return stars
+
+
+def is_unresolved_double(stars: pa.Table, doubles: Doubles) -> Flags:
+    """Return which stars an archive's flags say to leave out as doubles.
+
+    Parameters
+    ----------
+    stars : pyarrow.Table
+        Of the stars schema.
+    doubles : Doubles
+        ``flags``, with the limits that "unresolved" compares with.
+
+    Returns
+    -------
+    ndarray of bool, shape (N,)
+        ``ignore``: none. ``strict``: every flagged star. ``unresolved``: flagged, with a
+        separation below the limit or not stated, and a stated magnitude difference within
+        ``max_delta_mag``; a double whose difference nobody states is left to the search.
+    """
+    flagged = np.array(stars["is_flagged_double"])
+    if doubles.flags == "ignore" or doubles.action == "keep":
+        return np.zeros(len(stars), dtype=bool)
+    if doubles.flags == "strict":
+        return flagged
+    apart = floats_of(stars, "companion_separation_arcsec") / 3600.0
+    delta = floats_of(stars, "companion_delta_mag")
+    close = np.isnan(apart) | (apart <= doubles.min_separation_deg)
+    if doubles.max_delta_mag is None:
+        return np.asarray(flagged & close & ~np.isnan(delta))
+    return np.asarray(flagged & close & (delta <= doubles.max_delta_mag))
+
+
+def reject_variables(stars: pa.Table, variables: Variables, verdicts: Verdicts) -> None:
+    """Reject the stars whose brightness cannot be relied on.
+
+    Parameters
+    ----------
+    stars : pyarrow.Table
+        Of the stars schema, amplitudes joined.
+    variables : Variables
+        Limit and rule.
+    verdicts : Verdicts
+        Receives the reasons.
+    """
+    amplitude = floats_of(stars, "amplitude_mag")
+    if variables.max_amplitude_mag is not None:
+        verdicts.reject(amplitude > variables.max_amplitude_mag, Reason.variable)
+    flagged = np.array(stars["is_flagged_variable"])
+    if variables.flags == "strict":
+        verdicts.reject(flagged, Reason.flagged_variable)
+    elif variables.flags == "known":
+        verdicts.reject(flagged & np.isnan(amplitude), Reason.flagged_variable)
+
+
+def beyond_brightest(stars: pa.Table, kept: Flags, count: int) -> Flags:
+    """Return which stars are not among the brightest.
+
+    Parameters
+    ----------
+    stars : pyarrow.Table
+        Of the stars schema.
+    kept : ndarray of bool, shape (N,)
+        Stars that take part.
+    count : int
+        How many may stay; equal magnitudes go by star_id.
+
+    Returns
+    -------
+    ndarray of bool, shape (N,)
+        True for the stars beyond the count.
+    """
+    rows = np.flatnonzero(kept)
+    order = np.lexsort((stars["star_id"].to_numpy()[rows], floats_of(stars, "mag")[rows]))
+    beyond = np.zeros(len(stars), dtype=bool)
+    beyond[rows[order[count:]]] = True
+    return beyond

@@ -1,0 +1,256 @@
+"""The star table: one row a catalog record, columns as ``schemas/stars-*.json`` says.
+
+A catalog module fills in the columns that its archive has; this module adds the rest, moves
+positions to the epoch of the build and joins blocks into one table sorted by star.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from starcat.catalog.proper_motion import Motion, propagate
+from starcat.catalog.quality import Quality
+from starcat.catalog.verdict import Verdicts
+from starcat.schema import product_schema
+from starcat.sphere import directions_from_radec
+
+Values = NDArray[Any] | pa.Array | str | float | int | bool
+
+
+@dataclass(frozen=True)
+class StarBlock:
+    """What a catalog module makes of a block of records.
+
+    Attributes
+    ----------
+    columns : dict of str to Values
+        Star-table columns, arrays of shape (N,) or one value for all; NaN means null. A column
+        that the archive does not have is left out.
+    verdicts : Verdicts
+        Records that are not stars to keep, with the reason.
+    """
+
+    columns: dict[str, Values]
+    verdicts: Verdicts
+
+
+def move_to_epoch(columns: Mapping[str, Values], epoch_jyear: float | None) -> dict[str, Values]:
+    """Return the columns with positions at an epoch, and their directions.
+
+    Parameters
+    ----------
+    columns : mapping of str to Values
+        With ``ra_deg``, ``dec_deg``, ``epoch_jyear`` and, where known, proper motions.
+    epoch_jyear : float, optional
+        Julian year to move to; None leaves every star at its own epoch.
+
+    Returns
+    -------
+    dict of str to Values
+        The same with ``x``, ``y``, ``z``. A star without proper motion stays where and when
+        its archive has it, and its quality flags say so.
+    """
+    ra = np.asarray(columns["ra_deg"], dtype=np.float64)
+    dec = np.asarray(columns["dec_deg"], dtype=np.float64)
+    blank = np.full(len(ra), np.nan)
+    pm_ra = np.asarray(columns.get("pm_ra_cosdec_mas_yr", blank), dtype=np.float64)
+    pm_dec = np.asarray(columns.get("pm_dec_mas_yr", blank), dtype=np.float64)
+    unknown = np.isnan(pm_ra) | np.isnan(pm_dec)
+    epoch = np.broadcast_to(np.asarray(columns["epoch_jyear"], dtype=np.float64), len(ra))
+    motion = Motion(ra, dec, pm_ra, pm_dec)
+    if epoch_jyear is not None:
+        motion = propagate(motion, epoch_jyear - epoch)
+        epoch = np.where(unknown, epoch, epoch_jyear)
+    u = directions_from_radec(motion.ra_deg, motion.dec_deg)
+    flags = np.where(unknown, np.int32(Quality.NO_PROPER_MOTION), np.int32(0))
+    return {
+        **columns,
+        "ra_deg": motion.ra_deg,
+        "dec_deg": motion.dec_deg,
+        "epoch_jyear": epoch,
+        "x": u[:, 0],
+        "y": u[:, 1],
+        "z": u[:, 2],
+        "pm_ra_cosdec_mas_yr": motion.pm_ra_cosdec_mas_yr,
+        "pm_dec_mas_yr": motion.pm_dec_mas_yr,
+        "quality_flags": np.asarray(columns.get("quality_flags", 0), dtype=np.int32) | flags,
+    }
+
+
+def table_from_columns(product: str, columns: Mapping[str, Values], count: int) -> pa.Table:
+    """Return columns as a table of a product's schema.
+
+    Parameters
+    ----------
+    product : {"stars", "rejected"}
+        Whose schema.
+    columns : mapping of str to Values
+        Arrays of shape (count,) or one value for all; NaN means null.
+    count : int
+        Number of rows.
+
+    Returns
+    -------
+    pyarrow.Table
+        With every column of the schema, in its order; null where none was given.
+
+    Raises
+    ------
+    KeyError
+        If a column is given that the schema does not have.
+    """
+    schema = product_schema(product).arrow_schema
+    unknown = set(columns) - set(schema.names)
+    if unknown:
+        raise KeyError(f"{product} has no column {', '.join(sorted(unknown))}")
+    arrays = []
+    for field in schema:
+        value = columns.get(field.name)
+        if value is None:
+            is_flag = field.type == pa.bool_() and not field.nullable
+            value = False if is_flag else pa.nulls(count, field.type)
+        arrays.append(_as_array(value, field.type, count))
+    return pa.Table.from_arrays(arrays, schema=schema)
+
+
+def _as_array(value: Values, kind: pa.DataType, count: int) -> pa.Array:
+    if isinstance(value, pa.Array | pa.ChunkedArray):
+        return value if value.type == kind else value.cast(kind)
+    if isinstance(value, str | float | int | bool):
+        return pa.repeat(pa.scalar(value, kind), count)
+    array = np.asarray(value)
+    if array.dtype.kind == "f":
+        blank = np.isnan(array)
+        if pa.types.is_integer(kind):
+            array = np.where(blank, 0, array).astype(np.int64)
+        return pa.array(array, mask=blank if blank.any() else None).cast(kind)
+    return pa.array(array).cast(kind)
+
+
+def text_column(values: NDArray[Any]) -> pa.Array:
+    """Return fixed-width bytes as trimmed text, null where blank.
+
+    Parameters
+    ----------
+    values : ndarray of bytes, shape (N,)
+        Text as a reader returns it.
+
+    Returns
+    -------
+    pyarrow.Array
+        Of strings.
+    """
+    trimmed = pc.utf8_trim_whitespace(pa.array(values).cast(pa.string()))
+    return pc.if_else(pc.equal(trimmed, ""), pa.scalar(None, pa.string()), trimmed)
+
+
+def join_flags(parts: Mapping[str, tuple[NDArray[np.bool_], NDArray[Any] | None]]) -> pa.Array:
+    """Return the archive's codes as one text a star, such as ``Rem=1;m_HD=2``.
+
+    Parameters
+    ----------
+    parts : mapping of str to (ndarray of bool, ndarray of bytes or None)
+        Label of a code, where it applies, and its text (the label alone where None).
+
+    Returns
+    -------
+    pyarrow.Array
+        Of strings; null where no code applies.
+    """
+    joined = pa.nulls(len(next(iter(parts.values()))[0]), pa.string())
+    for label, (where, values) in parts.items():
+        if not where.any():
+            continue
+        text: Any = pa.scalar(label)
+        if values is not None:
+            text = pc.binary_join_element_wise(label, text_column(values), "=")
+        text = pc.if_else(pa.array(where), text, pa.scalar(None, pa.string()))
+        both = pc.binary_join_element_wise(joined, text, ";")
+        joined = pc.coalesce(both, joined, text)
+    return joined
+
+
+def numbered(prefix: str, number: NDArray[np.int64]) -> pa.Array:
+    """Return designations made of a prefix and a number.
+
+    Parameters
+    ----------
+    prefix : str
+        Such as ``SAO``.
+    number : ndarray of int64, shape (N,)
+        The numbers.
+
+    Returns
+    -------
+    pyarrow.Array
+        Of strings such as ``SAO 308``.
+    """
+    return pc.binary_join_element_wise(prefix, pa.array(number).cast(pa.string()), " ")
+
+
+def directions_of(stars: pa.Table) -> NDArray[np.float64]:
+    """Return the directions of a star table.
+
+    Parameters
+    ----------
+    stars : pyarrow.Table
+        Of the stars schema.
+
+    Returns
+    -------
+    ndarray of float64, shape (N, 3)
+        ICRS unit vectors, contiguous.
+    """
+    return np.stack([stars[name].to_numpy() for name in ("x", "y", "z")], axis=-1)
+
+
+def floats_of(stars: pa.Table, name: str) -> NDArray[np.float64]:
+    """Return a numeric column with NaN for null.
+
+    Parameters
+    ----------
+    stars : pyarrow.Table
+        Any table.
+    name : str
+        The column.
+
+    Returns
+    -------
+    ndarray of float64, shape (N,)
+        A copy.
+    """
+    column = stars[name]
+    if column.null_count:
+        column = pc.fill_null(column.cast(pa.float64()), float("nan"))
+    return np.array(column, dtype=np.float64)
+
+
+def sort_rows(table: pa.Table, keys: Sequence[str]) -> pa.Table:
+    """Sort a table by columns, nulls last; a sorted table is returned as it is.
+
+    Parameters
+    ----------
+    table : pyarrow.Table
+        The table.
+    keys : sequence of str
+        Columns, most significant first.
+
+    Returns
+    -------
+    pyarrow.Table
+        With the rows in order.
+    """
+    first = table[keys[0]]
+    if not first.null_count:
+        values = first.to_numpy()
+        if bool(np.all(values[1:] > values[:-1])):
+            return table
+    order = pc.sort_indices(table, [(key, "ascending") for key in keys])
+    return table.take(order)

@@ -1,0 +1,84 @@
+"""Verdicts: every record is kept, or leaves with exactly one reason.
+
+The reasons stand in the order in which they are tried; the first that applies is the verdict.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+
+class Reason(Enum):
+    """Why a record is not a guide star; the value is what it means."""
+
+    malformed_record = "the record does not follow the archive's layout"
+    deleted = "the archive says to ignore the record"
+    no_position = "the archive has no position"
+    duplicate_record = "another record has the same star_id, or the archive prefers another"
+    minor_planet = "the archive flags a minor planet"
+    extended = "the archive flags an extended or non-stellar source"
+    artifact = "the archive doubts that there is a star"
+    no_magnitude = "no magnitude in the band of the build"
+    uncertain_magnitude = "the magnitude may be wrong by more than 0.3 mag"
+    too_bright = "brighter than bright_limit_mag"
+    too_faint = "fainter than faint_limit_mag"
+    double = "a companion within min_separation_deg"
+    merged = "merged into the brighter star of a close group"
+    flagged_double = "the archive flags an unresolved double"
+    variable = "amplitude above max_amplitude_mag"
+    flagged_variable = "flagged variable, amplitude unknown"
+    beyond_count = "fainter than the brightest max_stars"
+
+
+_CODES = {reason: code for code, reason in enumerate(Reason, start=1)}
+_NAMES = pa.array(["kept", *(reason.name for reason in Reason)])
+
+
+class Verdicts:
+    """The verdicts on a number of records: kept until rejected, then final.
+
+    Parameters
+    ----------
+    count : int
+        Number of records.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._code = np.zeros(count, dtype=np.int8)
+
+    def reject(self, where: NDArray[np.bool_], reason: Reason) -> None:
+        """Reject records that no earlier reason applied to.
+
+        Parameters
+        ----------
+        where : ndarray of bool, shape (N,)
+            The records.
+        reason : Reason
+            Why.
+        """
+        self._code[where & (self._code == 0)] = _CODES[reason]
+
+    @property
+    def is_kept(self) -> NDArray[np.bool_]:
+        """Which records no reason has applied to, shape (N,)."""
+        return np.asarray(self._code == 0)
+
+    @property
+    def reasons(self) -> pa.Array:
+        """Names of the reasons of the rejected records, in order."""
+        return _NAMES.take(pa.array(self._code[self._code != 0]))
+
+    def count_by_reason(self) -> dict[str, int]:
+        """Return how many records each reason has taken.
+
+        Returns
+        -------
+        dict of str to int
+            Reasons that apply to at least one record, in the order in which they are tried.
+        """
+        counts = np.bincount(self._code, minlength=len(_NAMES))
+        return {r.name: int(counts[_CODES[r]]) for r in Reason if counts[_CODES[r]]}

