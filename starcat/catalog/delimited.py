@@ -107,7 +107,7 @@ def _read_csv(
 def _array(values: pa.ChunkedArray, column: Column) -> NDArray[Any]:
     if column.is_text:
         return _text_array(values)
-    numbers = np.array(pc.fill_null(values, float("nan")), dtype=np.float64)
+    numbers = pc.fill_null(values, float("nan")).to_numpy().copy()
     apply_nulls(numbers, column)
     return numbers
 

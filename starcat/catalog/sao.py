@@ -108,8 +108,8 @@ def icrs_from_fk5(
     velocity = pm_ra[:, None] * east + pm_dec[:, None] * north
     spin_mas_yr = np.degrees(spin) * 3.6e6
     icrs = fk5 @ rotation.T
-    # The spin is given in the FK5 frame, as seen from Hipparcos: it adds to every motion.
-    velocity = (velocity + np.cross(spin_mas_yr, fk5)) @ rotation.T
+    # The sign is that of SOFA, which gives the spin of FK5 against Hipparcos.
+    velocity = (velocity + np.cross(fk5, spin_mas_yr)) @ rotation.T
     ra, dec = radec_from_directions(icrs)
     east, north = tangent_axes(ra, dec)
     return (

@@ -175,7 +175,7 @@ def merge_doubles(stars: pa.Table, selection: Selection, verdicts: Verdicts) -> 
     if not len(pairs):
         return stars
     number = stars["star_id"].to_numpy()
-    directions, flags = directions_of(stars), np.array(stars["quality_flags"])
+    directions, flags = directions_of(stars), stars["quality_flags"].to_numpy().copy()
     absorbed = np.zeros(len(stars), dtype=bool)
     for members in _groups(pairs, len(stars)):
         ranked = members[np.lexsort((number[members], mag[members]))]

@@ -229,7 +229,7 @@ def floats_of(stars: pa.Table, name: str) -> NDArray[np.float64]:
     column = stars[name]
     if column.null_count:
         column = pc.fill_null(column.cast(pa.float64()), float("nan"))
-    return np.array(column, dtype=np.float64)
+    return np.array(column.to_numpy(), dtype=np.float64)
 
 
 def sort_rows(table: pa.Table, keys: Sequence[str]) -> pa.Table:

@@ -78,7 +78,8 @@ def read_amplitudes(
     read = ingest(source_name, paths, neighbours=False, progress=progress)
     # A star without a position can still be known to vary.
     rejected = read.rejected.select(read.stars.column_names)
-    stars = pa.concat_tables([read.stars, rejected.filter(pc.is_valid(rejected["star_id"]))])
+    usable = rejected.filter(pc.is_valid(rejected["star_id"]))
+    stars = pa.concat_tables([read.stars, usable], promote_options="permissive")
     known = pc.or_(pc.is_valid(stars["amplitude_mag"]), pc.is_valid(stars["variable_flag"]))
     stars = stars.filter(known)
     numbers = {name: _whole(stars, name) for name in ("hip_number", "hd_number")}
@@ -115,7 +116,7 @@ def join_amplitudes(stars: pa.Table, table: AmplitudeTable) -> tuple[pa.Table, i
     amplitude = floats_of(stars, "amplitude_mag")
     flag = np.array(stars["variable_flag"].to_pylist(), dtype=object)
     origin = np.array(stars["amplitude_source"].to_pylist(), dtype=object)
-    is_variable = np.array(stars["is_flagged_variable"])
+    is_variable = stars["is_flagged_variable"].to_numpy().copy()
     matched = np.zeros(len(stars), dtype=bool)
     for name, keys in table.numbers.items():
         star, row = _match(_star_numbers(stars, name), keys)

@@ -1,0 +1,412 @@
+"""Data sources: what the model refuses, and that the shipped tables fit the archives' records.
+
+A wrong byte in a column table gives wrong stars without an error, so the tables are checked
+twice: against themselves (ranges, overlaps, separators) and against genuine records.
+"""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from starcat.catalog.delimited import parse_delimited
+from starcat.catalog.fixed_width import parse_fixed_width
+from starcat.catalog.records import Records
+from starcat.catalog.source import (
+    Column,
+    DataSource,
+    RecordFile,
+    data_source,
+    read_source,
+    source_names,
+)
+from starcat.errors import ConfigError
+
+SOURCES = ("2mass", "gaia", "gcvs", "hipparcos", "sao", "tycho1", "tycho2")
+
+OVERLAPS = {("sao", "dm", "dm_component")}
+"""Columns that share bytes on purpose: the second is part of the first."""
+
+EXCERPTS = (
+    ("sao", "sao", "sao.dat.gz", 15_935),
+    ("hipparcos", "hip_main", "hip_main.dat.gz", 9_933),
+    ("tycho1", "tyc_main", "tyc_main.dat.gz", 45_978),
+    ("tycho1", "tyc_main", "samples/tycho1_I239_records.txt", 10),
+    ("tycho2", "tyc2", "tyc2.dat.gz", 44_626),
+    ("tycho2", "tyc2", "samples/tycho2_I259_records.txt", 3),
+    ("tycho2", "suppl_1", "samples/tycho2_I259_suppl_records.txt", 2),
+    ("2mass", "psc", "psc_measured.gz", 3_122),
+    ("2mass", "psc", "psc_estimated.gz", 48_717),
+    ("2mass", "psc", "samples/twomass_psc_record.txt", 1),
+    ("gcvs", "gcvs", "gcvs.tsv.gz", 49_992),
+)
+
+TINY = """\
+name = "tiny"
+title = "Tiny"
+identifier = "none"
+citation = "none"
+licence = "none"
+frame = "ICRS"
+urls_retrieved = "never"
+
+[[files]]
+name = "tiny"
+file_names = ["tiny.dat"]
+layout = "fixed_width"
+record_bytes = 10
+columns = [
+  { name = "number", bytes = [1, 4], format = "I4" },
+  { name = "mag", bytes = [6, 10], format = "F5.2", unit = "mag" },
+]
+"""
+
+
+def layouts() -> Iterator[tuple[DataSource, RecordFile]]:
+    for name in SOURCES:
+        source = data_source(name)
+        yield from ((source, file) for file in source.files)
+
+
+def with_bytes() -> list[tuple[str, RecordFile]]:
+    return [(source.name, file) for source, file in layouts() if file.record_bytes]
+
+
+def layout_of(source: str, name: str) -> RecordFile:
+    return next(file for file in data_source(source).files if file.name == name)
+
+
+def span(column: Column) -> range:
+    assert column.bytes is not None
+    return range(column.bytes[0], column.bytes[1] + 1)
+
+
+def read(path: Path) -> bytes:
+    return gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+
+
+def tiny(folder: Path, old: str = "", new: str = "") -> DataSource:
+    assert old in TINY
+    path = folder / "tiny.toml"
+    path.write_text(TINY.replace(old, new, 1) if old else TINY)
+    return read_source(path)
+
+
+# The model
+
+
+def test_a_good_file_is_read(tmp_path: Path) -> None:
+    source = tiny(tmp_path)
+    file = source.files[0]
+    assert (source.kind, source.epoch_jyear, source.rows) == ("stars", None, None)
+    assert file.column("mag").bytes == (6, 10)
+    with pytest.raises(KeyError, match="colour"):
+        file.column("colour")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "key", "message"),
+    [
+        ('citation = "none"', 'cite = "none"', "citation", "Field required"),
+        ('title = "Tiny"', 'title = "Tiny"\ncolour = 1', "colour", "Extra inputs"),
+        ("record_bytes", "record_length", "record_length", "Extra inputs"),
+        ('"I4"', '"I4", nulls = []', "nulls", "Extra inputs"),
+        ('unit = "mag"', 'unit = "parsec"', "files.0.columns.1", "unknown unit 'parsec'"),
+        ("[6, 10]", "[10, 6]", "files.0.columns.1", "not first <= last"),
+        ("[1, 4]", "[0, 4]", "files.0.columns.0", "not first <= last"),
+        ("[6, 10]", "[6, 11]", "files.0", "column mag has bytes (6, 11)"),
+        ("bytes = [6, 10], ", "", "files.0", "column mag has bytes None"),
+        ('"mag", bytes', '"number", bytes', "files.0", "named twice: ['number']"),
+        ('"F5.2"', '"R5.2"', "files.0.columns.1", "format 'R5.2' is not like I6"),
+        ('"F5.2"', '"F5"', "files.0.columns.1", "format 'F5' is not like I6"),
+        ('"mag", bytes', '"Vmag", bytes', "files.0.columns.1.name", "match pattern"),
+        ("record_bytes = 10\n", "", "files.0", "need record_bytes"),
+        ('"fixed_width"', '"fits"', "files.0.layout", "'delimited'"),
+        ('"ICRS"', '"FK4"', "frame", "'FK5'"),
+        ('["tiny.dat"]', "[]", "files.0.file_names", "at least 1 item"),
+    ],
+)
+def test_a_bad_file_is_refused_with_its_name_and_key(
+    tmp_path: Path, old: str, new: str, key: str, message: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        tiny(tmp_path, old, new)
+    assert str(caught.value).startswith("tiny.toml: ")
+    assert key in str(caught.value)
+    assert message in str(caught.value)
+    assert (caught.value.key or "").endswith(key)
+
+
+def test_a_file_that_is_not_toml(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"tiny\.toml is not a TOML file"):
+        tiny(tmp_path, 'title = "Tiny"', "title =")
+
+
+@pytest.mark.parametrize(
+    ("format_", "is_text", "is_integer", "decimals"),
+    [
+        ("A3", True, False, None),
+        ("A", True, False, None),
+        ("I6", False, True, 0),
+        ("I", False, True, 0),
+        ("F9.6", False, False, 6),
+        ("F", False, False, None),
+        ("D10.8", False, False, 8),
+        ("E12.5", False, False, 5),
+        ("<i8", False, True, None),
+        ("<f4", False, False, None),
+    ],
+)
+def test_formats(format_: str, is_text: bool, is_integer: bool, decimals: int | None) -> None:
+    column = Column(name="x", format=format_)
+    assert (column.is_text, column.is_integer, column.decimals) == (is_text, is_integer, decimals)
+
+
+@pytest.mark.parametrize(
+    ("name", "nearest"), [("tycho3", "tycho"), ("hiparcos", "hipparcos"), ("2mas", "2mass")]
+)
+def test_unknown_source_suggests_the_nearest(name: str, nearest: str) -> None:
+    with pytest.raises(ConfigError, match=f"did you mean '{nearest}") as caught:
+        data_source(name)
+    assert (caught.value.key, caught.value.value) == ("source", name)
+
+
+def test_unknown_source_lists_all() -> None:
+    with pytest.raises(ConfigError) as caught:
+        data_source("xyzzy")
+    assert "did you mean" not in str(caught.value)
+    assert all(name in str(caught.value) for name in SOURCES)
+
+
+# The seven files against themselves
+
+
+def test_seven_sources_ship() -> None:
+    assert source_names() == SOURCES
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_source_is_named_as_its_file_and_says_where_it_is_from(name: str) -> None:
+    source = data_source(name)
+    assert source.name == name
+    assert (source.kind == "stars") == bool(source.bands) == (source.frame != "none")
+    texts = (source.title, source.identifier, source.citation, source.licence, source.reference)
+    assert all(texts)
+    assert all(column.description for file in source.files for column in file.columns)
+
+
+def test_rows_of_the_archives() -> None:
+    assert {name: data_source(name).rows for name in SOURCES} == {
+        "2mass": 470_992_970,
+        "gaia": 482_176,
+        "gcvs": 49_992,
+        "hipparcos": 118_218,
+        "sao": 258_997,
+        "tycho1": 1_058_332,
+        "tycho2": 2_539_913 + 17_588,
+    }
+
+
+def test_epoch_is_given_only_where_all_records_share_it() -> None:
+    epochs = {name: data_source(name).epoch_jyear for name in SOURCES}
+    assert [name for name in SOURCES if epochs[name] is None] == ["2mass", "gcvs", "tycho2"]
+    assert (epochs["sao"], epochs["hipparcos"], epochs["gaia"]) == (2000.0, 1991.25, 2016.0)
+
+
+def test_each_part_has_its_own_name_and_address() -> None:
+    for _, file in layouts():
+        assert bool(file.parts) == ("{part}" in file.file_names[0])
+        assert len(set(file.parts)) == len(file.parts)
+        for url in file.urls:
+            assert url.removesuffix(".gz").rsplit("/", 1)[-1] in file.file_names
+
+
+@pytest.mark.parametrize(("source", "file"), with_bytes())
+def test_columns_lie_within_the_record_in_order_and_do_not_overlap(
+    source: str, file: RecordFile
+) -> None:
+    owner: dict[int, str] = {}
+    for column in file.columns:
+        for byte in span(column):
+            assert 1 <= byte <= (file.record_bytes or 0)
+            if byte in owner:
+                assert (source, owner[byte], column.name) in OVERLAPS
+            else:
+                owner[byte] = column.name
+    starts = [span(column).start for column in file.columns]
+    assert starts == sorted(starts)
+
+
+@pytest.mark.parametrize(("source", "file"), with_bytes())
+def test_format_is_as_wide_as_the_field(source: str, file: RecordFile) -> None:
+    for column in file.columns:
+        digits = column.format.lstrip("AIFDE<if").partition(".")[0]
+        assert int(digits) == len(span(column)), (source, column.name)
+
+
+@pytest.mark.parametrize(("source", "file"), with_bytes())
+def test_separators_are_outside_the_columns(source: str, file: RecordFile) -> None:
+    inside = {byte for column in file.columns for byte in span(column)}
+    assert not inside & {int(position) for position in file.literals}
+    assert set(file.literals.values()) <= {"|"}
+
+
+@pytest.mark.parametrize(
+    ("source", "name", "blank"),
+    [
+        ("sao", "sao", set()),
+        ("hipparcos", "hip_main", {*range(3, 9), 450}),
+        ("tycho1", "tyc_main", {7, 13, 48, 259}),
+        ("tycho2", "tyc2", {5, 11}),
+        ("tycho2", "suppl_1", {5, 11}),
+        ("gaia", "gaia_merged", set()),
+    ],
+)
+def test_every_byte_is_a_column_a_separator_or_blank(
+    source: str, name: str, blank: set[int]
+) -> None:
+    file = layout_of(source, name)
+    known = {byte for column in file.columns for byte in span(column)}
+    known |= {int(position) for position in file.literals}
+    assert set(range(1, (file.record_bytes or 0) + 1)) - known == blank
+
+
+def test_twomass_has_60_columns_and_92_parts() -> None:
+    file = data_source("2mass").files[0]
+    names = [column.name for column in file.columns]
+    assert len(names) == 60
+    assert (names[0], names[-1]) == ("ra", "coadd")
+    assert sum(part.startswith("a") for part in file.parts) == 57
+    assert sum(part.startswith("b") for part in file.parts) == 35
+    assert (file.parts[56], file.parts[57], file.parts[-1]) == ("ace", "baa", "bbi")
+    assert file.parts == tuple(sorted(file.parts))
+    assert {column.null for column in file.columns} == {("\\N",)}
+
+
+def test_twomass_columns_around_the_comma_that_others_lost() -> None:
+    names = [column.name for column in data_source("2mass").files[0].columns]
+    first = names.index("j_psfchi")
+    assert names[first : first + 4] == ["j_psfchi", "h_psfchi", "k_psfchi", "j_m_stdap"]
+
+
+def test_parts_of_tycho2() -> None:
+    main, supplement = data_source("tycho2").files
+    assert main.parts == tuple(f"{number:02}" for number in range(20))
+    assert supplement.optional
+    assert not main.optional
+
+
+def test_only_identifiers_and_delimited_positions_are_required() -> None:
+    required = {
+        file.name: " ".join(column.name for column in file.columns if column.required)
+        for _, file in layouts()
+    }
+    assert required == {
+        "psc": "ra dec designation",
+        "gaia_merged": "source_id ra_deg dec_deg mag_g",
+        "gcvs": "star_ref name",
+        "hip_main": "hip",
+        "sao": "sao",
+        "tyc_main": "tyc1 tyc2 tyc3",
+        "tyc2": "tyc1 tyc2 tyc3",
+        "suppl_1": "tyc1 tyc2 tyc3",
+    }
+
+
+def test_values_that_mean_no_value() -> None:
+    sao = data_source("sao").files[0]
+    assert [c.name for c in sao.columns if c.null == ("99.9",)] == ["p_mag", "v_mag"]
+    assert layout_of("tycho2", "tyc2").column("prox").null == ()
+
+
+# The tables against genuine records
+
+
+@pytest.mark.parametrize(
+    ("source", "name", "path"),
+    [
+        (source, name, path)
+        for source, name, path, _ in EXCERPTS
+        if layout_of(source, name).literals
+    ],
+)
+def test_every_record_has_the_separators(catalogs: Path, source: str, name: str, path: str) -> None:
+    file = layout_of(source, name)
+    bars = {int(position) for position in file.literals}
+    lines = read(catalogs / path).splitlines()
+    assert {len(line) for line in lines} == {file.record_bytes}
+    # Both ways: a bar at each place, and no bar anywhere else.
+    assert all(line.count(b"|") == len(bars) for line in lines)
+    assert all({line[byte - 1] for line in lines} == {ord("|")} for byte in bars)
+
+
+@pytest.mark.parametrize(("source", "name", "path", "rows"), EXCERPTS)
+def test_every_column_of_every_record_is_readable(
+    catalogs: Path, source: str, name: str, path: str, rows: int
+) -> None:
+    records = parsed(catalogs / path, layout_of(source, name))
+    assert records.problems == []
+    assert len(records) == rows
+
+
+def parsed(path: Path, file: RecordFile) -> Records:
+    parse = parse_fixed_width if file.layout == "fixed_width" else parse_delimited
+    return parse(read(path), file, [column.name for column in file.columns])
+
+
+def test_fields_of_genuine_records_are_what_they_should_be(catalogs: Path) -> None:
+    tycho2 = layout_of("tycho2", "tyc2")
+    main = parsed(catalogs / "samples/tycho2_I259_records.txt", tycho2)
+    assert main["pflag"].tolist() == [b" ", b" ", b"X"]
+    assert main["vt_mag"][1] == 8.670
+    assert main["corr"].tolist() == [-0.2, -0.2, 0.0]
+    supplement = parsed(
+        catalogs / "samples/tycho2_I259_suppl_records.txt", layout_of("tycho2", "suppl_1")
+    )
+    assert supplement["mflag"].tolist() == [b" ", b"H"]
+    assert (supplement["hip"][1], supplement["ccdm"][1]) == (1397.0, b"B")
+    tycho1 = layout_of("tycho1", "tyc_main")
+    first = parsed(catalogs / "samples/tycho1_I239_records.txt", tycho1)
+    assert [first[f"tyc{k}"][0] for k in (1, 2, 3)] == [1.0, 13.0, 1.0]
+    assert (first["dubious"][1], first["mult_flag"][0], first["hd"][0]) == (b"X", b"Y", 225210.0)
+    psc = parsed(catalogs / "samples/twomass_psc_record.txt", layout_of("2mass", "psc"))
+    assert (psc["k_psfchi"][0], psc["j_m_stdap"][0], psc["use_src"][0]) == (0.81, 12.481, 1.0)
+
+
+def test_sexagesimal_and_decimal_positions_of_hipparcos_agree(catalogs: Path) -> None:
+    hip = parsed(catalogs / "hip_main.dat.gz", layout_of("hipparcos", "hip_main"))
+    degree, minute, second = np.array([text.split() for text in hip["de_dms"]], float).T
+    size = abs(degree) + minute / 60.0 + second / 3600.0
+    # Stars without an astrometric solution have the text only.
+    solved = ~np.isnan(hip["de_deg"])
+    assert (~solved).sum() == 5
+    # The text has one decimal of an arcsecond.
+    assert abs(size - abs(hip["de_deg"]))[solved].max() < 0.051 / 3600.0
+    assert (hip["hip"] == hip["hip_repeated"]).all()
+
+
+@pytest.mark.parametrize("year", ["", "2000"])
+def test_sexagesimal_and_radian_positions_of_sao_agree(catalogs: Path, year: str) -> None:
+    sao = parsed(catalogs / "sao.dat.gz", layout_of("sao", "sao"))
+    ra = sao[f"ra{year}_h"] + sao[f"ra{year}_m"] / 60.0 + sao[f"ra{year}_s"] / 3600.0
+    dec = sao[f"de{year}_d"] + sao[f"de{year}_m"] / 60.0 + sao[f"de{year}_s"] / 3600.0
+    sign = np.where(sao[f"de{year}_sign"] == b"-", -1.0, 1.0)
+    # B1950 radians run from -pi to pi. Half a millisecond is 3.7e-8 rad, half of 0.01" 2.5e-8;
+    # negative B1950 radians have one decimal less.
+    difference = np.radians(15.0 * ra) - sao[f"ra{year}_rad"]
+    assert abs(np.angle(np.exp(1j * difference))).max() < 1.1e-7
+    assert abs(sign * np.radians(dec) - sao[f"de{year}_rad"]).max() < 3.1e-8
+
+
+def test_gcvs_flag_one_makes_the_minimum_an_amplitude(catalogs: Path) -> None:
+    gcvs = parsed(catalogs / "gcvs.tsv.gz", layout_of("gcvs", "gcvs"))
+    by_name = {name.decode().strip(): k for k, name in enumerate(gcvs["name"])}
+    k = by_name["WW And"]
+    assert (gcvs["mag_flag"][k], gcvs["mag_max"][k], gcvs["mag_min"][k]) == (1, b"10.92", b"0.67 ")
+    assert set(gcvs["mag_flag"]) == {0, 1, 2}
+    # Gaia numbers need 64-bit integers: a float64 would round them.
+    assert max(len(text.strip()) for text in gcvs["star_ref"]) == 19
