@@ -16,8 +16,8 @@ import numpy as np
 import pyarrow as pa
 
 from starcat.artifact.content import json_bytes
-from starcat.artifact.reader import check_artifact
 from starcat.artifact.manifest import SourceFacts
+from starcat.artifact.reader import check_artifact
 from starcat.artifact.writer import (
     Outcome,
     Product,

@@ -28,7 +28,7 @@ def nearest_neighbours(
     """
     # A plain split by midpoints builds far faster and searches no slower on a sky of stars.
     tree = cKDTree(directions, balanced_tree=False, compact_nodes=False)
-    _, found = tree.query(directions, k=2, workers=-1)
+    found = np.asarray(tree.query(directions, k=2, workers=-1)[1], dtype=np.int64)
     itself = np.arange(len(directions))
     # Of two stars at the same place the tree may name either first.
     index = np.where(found[:, 0] == itself, found[:, 1], found[:, 0])

@@ -41,7 +41,10 @@ class Doubles(_Section):
 
     min_separation_deg: float = Field(0.047, ge=0.0, le=10.0, description="closer is a double")
     max_delta_mag: float | None = Field(
-        None, ge=0.0, le=30.0, description="a companion fainter by more does not count; none: all do"
+        None,
+        ge=0.0,
+        le=30.0,
+        description="a companion fainter by more does not count; none: all do",
     )
     companion_limit_mag: Mag | None = Field(
         None, description="stars up to here count as companions; default faint_limit_mag"

@@ -13,8 +13,8 @@ import pyarrow as pa
 from starcat.artifact.content import content_sha256, file_sha256
 from starcat.artifact.database import MATCHER_STAR_COLUMNS
 from starcat.artifact.manifest import DATABASE_NAME, read_manifest
-from starcat.artifact.parquet import read_parquet
 from starcat.errors import ProductError
+from starcat.parquet import read_parquet
 from starcat.schema import ProductSchema, product_schema
 
 

@@ -24,9 +24,9 @@ from starcat.artifact.manifest import (
     SourceFacts,
     software_versions,
 )
-from starcat.artifact.parquet import write_parquet
 from starcat.errors import OutputError
 from starcat.kvector import KVector
+from starcat.parquet import write_parquet
 from starcat.schema import product_schema
 
 Outcome = Literal["written", "unchanged", "replaced"]
@@ -75,9 +75,7 @@ def partial_folder(final: Path) -> Iterator[Path]:
     """
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
-        made = Path(
-            tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".partial", dir=final.parent)
-        )
+        made = Path(tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".partial", dir=final.parent))
     except OSError as error:
         raise OutputError(
             f"{final.parent}: cannot write there ({error.strerror}); choose another folder "

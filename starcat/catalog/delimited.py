@@ -107,7 +107,7 @@ def _read_csv(
 def _array(values: pa.ChunkedArray, column: Column) -> NDArray[Any]:
     if column.is_text:
         return _text_array(values)
-    numbers = pc.fill_null(values, float("nan")).to_numpy().copy()
+    numbers: NDArray[np.float64] = pc.fill_null(values, float("nan")).to_numpy().copy()
     apply_nulls(numbers, column)
     return numbers
 

@@ -253,7 +253,7 @@ def open_input(path: Path) -> tuple[DigestReader, io.BufferedIOBase]:
     except OSError as error:
         raise SourceError(f"{path}: cannot be read: {error.strerror}", path=path) from error
     buffered = io.BufferedReader(raw, 1 << 20)
-    return raw, gzip.GzipFile(fileobj=buffered) if is_gzip else buffered  # type: ignore[return-value]
+    return raw, gzip.GzipFile(fileobj=buffered) if is_gzip else buffered
 
 
 def read_blocks(

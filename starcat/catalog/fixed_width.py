@@ -179,7 +179,7 @@ def _fixed_point(
         good &= is_digit[-1]
     digit *= is_digit
     places = [k for k in range(width) if k != point]
-    mantissa = np.zeros(count, dtype=np.int64 if len(places) > 9 else np.int32)
+    mantissa: NDArray[Any] = np.zeros(count, dtype=np.int64 if len(places) > 9 else np.int32)
     for k in places:
         mantissa *= 10
         mantissa += digit[k]

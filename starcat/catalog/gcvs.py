@@ -101,10 +101,16 @@ def _from_records(
     def text(name: str) -> list[str]:
         return [value.decode().strip() for part in parts for value in part[name].tolist()]
 
-    number = np.array([int(ref) if ref.isdigit() else 0 for ref in text("star_ref")], dtype=np.int64)
+    number = np.array(
+        [int(ref) if ref.isdigit() else 0 for ref in text("star_ref")], dtype=np.int64
+    )
     brightest, faintest = (_numbers(text(name)) for name in ("mag_max", "mag_min"))
     flag = np.concatenate([np.asarray(part["mag_flag"], dtype=np.float64) for part in parts])
-    amplitude = np.where(flag == 1, faintest, faintest - brightest)
+    # A few records contradict themselves: an "amplitude" fainter than the maximum is a
+    # magnitude after all, and a minimum brighter than the maximum says nothing.
+    is_amplitude = (flag == 1) & ~(faintest > brightest)
+    amplitude = np.where(is_amplitude, faintest, faintest - brightest)
+    amplitude[amplitude < 0.0] = np.nan
     is_hip = number < 1_000_000
     return Gcvs(
         files,

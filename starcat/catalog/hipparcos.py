@@ -14,10 +14,29 @@ from starcat.catalog.stars import StarBlock, join_flags, numbered
 from starcat.catalog.verdict import Reason, Verdicts
 
 COLUMNS = {
-    "hip_main": (
-        "hip proxy v_mag var_flag ra_deg de_deg pm_ra pm_de bt_mag vt_mag b_v hp_mag hp_max "
-        "hp_min hvar_type ccdm n_comp mult_flag rho dhp hd"
-    ).split()
+    "hip_main": [
+        "hip",
+        "proxy",
+        "v_mag",
+        "var_flag",
+        "ra_deg",
+        "de_deg",
+        "pm_ra",
+        "pm_de",
+        "bt_mag",
+        "vt_mag",
+        "b_v",
+        "hp_mag",
+        "hp_max",
+        "hp_min",
+        "hvar_type",
+        "ccdm",
+        "n_comp",
+        "mult_flag",
+        "rho",
+        "dhp",
+        "hd",
+    ]
 }
 
 _MAGNITUDES = {"V": "v_mag", "Hp": "hp_mag", "BT": "bt_mag", "VT": "vt_mag"}
@@ -101,9 +120,7 @@ def amplitudes(records: Records) -> NDArray[np.float64]:
         Magnitudes; the range between percentiles, raised to the lower bound of the class
         where the archive's class says more. NaN where nothing is known.
     """
-    amplitude = records["hp_min"] - records["hp_max"]
+    amplitude: NDArray[np.float64] = records["hp_min"] - records["hp_max"]
     for flag, bound in CLASS_LOWER_BOUND_MAG.items():
-        amplitude = np.where(
-            records["var_flag"] == flag, np.fmax(amplitude, bound), amplitude
-        )
+        amplitude = np.where(records["var_flag"] == flag, np.fmax(amplitude, bound), amplitude)
     return amplitude

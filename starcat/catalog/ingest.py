@@ -28,6 +28,7 @@ from starcat.catalog.files import (
 )
 from starcat.catalog.fixed_width import parse_fixed_width
 from starcat.catalog.nearest import add_nearest_neighbours
+from starcat.catalog.photometry import blend_weights
 from starcat.catalog.records import Problem, Records
 from starcat.catalog.source import DataSource, data_source
 from starcat.catalog.stars import (
@@ -141,7 +142,10 @@ def count_by_reason(rejected: pa.Table) -> dict[str, int]:
     dict of str to int
         In the order in which the reasons are tried.
     """
-    counted = {entry["values"]: entry["counts"] for entry in pc.value_counts(rejected["reason"]).to_pylist()}
+    counted = {
+        entry["values"]: entry["counts"]
+        for entry in pc.value_counts(rejected["reason"]).to_pylist()
+    }
     return {reason.name: counted[reason.name] for reason in Reason if reason.name in counted}
 
 
@@ -267,7 +271,7 @@ def check_band(source: DataSource, band: str | None) -> str:
     if band is None:
         return source.bands[0]
     if source.name == "2mass":
-        twomass.blend_weights(band)
+        blend_weights(band)
     elif band not in source.bands:
         raise ConfigError(
             f"{source.name} has no band {band!r}; it has {', '.join(source.bands)}",

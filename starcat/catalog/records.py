@@ -44,7 +44,9 @@ class Problem:
 
     def __str__(self) -> str:
         where = f" bytes {self.byte_range[0]}-{self.byte_range[1]}" if self.byte_range else ""
-        return f"line {self.line}{where}, {self.field}: found {self.found}; expected {self.expected}"
+        return (
+            f"line {self.line}{where}, {self.field}: found {self.found}; expected {self.expected}"
+        )
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import erfa
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from starcat.catalog.records import Records
@@ -18,10 +19,29 @@ from starcat.sphere import directions_from_radec, radec_from_directions, tangent
 Array = NDArray[np.float64]
 
 COLUMNS = {
-    "sao": (
-        "sao del_flag p_mag v_mag sp_type r_vmag rem dm_component hd m_hd ra2000_h ra2000_m "
-        "ra2000_s pm_ra2000 de2000_sign de2000_d de2000_m de2000_s pm_de2000 ra2000_rad de2000_rad"
-    ).split()
+    "sao": [
+        "sao",
+        "del_flag",
+        "p_mag",
+        "v_mag",
+        "sp_type",
+        "r_vmag",
+        "rem",
+        "dm_component",
+        "hd",
+        "m_hd",
+        "ra2000_h",
+        "ra2000_m",
+        "ra2000_s",
+        "pm_ra2000",
+        "de2000_sign",
+        "de2000_d",
+        "de2000_m",
+        "de2000_s",
+        "pm_de2000",
+        "ra2000_rad",
+        "de2000_rad",
+    ]
 }
 
 PRINTED_PM_DEC_ARCSEC_YR = {208759: -0.180, 208795: -0.042, 212470: -0.072}
@@ -140,7 +160,7 @@ def _proper_motions(
     return pm_ra, pm_dec
 
 
-def _duplicity(records: Records):  # type: ignore[no-untyped-def]
+def _duplicity(records: Records) -> tuple[pa.Array, NDArray[np.bool_], Array]:
     rem, m_hd = records["rem"], records["m_hd"]
     by_rem = np.isin(rem, [1, 2, 3, 7])
     by_hd = np.isin(m_hd, [1, 2, 9])

@@ -19,8 +19,29 @@ from starcat.errors import ConfigError
 from starcat.resources import resource_folder
 
 UNITS = frozenset(
-    "deg rad h min s arcmin arcsec mas cas darcsec mag mmag yr d mas/yr arcsec/yr s/yr "
-    "cas/yr pix ct km/s".split()
+    [
+        "deg",
+        "rad",
+        "h",
+        "min",
+        "s",
+        "arcmin",
+        "arcsec",
+        "mas",
+        "cas",
+        "darcsec",
+        "mag",
+        "mmag",
+        "yr",
+        "d",
+        "mas/yr",
+        "arcsec/yr",
+        "s/yr",
+        "cas/yr",
+        "pix",
+        "ct",
+        "km/s",
+    ]
 )
 """Units that a column may name; ``cas`` is 10 mas, ``darcsec`` is 0.1 arcsec."""
 

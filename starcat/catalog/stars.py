@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -21,7 +21,7 @@ from starcat.catalog.verdict import Verdicts
 from starcat.schema import product_schema
 from starcat.sphere import directions_from_radec
 
-Values = NDArray[Any] | pa.Array | str | float | int | bool
+Values: TypeAlias = NDArray[Any] | pa.Array | str | float | int | bool
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,23 @@ from starcat.catalog.stars import StarBlock, join_flags, text_column
 from starcat.catalog.verdict import Reason, Verdicts
 
 COLUMNS = {
-    "psc": (
-        "ra dec designation j_m h_m k_m ph_qual rd_flg bl_flg cc_flg gal_contam mp_flg pts_key "
-        "jdate use_src"
-    ).split()
+    "psc": [
+        "ra",
+        "dec",
+        "designation",
+        "j_m",
+        "h_m",
+        "k_m",
+        "ph_qual",
+        "rd_flg",
+        "bl_flg",
+        "cc_flg",
+        "gal_contam",
+        "mp_flg",
+        "pts_key",
+        "jdate",
+        "use_src",
+    ]
 }
 
 _BANDS = {"J": (0, "j_m"), "H": (1, "h_m"), "Ks": (2, "k_m")}
@@ -46,6 +59,8 @@ def stars(records: Records, band: str) -> StarBlock:
     mags = {name: _measured(records, name) for name in _BANDS}
     mag = np.sum([weight * mags[name] for name, weight in weights.items()], axis=0)
     verdicts = Verdicts(len(records))
+    number = _identity(records)
+    verdicts.reject(number == 0, Reason.no_identity)
     verdicts.reject(np.isnan(records["ra"]) | np.isnan(records["dec"]), Reason.no_position)
     verdicts.reject(records["use_src"] == 0, Reason.duplicate_record)
     verdicts.reject(records["mp_flg"] == 1, Reason.minor_planet)
@@ -56,7 +71,7 @@ def stars(records: Records, band: str) -> StarBlock:
     blended = _any_flag(records, "bl_flg", b"23456789", weights)
     return StarBlock(
         {
-            "star_id": _identity(records),
+            "star_id": number,
             "designation": pc.binary_join_element_wise(
                 "2MASS J", text_column(records["designation"]), ""
             ),
@@ -110,12 +125,22 @@ def _any_flag(
 
 
 def _identity(records: Records) -> NDArray[np.int64]:
-    """Return pts_key, or the designation packed above all keys where there is none."""
+    """Return pts_key, or the designation packed above all keys; 0 where there is neither.
+
+    ``hhmmssss+ddmmsss`` gives 15 digits, a component letter behind it (A, B …) a sixteenth
+    and seventeenth, the hemisphere a nineteenth: 1 north, 2 south.
+    """
     key = records["pts_key"]
-    text = np.char.strip(records["designation"])
-    digits = np.char.replace(np.char.replace(text, b"+", b""), b"-", b"")
-    is_packable = np.char.isdigit(digits) & (np.char.str_len(digits) == 15)
-    packed = np.where(is_packable, digits, b"0").astype(np.int64)
-    south = np.char.find(text, b"-") >= 0
-    packed += np.where(south, 2, 1) * 10**18
-    return np.where(np.isnan(key), packed, np.where(np.isnan(key), 0, key).astype(np.int64))
+    text = records["designation"]
+    chars = np.zeros((len(text), 20), dtype=np.uint8)
+    given = text.view(np.uint8).reshape(len(text), -1)[:, :20]
+    chars[:, : given.shape[1]] = given
+    digits = chars[:, [*range(8), *range(9, 16)]].astype(np.int64) - ord("0")
+    sign, tail = chars[:, 8], chars[:, 16:].max(axis=1)
+    component = np.where(tail >= ord("A"), tail.astype(np.int64) - ord("A") + 1, 0)
+    packed = digits @ (10 ** np.arange(14, -1, -1, dtype=np.int64)) + component * 10**15
+    packed += np.where(sign == ord("-"), 2, 1) * 10**18
+    is_regular = ((digits >= 0) & (digits <= 9)).all(axis=1) & np.isin(sign, [ord("+"), ord("-")])
+    return np.where(
+        np.isnan(key), np.where(is_regular, packed, 0), np.nan_to_num(key).astype(np.int64)
+    )

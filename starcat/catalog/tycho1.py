@@ -17,10 +17,31 @@ from starcat.catalog.stars import StarBlock, join_flags
 from starcat.catalog.verdict import Reason, Verdicts
 
 COLUMNS = {
-    "tyc_main": (
-        "tyc1 tyc2 tyc3 proxy v_mag ra_deg de_deg dubious pm_ra pm_de bt_mag r_bt_mag vt_mag b_v "
-        "q vt_max vt_min var var_flag mult_flag hip hd remark"
-    ).split()
+    "tyc_main": [
+        "tyc1",
+        "tyc2",
+        "tyc3",
+        "proxy",
+        "v_mag",
+        "ra_deg",
+        "de_deg",
+        "dubious",
+        "pm_ra",
+        "pm_de",
+        "bt_mag",
+        "r_bt_mag",
+        "vt_mag",
+        "b_v",
+        "q",
+        "vt_max",
+        "vt_min",
+        "var",
+        "var_flag",
+        "mult_flag",
+        "hip",
+        "hd",
+        "remark",
+    ]
 }
 
 _MAGNITUDES = {"V": "v_mag", "BT": "bt_mag", "VT": "vt_mag"}

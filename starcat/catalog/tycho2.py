@@ -20,13 +20,42 @@ from starcat.catalog.tycho1 import tycho_identity
 from starcat.catalog.verdict import Reason, Verdicts
 
 COLUMNS = {
-    "tyc2": (
-        "tyc1 tyc2 tyc3 pflag ra_mean_deg de_mean_deg pm_ra pm_de bt_mag vt_mag prox hip ccdm "
-        "ra_deg de_deg ep_ra_1990 ep_de_1990 posflg"
-    ).split(),
-    "suppl_1": (
-        "tyc1 tyc2 tyc3 flag ra_deg de_deg pm_ra pm_de mflag bt_mag vt_mag prox hip ccdm"
-    ).split(),
+    "tyc2": [
+        "tyc1",
+        "tyc2",
+        "tyc3",
+        "pflag",
+        "ra_mean_deg",
+        "de_mean_deg",
+        "pm_ra",
+        "pm_de",
+        "bt_mag",
+        "vt_mag",
+        "prox",
+        "hip",
+        "ccdm",
+        "ra_deg",
+        "de_deg",
+        "ep_ra_1990",
+        "ep_de_1990",
+        "posflg",
+    ],
+    "suppl_1": [
+        "tyc1",
+        "tyc2",
+        "tyc3",
+        "flag",
+        "ra_deg",
+        "de_deg",
+        "pm_ra",
+        "pm_de",
+        "mflag",
+        "bt_mag",
+        "vt_mag",
+        "prox",
+        "hip",
+        "ccdm",
+    ],
 }
 
 PROX_BEYOND = 999

@@ -17,6 +17,7 @@ class Reason(Enum):
 
     malformed_record = "the record does not follow the archive's layout"
     deleted = "the archive says to ignore the record"
+    no_identity = "neither a number nor a designation names the star"
     no_position = "the archive has no position"
     duplicate_record = "another record has the same star_id, or the archive prefers another"
     minor_planet = "the archive flags a minor planet"

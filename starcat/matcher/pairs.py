@@ -54,7 +54,7 @@ def candidate_triangles(
     u, v, w = (database.directions[stars[:, k]] for k in range(3))
     fits = np.abs(separation(v, w) - bc) <= tolerance_rad
     handed = np.einsum("ij,ij->i", np.cross(u, v), w) * float(np.cross(a, b) @ c) > 0.0
-    return stars[fits & handed].astype(np.int64)
+    return np.asarray(stars[fits & handed], dtype=np.int64)
 
 
 def _directed(

@@ -1,4 +1,4 @@
-"""Verification: does an attitude explain the frame, and how likely is that by chance?"""
+"""Verification: whether an attitude explains a frame, and how likely that is by chance."""
 
 from __future__ import annotations
 

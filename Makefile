@@ -1,0 +1,54 @@
+# Every target runs in .venv, which the first of them makes.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.DEFAULT_GOAL := help
+.PHONY: help install check format test test-all demo bench docs golden clean
+
+help: ## list the targets
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+
+$(READY): pyproject.toml
+	$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "starcat needs Python 3.11 or newer"'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $(READY)
+
+install: $(READY) ## install starcat and its tools into .venv
+
+check: $(READY) ## format, lint, types
+	$(BIN)/ruff format --check --quiet .
+	$(BIN)/ruff check --quiet .
+	$(BIN)/mypy
+
+format: $(READY) ## rewrite the code in the house format
+	$(BIN)/ruff format --quiet .
+	$(BIN)/ruff check --quiet --fix .
+
+test: $(READY) ## the fast tests and the docstrings' examples
+	$(BIN)/python -m pytest -q -n 2 -m 'not slow'
+
+test-all: $(READY) ## the fast tests and the sky-scale ones
+	$(BIN)/python -m pytest -q -n 2
+
+demo: $(READY) ## build a database from the embedded sky, check it, identify simulated fields
+	$(BIN)/starcat build --preset gaia-12deg --output dist --replace
+	$(BIN)/starcat inspect dist/gaia-12deg-1.0.0
+	$(BIN)/starcat simulate dist/gaia-12deg-1.0.0 --output dist/frame.csv --seed 7
+	$(BIN)/starcat identify dist/gaia-12deg-1.0.0 dist/frame.csv
+	$(BIN)/starcat selftest dist/gaia-12deg-1.0.0 --frames 500
+
+bench: $(READY) ## time and memory beside bare parsers, in one run
+	$(BIN)/python tests/benchmarks/ingest.py
+
+docs: $(READY) ## rewrite the generated pages of docs/
+	$(BIN)/python tests/builders/docs.py
+
+golden: $(READY) ## rewrite the golden digests; look at the difference before committing it
+	$(BIN)/python tests/builders/golden.py
+	@git --no-pager diff --stat tests/golden
+
+clean: ## remove what the targets made
+	rm -rf $(VENV) dist build .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,0 +1,366 @@
+"""What each command prints: the same facts as tables for people or JSON for machines."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcat.console import print_json, print_table, say
+from starcat.errors import SourceError
+
+if TYPE_CHECKING:
+    from starcat.artifact.reader import Artifact
+    from starcat.catalog.fetch import FetchReport
+    from starcat.catalog.ingest import Ingested
+    from starcat.evaluation.selftest import Rates
+    from starcat.matcher.database import Database
+    from starcat.matcher.result import MatchResult
+    from starcat.pipeline import Built
+
+
+def print_sources(*, as_json: bool) -> None:
+    """Print the data sources and where each would be read from.
+
+    Parameters
+    ----------
+    as_json : bool
+        Whether to print JSON.
+    """
+    from starcat.catalog.locate import locate
+    from starcat.catalog.source import data_source, source_names
+
+    found: list[dict[str, Any]] = []
+    for name in source_names():
+        source = data_source(name)
+        try:
+            place = ", ".join(str(path) for path in locate(name, {}))
+        except SourceError:
+            place = ""
+        found.append(
+            {
+                "name": name,
+                "kind": source.kind,
+                "identifier": source.identifier,
+                "rows": source.rows,
+                "bands": list(source.bands),
+                "epoch_jyear": source.epoch_jyear,
+                "licence": source.licence,
+                "citation": source.citation,
+                "found_at": place or None,
+            }
+        )
+    if as_json:
+        print_json(found)
+        return
+    print_table(
+        "",
+        ("source", "identifier", "rows", "bands", "read from"),
+        [
+            (
+                entry["name"],
+                entry["identifier"],
+                f"{entry['rows']:,}" if entry["rows"] else "",
+                " ".join(entry["bands"]) or "(joined)",
+                entry["found_at"] or "not found",
+            )
+            for entry in found
+        ],
+        numbers=(2,),
+    )
+
+
+def print_presets(*, as_json: bool) -> None:
+    """Print the presets.
+
+    Parameters
+    ----------
+    as_json : bool
+        Whether to print JSON, with every key of every spec.
+    """
+    from starcat.spec import preset, preset_names
+
+    specs = [preset(name) for name in preset_names()]
+    if as_json:
+        print_json([spec.model_dump(mode="json") for spec in specs])
+        return
+    rows = [(spec.name, spec.version, spec.catalog.source, spec.description) for spec in specs]
+    print_table("", ("preset", "version", "source", "what it is"), rows)
+
+
+def print_fetched(report: FetchReport, *, as_json: bool) -> None:
+    """Print what was fetched.
+
+    Parameters
+    ----------
+    report : FetchReport
+        Of `fetch_source`.
+    as_json : bool
+        Whether to print JSON.
+    """
+    rows = [
+        {
+            "name": file.name,
+            "status": file.status,
+            "rows": file.rows,
+            "bytes": file.bytes,
+            "sha256": file.sha256,
+            "path": str(file.path),
+        }
+        for file in report.files
+    ]
+    if as_json:
+        print_json(rows)
+        return
+    cells = [(r["name"], r["status"], f"{r['rows']:,}", f"{r['bytes']:,}") for r in rows]
+    print_table(f"{report.source}", ("file", "status", "rows", "bytes"), cells, numbers=(2, 3))
+
+
+def print_ingested(read: Ingested, output: Path, *, as_json: bool) -> None:
+    """Print what became of the records of a catalog.
+
+    Parameters
+    ----------
+    read : Ingested
+        Of `ingest`.
+    output : Path
+        File of the star table.
+    as_json : bool
+        Whether to print JSON.
+    """
+    from starcat.catalog.export import rejected_path
+
+    facts = {
+        "source": read.source,
+        "band": read.band,
+        "rows_read": read.rows_read,
+        "kept": len(read.stars),
+        "rejected": read.rejected_by_reason,
+        "files": [vars(file) for file in read.files],
+        "stars": str(output),
+        "rejected_rows": str(rejected_path(output)) if len(read.rejected) else None,
+        "problems": list(read.problems),
+    }
+    if as_json:
+        print_json(facts)
+        return
+    print_table("", ("records", "rows"), _balance(facts), numbers=(1,))
+    print_problems(read.problems)
+    say(f"wrote {output}" + (f" and {rejected_path(output).name}" if len(read.rejected) else ""))
+
+
+def print_problems(problems: Sequence[str]) -> None:
+    """Print the first malformed records on stderr.
+
+    Parameters
+    ----------
+    problems : sequence of str
+        Each with file, line and bytes.
+    """
+    for problem in problems[:5]:
+        say(f"malformed: {problem}")
+
+
+def _balance(facts: dict[str, Any]) -> list[tuple[str, str]]:
+    """Rows read, kept and rejected by reason: the two sides are equal."""
+    from starcat.catalog.verdict import Reason
+
+    rows = [("read", f"{facts['rows_read']:,}"), ("kept", f"{facts['kept']:,}")]
+    for name, count in facts["rejected"].items():
+        rows.append((f"rejected: {name} ({Reason[name].value})", f"{count:,}"))
+    return rows
+
+
+def print_built(built: Built, *, as_json: bool) -> None:
+    """Print what a build made.
+
+    Parameters
+    ----------
+    built : Built
+        Of `pipeline.build`.
+    as_json : bool
+        Whether to print JSON.
+    """
+    manifest = built.manifest
+    if as_json:
+        print_json(
+            {
+                "artifact": str(built.folder),
+                "outcome": built.outcome,
+                "coverage": [vars(step) for step in built.coverage],
+                "self_test": [rates.as_dict() for rates in built.rates],
+                **{key: manifest[key] for key in ("sources", "products", "files")},
+            }
+        )
+        return
+    for source in manifest["sources"]:
+        print_table(
+            f"{source['source']} ({source['role']})",
+            ("records", "rows"),
+            _balance(source),
+            numbers=(1,),
+        )
+    print_table(
+        "What each filter leaves in the fields of the tiling",
+        ("after", "stars", "median a field", "fewest", "fields below 4"),
+        [
+            (
+                step.step,
+                f"{step.stars:,}",
+                f"{step.median_per_field:g}",
+                step.min_per_field,
+                f"{step.share_below_4:.2%}",
+            )
+            for step in built.coverage
+        ],
+        numbers=(1, 2, 3, 4),
+    )
+    print_products(manifest)
+    print_rates(built.rates, as_json=False)
+    print_problems(built.problems)
+    say(f"{built.outcome}: {built.folder}")
+
+
+def print_products(manifest: dict[str, Any]) -> None:
+    """Print the products of an artifact.
+
+    Parameters
+    ----------
+    manifest : dict
+        Of the artifact.
+    """
+    files = manifest["files"]
+    rows = [
+        (name, facts["schema"], f"{facts['rows']:,}", f"{files[facts['parquet']]['bytes']:,}")
+        for name, facts in manifest["products"].items()
+    ]
+    rows.append(("database.h5", "", "", f"{files['database.h5']['bytes']:,}"))
+    print_table("Products", ("product", "schema", "rows", "bytes"), rows, numbers=(2, 3))
+
+
+def print_rates(rates: Sequence[Rates], *, as_json: bool) -> None:
+    """Print the rates of a self-test.
+
+    Parameters
+    ----------
+    rates : sequence of Rates
+        Of `self_test`.
+    as_json : bool
+        Whether to print JSON.
+    """
+    if as_json:
+        print_json([rate.as_dict() for rate in rates])
+        return
+    print_table(
+        "Simulated fields",
+        ("fields", "noise px", "dropped", "false", "tried", "4+ stars", "right", "wrong", "rate"),
+        [
+            (
+                rate.name,
+                f"{rate.noise_px:g}",
+                f"{rate.drop_probability:.0%}",
+                rate.false_stars,
+                rate.frames,
+                rate.identifiable,
+                rate.identified,
+                rate.wrong,
+                f"{rate.identified_share:.1%}",
+            )
+            for rate in rates
+        ],
+        numbers=tuple(range(1, 9)),
+    )
+
+
+def print_artifact(artifact: Artifact, *, as_json: bool) -> None:
+    """Print what an artifact holds.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        Open.
+    as_json : bool
+        Whether to print the manifest as JSON.
+    """
+    manifest = artifact.manifest
+    if as_json:
+        print_json(manifest)
+        return
+    spec = manifest["spec"]
+    camera = spec["camera"]
+    selection = spec["selection"]
+    print_table(
+        f"{manifest['name']}-{manifest['version']}",
+        ("", ""),
+        [
+            ("description", spec["description"]),
+            ("frame, epoch", f"{manifest['frame']}, J{manifest['epoch_jyear']:g}"),
+            ("camera", f"{camera['width_px']} x {camera['height_px']} px"),
+            ("faint limit", f"{selection['faint_limit_mag']:g} mag"),
+            ("made by", ", ".join(f"{k} {v}" for k, v in manifest["software"].items())),
+        ],
+    )
+    for source in manifest["sources"]:
+        files = ", ".join(f"{file['name']} ({file['sha256'][:12]})" for file in source["files"])
+        print_table(f"{source['source']} from {files}", ("records", "rows"), _balance(source), (1,))
+    print_products(manifest)
+
+
+def print_match(
+    result: MatchResult,
+    centroids_px: np.ndarray[Any, np.dtype[np.float64]],
+    database: Database,
+    *,
+    as_json: bool,
+) -> None:
+    """Print the answer to a frame.
+
+    Parameters
+    ----------
+    result : MatchResult
+        The answer.
+    centroids_px : ndarray of float64, shape (N, 2)
+        The frame.
+    database : Database
+        Names and magnitudes.
+    as_json : bool
+        Whether to print JSON.
+    """
+    is_identified = result.status == "identified"
+    facts: dict[str, Any] = {"status": result.status, "n_matched": result.n_matched}
+    if is_identified:
+        facts |= {
+            "boresight_ra_deg": result.boresight_ra_deg,
+            "boresight_dec_deg": result.boresight_dec_deg,
+            "roll_deg": result.roll_deg,
+            "q_body_from_icrs": result.q_body_from_icrs.tolist(),
+            "residual_arcsec": result.residual_arcsec,
+            "false_match_probability": result.false_match_probability,
+        }
+    stars = []
+    for (x, y), row in zip(centroids_px, result.star_index, strict=True):
+        star: dict[str, Any] = {"x_px": float(x), "y_px": float(y), "star": None, "mag": None}
+        if row >= 0:
+            star |= {"star": database.designation[row].decode(), "mag": float(database.mag[row])}
+        stars.append(star)
+    if as_json:
+        print_json({**facts, "stars": stars})
+        return
+    rows = [
+        (name, f"{value:.9g}" if isinstance(value, float) else value)
+        for name, value in facts.items()
+    ]
+    print_table(f"{len(centroids_px)} centroids, {database.name}", ("", ""), rows)
+    if is_identified:
+        print_table(
+            "Stars",
+            ("x px", "y px", "star", "mag"),
+            [
+                (f"{s['x_px']:.2f}", f"{s['y_px']:.2f}", s["star"] or "-",
+                 "" if s["mag"] is None else f"{s['mag']:.2f}")
+                for s in stars
+            ],
+            numbers=(0, 1, 3),
+        )  # fmt: skip
