@@ -22,7 +22,12 @@ def write_parquet(table: pa.Table, path: Path) -> None:
         Overwritten if it exists.
     """
     floating = [field.name for field in table.schema if pa.types.is_floating(field.type)]
-    dictionary = [field.name for field in table.schema if pa.types.is_string(field.type)]
+    # Names differ in every row: a dictionary of them would be the column again.
+    dictionary = [
+        field.name
+        for field in table.schema
+        if pa.types.is_string(field.type) and field.name != "designation"
+    ]
     pq.write_table(
         table,
         path,

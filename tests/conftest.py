@@ -3,9 +3,23 @@
 from __future__ import annotations
 
 import os
+import signal
+import sys
+import tomllib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
+from hypothesis import settings
+from numpy.typing import NDArray
+
+# The same examples on every machine and in every run: a test fails for everybody or for nobody.
+settings.register_profile(
+    "starcat", derandomize=True, deadline=None, max_examples=60, database=None
+)
+settings.load_profile("starcat")
 
 
 @pytest.fixture(scope="session")
@@ -19,3 +33,96 @@ def catalogs() -> Path:
             f"or put it at {beside}"
         )
     return folder
+
+
+@pytest.fixture(scope="session")
+def random_directions() -> Callable[[int, int], NDArray[np.float64]]:
+    """Directions uniform over the sphere: of a count and a seed."""
+
+    def draw(count: int, seed: int) -> NDArray[np.float64]:
+        v = np.random.default_rng(seed).normal(size=(count, 3))
+        return v / np.linalg.norm(v, axis=1)[:, None]
+
+    return draw
+
+
+SMALL_SPEC = """\
+name = "small"
+version = "1.0.0"
+epoch_jyear = 2026.0
+catalog.source = "sao"
+selection.faint_limit_mag = 6.0
+camera = { width_px = 512, height_px = 512, fov_x_deg = 40.0 }
+boresights.count = 200
+self_test = { frames = 5, min_identified = 0.8 }
+"""
+
+
+@pytest.fixture(scope="session")
+def sao_lines() -> list[bytes]:
+    """600 records in the layout of SAO, of stars that do not exist, V 2.0 to 6.4."""
+    generator = np.random.default_rng(600)
+    ra_rad = generator.uniform(0.0, 2.0 * np.pi, 600)
+    dec_rad = np.arcsin(generator.uniform(-1.0, 1.0, 600))
+    lines = []
+    for number, (ra, dec) in enumerate(zip(ra_rad, dec_rad, strict=True), start=1):
+        mag = 2.0 + 4.4 * number / 600
+        front = f"{number:6d}".ljust(80) + f"{mag:4.1f}A0V"
+        lines.append(f"{front.ljust(183)}{ra:10.8f}{dec:+11.8f}\n".encode())
+    return lines
+
+
+@pytest.fixture(scope="session")
+def small_spec() -> str:
+    """A spec whose build from `sao_lines` takes a tenth of a second."""
+    return SMALL_SPEC
+
+
+@dataclass(frozen=True)
+class Ran:
+    """What a run of the command line gave."""
+
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def starcat(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> Iterator[Callable[[Sequence[object]], Ran]]:
+    """The command line in this process: arguments in, exit code and output out.
+
+    It finds no catalog but those that it is given.
+    """
+    from starcat.cli import main
+
+    monkeypatch.setenv("STARCAT_CACHE", str(tmp_path / "no-cache"))
+    monkeypatch.delenv("STARCAT_CATALOGS", raising=False)
+    before = signal.getsignal(signal.SIGTERM)
+
+    def run(arguments: Sequence[object]) -> Ran:
+        monkeypatch.setattr(sys, "argv", ["starcat", *map(str, arguments)])
+        capsys.readouterr()
+        code = 0
+        try:
+            main()
+        except SystemExit as stop:
+            code = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+        captured = capsys.readouterr()
+        return Ran(code, captured.out, captured.err)
+
+    yield run
+    signal.signal(signal.SIGTERM, before)
+
+
+@pytest.fixture(scope="session")
+def small_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> Path:
+    """The artifact of `small_spec`; to be copied by who changes it."""
+    from starcat.pipeline import build
+    from starcat.spec import spec_from_dict
+
+    folder = tmp_path_factory.mktemp("small")
+    (folder / "sao.dat").write_bytes(b"".join(sao_lines))
+    spec = spec_from_dict(tomllib.loads(SMALL_SPEC), "small.toml")
+    return build(spec, {"sao": [folder / "sao.dat"]}, folder / "dist").folder

@@ -282,10 +282,11 @@ def read_blocks(
     """
     raw, stream = open_input(file.path)
     line, tail = 1, b""
-    if file.layout.layout == "binary":
-        check_magic(stream.read(file.layout.header_bytes), file, source_name)
     try:
-        while chunk := stream.read(BLOCK_BYTES):
+        if file.layout.layout == "binary":
+            check_magic(stream.read(file.layout.header_bytes), file, source_name)
+        size = _read_size(file.layout)
+        while chunk := stream.read(size):
             data = tail + chunk
             cut = _last_whole(data, file.layout)
             tail = data[cut:]
@@ -340,6 +341,12 @@ def check_magic(header: bytes, file: InputFile, source_name: str) -> None:
             path=file.path,
             byte_range=(1, file.layout.header_bytes),
         )
+
+
+def _read_size(layout: RecordFile) -> int:
+    """Return a whole number of records, so that a regular file never has to be cut and joined."""
+    record = (layout.record_bytes or 1) + (layout.layout == "fixed_width")
+    return max(1, BLOCK_BYTES // record) * record
 
 
 def _last_whole(data: bytes, layout: RecordFile) -> int:

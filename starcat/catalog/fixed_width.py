@@ -89,7 +89,7 @@ def _split_lines(
     if len(raw) % stride == 0:
         matrix = raw.reshape(-1, stride)
         ends = matrix[:, length:]
-        regular = bool((ends[:, -1] == _NEWLINE).all()) and bool((ends[:, 0] <= _RETURN).all())
+        regular = bool((ends[:, -1] == _NEWLINE).all()) and bool((ends[:, 0] == ends[0, 0]).all())
         if regular and not (matrix[:, :length] == _NEWLINE).any():
             line = np.arange(first_line, first_line + len(matrix), dtype=np.int64)
             return matrix[:, :length], line, []
@@ -120,7 +120,11 @@ def _check_literals(
     chars: NDArray[np.uint8], line: NDArray[np.int64], layout: RecordFile, bad: NDArray[np.bool_]
 ) -> list[Problem]:
     """Mark the records that lack a separator where the layout has one."""
-    problems = []
+    problems: list[Problem] = []
+    places = np.array([int(position) - 1 for position in layout.literals], dtype=np.intp)
+    texts = np.array([ord(text) for text in layout.literals.values()], dtype=np.uint8)
+    if bool((chars[:, places] == texts).all()):
+        return problems
     for position, text in layout.literals.items():
         byte = int(position)
         wrong = (chars[:, byte - 1] != ord(text)) & ~bad
@@ -145,7 +149,7 @@ def _parse_numbers(
         text = field[i].tobytes()
         try:
             values[i] = np.nan if text.strip().decode() in column.null else number_from_text(text)
-            if column.is_integer and values[i] % 1.0:
+            if column.is_integer and values[i] % 1.0 > 0.0:
                 raise ValueError(text)
         except ValueError:
             if not bad[i]:

@@ -226,7 +226,7 @@ def ingest(
     rows = [0] * len(files)
     problems: list[tuple[int, Problem]] = []
     for part in map_in_order(to_part, blocks):
-        if not rows[part.file_number] and part.rows == len(part.problems):
+        if part.problems and not rows[part.file_number] and part.rows == len(part.problems):
             raise not_this_archive(files[part.file_number], source, part.problems)
         rows[part.file_number] += part.rows
         problems += [(part.file_number, problem) for problem in part.problems]
@@ -374,7 +374,8 @@ def _malformed_rows(
 
 def _join(parts: Sequence[_Part], source_name: str, band: str) -> tuple[pa.Table, pa.Table]:
     """Join the blocks, sorted, and reject the records whose star was read before."""
-    stars = pa.concat_tables([part.stars for part in parts]).combine_chunks()
+    # Chunks stay as they are: joining them would hold the whole catalog in memory twice.
+    stars = pa.concat_tables([part.stars for part in parts])
     keys = ["star_id", "source_file", "source_line"]
     stars = sort_rows(stars, keys)
     rejected = [part.rejected for part in parts]

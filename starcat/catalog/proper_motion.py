@@ -13,8 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from starcat.sphere import directions_from_radec, radec_from_directions, tangent_axes
-
 Array = NDArray[np.float64]
 
 MAS = np.pi / (180.0 * 3600.0 * 1000.0)  # rad in a milliarcsecond
@@ -57,28 +55,64 @@ def propagate(motion: Motion, years: ArrayLike) -> Motion:
     ----------
     ESA SP-1200 (1997), vol. 1, eqs. 1.5.21 and 1.5.22 with zero parallax.
     """
+    return propagate_directions(motion, years)[0]
+
+
+def propagate_directions(motion: Motion, years: ArrayLike) -> tuple[Motion, Array]:
+    """Move positions as `propagate` does, and return the directions too.
+
+    Parameters
+    ----------
+    motion : Motion
+        As for `propagate`.
+    years : array_like of float64, shape (N,) or ()
+        As for `propagate`.
+
+    Returns
+    -------
+    motion : Motion
+        At the second epoch.
+    directions : ndarray of float64, shape (N, 3)
+        ICRS unit vectors at the second epoch.
+    """
     unknown = np.isnan(motion.pm_ra_cosdec_mas_yr) | np.isnan(motion.pm_dec_mas_yr)
     pm_ra = np.where(unknown, 0.0, motion.pm_ra_cosdec_mas_yr) * MAS
     pm_dec = np.where(unknown, 0.0, motion.pm_dec_mas_yr) * MAS
-    east, north = tangent_axes(motion.ra_deg, motion.dec_deg)
-    velocity = pm_ra[:, None] * east + pm_dec[:, None] * north
-    start = directions_from_radec(motion.ra_deg, motion.dec_deg)
-    end = start + velocity * np.broadcast_to(years, len(start))[:, None]
-    length = np.sqrt(np.einsum("ij,ij->i", end, end))[:, None]
-    direction = end / length
-    # d/dt of p/|p|: the part of the velocity across the new direction, slowed by the distance.
-    along = np.einsum("ij,ij->i", velocity, direction)[:, None]
-    rate = (velocity - along * direction) / length
+    ra, dec = np.radians(motion.ra_deg), np.radians(motion.dec_deg)
+    sin_ra, cos_ra, sin_dec, cos_dec = np.sin(ra), np.cos(ra), np.sin(dec), np.cos(dec)
+    # The velocity along east (-sin ra, cos ra, 0) and north (-sin dec cos ra, ...), a component
+    # at a time: on millions of stars that is several times faster than rows of vectors.
+    inward = -pm_dec * sin_dec
+    vx = inward * cos_ra - pm_ra * sin_ra
+    vy = inward * sin_ra + pm_ra * cos_ra
+    vz = pm_dec * cos_dec
+    u = np.empty((len(ra), 3))
+    u[:, 0], u[:, 1], u[:, 2] = cos_dec * cos_ra, cos_dec * sin_ra, sin_dec
+    for axis, v in enumerate((vx, vy, vz)):
+        u[:, axis] += v * years
+    length = np.sqrt(np.einsum("ij,ij->i", u, u))
+    u /= length[:, None]
+    x, y, z = u[:, 0], u[:, 1], u[:, 2]
+    ground = np.hypot(x, y)
     moved = (pm_ra != 0.0) | (pm_dec != 0.0)
-    ra_deg, dec_deg = radec_from_directions(direction)
-    ra_deg = np.where(moved, ra_deg, motion.ra_deg)
-    dec_deg = np.where(moved, dec_deg, motion.dec_deg)
-    east, north = tangent_axes(ra_deg, dec_deg)
-    pm_ra_end = np.einsum("ij,ij->i", rate, east) / MAS
-    pm_dec_end = np.einsum("ij,ij->i", rate, north) / MAS
-    return Motion(
+    ra_deg = np.where(moved, np.degrees(np.arctan2(y, x)), motion.ra_deg)
+    ra_deg = np.where(moved & (ra_deg < 0.0), ra_deg + 360.0, ra_deg)
+    ra_deg = np.where(moved & (ra_deg >= 360.0), 0.0, ra_deg)
+    dec_deg = np.where(moved, np.degrees(np.arctan2(z, ground)), motion.dec_deg)
+    # East and north there: (-y, x, 0) / ground; at the very pole the right ascension tells.
+    at_pole = ground == 0.0
+    if at_pole.any():
+        cos_end = np.where(at_pole, cos_ra, np.divide(x, ground, where=~at_pole))
+        sin_end = np.where(at_pole, sin_ra, np.divide(y, ground, where=~at_pole))
+    else:
+        cos_end, sin_end = x / ground, y / ground
+    # d/dt of p/|p| along east and north: the velocity there, slowed by the distance.
+    pm_ra_end = (vy * cos_end - vx * sin_end) / (length * MAS)
+    pm_dec_end = (vz * ground - (vx * cos_end + vy * sin_end) * z) / (length * MAS)
+    end = Motion(
         ra_deg,
         dec_deg,
         np.where(unknown, motion.pm_ra_cosdec_mas_yr, pm_ra_end),
         np.where(unknown, motion.pm_dec_mas_yr, pm_dec_end),
     )
+    return end, u

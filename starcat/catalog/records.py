@@ -7,6 +7,7 @@ the field is blank; text is fixed-width bytes. No catalog's meaning is known her
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -147,14 +148,17 @@ def number_from_text(text: bytes) -> float:
     Raises
     ------
     ValueError
-        If the text is neither blank nor a decimal number.
+        If the text is neither blank nor a finite decimal number.
     """
     stripped = text.strip()
     if not stripped:
         return float("nan")
     if not _NUMBER.fullmatch(stripped):
         raise ValueError(text)
-    return float(stripped.replace(b"D", b"E").replace(b"d", b"e"))
+    number = float(stripped.replace(b"D", b"E").replace(b"d", b"e"))
+    if math.isinf(number):
+        raise ValueError(text)
+    return number
 
 
 def apply_nulls(values: NDArray[np.float64], column: Column) -> None:

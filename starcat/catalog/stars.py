@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from starcat.catalog.proper_motion import Motion, propagate
+from starcat.catalog.proper_motion import Motion, propagate_directions
 from starcat.catalog.quality import Quality
 from starcat.catalog.verdict import Verdicts
 from starcat.schema import product_schema
@@ -65,10 +65,11 @@ def move_to_epoch(columns: Mapping[str, Values], epoch_jyear: float | None) -> d
     unknown = np.isnan(pm_ra) | np.isnan(pm_dec)
     epoch = np.broadcast_to(np.asarray(columns["epoch_jyear"], dtype=np.float64), len(ra))
     motion = Motion(ra, dec, pm_ra, pm_dec)
-    if epoch_jyear is not None:
-        motion = propagate(motion, epoch_jyear - epoch)
+    if epoch_jyear is None:
+        u = directions_from_radec(ra, dec)
+    else:
+        motion, u = propagate_directions(motion, epoch_jyear - epoch)
         epoch = np.where(unknown, epoch, epoch_jyear)
-    u = directions_from_radec(motion.ra_deg, motion.dec_deg)
     flags = np.where(unknown, np.int32(Quality.NO_PROPER_MOTION), np.int32(0))
     return {
         **columns,
@@ -164,17 +165,20 @@ def join_flags(parts: Mapping[str, tuple[NDArray[np.bool_], NDArray[Any] | None]
     pyarrow.Array
         Of strings; null where no code applies.
     """
-    joined = pa.nulls(len(next(iter(parts.values()))[0]), pa.string())
+    is_flagged = np.logical_or.reduce([where for where, _ in parts.values()])
+    rows = np.flatnonzero(is_flagged)
+    joined = pa.nulls(len(rows), pa.string())
     for label, (where, values) in parts.items():
         if not where.any():
             continue
         text: Any = pa.scalar(label)
         if values is not None:
-            text = pc.binary_join_element_wise(label, text_column(values), "=")
-        text = pc.if_else(pa.array(where), text, pa.scalar(None, pa.string()))
+            text = pc.binary_join_element_wise(label, text_column(values[rows]), "=")
+        text = pc.if_else(pa.array(where[rows]), text, pa.scalar(None, pa.string()))
         both = pc.binary_join_element_wise(joined, text, ";")
         joined = pc.coalesce(both, joined, text)
-    return joined
+    # Few stars are flagged: texts are made for those alone and put in their places.
+    return joined.take(pa.array(np.cumsum(is_flagged) - 1, mask=~is_flagged))
 
 
 def numbered(prefix: str, number: NDArray[np.int64]) -> pa.Array:

@@ -114,7 +114,7 @@ def _any_flag(
 ) -> NDArray[np.bool_]:
     """Return where a flag column has one of the codes in any of the bands."""
     text = records[column]
-    chars = text.view(np.uint8).reshape(len(text), -1)
+    chars = text.view(np.uint8).reshape(len(text), text.dtype.itemsize)
     wanted = np.frombuffer(codes, dtype=np.uint8)
     found = np.zeros(len(text), dtype=bool)
     for band in bands:
@@ -133,7 +133,7 @@ def _identity(records: Records) -> NDArray[np.int64]:
     key = records["pts_key"]
     text = records["designation"]
     chars = np.zeros((len(text), 20), dtype=np.uint8)
-    given = text.view(np.uint8).reshape(len(text), -1)[:, :20]
+    given = text.view(np.uint8).reshape(len(text), text.dtype.itemsize)[:, :20]
     chars[:, : given.shape[1]] = given
     digits = chars[:, [*range(8), *range(9, 16)]].astype(np.int64) - ord("0")
     sign, tail = chars[:, 8], chars[:, 16:].max(axis=1)

@@ -44,6 +44,12 @@ COLUMNS = {
     ]
 }
 
+_NUMBER_TEXTS = pa.array([str(number) for number in range(100_000)])
+"""Texts of all numbers that TYC2 and TYC3 can be: looking up is faster than formatting."""
+
+_REGION_TEXTS = pc.binary_join_element_wise("TYC", _NUMBER_TEXTS[:10_000], " ")
+"""The same for TYC1, with the catalog's name before it."""
+
 _MAGNITUDES = {"V": "v_mag", "BT": "bt_mag", "VT": "vt_mag"}
 
 
@@ -135,6 +141,6 @@ def tycho_identity(records: Records) -> tuple[NDArray[np.int64], pa.Array]:
     """
     parts = [records.integers(name) for name in ("tyc1", "tyc2", "tyc3")]
     number = parts[0] * 1_000_000 + parts[1] * 10 + parts[2]
-    texts = [pa.array(part).cast(pa.string()) for part in parts]
-    first = pc.binary_join_element_wise("TYC", texts[0], " ")
-    return number, pc.binary_join_element_wise(first, texts[1], texts[2], "-")
+    region = _REGION_TEXTS.take(pa.array(parts[0]))
+    texts = [_NUMBER_TEXTS.take(pa.array(part)) for part in parts[1:]]
+    return number, pc.binary_join_element_wise(region, *texts, "-")

@@ -1,0 +1,113 @@
+"""Archive files of full size and true layout, made from the excerpts' own records.
+
+Records of an excerpt are repeated and given new identities, positions, motions and
+magnitudes, so that every byte has the archive's format and the sky has the archive's density.
+"""
+
+from __future__ import annotations
+
+import gzip
+import os
+from pathlib import Path
+
+import numpy as np
+
+SAO_ROWS = 258_997
+TYCHO2_ROWS = 2_539_913
+TYCHO2_PART_ROWS = 127_000
+
+
+def catalogs_folder() -> Path:
+    """Return the folder of the excerpts."""
+    default = Path(__file__).parents[3] / "shared" / "catalogs"
+    return Path(os.environ.get("STARCAT_CATALOGS", default))
+
+
+def read_lines(name: str, length: int) -> np.ndarray:
+    """Return the records of an excerpt as a matrix of bytes, line ends included."""
+    data = gzip.decompress((catalogs_folder() / name).read_bytes())
+    return np.frombuffer(data, dtype=np.uint8).reshape(-1, length + 1)
+
+
+def put(records: np.ndarray, first: int, values: np.ndarray, width: int, decimals: int = 0) -> None:
+    """Write numbers into a field, right-aligned, as Fortran would."""
+    scaled = np.rint(np.abs(values) * 10.0**decimals).astype(np.int64)
+    places = [first - 1 + k for k in range(width)]
+    if decimals:
+        point = places.pop(width - 1 - decimals)
+        records[:, point] = ord(".")
+    started = np.zeros(len(values), dtype=bool)
+    for k, place in enumerate(reversed(places)):
+        digit = (scaled // 10**k) % 10
+        is_used = (scaled >= 10**k) | (k <= decimals)
+        sign = (values < 0) & ~is_used & ~started
+        records[:, place] = np.where(is_used, digit + 48, np.where(sign, ord("-"), ord(" ")))
+        started |= sign
+
+
+def random_sky(count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return uniform positions, degrees."""
+    ra = generator.random(count) * 360.0
+    dec = np.degrees(np.arcsin(generator.uniform(-1.0, 1.0, count)))
+    return ra, dec
+
+
+def by_region(ra: np.ndarray, dec: np.ndarray) -> np.ndarray:
+    """Return the order of GSC regions, roughly: zones of 7.5 deg, then right ascension."""
+    return np.lexsort((dec, np.floor(ra / 3.75), np.floor(dec / 7.5)))
+
+
+def make_sao(folder: Path) -> Path:
+    """Write a file of the size and layout of sao.dat."""
+    generator = np.random.default_rng(1)
+    lines = read_lines("sao.dat.gz", 204)
+    records = lines[generator.integers(len(lines), size=SAO_ROWS)].copy()
+    ra, dec = random_sky(SAO_ROWS, generator)
+    put(records, 1, np.arange(1, SAO_ROWS + 1), 6)
+    put(records, 81, generator.uniform(4.0, 10.9, SAO_ROWS), 4, 1)
+    put(records, 118, generator.integers(1, 359_083, SAO_ROWS), 6)
+    put(records, 161, generator.normal(0.0, 0.003, SAO_ROWS), 7, 4)
+    put(records, 178, generator.normal(0.0, 0.04, SAO_ROWS), 6, 3)
+    put(records, 184, np.radians(ra), 10, 8)
+    put(records, 194, np.radians(dec), 11, 8)
+    path = folder / "sao.dat"
+    records.tofile(path)
+    return path
+
+
+def make_tycho2(folder: Path, *, compress: bool) -> Path:
+    """Write the 20 parts of tyc2.dat, plain or compressed; return their folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    generator = np.random.default_rng(2)
+    lines = read_lines("tyc2.dat.gz", 206)
+    all_ra, all_dec = random_sky(TYCHO2_ROWS, generator)
+    order = by_region(all_ra, all_dec)
+    all_ra, all_dec = all_ra[order], all_dec[order]
+    for part in range(20):
+        start = part * TYCHO2_PART_ROWS
+        count = min(TYCHO2_PART_ROWS, TYCHO2_ROWS - start)
+        records = lines[generator.integers(len(lines), size=count)].copy()
+        number = start + np.arange(count)
+        ra, dec = all_ra[number], all_dec[number]
+        put(records, 1, 1 + number // 267, 4)
+        put(records, 6, 1 + number % 267, 5)
+        for first, values in ((16, ra), (29, dec), (153, ra), (166, dec)):
+            put(records, first, values, 12, 8)
+        for first in (42, 50):
+            put(records, first, generator.normal(0.0, 20.0, count), 7, 1)
+        for first in (111, 124):
+            put(records, first, generator.uniform(7.0, 12.5, count), 6, 3)
+        for first in (58, 62):
+            put(records, first, generator.integers(3, 90, count), 3)
+        for first in (66, 71):
+            put(records, first, generator.uniform(0.5, 4.0, count), 4, 1)
+        for first in (76, 84):
+            put(records, first, generator.uniform(1900.0, 1991.0, count), 7, 2)
+        for first in (118, 131):
+            put(records, first, generator.uniform(0.01, 0.3, count), 5, 3)
+        name = f"tyc2.dat.{part:02d}"
+        if compress:
+            (folder / f"{name}.gz").write_bytes(gzip.compress(records.tobytes(), 6, mtime=0))
+        else:
+            records.tofile(folder / name)
+    return folder

@@ -1,0 +1,598 @@
+"""Bad input: every kind in docs/errors.md, given to the real commands.
+
+The page and this file hold each other up: a kind stands in both, with its exit code, and what
+the page says that starcat says is looked for in what it says (``…`` stands for anything).
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import os
+import re
+import resource
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+
+from starcat.artifact.reader import check_artifact
+from starcat.catalog.source import read_source
+from starcat.errors import StarcatError
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "errors.md"
+
+Call = list[Any] | Callable[[], object]
+
+
+@dataclass
+class Place:
+    """A folder to misbehave in, with what the cases are made of."""
+
+    folder: Path
+    lines: list[bytes]
+    spec: str
+    artifact: Path
+    file_limit_bytes: int | None = None
+    out: Path = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.out = self.folder / "out"
+
+    def write(self, name: str, content: bytes | str | list[bytes]) -> Path:
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if isinstance(content, list):
+            content = b"".join(content)
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+        return path
+
+    def ingest(self, content: bytes | list[bytes], name: str = "sao.dat") -> Call:
+        return self.ingest_file("sao", self.write(name, content))
+
+    def ingest_file(self, source: str, path: Path) -> Call:
+        return ["ingest", source, "--input", path, "-o", self.out / "stars.parquet"]
+
+    def build(self, old: str = "", new: str = "", *more: object) -> Call:
+        """Build the small spec from good stars, with one text of the spec replaced."""
+        assert old in self.spec
+        spec = self.write("spec.toml", self.spec.replace(old, new, 1) if old else self.spec)
+        stars = self.write("sao.dat", self.lines)
+        return ["build", spec, "--input", f"sao={stars}", "-o", self.out, *more]
+
+    def copy(self) -> Path:
+        """A copy of a good artifact, to be damaged."""
+        return Path(shutil.copytree(self.artifact, self.folder / self.artifact.name))
+
+    def manifest(self, change: Callable[[dict[str, Any]], object]) -> Path:
+        """A copy of a good artifact with a changed manifest."""
+        path = self.copy() / "manifest.json"
+        content = json.loads(path.read_text())
+        change(content)
+        path.write_text(json.dumps(content))
+        return path.parent
+
+    def identify(self, csv: bytes | str) -> Call:
+        return ["identify", self.artifact, self.write("frame.csv", csv)]
+
+
+@dataclass(frozen=True)
+class Case:
+    kind: str
+    code: int
+    call: Callable[[Place], Call]
+
+
+CASES: list[Case] = []
+
+
+def case(kind: str, code: int) -> Callable[[Callable[[Place], Call]], Callable[[Place], Call]]:
+    """Add the function below to the cases: it sets the scene and returns what to run."""
+
+    def add(call: Callable[[Place], Call]) -> Callable[[Place], Call]:
+        CASES.append(Case(kind, code, call))
+        return call
+
+    return add
+
+
+def with_text(line: bytes, first_byte: int, text: bytes) -> bytes:
+    """A record with other characters from a byte on, counted from 1 as the archives do."""
+    return line[: first_byte - 1] + text + line[first_byte - 1 + len(text) :]
+
+
+def flip(path: Path, at: float = 0.5) -> None:
+    """Change one byte, by default in the middle."""
+    data = bytearray(path.read_bytes())
+    data[int(at * len(data))] ^= 0x20
+    path.write_bytes(data)
+
+
+# Catalog files -----------------------------------------------------------------------------
+
+
+@case("gzip file cut off", 3)
+def _(place: Place) -> Call:
+    return place.ingest(gzip.compress(b"".join(place.lines))[:-400], "sao.dat.gz")
+
+
+@case("gzip file damaged", 3)
+def _(place: Place) -> Call:
+    path = place.write("sao.dat.gz", gzip.compress(b"".join(place.lines)))
+    flip(path)
+    return place.ingest_file("sao", path)
+
+
+@case("gzip file with other bytes after its end", 3)
+def _(place: Place) -> Call:
+    return place.ingest(gzip.compress(b"".join(place.lines)) + b"<html>", "sao.dat.gz")
+
+
+@case("line ends CR LF", 0)
+def _(place: Place) -> Call:
+    return place.ingest([line.replace(b"\n", b"\r\n") for line in place.lines])
+
+
+@case("no line end after the last record", 0)
+def _(place: Place) -> Call:
+    return place.ingest(b"".join(place.lines).removesuffix(b"\n"))
+
+
+@case("one line too short", 0)
+def _(place: Place) -> Call:
+    return place.ingest([*place.lines[:9], place.lines[9][:150] + b"\n", *place.lines[10:]])
+
+
+@case("last line cut off", 0)
+def _(place: Place) -> Call:
+    return place.ingest(b"".join(place.lines)[:-100])
+
+
+@case("letters in a number", 0)
+def _(place: Place) -> Call:
+    wrong = with_text(place.lines[2], 81, b" x.2")
+    return place.ingest([*place.lines[:2], wrong, *place.lines[3:]])
+
+
+@case("required number blank", 0)
+def _(place: Place) -> Call:
+    wrong = with_text(place.lines[4], 1, b" " * 6)
+    return place.ingest([*place.lines[:4], wrong, *place.lines[5:]])
+
+
+@case("bytes that are no text", 0)
+def _(place: Place) -> Call:
+    wrong = with_text(place.lines[4], 85, b"\xff\xfe\x00")
+    return place.ingest([*place.lines[:4], wrong, *place.lines[5:]])
+
+
+@case("the same star twice", 0)
+def _(place: Place) -> Call:
+    return place.ingest([*place.lines, place.lines[7]])
+
+
+@case("too many malformed records", 3)
+def _(place: Place) -> Call:
+    return place.ingest(place.lines[:300] + [line[:80] + b"\n" for line in place.lines[300:]])
+
+
+@case("another archive: longer records", 3)
+def _(place: Place) -> Call:
+    return place.ingest([b"H|" + line[:-1].ljust(448) + b"\n" for line in place.lines])
+
+
+@case("another archive: any text", 3)
+def _(place: Place) -> Call:
+    return place.ingest(b"<!DOCTYPE html>\n<html><head><title>404 Not Found</title></head></html>\n")
+
+
+@case("another archive: bytes without line ends", 3)
+def _(place: Place) -> Call:
+    path = place.write("sao.dat", b"\x89HDF\r\n\x1a")
+    os.truncate(path, 1 << 26)
+    return place.ingest_file("sao", path)
+
+
+@case("another archive: wrong magic of a binary file", 3)
+def _(place: Place) -> Call:
+    return place.ingest_file("gaia", place.write("gaia_merged.bin", place.lines))
+
+
+@case("binary file cut off", 0)
+def _(place: Place) -> Call:
+    from starcat.catalog.gaia import embedded_sky
+
+    with embedded_sky().open("rb") as sky:
+        return place.ingest_file("gaia", place.write("gaia_merged.bin", sky.read(40_000)))
+
+
+@case("binary file with a damaged gzip header", 3)
+def _(place: Place) -> Call:
+    return place.ingest_file("gaia", place.write("gaia_merged.bin.gz", b"\x1f\x8b\x08\x00\x00"))
+
+
+@case("empty file", 3)
+def _(place: Place) -> Call:
+    return place.ingest(b"")
+
+
+@case("file of empty lines", 3)
+def _(place: Place) -> Call:
+    return place.ingest(b"\n" * 1000)
+
+
+@case("file missing", 3)
+def _(place: Place) -> Call:
+    return place.ingest_file("sao", place.folder / "sao.dat.gz")
+
+
+@case("folder without the file", 3)
+def _(place: Place) -> Call:
+    place.write("archive/readme.txt", b"none")
+    return place.ingest_file("sao", place.folder / "archive")
+
+
+@case("folder lacks parts", 3)
+def _(place: Place) -> Call:
+    for part in ("00", "02"):
+        place.write(f"archive/tyc2.dat.{part}.gz", b"")
+    return place.ingest_file("tycho2", place.folder / "archive")
+
+
+@case("no input named and none found", 3)
+def _(place: Place) -> Call:
+    return ["ingest", "sao", "-o", place.out / "stars.parquet"]
+
+
+@case("joined catalog missing", 3)
+def _(place: Place) -> Call:
+    return place.build("boresights", 'selection.variables.join = ["hipparcos"]\nboresights')
+
+
+@case("source unknown", 2)
+def _(place: Place) -> Call:
+    return ["ingest", "soa", "-o", place.out / "stars.parquet"]
+
+
+@case("source unknown, like no other", 2)
+def _(place: Place) -> Call:
+    return ["build", "--input", "xyzzy=a.dat", "-o", place.out]
+
+
+@case("source is not a star catalog", 2)
+def _(place: Place) -> Call:
+    return place.ingest_file("gcvs", place.write("gcvs.tsv", b"1\n"))
+
+
+@case("band unknown", 2)
+def _(place: Place) -> Call:
+    return [*place.ingest(place.lines), "--band", "K"]
+
+
+# Specs and options -------------------------------------------------------------------------
+
+
+@case("--input without =", 2)
+def _(place: Place) -> Call:
+    return ["build", "--input", "sao.dat.gz", "-o", place.out]
+
+
+@case("--input that the spec does not use", 2)
+def _(place: Place) -> Call:
+    stars = place.write("sao.dat", place.lines)
+    return ["build", "--preset", "gaia-12deg", "--input", f"sao={stars}", "-o", place.out]
+
+
+@case("spec and --preset", 2)
+def _(place: Place) -> Call:
+    return [*place.build(), "--preset", "sao-12deg"]
+
+
+@case("preset unknown", 2)
+def _(place: Place) -> Call:
+    return ["build", "--preset", "sao-12degs", "-o", place.out]
+
+
+@case("spec missing", 2)
+def _(place: Place) -> Call:
+    return ["build", place.folder / "camera.toml", "-o", place.out]
+
+
+@case("spec not TOML", 2)
+def _(place: Place) -> Call:
+    return place.build('name = "small"', "name: small")
+
+
+@case("spec not text", 2)
+def _(place: Place) -> Call:
+    return ["build", place.write("spec.toml", b"name = \xff"), "-o", place.out]
+
+
+@case("key unknown", 2)
+def _(place: Place) -> Call:
+    return place.build("faint_limit_mag", "faint_limit")
+
+
+@case("key missing", 2)
+def _(place: Place) -> Call:
+    return place.build("epoch_jyear = 2026.0", "")
+
+
+@case("value of the wrong type", 2)
+def _(place: Place) -> Call:
+    return place.build("faint_limit_mag = 6.0", 'faint_limit_mag = "six"')
+
+
+@case("value out of range", 2)
+def _(place: Place) -> Call:
+    return place.build("epoch_jyear = 2026.0", "epoch_jyear = 26.0")
+
+
+@case("value not finite", 2)
+def _(place: Place) -> Call:
+    return place.build("faint_limit_mag = 6.0", "faint_limit_mag = nan")
+
+
+@case("limits swapped", 2)
+def _(place: Place) -> Call:
+    return place.build("boresights", "selection.bright_limit_mag = 7\nboresights")
+
+
+@case("camera described twice", 2)
+def _(place: Place) -> Call:
+    return place.build("fov_x_deg = 40.0", "fov_x_deg = 40.0, focal_length_mm = 30, pixel_um = 5")
+
+
+@case("band unknown in a spec", 2)
+def _(place: Place) -> Call:
+    return place.build('catalog.source = "sao"', 'catalog = { source = "sao", band = "K" }')
+
+
+@case("option of the wrong type", 2)
+def _(place: Place) -> Call:
+    return ["selftest", place.artifact, "--frames", "many"]
+
+
+@case("option unknown", 2)
+def _(place: Place) -> Call:
+    return ["build", "--ouput", place.out]
+
+
+@case("unknown unit in a data-source file", 2)
+def _(place: Place) -> Call:
+    shipped = Path(__file__).resolve().parents[1] / "data_sources" / "sao.toml"
+    text = shipped.read_text().replace('unit = "mas/yr"', 'unit = "mas/year"', 1)
+    path = place.write("sao.toml", text)
+    return lambda: read_source(path)
+
+
+# Builds ------------------------------------------------------------------------------------
+
+
+@case("no stars left", 1)
+def _(place: Place) -> Call:
+    return place.build("faint_limit_mag = 6.0", "faint_limit_mag = 1.0")
+
+
+@case("database that cannot identify", 1)
+def _(place: Place) -> Call:
+    return place.build("fov_x_deg = 40.0", "fov_x_deg = 4.0")
+
+
+@case("output below a file", 1)
+def _(place: Place) -> Call:
+    place.out = place.write("file", b"") / "dist"
+    return place.build()
+
+
+@case("star table below a file", 1)
+def _(place: Place) -> Call:
+    place.out = place.write("file", b"")
+    return place.ingest(place.lines)
+
+
+@case("star table in place of a folder", 1)
+def _(place: Place) -> Call:
+    (place.out / "stars.parquet").mkdir(parents=True)
+    return place.ingest(place.lines)
+
+
+@case("frame below a file", 1)
+def _(place: Place) -> Call:
+    return ["simulate", place.artifact, "-o", place.write("file", b"") / "frame.csv"]
+
+
+@case("another artifact of that name", 1)
+def _(place: Place) -> Call:
+    shutil.copytree(place.artifact, place.out / place.artifact.name)
+    return place.build("faint_limit_mag = 6.0", "faint_limit_mag = 5.9")
+
+
+@case("disk full while building", 1)
+def _(place: Place) -> Call:
+    place.file_limit_bytes = 1 << 14
+    return place.build()
+
+
+@case("disk full while ingesting", 1)
+def _(place: Place) -> Call:
+    place.file_limit_bytes = 1 << 14
+    return place.ingest(place.lines)
+
+
+# Artifacts and frames ----------------------------------------------------------------------
+
+
+@case("not an artifact", 5)
+def _(place: Place) -> Call:
+    return ["inspect", place.folder]
+
+
+@case("manifest not JSON", 5)
+def _(place: Place) -> Call:
+    path = place.copy() / "manifest.json"
+    path.write_bytes(path.read_bytes()[:500])
+    return ["inspect", path.parent]
+
+
+@case("manifest without a version", 5)
+def _(place: Place) -> Call:
+    return ["inspect", place.manifest(lambda content: content.pop("manifest_version"))]
+
+
+@case("manifest without its parts", 5)
+def _(place: Place) -> Call:
+    return ["inspect", place.manifest(lambda content: content.pop("products"))]
+
+
+@case("manifest version that is no version", 5)
+def _(place: Place) -> Call:
+    return ["inspect", place.manifest(lambda content: content.update(manifest_version=2))]
+
+
+@case("manifest of a newer starcat", 4)
+def _(place: Place) -> Call:
+    return ["inspect", place.manifest(lambda content: content.update(manifest_version="2.0.0"))]
+
+
+@case("product of a newer schema", 4)
+def _(place: Place) -> Call:
+    folder = place.manifest(lambda content: content["products"]["pairs"].update(schema="pairs-2.0.0"))
+    return lambda: check_artifact(folder)
+
+
+@case("Parquet file damaged", 5)
+def _(place: Place) -> Call:
+    folder = place.copy()
+    flip(folder / "pairs.parquet")
+    return lambda: check_artifact(folder)
+
+
+@case("one byte of the database changed", 5)
+def _(place: Place) -> Call:
+    folder = place.copy()
+    flip(folder / "database.h5")
+    return lambda: check_artifact(folder)
+
+
+@case("file of an artifact missing", 5)
+def _(place: Place) -> Call:
+    folder = place.copy()
+    (folder / "rejected.parquet").unlink()
+    return lambda: check_artifact(folder)
+
+
+@case("database cut off", 5)
+def _(place: Place) -> Call:
+    folder = place.copy()
+    os.truncate(folder / "database.h5", 20_000)
+    return ["selftest", folder]
+
+
+@case("no database", 5)
+def _(place: Place) -> Call:
+    return ["simulate", place.folder / "small-1.0.0", "-o", place.out / "frame.csv"]
+
+
+@case("frame missing", 2)
+def _(place: Place) -> Call:
+    return ["identify", place.artifact, place.folder / "frame.csv"]
+
+
+@case("frame lacks columns", 2)
+def _(place: Place) -> Call:
+    return place.identify("x,y\n1,2\n")
+
+
+@case("frame with letters", 2)
+def _(place: Place) -> Call:
+    return place.identify("x_px,y_px\n1,2\n3,abc\n")
+
+
+@case("frame with a number that is not finite", 2)
+def _(place: Place) -> Call:
+    return place.identify("x_px,y_px\n1,2\n3,nan\n")
+
+
+@case("frame with a short line", 2)
+def _(place: Place) -> Call:
+    return place.identify("x_px,y_px\n1,2\n3\n")
+
+
+@case("frame that is no text", 2)
+def _(place: Place) -> Call:
+    return place.identify(b"\x89PNG\r\n\x1a\n")
+
+
+@case("frame with a field without end", 2)
+def _(place: Place) -> Call:
+    return place.identify('x_px,y_px\n1,"' + "2" * 200_000)
+
+
+@case("frame without centroids", 0)
+def _(place: Place) -> Call:
+    return place.identify("x_px,y_px\n")
+
+
+# The tests ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def place(tmp_path: Path, sao_lines: list[bytes], small_spec: str, small_artifact: Path) -> Place:
+    return Place(tmp_path, sao_lines, small_spec, small_artifact)
+
+
+def page_rows() -> dict[str, tuple[str, int]]:
+    """Kind to (what starcat says, exit code), as the page has them."""
+    rows = re.findall(r"^\| (.+?) \| (.+?) \| (\d) \|$", PAGE.read_text(), re.MULTILINE)
+    return {kind.replace("`", ""): (says, int(code)) for kind, says, code in rows}
+
+
+def files_below(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def run_limited(place: Place, call: Call) -> tuple[int, str]:
+    """Run in another process that may write no file beyond a size: as on a full disk."""
+    limit = (place.file_limit_bytes, place.file_limit_bytes)
+    done = subprocess.run(
+        [sys.executable, "-m", "starcat", *map(str, call)],
+        capture_output=True,
+        text=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, limit),
+    )
+    return done.returncode, done.stderr
+
+
+def run_call(place: Place, call: Call, starcat: Any) -> tuple[int, str]:
+    if callable(call):
+        with pytest.raises(StarcatError) as caught:
+            call()
+        return caught.value.exit_code, str(caught.value)
+    if place.file_limit_bytes:
+        return run_limited(place, call)
+    ran = starcat(call)
+    return ran.code, ran.err + (ran.out if ran.code == 0 else "")
+
+
+@pytest.mark.parametrize("given", CASES, ids=[case.kind for case in CASES])
+def test_bad_input(given: Case, place: Place, starcat: Any) -> None:
+    call = given.call(place)
+    before = files_below(place.folder)
+    code, text = run_call(place, call, starcat)
+    if os.environ.get("SHOW"):
+        print("@@", given.kind, "|", text.replace(str(place.folder), "F").strip(), "|", code, "|", given.code)
+        return
+    assert code == given.code, text
+    assert "Traceback" not in text
+    says, _ = page_rows()[given.kind]
+    pattern = ".*".join(re.escape(part.strip()) for part in says.replace("`", "").split("…"))
+    assert re.search(pattern, text, re.DOTALL), text
+    if code:
+        assert files_below(place.folder) == before

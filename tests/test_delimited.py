@@ -1,0 +1,189 @@
+"""Delimited records: a field that cannot be read costs its own line and no other."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from starcat.catalog.delimited import parse_delimited
+from starcat.catalog.records import Problem
+from starcat.catalog.source import Column, RecordFile, data_source
+
+# The genuine record of samples/twomass_psc_record.txt.
+RECORD = (
+    rb"1.119851|-89.91861|0.11|0.06|90|00042876-8955069 |12.467|0.018|0.021|359.4|12.131|0.025|"
+    rb"0.026|224.7|11.963|0.023|0.025|133.7|AAA|222|111|000|666666|37.2|245|1329023254|0|0|"
+    rb"1101364107|s|2000-09-22|64|302.951|-27.208|1.6|2451809.7124|1.07|1.18|0.81|12.481|0.014|"
+    rb"12.112|0.028|11.98|0.012|332|251|sw|1|1|0|\N|\N|\N|\N|0|\N|59038|1357874|267"
+)
+PSC = data_source("2mass").files[0]
+GCVS = data_source("gcvs").files[0]
+
+TINY = RecordFile(
+    name="tiny",
+    file_names=("tiny.csv",),
+    layout="delimited",
+    delimiter=",",
+    comment="#",
+    columns=(
+        Column(name="name", format="A3", required=True),
+        Column(name="mag", format="F5.2", null=("none", "99.99")),
+        Column(name="code", format="A1", null=("?",)),
+    ),
+)
+
+
+def test_the_sample_is_the_record_above(catalogs: Path) -> None:
+    assert (catalogs / "samples" / "twomass_psc_record.txt").read_bytes().strip() == RECORD
+
+
+def test_every_field_of_a_genuine_2mass_record() -> None:
+    names = [column.name for column in PSC.columns]
+    parsed = parse_delimited(RECORD, PSC, names)
+    assert parsed.problems == []
+    for column, text in zip(PSC.columns, RECORD.split(b"|"), strict=True):
+        value = parsed[column.name][0]
+        if column.is_text:
+            assert value.strip() == text.strip().removeprefix(rb"\N"), column.name
+        elif text == rb"\N":
+            assert np.isnan(value), column.name
+        else:
+            assert value == float(text), column.name
+
+
+def test_text_is_padded_with_blanks_as_fixed_width_text_is() -> None:
+    parsed = parse_delimited(b"a,1,x\nbcd,2,?\n", TINY, ["name", "code"])
+    assert parsed["name"].tolist() == [b"a  ", b"bcd"]
+    assert parsed.is_blank("code").tolist() == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "column"),
+    [
+        (b"|12.467|", rb"|\N|", "j_m"),
+        (b"|12.467|", b"||", "j_m"),
+        (b"|1101364107|", rb"|\N|", "pts_key"),
+        (b"|2451809.7124|", rb"|\N|", "jdate"),
+    ],
+)
+def test_no_value_is_nan(old: bytes, new: bytes, column: str) -> None:
+    parsed = parse_delimited(RECORD + b"\n" + RECORD.replace(old, new), PSC, ["ra", column])
+    assert parsed.problems == []
+    assert np.isnan(parsed[column]).tolist() == [False, True]
+
+
+@pytest.mark.parametrize("names", [["ra", "j_m"], ["j_m", "designation", "ra"]])
+@pytest.mark.parametrize(
+    "text", ["12.x67", "1_2", "12,4", "12 4", "--1", "-", "nan", "inf", "1e999"]
+)
+def test_letters_in_a_number_cost_only_that_line(names: list[str], text: str) -> None:
+    bad = RECORD.replace(b"|12.467|", b"|" + text.encode() + b"|")
+    parsed = parse_delimited(b"\n".join([RECORD, bad, RECORD]), PSC, names, first_line=50)
+    assert parsed.problems == [Problem(51, "j_m", None, repr(text), "a number like F")]
+    assert parsed.line.tolist() == [50, 52]
+    assert parsed["j_m"].tolist() == [12.467, 12.467]
+    assert parsed["ra"].tolist() == [1.119851, 1.119851]
+
+
+def test_a_line_with_two_bad_numbers_has_one_problem() -> None:
+    bad = RECORD.replace(b"|12.467|", b"|x|").replace(b"|12.131|", b"|y|")
+    parsed = parse_delimited(RECORD + b"\n" + bad, PSC, ["h_m", "j_m"])
+    assert [(problem.line, problem.field) for problem in parsed.problems] == [(2, "h_m")]
+
+
+@pytest.mark.parametrize(
+    ("line", "found"),
+    [(RECORD + b"|1", "61 fields"), (RECORD.rpartition(b"|")[0], "59 fields"), (b"x", "1 fields")],
+)
+def test_wrong_number_of_fields(line: bytes, found: str) -> None:
+    parsed = parse_delimited(line + b"\n" + RECORD, PSC, ["ra"], first_line=7)
+    assert parsed.problems == [Problem(7, "record", None, found, "60 fields")]
+    assert parsed.line.tolist() == [8]
+
+
+@pytest.mark.parametrize(
+    ("line", "column"),
+    [
+        (RECORD.replace(b"1.119851|", rb"\N|"), "ra"),
+        (RECORD.replace(b"|-89.91861|", b"||"), "dec"),
+        (RECORD.replace(b"|00042876-8955069 |", b"|                 |"), "designation"),
+        (RECORD.replace(b"|00042876-8955069 |", rb"|\N|"), "designation"),
+    ],
+)
+def test_a_required_field_that_is_blank(line: bytes, column: str) -> None:
+    parsed = parse_delimited(line + b"\n" + RECORD, PSC, ["ra", "dec", "designation"])
+    assert parsed.problems == [Problem(1, column, None, "a blank field", "a value")]
+    assert parsed.line.tolist() == [2]
+
+
+@pytest.mark.parametrize(
+    ("data", "lines"),
+    [
+        (RECORD, [1]),
+        (RECORD + b"\r\n" + RECORD + b"\r\n", [1, 2]),
+        (b"\n" + RECORD + b"\n\r\n" + RECORD, [2, 4]),
+        (b"", []),
+        (b"\n\n", []),
+    ],
+)
+def test_line_ends_and_empty_lines(data: bytes, lines: list[int]) -> None:
+    parsed = parse_delimited(data, PSC, ["ra", "coadd", "designation"])
+    assert parsed.problems == []
+    assert parsed.line.tolist() == lines
+    assert parsed["coadd"].tolist() == [267.0] * len(lines)
+    assert parsed["designation"].tolist() == [b"00042876-8955069 "] * len(lines)
+
+
+def test_text_nulls_are_nan_and_comments_are_no_records() -> None:
+    data = b"# heading\na,none,x\n#b,1,x\nc,99.99,x\nd,99.990,x\ne,9.99,x\n"
+    parsed = parse_delimited(data, TINY, ["name", "mag"])
+    assert parsed.problems == []
+    assert parsed.line.tolist() == [2, 4, 5, 6]
+    assert np.isnan(parsed["mag"]).tolist() == [True, True, True, False]
+
+
+def test_nulls_hold_where_the_block_is_read_field_by_field() -> None:
+    parsed = parse_delimited(b"a,none,x\nb,bad,x\nc,99.99,?\nd,7.5,x\n", TINY, ["mag", "code"])
+    assert [problem.line for problem in parsed.problems] == [2]
+    assert np.isnan(parsed["mag"]).tolist() == [True, True, False]
+    assert parsed.is_blank("code").tolist() == [False, True, False]
+
+
+def test_quotes_and_bytes_beyond_ascii_are_text() -> None:
+    parsed = parse_delimited(b'"a,1,x\n\xb7b,2,"\n', TINY, ["name", "mag", "code"])
+    assert parsed.problems == []
+    assert parsed["name"].tolist() == [b'"a', b"\xb7b"]
+    assert parsed["code"].tolist() == [b"x", b'"']
+
+
+def test_a_genuine_gcvs_record_with_comments_around_it() -> None:
+    record = (
+        b"114484\tRT And\tEA/RS\t8.97\t0\t9.83\t9.28\tV\t51421.737\t0.6289216\t17\tF8V+K1\n"
+        b"116287\tZ And\tZAND\t7.7\t0\t11.3\t\tV\t\t\t\tM2III+B1eq\n"
+    )
+    data = b"#   - HIP/Gaia3\n#\n" + record + b"# end"
+    parsed = parse_delimited(data, GCVS, ["star_ref", "var_type", "mag_max", "mag_min2", "period"])
+    assert parsed.problems == []
+    assert parsed.line.tolist() == [3, 4]
+    assert [ref.strip() for ref in parsed["star_ref"].tolist()] == [b"114484", b"116287"]
+    assert [text.strip() for text in parsed["mag_max"].tolist()] == [b"8.97", b"7.7"]
+    assert parsed["mag_min2"][0] == 9.28
+    assert np.isnan(parsed["mag_min2"][1])
+    assert parsed.is_blank("period").tolist() == [False, True]
+
+
+def test_blocks_do_not_matter(catalogs: Path) -> None:
+    with gzip.open(catalogs / "psc_measured.gz") as file:
+        data = file.read()
+    names = ["ra", "designation", "j_m", "jdate"]
+    whole = parse_delimited(data, PSC, names)
+    cut = data.index(b"\n", len(data) // 3) + 1
+    first = parse_delimited(data[:cut], PSC, names)
+    second = parse_delimited(data[cut:], PSC, names, first_line=data[:cut].count(b"\n") + 1)
+    assert len(whole) == 3_122
+    assert [*first.line, *second.line] == whole.line.tolist()
+    for name in names:
+        np.testing.assert_array_equal(np.concatenate([first[name], second[name]]), whole[name])

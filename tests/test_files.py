@@ -1,0 +1,383 @@
+"""Files on disk: what is found, in which order it is read, and that damage never passes."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import random
+import struct
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from starcat.catalog import files
+from starcat.catalog.binary import parse_binary
+from starcat.catalog.files import (
+    Block,
+    DigestReader,
+    InputFile,
+    find_files,
+    holds_source,
+    map_in_order,
+    read_blocks,
+)
+from starcat.catalog.source import Column, DataSource, RecordFile
+from starcat.errors import ParseError, SourceError, SourceMissing
+
+LINES = b"".join(b"%05d\n" % number for number in range(1, 2001))
+
+
+def text_file(name: str = "tiny", **rest: object) -> RecordFile:
+    return RecordFile(
+        name=name,
+        layout="fixed_width",
+        record_bytes=5,
+        columns=(Column(name="n", bytes=(1, 5), format="I5"),),
+        **{"file_names": (f"{name}.dat",), **rest},
+    )
+
+
+def source_of(*layouts: RecordFile) -> DataSource:
+    return DataSource(
+        name="tiny",
+        title="Tiny",
+        identifier="none",
+        citation="none",
+        licence="none",
+        frame="ICRS",
+        urls_retrieved="never",
+        files=layouts,
+    )
+
+
+PARTED = text_file("many", file_names=("many.{part}", "many.dat"), parts=("00", "01", "02"))
+SOURCE = source_of(PARTED, text_file("extra", optional=True))
+
+BINARY = RecordFile(
+    name="packed",
+    file_names=("packed.bin",),
+    layout="binary",
+    record_bytes=12,
+    header_bytes=8,
+    magic="PACK",
+    columns=(
+        Column(name="n", bytes=(1, 4), format="<i4"),
+        Column(name="x", bytes=(5, 12), format="<f8"),
+    ),
+)
+
+
+def pack(count: int) -> bytes:
+    return b"PACK\0\0\0\0" + b"".join(struct.pack("<id", n, n / 7) for n in range(count))
+
+
+def read(path: Path, layout: RecordFile) -> tuple[list[Block], list[DigestReader]]:
+    ends: list[DigestReader] = []
+    blocks = list(read_blocks(InputFile(path, layout), "tiny", ends.append))
+    return blocks, ends
+
+
+def names_found(paths: list[Path], source: DataSource = SOURCE) -> list[tuple[str, str]]:
+    return [(file.path.name, file.layout.name) for file in find_files(source, paths)]
+
+
+@pytest.fixture
+def small_blocks(monkeypatch):
+    monkeypatch.setattr(files, "BLOCK_BYTES", 100)
+
+
+@pytest.mark.parametrize("block_bytes", [1, 7, 100, 1 << 22])
+@pytest.mark.parametrize("is_gzip", [False, True])
+@pytest.mark.parametrize("end", [b"\n", b""])
+def test_blocks_are_whole_lines_in_order_plain_or_gzipped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes, is_gzip, end
+) -> None:
+    monkeypatch.setattr(files, "BLOCK_BYTES", block_bytes)
+    content = LINES[:600].rstrip(b"\n") + end
+    path = tmp_path / "tiny.dat"
+    path.write_bytes(gzip.compress(content) if is_gzip else content)
+    blocks, ends = read(path, text_file())
+    assert b"".join(block.data for block in blocks) == content
+    assert all(block.data.endswith(b"\n") for block in blocks[:-1])
+    assert [int(block.data[:5]) for block in blocks] == [block.first_line for block in blocks]
+    assert len(ends) == 1
+
+
+@pytest.mark.parametrize("is_gzip", [False, True])
+@pytest.mark.usefixtures("small_blocks")
+def test_digest_and_size_are_those_of_the_file_on_disk(tmp_path: Path, is_gzip) -> None:
+    path = tmp_path / "tiny.dat"
+    path.write_bytes(gzip.compress(LINES) if is_gzip else LINES)
+    _, (digest,) = read(path, text_file())
+    assert digest.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert digest.bytes_read == path.stat().st_size
+
+
+def test_gzip_members_one_after_another_are_one_file(tmp_path: Path) -> None:
+    path = tmp_path / "tiny.dat.gz"
+    path.write_bytes(gzip.compress(LINES[:60]) + gzip.compress(LINES[60:120]))
+    blocks, (digest,) = read(path, text_file())
+    assert b"".join(block.data for block in blocks) == LINES[:120]
+    assert digest.bytes_read == path.stat().st_size
+
+
+@pytest.mark.parametrize("is_named_gz", [False, True])
+def test_compression_is_recognised_by_content(tmp_path: Path, is_named_gz) -> None:
+    path = tmp_path / ("tiny.dat.gz" if is_named_gz else "tiny.dat")
+    path.write_bytes(LINES if is_named_gz else gzip.compress(LINES))
+    blocks, _ = read(path, text_file())
+    assert b"".join(block.data for block in blocks) == LINES
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_truncated_gzip_names_the_file_and_the_last_line(tmp_path: Path) -> None:
+    noise = random.Random(1)
+    content = b"".join(b"%05d\n" % noise.randrange(100_000) for _ in range(2000))
+    path = tmp_path / "tiny.dat.gz"
+    compressed = gzip.compress(content)
+    path.write_bytes(compressed[: len(compressed) // 2])
+    seen, ends = [], []
+    with pytest.raises(ParseError, match=r"damaged or cut off after line \d+ .*fetch") as caught:
+        seen.extend(read_blocks(InputFile(path, text_file()), "tiny", ends.append))
+    assert caught.value.path == path
+    assert str(path) in str(caught.value)
+    assert caught.value.line == sum(block.data.count(b"\n") for block in seen)
+    assert 500 < caught.value.line < 1500
+    assert ends == []
+
+
+def test_gzip_with_a_wrong_checksum(tmp_path: Path) -> None:
+    path = tmp_path / "tiny.dat.gz"
+    whole = bytearray(gzip.compress(LINES))
+    whole[-8] ^= 1
+    path.write_bytes(bytes(whole))
+    with pytest.raises(ParseError, match="damaged"):
+        read(path, text_file())
+
+
+def test_rubbish_behind_a_gzip_member(tmp_path: Path) -> None:
+    path = tmp_path / "tiny.dat.gz"
+    path.write_bytes(gzip.compress(LINES) + b"rubbish")
+    with pytest.raises(ParseError, match="damaged"):
+        read(path, text_file())
+
+
+@pytest.mark.parametrize("content", [b"", gzip.compress(b"")])
+def test_an_empty_file_is_refused(tmp_path: Path, content) -> None:
+    path = tmp_path / "tiny.dat"
+    path.write_bytes(content)
+    with pytest.raises(ParseError, match=r"tiny\.dat: the file is empty; expected records of tiny"):
+        read(path, text_file())
+
+
+def test_a_file_that_cannot_be_opened(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="cannot be read"):
+        read(tmp_path / "missing.dat", text_file())
+
+
+@pytest.mark.usefixtures("small_blocks")
+@pytest.mark.parametrize("is_gzip", [False, True])
+def test_binary_blocks_are_whole_records(tmp_path: Path, is_gzip) -> None:
+    path = tmp_path / "packed.bin"
+    path.write_bytes(gzip.compress(pack(50)) if is_gzip else pack(50))
+    blocks, _ = read(path, BINARY)
+    assert len(blocks) > 1
+    parsed = [parse_binary(block.data, BINARY, ["n", "x"], block.first_line) for block in blocks]
+    assert [line for part in parsed for line in part.line] == list(range(1, 51))
+    assert [n for part in parsed for n in part["n"]] == list(range(50))
+    assert [x for part in parsed for x in part["x"]] == [n / 7 for n in range(50)]
+    assert not any(part.problems for part in parsed)
+
+
+def test_a_binary_record_that_is_cut_off_is_a_problem(tmp_path: Path) -> None:
+    path = tmp_path / "packed.bin"
+    path.write_bytes(pack(5)[:-1])
+    blocks, _ = read(path, BINARY)
+    parsed = [parse_binary(block.data, BINARY, ["n"], block.first_line) for block in blocks]
+    assert [n for part in parsed for n in part["n"]] == [0, 1, 2, 3]
+    (problem,) = [problem for part in parsed for problem in part.problems]
+    assert str(problem) == "line 5, record: found 11 bytes; expected 12 bytes"
+
+
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [
+        (b"JUNK" + pack(1)[4:], "b'JUNK"),
+        (b"PACK", "b'PACK'"),
+        (b"", "b''"),
+        (LINES, "b'00001"),
+    ],
+)
+def test_a_binary_file_of_another_kind(tmp_path: Path, content, found) -> None:
+    path = tmp_path / "packed.bin"
+    path.write_bytes(content)
+    with pytest.raises(ParseError, match="expected b'PACK' and a header of 8 bytes") as caught:
+        read(path, BINARY)
+    assert f"begins with {found}" in str(caught.value)
+    assert caught.value.byte_range == (1, 8)
+
+
+def test_a_binary_file_with_only_its_header_is_empty(tmp_path: Path) -> None:
+    path = tmp_path / "packed.bin"
+    path.write_bytes(pack(0))
+    with pytest.raises(ParseError, match="empty"):
+        read(path, BINARY)
+
+
+def test_a_gzipped_binary_file_cut_off_in_its_header(tmp_path: Path) -> None:
+    path = tmp_path / "packed.bin.gz"
+    path.write_bytes(gzip.compress(pack(5))[:12])
+    with pytest.raises(ParseError, match="damaged or cut off"):
+        read(path, BINARY)
+
+
+def test_parts_are_read_in_the_order_of_the_archive(tmp_path: Path) -> None:
+    for name in ("many.02", "many.00.gz", "many.01"):
+        (tmp_path / name).write_bytes(b"")
+    expected = [("many.00.gz", "many"), ("many.01", "many"), ("many.02", "many")]
+    assert names_found([tmp_path]) == expected
+
+
+@pytest.mark.parametrize(
+    ("present", "expected"),
+    [
+        (["many.dat"], ["many.dat"]),
+        (["many.dat.gz"], ["many.dat.gz"]),
+        (["many.dat", "many.dat.gz"], ["many.dat"]),
+        (["many.dat", "extra.dat"], ["many.dat", "extra.dat"]),
+        (["many.dat", "many.00", "many.01", "many.02"], ["many.00", "many.01", "many.02"]),
+        (["many.dat", "unrelated.txt"], ["many.dat"]),
+    ],
+)
+def test_what_a_folder_gives(tmp_path: Path, present, expected) -> None:
+    for name in present:
+        (tmp_path / name).write_bytes(b"")
+    assert [name for name, _ in names_found([tmp_path])] == expected
+
+
+def test_a_missing_part_is_named(tmp_path: Path) -> None:
+    (tmp_path / "many.00").write_bytes(b"")
+    (tmp_path / "many.02").write_bytes(b"")
+    with pytest.raises(SourceMissing, match=r"has 2 of 3 parts of many.\{part\}; missing: 01\."):
+        find_files(SOURCE, [tmp_path])
+
+
+def test_many_missing_parts_are_not_all_named(tmp_path: Path) -> None:
+    source = source_of(text_file(file_names=("t.{part}",), parts=tuple(map(str, range(10, 40)))))
+    (tmp_path / "t.10").write_bytes(b"")
+    with pytest.raises(SourceMissing, match="missing: 11, 12, 13, 14, 15, 16, 17, 18 …"):
+        find_files(source, [tmp_path])
+
+
+@pytest.mark.parametrize("present", [[], ["extra.dat"], ["other.dat"]])
+def test_a_folder_without_the_file_that_is_needed(tmp_path: Path, present) -> None:
+    for name in present:
+        (tmp_path / name).write_bytes(b"")
+    with pytest.raises(SourceMissing, match="starcat fetch tiny") as caught:
+        find_files(SOURCE, [tmp_path])
+    assert caught.value.path == tmp_path
+
+
+def test_a_path_that_does_not_exist(tmp_path: Path) -> None:
+    with pytest.raises(SourceMissing, match=r"nowhere does not exist.*extra\.dat\[\.gz\]"):
+        find_files(SOURCE, [tmp_path / "nowhere"])
+
+
+@pytest.mark.parametrize(
+    ("name", "layout"),
+    [
+        ("many.01", "many"),
+        ("many.07.gz", "many"),
+        ("extra.dat", "extra"),
+        ("extra.dat.gz", "extra"),
+        ("renamed.txt", "many"),
+        ("extraxdat", "many"),
+    ],
+)
+def test_layout_of_a_file_by_its_name_or_the_first(tmp_path: Path, name, layout) -> None:
+    (tmp_path / name).write_bytes(b"")
+    assert names_found([tmp_path / name]) == [(name, layout)]
+
+
+def test_files_named_one_by_one_keep_their_order(tmp_path: Path) -> None:
+    for name in ("many.02", "many.00"):
+        (tmp_path / name).write_bytes(b"")
+    found = names_found([tmp_path / "many.02", tmp_path / "many.00"])
+    assert [name for name, _ in found] == ["many.02", "many.00"]
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("many.01", True),
+        ("many.01.gz", True),
+        ("many.dat", True),
+        ("extra.dat.gz", True),
+        ("many.03", False),
+        ("many.dat.zip", False),
+        ("", False),
+    ],
+)
+def test_whether_a_folder_holds_a_source(tmp_path: Path, name, expected) -> None:
+    if name:
+        (tmp_path / name).write_bytes(b"")
+    assert holds_source(SOURCE, tmp_path) is expected
+
+
+def test_a_folder_of_the_name_of_a_file_is_not_the_file(tmp_path: Path) -> None:
+    (tmp_path / "many.dat").mkdir()
+    assert not holds_source(SOURCE, tmp_path)
+
+
+@pytest.mark.parametrize("workers", [1, 2, 5])
+def test_results_come_in_the_order_of_the_items(workers) -> None:
+    delays = random.Random(7)
+    waits = [delays.uniform(0.0, 0.004) for _ in range(60)]
+
+    def slow(item):
+        time.sleep(waits[item])
+        return item * item
+
+    assert list(map_in_order(slow, iter(range(60)), workers)) == [n * n for n in range(60)]
+
+
+def test_two_items_are_worked_on_at_once() -> None:
+    both = threading.Barrier(2, timeout=5.0)
+    assert len(list(map_in_order(lambda _: both.wait(), iter(range(4))))) == 4
+
+
+def test_no_more_than_a_few_items_are_read_ahead() -> None:
+    taken = []
+    items = (taken.append(n) or n for n in range(100))
+    results = map_in_order(str, items, workers=2)
+    assert [next(results) for _ in range(3)] == ["0", "1", "2"]
+    assert len(taken) <= 3 + 2 + 1
+    results.close()
+
+
+def test_no_items() -> None:
+    assert list(map_in_order(str, iter(()))) == []
+
+
+@pytest.mark.parametrize("bad", [0, 3, 9])
+def test_an_error_in_the_function_reaches_the_caller_in_its_place(bad) -> None:
+    def fail(item):
+        if item == bad:
+            raise ZeroDivisionError
+        return item
+
+    done = []
+    with pytest.raises(ZeroDivisionError):
+        done.extend(map_in_order(fail, iter(range(10))))
+    assert done == list(range(bad))
+
+
+def test_an_error_in_the_items_reaches_the_caller() -> None:
+    def items():
+        yield from (1, 2, 3)
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        list(map_in_order(str, items()))
