@@ -119,7 +119,9 @@ def radec_roll_from_matrix(matrix: Array) -> tuple[float, float, float]:
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])
     north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
     roll = np.arctan2(-matrix[0] @ north, -matrix[0] @ east)
-    return float(np.degrees(ra) % 360.0), float(np.degrees(dec)), float(np.degrees(roll) % 360.0)
+    # A tiny negative angle modulo 360 rounds to 360 itself; the second modulo makes that 0.
+    ra_deg, roll_deg = np.degrees([ra, roll]) % 360.0 % 360.0
+    return float(ra_deg), float(np.degrees(dec)), float(roll_deg)
 
 
 def solve_wahba_svd(body: Array, icrs: Array, weights: Array | None = None) -> Array:

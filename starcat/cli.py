@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from starcat import __version__
-from starcat.errors import ConfigError, StarcatError
+from starcat.errors import ConfigError, StarcatError, reason
 
 if TYPE_CHECKING:
     from starcat.spec import BuildSpec
@@ -288,7 +288,10 @@ def _stop(number: int, frame: Any) -> None:
 
 
 def main() -> None:
-    """Run the command line, and turn starcat's errors into a message and an exit code."""
+    """Run the command line, and turn errors into a message and an exit code.
+
+    What the operating system refuses at a place that nobody foresaw exits with 1.
+    """
     signal.signal(signal.SIGTERM, _stop)
     try:
         app()
@@ -297,3 +300,9 @@ def main() -> None:
             raise
         sys.stderr.write(f"starcat: error: {error}\n")
         sys.exit(error.exit_code)
+    except OSError as error:
+        if "--debug" in sys.argv:
+            raise
+        where = f"{error.filename}: " if error.filename else ""
+        sys.stderr.write(f"starcat: error: {where}{reason(error)}\n")
+        sys.exit(1)

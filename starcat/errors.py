@@ -6,7 +6,29 @@ expected and what to do next. ``exit_code`` is what the command line returns for
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
+
+
+def reason(error: OSError) -> str:
+    """Return why the operating system refused, without the path that a message names itself.
+
+    Parameters
+    ----------
+    error : OSError
+        Of Python or of a library, which often puts more before the system's own words.
+
+    Returns
+    -------
+    str
+        The system's words where it has a number for the error, else the library's.
+
+    Examples
+    --------
+    >>> reason(OSError(28, "Error writing bytes to file. Detail: [errno 28] ..."))
+    'No space left on device'
+    """
+    return os.strerror(error.errno) if error.errno else str(error)
 
 
 class StarcatError(Exception):

@@ -48,7 +48,7 @@ class KVector:
         Returns
         -------
         slice
-            A superset: at most the values of one step of the line more at either end.
+            A superset: at most the values of two steps of the line more at either end.
         """
         n = len(self.values)
         if n == 0 or not low <= high or high < self.values[0] or low > self.values[-1]:

@@ -31,7 +31,7 @@ from starcat.catalog.locate import locate
 from starcat.catalog.selection import Selected, Step, select_guide_stars
 from starcat.catalog.stars import directions_of, floats_of, sort_rows
 from starcat.catalog.variability import AmplitudeTable, join_amplitudes, read_amplitudes
-from starcat.errors import BuildError
+from starcat.errors import BuildError, ConfigError
 from starcat.evaluation.selftest import Rates, self_test
 from starcat.matcher.matcher import Matcher
 from starcat.products.boresights import FieldStars, tile_sphere
@@ -182,6 +182,7 @@ def read_sources(
         In the order of the spec.
     """
     joins = spec.selection.variables.join
+    check_inputs(spec, inputs)
     # All inputs are found before any is read: a missing one is known at once.
     paths = {name: locate(name, inputs) for name in (spec.catalog.source, *joins)}
     catalog = ingest(
@@ -193,6 +194,32 @@ def read_sources(
         progress=progress,
     )
     return catalog, [read_amplitudes(name, paths[name], progress) for name in joins]
+
+
+def check_inputs(spec: BuildSpec, inputs: Inputs) -> None:
+    """Check that the spec uses every source that an input is given for.
+
+    Parameters
+    ----------
+    spec : BuildSpec
+        Which sources.
+    inputs : mapping of str to sequence of Path
+        As for `build`.
+
+    Raises
+    ------
+    ConfigError
+        Naming the source that would be ignored.
+    """
+    used = (spec.catalog.source, *spec.selection.variables.join)
+    for name in inputs:
+        if name not in used:
+            raise ConfigError(
+                f"--input {name}=...: {spec.name} does not read {name} but {', '.join(used)}; "
+                "choose another preset or spec, or leave the input out",
+                key="input",
+                value=name,
+            )
 
 
 def _join_all(

@@ -168,6 +168,7 @@ def read_schema(path: Path) -> ProductSchema:
         columns += [
             SchemaColumn(c.name, c.dtype, c.unit, c.nullable or loose, c.description, c.ucd)
             for c in base.columns
+            if c.name not in content.get("extends_without", ())
         ]
     columns += [
         SchemaColumn(

@@ -229,7 +229,9 @@ def spec_from_dict(content: dict[str, Any], origin: str) -> BuildSpec:
     try:
         return BuildSpec.model_validate(content)
     except ValidationError as error:
-        first = error.errors()[0]
+        # A misspelt key is missing too: the spelling is what helps.
+        wrong = sorted(error.errors(), key=lambda entry: entry["type"] != "extra_forbidden")
+        first = wrong[0]
         key = ".".join(str(part) for part in first["loc"]) or "spec"
         raise ConfigError(
             f"{origin}: {key}: {_explain(dict(first))}", key=key, value=first["input"]

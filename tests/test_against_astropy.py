@@ -136,16 +136,15 @@ def test_every_number_is_the_one_that_astropy_reads(
     theirs = astropy_columns(lines, ranges)
     assert len(ours) == len(lines) == (count or {"hip_main": 9_933, "sao": 15_935}[name])
     assert len(ranges) > 25
+    assert sum(np.isfinite(values).any() for values in theirs.values()) >= 14
     for column, expected in theirs.items():
         for null in layout.column(column).null:
             expected[expected == float(null)] = np.nan
         np.testing.assert_array_equal(ours[column], expected, err_msg=column, strict=True)
 
 
-@pytest.mark.parametrize(("source", "name", "path", "count"), CASES)
-def test_bytes_that_the_read_me_prints(
-    catalogs: Path, source: str, name: str, path: str, count: int | None
-) -> None:
+@pytest.mark.parametrize(("source", "name", "path"), [case[:3] for case in CASES])
+def test_bytes_that_the_read_me_prints(catalogs: Path, source: str, name: str, path: str) -> None:
     (layout,) = (file for file in data_source(source).files if file.name == name)
     lines = read_lines(catalogs / path, 2_000)
     ours = parse_fixed_width("\n".join(lines).encode(), layout, list(READ_ME[name]))

@@ -6,7 +6,8 @@ list column ``name`` is two datasets: ``name_offsets`` (rows + 1) and ``name_val
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -102,17 +103,31 @@ def _as_numpy(values: pa.Array, dtype: str) -> NDArray[Any]:
     )
 
 
-def open_for_writing(path: Path) -> h5py.File:
-    """Open a new HDF5 file whose bytes depend on its content alone.
+@contextmanager
+def open_for_writing(path: Path) -> Iterator[h5py.File]:
+    """Open a new HDF5 file whose bytes depend on its content alone, and close it afterwards.
 
     Parameters
     ----------
     path : Path
         Overwritten if it exists.
 
-    Returns
-    -------
+    Yields
+    ------
     h5py.File
-        To be closed by the caller; object times are never stored.
+        Object times are never stored.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written, with the system's number for the reason.
     """
-    return h5py.File(path, "w", libver=("earliest", "v110"))
+    file = h5py.File(path, "w", libver=("earliest", "v110"))
+    try:
+        yield file
+        file.flush()
+    except BaseException:
+        with suppress(Exception):  # on a full disk closing fails as well; the first error counts
+            file.close()
+        raise
+    file.close()

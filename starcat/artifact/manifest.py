@@ -22,6 +22,7 @@ from starcat.schema import ProductSchema
 MANIFEST_NAME = "manifest.json"
 MANIFEST_VERSION = "1.0.0"
 DATABASE_NAME = "database.h5"
+PARTS = ("name", "version", "frame", "epoch_jyear", "spec", "sources", "products", "files")
 LIBRARIES = ("numpy", "scipy", "pyerfa", "pyarrow", "h5py", "pydantic")
 
 
@@ -110,6 +111,10 @@ def software_versions() -> dict[str, str]:
     return {"starcat": __version__, "python": platform.python_version(), **found}
 
 
+def _lacks(error: Exception) -> str:
+    return f"no {error.args[0]}" if isinstance(error, KeyError) else str(error)
+
+
 def read_manifest(folder: Path) -> dict[str, Any]:
     """Read the manifest of an artifact.
 
@@ -133,7 +138,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     path = folder / MANIFEST_NAME
     try:
         manifest = json.loads(path.read_bytes())
-        found = manifest["manifest_version"]
+        found = str(manifest["manifest_version"])
     except OSError as error:
         raise ProductError(
             f"{folder}: not an artifact, {MANIFEST_NAME} cannot be read ({error.strerror}); give "
@@ -142,14 +147,23 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         ) from error
     except (ValueError, KeyError, TypeError) as error:
         raise ProductError(
-            f"{path}: not a starcat manifest ({error}); rebuild the artifact", path=path
+            f"{path}: not a starcat manifest ({_lacks(error)}); rebuild the artifact",
+            path=path,
         ) from error
     if found.split(".")[0] != MANIFEST_VERSION.split(".")[0]:
+        software = manifest.get("software")
+        made_by = software.get("starcat") if isinstance(software, dict) else None
         raise SchemaVersionError(
             f"{path}: manifest version {found}; this starcat reads {MANIFEST_VERSION}. Install "
-            f"starcat {manifest.get('software', {}).get('starcat', 'of a newer release')}",
+            f"starcat {made_by or 'of the release that wrote it'}",
             product="manifest",
             found=found,
             expected=MANIFEST_VERSION,
+        )
+    lacking = [part for part in PARTS if part not in manifest]
+    if lacking:
+        raise ProductError(
+            f"{path}: not a starcat manifest (no {', '.join(lacking)}); rebuild the artifact",
+            path=path,
         )
     return dict(manifest)

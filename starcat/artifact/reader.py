@@ -17,6 +17,8 @@ from starcat.errors import ProductError
 from starcat.parquet import read_parquet
 from starcat.schema import ProductSchema, product_schema
 
+_AGAIN = "Build the artifact again, or fetch it again"
+
 
 @dataclass(frozen=True)
 class Artifact:
@@ -134,11 +136,16 @@ def check_artifact(folder: Path) -> Artifact:
     for name, facts in artifact.manifest["files"].items():
         path = folder / name
         if not path.is_file():
-            raise ProductError(f"{path}: missing; the manifest lists it", path=path)
+            raise ProductError(f"{path}: missing; the manifest lists it. {_AGAIN}", path=path)
+        size = path.stat().st_size
+        if size != facts["bytes"]:
+            raise ProductError(
+                f"{path}: {size} bytes; the manifest says {facts['bytes']}. {_AGAIN}", path=path
+            )
         if file_sha256(path) != facts["sha256"]:
             raise ProductError(
-                f"{path}: its bytes are not those that the manifest lists "
-                f"({path.stat().st_size} bytes, expected {facts['bytes']})",
+                f"{path}: changed since it was built, its digest is not that of the manifest. "
+                f"{_AGAIN}",
                 path=path,
             )
     for product, facts in artifact.manifest["products"].items():

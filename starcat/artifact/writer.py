@@ -24,7 +24,7 @@ from starcat.artifact.manifest import (
     SourceFacts,
     software_versions,
 )
-from starcat.errors import OutputError
+from starcat.errors import OutputError, reason
 from starcat.kvector import KVector
 from starcat.parquet import write_parquet
 from starcat.schema import product_schema
@@ -78,7 +78,7 @@ def partial_folder(final: Path) -> Iterator[Path]:
         made = Path(tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".partial", dir=final.parent))
     except OSError as error:
         raise OutputError(
-            f"{final.parent}: cannot write there ({error.strerror}); choose another folder "
+            f"{final.parent}: cannot write there ({reason(error)}); choose another folder "
             "with --output",
             path=final.parent,
         ) from error
@@ -86,9 +86,9 @@ def partial_folder(final: Path) -> Iterator[Path]:
         made.chmod(0o755)
         yield made
     except OSError as error:
-        if error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES}:
+        if error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES}:
             raise OutputError(
-                f"{final.parent}: writing failed ({error.strerror}); nothing was left there",
+                f"{final.parent}: writing failed ({reason(error)}); nothing was left there",
                 path=final.parent,
             ) from error
         raise
@@ -210,8 +210,7 @@ def publish(partial: Path, final: Path, *, replace: bool) -> Outcome:
         if path.is_file():
             with path.open("rb") as file:
                 os.fsync(file.fileno())
-    if not final.exists():
-        partial.rename(final)
+    if not final.exists() and _rename(partial, final):
         return "written"
     new = (partial / MANIFEST_NAME).read_bytes()
     old = final / MANIFEST_NAME
@@ -224,10 +223,26 @@ def publish(partial: Path, final: Path, *, replace: bool) -> Outcome:
             path=final,
         )
     aside = partial.with_name(f"{partial.name}.old.partial")
-    final.rename(aside)
-    partial.rename(final)
+    try:
+        final.rename(aside)
+        partial.rename(final)
+    except BaseException:  # a signal between the two must not leave the name empty
+        if aside.exists() and not final.exists():
+            aside.rename(final)
+        raise
     shutil.rmtree(aside, ignore_errors=True)
     return "replaced"
+
+
+def _rename(partial: Path, final: Path) -> bool:
+    """Rename, and return False where another build has just taken the name."""
+    try:
+        partial.rename(final)
+    except OSError:
+        if final.exists():
+            return False
+        raise
+    return True
 
 
 def _is_whole(final: Path, partial: Path) -> bool:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 import pyarrow as pa
 
 from starcat.catalog.ingest import Ingested
-from starcat.errors import OutputError
+from starcat.errors import OutputError, reason
 from starcat.parquet import write_parquet
 
 
@@ -59,8 +60,9 @@ def _write(table: pa.Table, path: Path) -> None:
         partial.replace(path)
     except OSError as error:
         raise OutputError(
-            f"{path}: cannot be written ({error.strerror or error}); choose another --output",
+            f"{path}: cannot be written ({reason(error)}); choose another --output",
             path=path,
         ) from error
     finally:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):  # where the folder could not be made there is nothing to remove
+            partial.unlink(missing_ok=True)

@@ -25,6 +25,9 @@ from starcat.errors import ParseError, SourceError, SourceMissing
 
 BLOCK_BYTES = 1 << 22
 
+MAX_LINE_BYTES = 1 << 24
+"""Text without a line end for longer than this is no archive's, and is not read to its end."""
+
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
@@ -290,6 +293,8 @@ def read_blocks(
             data = tail + chunk
             cut = _last_whole(data, file.layout)
             tail = data[cut:]
+            if len(tail) > MAX_LINE_BYTES:
+                raise _endless_line(file, source_name, line)
             if cut:
                 yield Block(file, data[:cut], line)
                 line += _count(data[:cut], file.layout)
@@ -303,9 +308,10 @@ def read_blocks(
             )
         on_end(raw)
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        what = "cut off" if isinstance(error, EOFError) else "damaged"
+        where = f" after line {line - 1}" if line > 1 else ""
         raise ParseError(
-            f"{file.path}: the compressed data is damaged or cut off after line {line - 1} "
-            f"({error}); fetch the file again",
+            f"{file.path}: the compressed data is {what}{where} ({error}); fetch the file again",
             source=source_name,
             path=file.path,
             line=line - 1,
@@ -313,6 +319,18 @@ def read_blocks(
     finally:
         stream.close()
         raw.close()
+
+
+def _endless_line(file: InputFile, source_name: str, line: int) -> ParseError:
+    length = file.layout.record_bytes
+    expected = f"records of {length} bytes" if length else "lines"
+    return ParseError(
+        f"{file.path}: line {line} has no end within {MAX_LINE_BYTES >> 20} MiB; expected "
+        f"{expected} of {source_name} ({file.layout.name}). Is this the right archive?",
+        source=source_name,
+        path=file.path,
+        line=line,
+    )
 
 
 def check_magic(header: bytes, file: InputFile, source_name: str) -> None:

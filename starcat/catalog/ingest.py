@@ -351,7 +351,8 @@ def reject_rows(stars: pa.Table, reasons: pa.Array) -> pa.Table:
         Of the rejected schema.
     """
     schema = product_schema("rejected").arrow_schema
-    columns = [*stars.columns, reasons, pa.nulls(len(stars), pa.string())]
+    verdict = {"reason": reasons, "detail": pa.nulls(len(stars), pa.string())}
+    columns = [verdict[name] if name in verdict else stars[name] for name in schema.names]
     return pa.Table.from_arrays(columns, schema=schema)
 
 
@@ -426,7 +427,7 @@ def check_malformed(
     problems: Sequence[tuple[int, Problem]],
     source: DataSource,
 ) -> None:
-    """Refuse a file with too many malformed records.
+    """Refuse a file without records or with too many malformed ones.
 
     Parameters
     ----------
@@ -442,9 +443,16 @@ def check_malformed(
     Raises
     ------
     ParseError
-        If more than 10 records of a file and 1 % are malformed.
+        If a file has no record, or more than 10 of them and 1 % are malformed.
     """
     for number, file in enumerate(files):
+        if not rows[number]:
+            raise ParseError(
+                f"{file.path}: no record in the file; expected records of {source.name} "
+                f"({file.layout.name}). Is this the right archive?",
+                source=source.name,
+                path=file.path,
+            )
         bad = [problem for n, problem in problems if n == number]
         if len(bad) > 10 and len(bad) > MAX_MALFORMED_FRACTION * rows[number]:
             raise ParseError(

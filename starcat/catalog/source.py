@@ -282,7 +282,8 @@ def read_source(path: Path) -> DataSource:
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
-        raise ConfigError(f"{path.name}: {key}: {first['msg']}", key=key) from error
+        said = first["msg"].removeprefix("Value error, ")
+        raise ConfigError(f"{path.name}: {key}: {said}", key=key) from error
 
 
 @cache
@@ -330,9 +331,9 @@ def data_source(name: str) -> DataSource:
         from difflib import get_close_matches
 
         near = get_close_matches(name, source_names(), 1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
+        hint = f"did you mean {near[0]!r}? " if near else ""
         raise ConfigError(
-            f"unknown source {name!r}{hint} Known sources: {', '.join(source_names())}",
+            f"unknown source {name!r}; {hint}known sources: {', '.join(source_names())}",
             key="source",
             value=name,
         )

@@ -77,9 +77,10 @@ def read_amplitudes(
         )  # fmt: skip
     read = ingest(source_name, paths, neighbours=False, progress=progress)
     # A star without a position can still be known to vary.
-    rejected = read.rejected.select(read.stars.column_names)
-    usable = rejected.filter(pc.is_valid(rejected["star_id"]))
-    stars = pa.concat_tables([read.stars, usable], promote_options="permissive")
+    usable = read.rejected.filter(pc.is_valid(read.rejected["star_id"]))
+    columns = [name for name in usable.column_names if name in read.stars.column_names]
+    tables = [read.stars.select(columns), usable.select(columns)]
+    stars = pa.concat_tables(tables, promote_options="permissive")
     known = pc.or_(pc.is_valid(stars["amplitude_mag"]), pc.is_valid(stars["variable_flag"]))
     stars = stars.filter(known)
     numbers = {name: _whole(stars, name) for name in ("hip_number", "hd_number")}

@@ -95,7 +95,7 @@ def open_database(artifact: Path) -> Database:
     try:
         with h5py.File(path, "r") as file:
             return _read(file, path)
-    except (OSError, KeyError) as error:
+    except (OSError, KeyError, ValueError, RuntimeError) as error:
         raise ProductError(
             f"{path}: not a readable starcat database ({error}); build it again", path=path
         ) from error

@@ -1,0 +1,76 @@
+"""Write the golden figures of two builds: ``make golden``; look at the difference.
+
+Whole numbers and texts are held as digests. Real numbers are held as sums and first rows, as
+their last bit may differ between processors (docs/decisions.md).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from starcat.artifact.reader import open_artifact
+from starcat.pipeline import build
+from starcat.spec import preset
+
+PRESETS = ("gaia-12deg", "sao-12deg")
+GOLDEN = Path(__file__).parents[1] / "golden"
+
+
+def golden_figures(name: str, catalogs: Path) -> dict[str, Any]:
+    """Build a preset and return what has to stay the same.
+
+    Parameters
+    ----------
+    name : str
+        A preset.
+    catalogs : Path
+        Folder of the excerpts.
+
+    Returns
+    -------
+    dict
+        By product: rows, digest of the exact columns, sums and first rows of the others.
+    """
+    inputs = {"sao": [catalogs / "sao.dat.gz"]} if name.startswith("sao") else {}
+    with tempfile.TemporaryDirectory() as folder:
+        artifact = open_artifact(build(preset(name), inputs, Path(folder)).folder)
+        return {product: figures(artifact.table(product)) for product in artifact.products}
+
+
+def figures(table: pa.Table) -> dict[str, Any]:
+    """Return the golden figures of one product."""
+    exact, sums = hashlib.sha256(), {}
+    for field in table.schema:
+        column = table[field.name]
+        if pa.types.is_floating(field.type):
+            sums[field.name] = [len(column) - column.null_count, pc.sum(column).as_py()]
+        else:
+            exact.update(json.dumps([field.name, column.to_pylist()]).encode())
+    return {
+        "rows": len(table),
+        "exact_sha256": exact.hexdigest(),
+        "sums": sums,
+        "first_rows": table.slice(0, 3).to_pylist(),
+    }
+
+
+def main() -> None:
+    """Write one file a preset."""
+    default = Path(__file__).parents[3] / "shared" / "catalogs"
+    catalogs = Path(os.environ.get("STARCAT_CATALOGS", default))
+    GOLDEN.mkdir(exist_ok=True)
+    for name in PRESETS:
+        text = json.dumps(golden_figures(name, catalogs), indent=1, sort_keys=True)
+        (GOLDEN / f"{name}.json").write_text(text + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

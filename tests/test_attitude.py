@@ -1,0 +1,189 @@
+"""Attitudes: quaternion, matrix and angles say the same, and mean what the manual says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from starcat.attitude import (
+    matrix_from_quaternion,
+    matrix_from_radec_roll,
+    quaternion_from_matrix,
+    radec_roll_from_matrix,
+    random_attitudes,
+    solve_wahba_svd,
+)
+from starcat.sphere import directions_from_radec, separation, tangent_axes
+
+# Components are rounded to 1.1e-16, and a handful of products add up.
+ROUNDING = 4e-15
+
+ARCSEC = np.pi / (180.0 * 3600.0)
+
+
+@st.composite
+def quaternions(draw) -> np.ndarray:
+    # Zeros and tiny components are where a careless formula divides by nothing.
+    part = st.one_of(st.sampled_from([0.0, 1.0, -1.0, 1e-9, -1e-9]), st.floats(-1.0, 1.0))
+    q = np.array([draw(part) for _ in range(4)])
+    if np.linalg.norm(q) < 1e-8:
+        q[draw(st.integers(0, 3))] = 1.0
+    return q / np.linalg.norm(q)
+
+
+angles = st.tuples(
+    st.floats(0.0, 360.0, exclude_max=True),
+    st.one_of(
+        st.floats(-90.0, 90.0),
+        st.sampled_from([-90.0, 90.0, -89.9999999, 89.9999999, 89.999999999999]),
+    ),
+    st.floats(0.0, 360.0, exclude_max=True),
+)
+
+
+@given(quaternions())
+def test_matrix_is_that_of_scipy(q):
+    # scipy turns a vector; this turns the axes under it, which is the inverse.
+    expected = Rotation.from_quat(q).inv().as_matrix()
+    assert np.abs(matrix_from_quaternion(q) - expected).max() < ROUNDING
+
+
+@given(quaternions())
+def test_quaternion_round_trip(q):
+    back = quaternion_from_matrix(matrix_from_quaternion(q))
+    assert back[3] >= 0.0
+    assert np.linalg.norm(back) == pytest.approx(1.0, abs=ROUNDING)
+    assert min(np.abs(back - q).max(), np.abs(back + q).max()) < ROUNDING
+
+
+@given(quaternions())
+def test_quaternion_of_a_matrix_is_that_of_scipy(q):
+    matrix = matrix_from_quaternion(q)
+    expected = Rotation.from_matrix(matrix).inv().as_quat(canonical=True)
+    found = quaternion_from_matrix(matrix)
+    assert min(np.abs(found - expected).max(), np.abs(found + expected).max()) < ROUNDING
+
+
+def test_quaternion_is_normalised():
+    q = np.array([1.0, 2.0, 3.0, 4.0])
+    assert np.allclose(matrix_from_quaternion(q), matrix_from_quaternion(q / 7.0), atol=ROUNDING)
+
+
+def test_matrix_turns_icrs_into_body(random_directions):
+    icrs = random_directions(20, 1)
+    q = np.array([0.1, -0.2, 0.3, 0.9])
+    body = Rotation.from_quat(q).inv().apply(icrs)
+    assert np.abs(icrs @ matrix_from_quaternion(q).T - body).max() < ROUNDING
+
+
+@given(angles)
+def test_radec_roll_round_trip(given_angles):
+    matrix = matrix_from_radec_roll(*given_angles)
+    back = radec_roll_from_matrix(matrix)
+    # Near a pole right ascension and roll are only defined together, so the matrices compare.
+    assert np.abs(matrix_from_radec_roll(*back) - matrix).max() < ROUNDING
+    assert 0.0 <= back[0] < 360.0
+    assert -90.0 <= back[1] <= 90.0
+    assert 0.0 <= back[2] < 360.0
+
+
+@pytest.mark.parametrize("ra_deg", [0.0, 83.2, 180.0, 359.0])
+@pytest.mark.parametrize("dec_deg", [-89.0, -5.0, 0.0, 60.0])
+@pytest.mark.parametrize("roll_deg", [0.0, 45.0, 200.0])
+def test_each_angle_comes_back(ra_deg, dec_deg, roll_deg):
+    back = radec_roll_from_matrix(matrix_from_radec_roll(ra_deg, dec_deg, roll_deg))
+    wrapped = (np.subtract(back, (ra_deg, dec_deg, roll_deg)) + 180.0) % 360.0 - 180.0
+    # At 89 deg the meridians converge 57-fold.
+    assert np.abs(wrapped).max() < 1e-11
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, -1e-14, 1e-14, 359.9999999999999])
+def test_angles_never_reach_360(angle_deg):
+    ra_deg, _, roll_deg = radec_roll_from_matrix(matrix_from_radec_roll(angle_deg, 0.0, angle_deg))
+    assert 0.0 <= ra_deg < 360.0
+    assert 0.0 <= roll_deg < 360.0
+
+
+@given(angles)
+def test_matrix_of_angles_is_a_proper_rotation_with_the_boresight_as_z(given_angles):
+    matrix = matrix_from_radec_roll(*given_angles)
+    assert np.abs(matrix @ matrix.T - np.eye(3)).max() < ROUNDING
+    assert np.linalg.det(matrix) == pytest.approx(1.0)
+    assert separation(matrix[2], directions_from_radec(*given_angles[:2])) < ROUNDING
+
+
+@pytest.mark.parametrize("ra_deg", [0.0, 100.0, 359.9])
+@pytest.mark.parametrize("dec_deg", [-80.0, 0.0, 45.0])
+def test_at_roll_0_north_is_up_and_east_is_left(ra_deg, dec_deg):
+    matrix = matrix_from_radec_roll(ra_deg, dec_deg, 0.0)
+    east, north = tangent_axes(ra_deg, dec_deg)
+    assert np.abs(matrix @ north - [0.0, -1.0, 0.0]).max() < ROUNDING
+    assert np.abs(matrix @ east - [-1.0, 0.0, 0.0]).max() < ROUNDING
+
+
+def test_positive_roll_turns_north_to_the_left():
+    matrix = matrix_from_radec_roll(30.0, 40.0, 90.0)
+    _, north = tangent_axes(30.0, 40.0)
+    assert np.abs(matrix @ north - [-1.0, 0.0, 0.0]).max() < ROUNDING
+
+
+@pytest.mark.parametrize("count", [2, 3, 20])
+def test_wahba_finds_the_attitude_of_exact_directions(count, random_directions):
+    for seed, matrix in enumerate(random_attitudes(20, np.random.default_rng(7))):
+        icrs = random_directions(count, seed)
+        found = solve_wahba_svd(icrs @ matrix.T, icrs)
+        # Two directions a degree apart fix the third axis 60 times worse than themselves.
+        assert np.abs(found - matrix).max() < 1e-12
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("noise", [30 * ARCSEC, 0.3])
+def test_wahba_agrees_with_scipy(noise, weighted, random_directions):
+    generator = np.random.default_rng(8)
+    for seed, matrix in enumerate(random_attitudes(20, generator)):
+        icrs = random_directions(6, seed)
+        body = icrs @ matrix.T + generator.normal(scale=noise, size=icrs.shape)
+        weights = generator.uniform(0.1, 5.0, 6) if weighted else None
+        expected = Rotation.align_vectors(body, icrs, weights=weights)[0].as_matrix()
+        assert np.abs(solve_wahba_svd(body, icrs, weights) - expected).max() < 1e-12
+
+
+def test_a_weight_of_zero_leaves_a_star_out(random_directions):
+    icrs = random_directions(5, 3)
+    matrix = matrix_from_radec_roll(10.0, 20.0, 30.0)
+    body = icrs @ matrix.T
+    body[4] = -body[4]
+    found = solve_wahba_svd(body, icrs, np.array([1.0, 1.0, 1.0, 1.0, 0.0]))
+    assert np.abs(found - matrix).max() < 1e-12
+
+
+@pytest.mark.parametrize("kind", ["noise only", "coplanar", "two", "mirrored"])
+def test_wahba_always_gives_a_proper_rotation(kind, random_directions):
+    generator = np.random.default_rng(9)
+    for seed in range(30):
+        icrs = random_directions(2 if kind == "two" else 5, seed)
+        body = random_directions(len(icrs), seed + 100)
+        if kind == "coplanar":
+            icrs[:, 2] = 0.0
+            turned = random_attitudes(1, generator)[0]
+            body = icrs @ turned.T + generator.normal(scale=1e-5, size=icrs.shape)
+        if kind == "mirrored":
+            body = icrs * [-1.0, 1.0, 1.0]
+        found = solve_wahba_svd(body, icrs)
+        assert np.linalg.det(found) == pytest.approx(1.0)
+        assert np.abs(found @ found.T - np.eye(3)).max() < ROUNDING
+
+
+def test_random_attitudes_are_rotations_spread_evenly():
+    matrices = random_attitudes(4000, np.random.default_rng(10))
+    assert np.allclose(np.linalg.det(matrices), 1.0)
+    # Each element of a uniform rotation has mean 0 and variance 1/3; five sigma of 4000.
+    assert np.abs(matrices.mean(axis=0)).max() < 5.0 * np.sqrt(1.0 / 3.0 / 4000)
+    assert np.abs((matrices**2).mean(axis=0) - 1.0 / 3.0).max() < 5.0 * np.sqrt(4.0 / 45.0 / 4000)
+
+
+def test_no_random_attitudes():
+    assert random_attitudes(0, np.random.default_rng(0)).shape == (0, 3, 3)

@@ -1,0 +1,132 @@
+"""Proper motion: straight lines, poles without trouble, and stars that do not move."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from starcat.catalog.proper_motion import Motion, propagate, propagate_directions
+from starcat.sphere import directions_from_radec, separation
+
+ARCSEC = np.pi / (180.0 * 3600.0)
+
+# Directions are rounded to 1e-16, so a position is good to 1e-10 arcsec after a few steps.
+ROUNDING_RAD = 1e-15
+
+
+def motion(*rows: tuple[float, float, float, float]) -> Motion:
+    return Motion(*np.array(rows, dtype=float).T)
+
+
+def directions(moved: Motion) -> np.ndarray:
+    return directions_from_radec(moved.ra_deg, moved.dec_deg)
+
+
+stars = st.tuples(
+    st.floats(0.0, 360.0, exclude_max=True),
+    st.one_of(st.floats(-90.0, 90.0), st.sampled_from([-90.0, 90.0, 89.9999, -89.9999])),
+    st.floats(-10000.0, 10000.0),
+    st.floats(-10000.0, 10000.0),
+)
+spans = st.floats(-150.0, 150.0)
+
+
+@given(stars, spans)
+def test_there_and_back(star, years):
+    start = motion(star)
+    back = propagate(propagate(start, years), -years)
+    assert separation(directions(back), directions(start)).max() < ROUNDING_RAD * 10
+    # Beside a pole the axes turn by whole radians; only the speed is then worth comparing.
+    speed = np.hypot(back.pm_ra_cosdec_mas_yr, back.pm_dec_mas_yr)
+    assert speed == pytest.approx(np.hypot(*star[2:]), rel=1e-9, abs=1e-12)
+
+
+@given(stars, spans)
+def test_directions_are_those_of_the_positions(star, years):
+    moved, u = propagate_directions(motion(star), years)
+    assert separation(u, directions(moved)).max() < ROUNDING_RAD
+    assert np.abs(np.linalg.norm(u, axis=1) - 1.0).max() < ROUNDING_RAD
+    assert 0.0 <= moved.ra_deg[0] < 360.0
+    assert -90.0 <= moved.dec_deg[0] <= 90.0
+
+
+@given(stars, spans)
+def test_a_star_moves_by_the_arc_tangent_of_its_motion(star, years):
+    start = motion(star)
+    moved = propagate(start, years)
+    drift_rad = np.hypot(star[2], star[3]) * 1e-3 * ARCSEC * abs(years)
+    assert separation(directions(moved), directions(start))[0] == pytest.approx(
+        np.arctan(drift_rad), rel=0.0, abs=ROUNDING_RAD
+    )
+
+
+@given(stars, spans)
+def test_the_motion_at_the_end_is_the_derivative_there(star, years):
+    step = 1e-2
+    moved, u = propagate_directions(motion(star), years)
+    ahead, behind = (propagate_directions(motion(star), years + s)[1] for s in (step, -step))
+    ra, dec = np.radians(moved.ra_deg[0]), np.radians(moved.dec_deg[0])
+    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
+    north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
+    rate = (ahead - behind)[0] / (2.0 * step) / (1e-3 * ARCSEC)
+    found = [moved.pm_ra_cosdec_mas_yr[0], moved.pm_dec_mas_yr[0]]
+    # The difference of two directions over 0.02 yr is good to 1e-16/0.02 rad/yr, 1e-6 mas/yr.
+    assert found == pytest.approx([rate @ east, rate @ north], rel=1e-8, abs=1e-5)
+    assert abs(rate @ u[0]) < 1e-2
+
+
+def test_positions_add_up_by_hand_on_the_equator():
+    moved = propagate(motion((359.9999, 0.0, 3600.0, 0.0), (10.0, 0.0, 0.0, -3600.0)), 100.0)
+    # 360 arcsec along a line of length 1 is an arc shorter by a millionth of itself.
+    assert moved.ra_deg == pytest.approx([0.0999, 10.0], rel=0.0, abs=2e-7)
+    assert moved.dec_deg == pytest.approx([0.0, -0.1], rel=0.0, abs=2e-7)
+
+
+@pytest.mark.parametrize("dec_deg", [90.0, -90.0, 89.99999])
+def test_a_star_crosses_the_pole(dec_deg):
+    towards = -3600.0 if dec_deg < 0.0 else 3600.0
+    moved = propagate(motion((20.0, dec_deg, 0.0, towards)), 100.0)
+    assert moved.ra_deg[0] == pytest.approx(200.0, abs=1e-6)
+    past_deg = abs(dec_deg) + 0.1 - 90.0
+    assert abs(moved.dec_deg[0]) == pytest.approx(90.0 - past_deg, abs=1e-6)
+    assert moved.pm_dec_mas_yr[0] == pytest.approx(-towards, rel=1e-5)
+
+
+NO_MOTION = [
+    (10.1, 20.2, np.nan, np.nan),
+    (359.99999999999994, -89.99999, 0.0, 0.0),
+    (0.1, 90.0, np.nan, 5.0),
+    (12.3, -45.6, 7.0, np.nan),
+    (77.7, 0.3, -0.0, 0.0),
+]
+
+
+def test_a_star_without_proper_motion_stays_to_the_last_bit():
+    start = motion(*NO_MOTION)
+    moved = propagate(start, 57.3)
+    assert moved.ra_deg.tobytes() == start.ra_deg.tobytes()
+    assert moved.dec_deg.tobytes() == start.dec_deg.tobytes()
+    for name in ("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr"):
+        assert np.array_equal(getattr(moved, name), getattr(start, name), equal_nan=True)
+
+
+def test_unknown_motion_of_one_star_does_not_touch_its_neighbours():
+    alone = propagate(motion((50.0, 60.0, 100.0, -200.0)), 26.0)
+    among = propagate(motion((1.0, 2.0, np.nan, np.nan), (50.0, 60.0, 100.0, -200.0)), 26.0)
+    assert among.ra_deg[1] == alone.ra_deg[0]
+    assert among.dec_deg[1] == alone.dec_deg[0]
+
+
+def test_each_star_has_its_own_span():
+    rows = [(50.0, 60.0, 100.0, -200.0)] * 3
+    moved = propagate(motion(*rows), np.array([0.0, 10.0, -25.0]))
+    for row, years in enumerate([0.0, 10.0, -25.0]):
+        assert moved.ra_deg[row] == propagate(motion(rows[0]), years).ra_deg[0]
+
+
+def test_no_stars():
+    moved, u = propagate_directions(Motion(*(np.empty(0) for _ in range(4))), 10.0)
+    assert moved.ra_deg.shape == (0,)
+    assert u.shape == (0, 3)
