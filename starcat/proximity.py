@@ -28,9 +28,10 @@ def nearest_neighbours(
     """
     # A plain split by midpoints builds far faster and searches no slower on a sky of stars.
     tree = cKDTree(directions, leafsize=32, balanced_tree=False)
-    chord, found = tree.query(directions, k=2, workers=-1)
+    near = tree.query(directions, k=2, workers=-1)
+    chord, found = np.asarray(near[0], dtype=np.float64), np.asarray(near[1], dtype=np.int64)
     # Of two stars at the same place the tree may name either first.
-    itself = np.asarray(found)[:, 0] == np.arange(len(directions))
+    itself = found[:, 0] == np.arange(len(directions))
     index = np.where(itself, found[:, 1], found[:, 0])
     chord = np.where(itself, chord[:, 1], chord[:, 0])
     # |u - v| is the chord, and |u + v| the other leg of the right angle over the diameter.

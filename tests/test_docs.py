@@ -11,7 +11,6 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "builders"))
 
 from docs import pages
-
 from starcat import cli
 
 

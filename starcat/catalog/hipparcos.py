@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.catalog.records import Records
-from starcat.catalog.stars import StarBlock, join_flags, numbered
+from starcat.catalog.stars import StarBlock, join_flags, numbered, where_known
 from starcat.catalog.verdict import Reason, Verdicts
 
 COLUMNS = {
@@ -68,6 +68,7 @@ def stars(records: Records, band: str) -> StarBlock:
     has_solution = ~records.is_blank("mult_flag")
     in_ccdm = ~records.is_blank("ccdm")
     is_class, is_type = ~records.is_blank("var_flag"), np.isin(records["hvar_type"], [b"P", b"U"])
+    amplitude = amplitudes(records)
     return StarBlock(
         {
             "star_id": number,
@@ -97,8 +98,8 @@ def stars(records: Records, band: str) -> StarBlock:
                 {"H6": (is_class, records["var_flag"]), "H52": (is_type, records["hvar_type"])}
             ),
             "is_flagged_variable": is_type | np.isin(records["var_flag"], [b"2", b"3"]),
-            "amplitude_mag": amplitudes(records),
-            "amplitude_source": "hipparcos",
+            "amplitude_mag": amplitude,
+            "amplitude_source": where_known(amplitude, "hipparcos"),
             "hip_number": number,
             "hd_number": records["hd"],
         },

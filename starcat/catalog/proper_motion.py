@@ -78,6 +78,7 @@ def propagate_directions(motion: Motion, years: ArrayLike) -> tuple[Motion, Arra
     unknown = np.isnan(motion.pm_ra_cosdec_mas_yr) | np.isnan(motion.pm_dec_mas_yr)
     pm_ra = np.where(unknown, 0.0, motion.pm_ra_cosdec_mas_yr) * MAS
     pm_dec = np.where(unknown, 0.0, motion.pm_dec_mas_yr) * MAS
+    elapsed = np.asarray(years, dtype=np.float64)
     ra, dec = np.radians(motion.ra_deg), np.radians(motion.dec_deg)
     sin_ra, cos_ra, sin_dec, cos_dec = np.sin(ra), np.cos(ra), np.sin(dec), np.cos(dec)
     # The velocity along east (-sin ra, cos ra, 0) and north (-sin dec cos ra, ...), a component
@@ -89,7 +90,7 @@ def propagate_directions(motion: Motion, years: ArrayLike) -> tuple[Motion, Arra
     u = np.empty((len(ra), 3))
     u[:, 0], u[:, 1], u[:, 2] = cos_dec * cos_ra, cos_dec * sin_ra, sin_dec
     for axis, v in enumerate((vx, vy, vz)):
-        u[:, axis] += v * years
+        u[:, axis] += v * elapsed
     length = np.sqrt(np.einsum("ij,ij->i", u, u))
     u /= length[:, None]
     x, y, z = u[:, 0], u[:, 1], u[:, 2]

@@ -181,6 +181,24 @@ def join_flags(parts: Mapping[str, tuple[NDArray[np.bool_], NDArray[Any] | None]
     return joined.take(pa.array(np.cumsum(is_flagged) - 1, mask=~is_flagged))
 
 
+def where_known(values: NDArray[np.float64], text: str) -> pa.Array:
+    """Return a text for every value that is known, such as its source.
+
+    Parameters
+    ----------
+    values : ndarray of float64, shape (N,)
+        NaN where unknown.
+    text : str
+        What to say of the others.
+
+    Returns
+    -------
+    pyarrow.Array
+        Of strings; null where the value is NaN.
+    """
+    return pc.if_else(pa.array(np.isnan(values)), pa.scalar(None, pa.string()), text)
+
+
 def numbered(prefix: str, number: NDArray[np.int64]) -> pa.Array:
     """Return designations made of a prefix and a number.
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from starcat.catalog.quality import Quality, quality_flags
 from starcat.catalog.records import Records
-from starcat.catalog.stars import StarBlock, join_flags
+from starcat.catalog.stars import StarBlock, join_flags, where_known
 from starcat.catalog.verdict import Reason, Verdicts
 
 COLUMNS = {
@@ -77,6 +77,8 @@ def stars(records: Records, band: str) -> StarBlock:
     is_double = np.isin(records["mult_flag"], [b"D", b"R", b"S"]) | (quality == 6)
     variable = np.isin(records["var_flag"], [b"U", b"V", b"W"])
     named = np.isin(records["var"], [b"G", b"N"])
+    # VTmax and VTmin are percentiles of noisy transits: an amplitude only if flagged.
+    amplitude = np.where(variable, records["vt_min"] - records["vt_max"], np.nan)
     second = "VT" if band != "VT" else "BT"
     return StarBlock(
         {
@@ -105,9 +107,8 @@ def stars(records: Records, band: str) -> StarBlock:
                 {"T47": (named, records["var"]), "T48": (variable, records["var_flag"])}
             ),
             "is_flagged_variable": variable | named,
-            # VTmax and VTmin are percentiles of noisy transits: an amplitude only if flagged.
-            "amplitude_mag": np.where(variable, records["vt_min"] - records["vt_max"], np.nan),
-            "amplitude_source": "tycho1",
+            "amplitude_mag": amplitude,
+            "amplitude_source": where_known(amplitude, "tycho1"),
             "hip_number": records["hip"],
             "hd_number": records["hd"],
             "quality_flags": quality_flags(
