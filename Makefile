@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help install check format test test-all demo bench docs golden clean
+.PHONY: help install check format test test-all demo bench docs golden release clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -49,6 +49,9 @@ docs: $(READY) ## rewrite the generated pages of docs/
 golden: $(READY) ## rewrite the golden digests; look at the difference before committing it
 	$(BIN)/python tests/builders/golden.py
 	@git --no-pager diff --stat tests/golden
+
+release: $(READY) ## list new schemas in schemas/RELEASED.sha256; a listed one never changes
+	$(BIN)/python tests/builders/release_schemas.py
 
 clean: ## remove what the targets made
 	rm -rf $(VENV) dist build .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -54,11 +54,18 @@ class Camera:
         Camera
             Square pixels: the vertical field follows from the height.
 
+        Raises
+        ------
+        ValueError
+            If the field is not between 0 and 180 degrees.
+
         Examples
         --------
         >>> round(Camera.from_fov(1024, 1024, 12.0).fov_y_deg, 9)
         12.0
         """
+        if not 0.0 < fov_x_deg < 180.0:
+            raise ValueError(f"fov_x_deg is {fov_x_deg}; expected more than 0 and less than 180")
         focal_length_px = 0.5 * width_px / np.tan(np.radians(0.5 * fov_x_deg))
         return cls(width_px, height_px, float(focal_length_px))
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from starcat import __version__
-from starcat.errors import ConfigError, StarcatError, reason
+from starcat.errors import ConfigError, ProductError, StarcatError, reason
 
 if TYPE_CHECKING:
     from starcat.spec import BuildSpec
@@ -35,6 +35,7 @@ Input = Annotated[
     list[str] | None,
     typer.Option("--input", metavar="SOURCE=PATH", help="File or folder of a source. Repeatable."),
 ]
+NoisePx = Annotated[float, typer.Option(min=0, max=50, help="Of a centroid, each axis.")]
 
 
 def _version(wanted: bool) -> None:
@@ -123,7 +124,8 @@ def ingest(
     ] = None,
     band: Annotated[str | None, typer.Option(help="Band of the magnitudes.")] = None,
     read_limit_mag: Annotated[
-        float | None, typer.Option(help="Leave out fainter records while reading.")
+        float | None,
+        typer.Option(min=-30, max=40, help="Leave out fainter records while reading."),
     ] = None,
     json: Json = False,
 ) -> None:
@@ -161,6 +163,9 @@ def build(
     replace: Annotated[
         bool, typer.Option("--replace", help="Replace a different artifact of that name.")
     ] = False,
+    workers: Annotated[
+        int, typer.Option(min=1, max=64, help="Threads; the artifact is the same for any number.")
+    ] = 2,
     json: Json = False,
 ) -> None:
     """Build a guide-star database, check it, and prove that it identifies its own fields.
@@ -173,7 +178,9 @@ def build(
 
     chosen, given = _spec(spec, preset), _inputs(inputs)
     with progress_bars() as progress:
-        built = run_build(chosen, given, output, replace=replace, progress=progress)
+        built = run_build(
+            chosen, given, output, replace=replace, workers=workers, progress=progress
+        )
     print_built(built, as_json=json)
 
 
@@ -193,11 +200,94 @@ def inspect(
 
 
 @app.command()
+def verify(
+    artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
+    json: Json = False,
+) -> None:
+    """Check an artifact: digests, schemas, rows, orders, indices, references, counts.
+
+    Exits with 5 if anything is wrong.
+
+    Example: starcat verify dist/gaia-12deg-1.0.0
+    """
+    from starcat.artifact.verify import verify_artifact
+    from starcat.artifact_reports import print_verification
+
+    found = verify_artifact(artifact)
+    print_verification(found, as_json=json)
+    if found.findings:
+        raise typer.Exit(ProductError.exit_code)
+
+
+@app.command()
+def diff(
+    a: Annotated[Path, typer.Argument(metavar="A", help="The earlier artifact's folder.")],
+    b: Annotated[Path, typer.Argument(metavar="B", help="The later one's.")],
+    json: Json = False,
+) -> None:
+    """Say what differs between two artifacts: spec, sources, stars and why, products.
+
+    Example: starcat diff dist/gaia-12deg-1.0.0 dist/gaia-12deg-1.1.0
+    """
+    from starcat.artifact.diff import diff_artifacts
+    from starcat.artifact.reader import open_artifact
+    from starcat.artifact_reports import print_difference
+
+    found = diff_artifacts(open_artifact(a), open_artifact(b))
+    print_difference(found, (a.resolve().name, b.resolve().name), as_json=json)
+
+
+@app.command()
+def rebuild(
+    artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
+    inputs: Input = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder to keep the new artifact in.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Build an artifact again from its manifest and compare every byte.
+
+    Exits with 5 if a file differs.
+
+    Example: starcat rebuild dist/sao-12deg-1.0.0 --input sao=sao.dat.gz
+    """
+    from starcat.artifact_reports import print_rebuilt
+    from starcat.console import progress_bars
+    from starcat.rebuild import rebuild as build_again
+
+    given = _inputs(inputs)
+    with progress_bars() as progress:
+        rebuilt = build_again(artifact, given, output, progress)
+    print_rebuilt(rebuilt, as_json=json)
+    if not rebuilt.is_identical:
+        raise typer.Exit(ProductError.exit_code)
+
+
+@app.command()
+def coverage(
+    artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder for CSV, JSON, PNG and SVG.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Say how many stars, pairs and triangles the fields of an artifact hold.
+
+    Example: starcat coverage dist/gaia-12deg-1.0.0 -o coverage
+    """
+    from starcat.artifact.reader import open_artifact
+    from starcat.coverage_tables import print_coverage
+
+    print_coverage(open_artifact(artifact), output, as_json=json)
+
+
+@app.command()
 def simulate(
     artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="CSV file to write.")],
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same frame.")] = 0,
-    noise_px: Annotated[float, typer.Option(min=0, help="Of a centroid, each axis.")] = 0.5,
+    noise_px: NoisePx = 0.5,
     false_stars: Annotated[int, typer.Option(min=0, help="Spots that are no stars.")] = 0,
 ) -> None:
     """Write the centroids of one simulated frame, to try 'starcat identify' with.
@@ -219,7 +309,7 @@ def identify(
     artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
     centroids: Annotated[Path, typer.Argument(help="CSV file with the columns x_px,y_px.")],
     tolerance_px: Annotated[
-        float, typer.Option(min=0.01, help="Largest error of a centroid.")
+        float, typer.Option(min=0.01, max=200, help="Largest error of a centroid.")
     ] = 2.0,
     json: Json = False,
 ) -> None:
@@ -241,7 +331,7 @@ def selftest(
     artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
     frames: Annotated[int, typer.Option(min=1, help="Fields of each kind.")] = 500,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same fields.")] = 1,
-    noise_px: Annotated[float, typer.Option(min=0, help="Of a centroid, each axis.")] = 0.5,
+    noise_px: NoisePx = 0.5,
     json: Json = False,
 ) -> None:
     """Identify simulated fields with a database and print the rates.

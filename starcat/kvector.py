@@ -48,18 +48,22 @@ class KVector:
         Returns
         -------
         slice
-            A superset: at most the values of two steps of the line more at either end.
+            A superset: at most the values of one step of the line more at either end.
         """
         n = len(self.values)
         if n == 0 or not low <= high or high < self.values[0] or low > self.values[-1]:
             return slice(0, 0)
         if self.slope == 0.0:
             return slice(0, n)
-        first = int(np.floor((max(low, self.values[0]) - self.intercept) / self.slope)) - 1
-        last = int(np.ceil((min(high, self.values[-1]) - self.intercept) / self.slope))
+        # The inverse line, clamped to its ends; rounding can put either a step inside.
+        first = int(np.clip(np.floor((low - self.intercept) / self.slope), 0, n - 1))
+        last = int(np.clip(np.ceil((high - self.intercept) / self.slope), 0, n - 1))
+        while first >= 0 and self.intercept + self.slope * first >= low:
+            first -= 1
+        while last < n and self.intercept + self.slope * last < high:
+            last += 1
         start = int(self.counts[first]) if first >= 0 else 0
-        # The line is monotonic, so one step further covers the rounding of the division.
-        stop = int(self.counts[last + 1]) if last + 1 < n else n
+        stop = int(self.counts[last]) if last < n else n
         return slice(start, stop)
 
     def exact(self, low: float, high: float) -> slice:

@@ -7,6 +7,8 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from starcat.votable import astropy_metadata, votable_metadata
+
 ROW_GROUP_ROWS = 1 << 17
 """Fixed, as the size of row groups is part of the bytes."""
 
@@ -28,16 +30,19 @@ def write_parquet(table: pa.Table, path: Path) -> None:
         for field in table.schema
         if pa.types.is_string(field.type) and field.name != "designation"
     ]
-    pq.write_table(
-        table,
+    known = {**(table.schema.metadata or {}), **astropy_metadata(table)}
+    table = table.replace_schema_metadata(known)
+    with pq.ParquetWriter(
         path,
-        row_group_size=ROW_GROUP_ROWS,
+        table.schema,
         compression="zstd",
         compression_level=1,
         use_dictionary=dictionary or False,
         column_encoding=dict.fromkeys(floating, "BYTE_STREAM_SPLIT") or None,
         write_statistics=True,
-    )
+    ) as writer:
+        writer.write_table(table, row_group_size=ROW_GROUP_ROWS)
+        writer.add_key_value_metadata(votable_metadata(table))
 
 
 def read_parquet(path: Path) -> pa.Table:

@@ -7,17 +7,15 @@ folder, read it back, identify simulated fields with it and only then give it it
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 
-from starcat.artifact.content import json_bytes
-from starcat.artifact.manifest import SourceFacts
-from starcat.artifact.reader import check_artifact
+from starcat.artifact.verify import check_artifact
 from starcat.artifact.writer import (
     Outcome,
     Product,
@@ -26,48 +24,34 @@ from starcat.artifact.writer import (
     write_manifest,
     write_products,
 )
-from starcat.catalog.ingest import Ingested, count_by_reason, ingest
+from starcat.build_log import Stopwatch, write_build_log
+from starcat.build_report import (
+    FilterCoverage,
+    Results,
+    build_facts,
+    filter_coverage,
+    source_facts,
+)
+from starcat.catalog.ingest import Ingested, ingest
 from starcat.catalog.locate import locate
-from starcat.catalog.selection import Selected, Step, select_guide_stars
-from starcat.catalog.stars import directions_of, floats_of, sort_rows
+from starcat.catalog.selection import Selected
+from starcat.catalog.stars import directions_of, sort_rows
 from starcat.catalog.variability import AmplitudeTable, join_amplitudes, read_amplitudes
 from starcat.errors import BuildError, ConfigError
 from starcat.evaluation.selftest import Rates, self_test
+from starcat.guide_stars import select_stars
 from starcat.matcher.matcher import Matcher
-from starcat.products.boresights import FieldStars, tile_sphere
-from starcat.products.pairs import find_pairs
+from starcat.products.boresights import FieldStars
 from starcat.progress import Progress, no_progress
+from starcat.recipes import RECIPES, Sky, boresight_product, cook
+from starcat.report.coverage import CoverageReport, holes_warning
+from starcat.report.report import write_report
 from starcat.schema import product_schema
 from starcat.spec import BuildSpec
-from starcat.sphere import radec_from_directions
-
-MIN_GUIDE_STARS = 4
-"""Fewer than these cannot be identified by anything."""
 
 Inputs = Mapping[str, Sequence[Path]]
 
-
-@dataclass(frozen=True)
-class Coverage:
-    """What one filter leaves in the fields of the tiling.
-
-    Attributes
-    ----------
-    step : str
-        The filter.
-    stars : int
-        Stars left.
-    median_per_field, min_per_field : float
-        Stars in the field of a boresight.
-    share_below_4 : float
-        Share of the fields with fewer than 4 stars.
-    """
-
-    step: str
-    stars: int
-    median_per_field: float
-    min_per_field: int
-    share_below_4: float
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -82,20 +66,29 @@ class Built:
         What happened to the folder.
     manifest : dict
         Of the artifact.
-    coverage : tuple of Coverage
+    filters : tuple of FilterCoverage
         What each filter left.
+    coverage : CoverageReport
+        Of the guide stars.
     rates : tuple of Rates
         Of the self-test: clean and hard frames.
     problems : tuple of str
         The first malformed records.
+    warnings : tuple of str
+        What is worth a second look, such as holes of the tiling.
+    times_s : dict of str to float
+        Seconds by stage.
     """
 
     folder: Path
     outcome: Outcome
     manifest: dict[str, Any]
-    coverage: tuple[Coverage, ...]
+    filters: tuple[FilterCoverage, ...]
+    coverage: CoverageReport
     rates: tuple[Rates, Rates]
     problems: tuple[str, ...]
+    warnings: tuple[str, ...]
+    times_s: dict[str, float]
 
 
 def build(
@@ -104,6 +97,7 @@ def build(
     output: Path,
     *,
     replace: bool = False,
+    workers: int = 2,
     progress: Progress = no_progress,
 ) -> Built:
     """Build an artifact.
@@ -118,6 +112,8 @@ def build(
         Folder that the artifact's own folder is made in.
     replace : bool, default False
         Whether a different artifact of the same name and version may be replaced.
+    workers : int, default 2
+        Threads; the artifact is the same for any number.
     progress : Progress
         Called with (stage, done, total).
 
@@ -131,37 +127,45 @@ def build(
     ConfigError, SourceError
         If the spec or an input cannot be used.
     BuildError
-        If no stars are left, or the database cannot identify its own fields.
+        If too few stars are left, or the database cannot identify its own fields.
     OutputError
         If the output cannot be written, or another artifact is there.
     """
     final = output / f"{spec.name}-{spec.version}"
+    clock = Stopwatch()
     with partial_folder(final) as partial:
-        catalog, amplitudes = read_sources(spec, inputs, progress)
+        catalog, amplitudes = read_sources(spec, inputs, workers, progress)
         stars, joined = _join_all(catalog.stars, amplitudes)
-        selected = select_guide_stars(stars, spec.selection)
-        check_guide_stars(selected, spec)
-        progress("products", 0, None)
-        fields = _tile(selected.guide_stars, spec)
-        products = make_products(spec, catalog, selected, fields)
+        clock.lap("read")
+        selected, fields = select_stars(stars, spec)
+        clock.lap("select")
+        products = make_products(spec, catalog, selected, fields, progress)
+        clock.lap("products")
         facts = write_products(partial, products, database_facts(spec))
+        clock.lap("write")
         rates = run_self_test(partial, spec, progress)
-        report = partial / "report"
-        report.mkdir()
-        results = [rate.as_dict() for rate in rates]
-        (report / "self_test.json").write_bytes(json_bytes(results))
-        sources = _source_facts(catalog, selected, amplitudes, joined)
+        clock.lap("self-test")
+        progress("report", 0, None)
+        sources = source_facts(catalog, selected, amplitudes, joined)
+        filters = tuple(filter_coverage(step, spec) for step in selected.steps)
+        results = Results(spec, sources, products, facts, fields, filters, rates)
+        report = report_build(partial, results)
+        clock.lap("report")
         manifest = write_manifest(partial, spec.model_dump(mode="json"), sources, facts)
         progress("verify", 0, None)
         check_artifact(partial)
         check_rates(rates, spec)
         outcome = publish(partial, final, replace=replace)
-    coverage = tuple(_coverage(step, spec) for step in selected.steps)
-    return Built(final, outcome, manifest, coverage, rates, catalog.problems)
+        clock.lap("verify")
+    write_build_log(final, outcome, clock.times_s)
+    warnings = tuple(filter(None, [holes_warning(report.gap)]))
+    return Built(
+        final, outcome, manifest, filters, report, rates, catalog.problems, warnings, clock.times_s
+    )
 
 
 def read_sources(
-    spec: BuildSpec, inputs: Inputs, progress: Progress
+    spec: BuildSpec, inputs: Inputs, workers: int, progress: Progress
 ) -> tuple[Ingested, list[AmplitudeTable]]:
     """Read the star catalog and the sources of amplitudes.
 
@@ -171,6 +175,8 @@ def read_sources(
         Which sources, and the epoch.
     inputs : mapping of str to sequence of Path
         As for `build`.
+    workers : int
+        Threads.
     progress : Progress
         Passed on.
 
@@ -191,6 +197,7 @@ def read_sources(
         band=spec.catalog.band,
         epoch_jyear=spec.epoch_jyear,
         read_limit_mag=spec.catalog.read_limit_mag,
+        workers=workers,
         progress=progress,
     )
     return catalog, [read_amplitudes(name, paths[name], progress) for name in joins]
@@ -231,43 +238,36 @@ def _join_all(
     return stars, joined
 
 
-def check_guide_stars(selected: Selected, spec: BuildSpec) -> None:
-    """Check that the selection left stars to build from.
+def report_build(folder: Path, results: Results) -> CoverageReport:
+    """Write the report of a build.
 
     Parameters
     ----------
-    selected : Selected
-        The selection.
-    spec : BuildSpec
-        For the message.
+    folder : Path
+        With the products written; gets a folder ``report``.
+    results : Results
+        Of the stages before.
 
-    Raises
-    ------
-    BuildError
-        If fewer than 4 stars are left, with the reasons of the others.
+    Returns
+    -------
+    CoverageReport
+        What it says about coverage.
     """
-    left = len(selected.guide_stars)
-    if left < MIN_GUIDE_STARS:
-        counts = count_by_reason(selected.rejected)
-        reasons = ", ".join(f"{name} {count}" for name, count in counts.items()) or "none read"
-        raise BuildError(
-            f"{spec.name}: {left} guide stars left of {len(selected.rejected) + left}; at least "
-            f"{MIN_GUIDE_STARS} are needed. Rejected: {reasons}. Check the limits of [selection]"
-        )
-
-
-def _tile(guide_stars: pa.Table, spec: BuildSpec) -> FieldStars:
-    return tile_sphere(
-        spec.boresights.count,
-        directions_of(guide_stars),
-        floats_of(guide_stars, "mag"),
-        spec.camera.camera(),
-        spec.boresights.field,
-    )
+    facts = build_facts(folder, results)
+    (folder / "report").mkdir()
+    write_report(folder / "report", facts)
+    warning = holes_warning(facts.coverage.gap)
+    if warning is not None:
+        _logger.warning("%s: %s", facts.title, warning)
+    return facts.coverage
 
 
 def make_products(
-    spec: BuildSpec, catalog: Ingested, selected: Selected, fields: FieldStars
+    spec: BuildSpec,
+    catalog: Ingested,
+    selected: Selected,
+    fields: FieldStars,
+    progress: Progress = no_progress,
 ) -> list[Product]:
     """Compute the products of an artifact.
 
@@ -281,6 +281,8 @@ def make_products(
         Guide stars, and stars rejected by the selection.
     fields : FieldStars
         The tiling of the guide stars.
+    progress : Progress
+        Called with ("product <name>", 0, None).
 
     Returns
     -------
@@ -289,67 +291,17 @@ def make_products(
     """
     rejected = pa.concat_tables([catalog.rejected, selected.rejected]).combine_chunks()
     order = product_schema("rejected").order
-    return [
+    products = [
         Product("stars", selected.guide_stars),
         Product("rejected", sort_rows(rejected, order), in_database=False),
         boresight_product(fields, spec.boresights.brightest),
-        pair_product(selected.guide_stars, spec),
     ]
-
-
-def boresight_product(fields: FieldStars, brightest: int) -> Product:
-    """Return the boresights as a product.
-
-    Parameters
-    ----------
-    fields : FieldStars
-        The tiling.
-    brightest : int
-        Length of each field's list of stars.
-
-    Returns
-    -------
-    Product
-        One row a boresight.
-    """
-    ra_deg, dec_deg = radec_from_directions(fields.boresights)
-    offsets, star_index = fields.brightest(brightest)
-    lists = pa.ListArray.from_arrays(pa.array(offsets, pa.int32()), pa.array(star_index))
-    columns = [
-        np.arange(len(fields.boresights), dtype=np.int32),
-        ra_deg,
-        dec_deg,
-        *(np.ascontiguousarray(fields.boresights[:, k]) for k in range(3)),
-        fields.count.astype(np.int32),
-    ]
-    schema = product_schema("boresights").arrow_schema
-    arrays = [*(pa.array(values) for values in columns), lists.cast(schema.field("brightest").type)]
-    return Product("boresights", pa.Table.from_arrays(arrays, schema=schema))
-
-
-def pair_product(guide_stars: pa.Table, spec: BuildSpec) -> Product:
-    """Return the star pairs as a product.
-
-    Parameters
-    ----------
-    guide_stars : pyarrow.Table
-        Of the stars schema.
-    spec : BuildSpec
-        Range of separations; the field's diagonal where none is given.
-
-    Returns
-    -------
-    Product
-        One row a pair, with its K-vector.
-    """
-    wanted = spec.products.pairs
-    most = spec.camera.camera().diagonal_rad
-    if wanted.max_separation_deg is not None:
-        most = np.radians(wanted.max_separation_deg)
-    pairs = find_pairs(directions_of(guide_stars), np.radians(wanted.min_separation_deg), most)
-    schema = product_schema("pairs").arrow_schema
-    arrays = [pa.array(values) for values in (pairs.i, pairs.j, pairs.separation_rad)]
-    return Product("pairs", pa.Table.from_arrays(arrays, schema=schema), pairs.kvector)
+    sky = Sky(directions_of(selected.guide_stars), fields, spec)
+    for name in RECIPES:
+        if getattr(spec.products, name).enabled:
+            progress(f"product {name}", 0, None)
+            products.append(cook(name, sky))
+    return products
 
 
 def database_facts(spec: BuildSpec) -> dict[str, str | float]:
@@ -426,56 +378,3 @@ def check_rates(rates: tuple[Rates, Rates], spec: BuildSpec) -> None:
     wrong = sum(rate.wrong for rate in rates)
     if wrong:
         raise BuildError(f"{spec.name}: {wrong} simulated fields got a wrong answer")
-
-
-def _source_facts(
-    catalog: Ingested,
-    selected: Selected,
-    amplitudes: Sequence[AmplitudeTable],
-    joined: Mapping[str, int],
-) -> list[SourceFacts]:
-    rejected = {**catalog.rejected_by_reason, **count_by_reason(selected.rejected)}
-    for reason in catalog.rejected_by_reason.keys() & count_by_reason(selected.rejected).keys():
-        rejected[reason] += catalog.rejected_by_reason[reason]
-    facts = [
-        SourceFacts(
-            catalog.source,
-            "stars",
-            catalog.files,
-            catalog.rows_read,
-            len(selected.guide_stars),
-            rejected,
-        )
-    ]
-    for table in amplitudes:
-        read = sum(file.rows for file in table.files)
-        facts.append(
-            SourceFacts(
-                table.source,
-                "variability",
-                table.files,
-                read,
-                table.kept,
-                table.rejected,
-                joined[table.source],
-            )
-        )
-    return facts
-
-
-def _coverage(step: Step, spec: BuildSpec) -> Coverage:
-    fields = tile_sphere(
-        spec.boresights.count,
-        step.directions,
-        np.zeros(len(step.directions)),
-        spec.camera.camera(),
-        spec.boresights.field,
-    )
-    count = fields.count
-    return Coverage(
-        step.name,
-        len(step.directions),
-        float(np.median(count)),
-        int(count.min()),
-        float((count < MIN_GUIDE_STARS).mean()),
-    )

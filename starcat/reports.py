@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcat.console import print_json, print_table, say
+from starcat.coverage_tables import print_coverage_table
 from starcat.errors import SourceError
 
 if TYPE_CHECKING:
@@ -189,8 +190,11 @@ def print_built(built: Built, *, as_json: bool) -> None:
             {
                 "artifact": str(built.folder),
                 "outcome": built.outcome,
-                "coverage": [vars(step) for step in built.coverage],
+                "filters": [vars(step) for step in built.filters],
+                "coverage": built.coverage.as_dict(),
                 "self_test": [rates.as_dict() for rates in built.rates],
+                "warnings": list(built.warnings),
+                "times_s": built.times_s,
                 **{key: manifest[key] for key in ("sources", "products", "files")},
             }
         )
@@ -213,13 +217,18 @@ def print_built(built: Built, *, as_json: bool) -> None:
                 step.min_per_field,
                 f"{step.share_below_4:.2%}",
             )
-            for step in built.coverage
+            for step in built.filters
         ],
         numbers=(1, 2, 3, 4),
     )
     print_products(manifest)
+    print_coverage_table(built.coverage)
     print_rates(built.rates, as_json=False)
+    seconds = [(stage, f"{taken:.2f}") for stage, taken in built.times_s.items()]
+    print_table("Times", ("stage", "seconds"), seconds, numbers=(1,))
     print_problems(built.problems)
+    for warning in built.warnings:
+        say(f"warning: {warning}")
     say(f"{built.outcome}: {built.folder}")
 
 

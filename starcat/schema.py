@@ -7,7 +7,7 @@ rows. Writers, readers and checks are driven by it; a column is described nowher
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -42,6 +42,10 @@ class SchemaColumn:
         Whether a row may lack a value.
     description, ucd : str
         Meaning, and the IVOA content descriptor where there is one.
+    refers_to : str
+        Product whose rows the values are; empty where they are no rows.
+    in_database : bool
+        Whether the matcher's HDF5 file has the column.
     """
 
     name: str
@@ -50,6 +54,8 @@ class SchemaColumn:
     nullable: bool
     description: str
     ucd: str
+    refers_to: str = ""
+    in_database: bool = True
 
     @property
     def is_list(self) -> bool:
@@ -166,7 +172,7 @@ def read_schema(path: Path) -> ProductSchema:
         base = read_schema(path.with_name(f"{content['extends']}.json"))
         loose = bool(content.get("extends_as_nullable", False))
         columns += [
-            SchemaColumn(c.name, c.dtype, c.unit, c.nullable or loose, c.description, c.ucd)
+            replace(c, nullable=c.nullable or loose)
             for c in base.columns
             if c.name not in content.get("extends_without", ())
         ]
@@ -178,6 +184,8 @@ def read_schema(path: Path) -> ProductSchema:
             nullable=column.get("nullable", False),
             description=column["description"],
             ucd=column.get("ucd", ""),
+            refers_to=column.get("refers_to", ""),
+            in_database=column.get("in_database", True),
         )
         for column in content["columns"]
     ]

@@ -23,7 +23,7 @@ Mag = Annotated[float, Field(ge=-30.0, le=40.0)]
 class _Section(BaseModel):
     """Frozen; refuses unknown keys, wrong types and numbers that are not finite."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=False, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
 class Catalog(_Section):
@@ -71,7 +71,9 @@ class Variables(_Section):
         "or reject all",
     )
     join: tuple[Literal["hipparcos", "tycho1", "gcvs"], ...] = Field(
-        (), description="sources whose amplitudes are joined by HIP, HD, TYC or Gaia number"
+        (),
+        strict=False,  # a list in TOML
+        description="sources whose amplitudes are joined by HIP, HD, TYC or Gaia number",
     )
 
 
@@ -81,6 +83,13 @@ class Selection(_Section):
     bright_limit_mag: Mag = Field(-30.0, description="brighter is rejected")
     faint_limit_mag: Mag = Field(description="fainter is rejected; the limit itself is kept")
     max_stars: int | None = Field(None, ge=1, description="keep only this many, the brightest")
+    max_stars_per_field: int | None = Field(
+        None,
+        ge=1,
+        le=10_000,
+        description="thin to an even density: keep the stars that are among the brightest this "
+        "many of some field of the tiling",
+    )
     doubles: Doubles = Doubles()
     variables: Variables = Variables()
 
@@ -130,13 +139,26 @@ class Boresights(_Section):
     """The tiling of the sphere."""
 
     count: int = Field(10_000, ge=1, le=1_000_000, description="Saff-Kuijlaars points")
+    fov_x_deg: float | None = Field(
+        None, gt=0.0, lt=120.0, description="of the tiling's fields; default: the camera's"
+    )
+    fov_y_deg: float | None = Field(None, gt=0.0, lt=120.0)
     field: Literal["rectangular", "circular"] = Field(
         "rectangular", description="the camera's frame at roll 0, or the circle inside it"
     )
     brightest: int = Field(6, ge=1, le=100, description="length of each field's list of stars")
+    min_stars_per_field: int | None = Field(
+        None, ge=1, le=10_000, description="the build fails if a field of the tiling has fewer"
+    )
 
 
-class Pairs(_Section):
+class _Product(_Section):
+    """A product that can be left out."""
+
+    enabled: bool = True
+
+
+class Pairs(_Product):
     """Star pairs and their K-vector."""
 
     min_separation_deg: float = Field(0.0, ge=0.0, le=180.0)
@@ -145,10 +167,66 @@ class Pairs(_Section):
     )
 
 
+class Triangles(_Product):
+    """Triangles of the brightest stars of each boresight's field (S4)."""
+
+
+class Neighbours(_Product):
+    """Angles and separations of each star's neighbours, with a look-up table (S2)."""
+
+    radius_deg: float | None = Field(
+        None, gt=0.0, le=90.0, description="default: half of the narrower field"
+    )
+    angle_bin_deg: float = Field(2.0, gt=0.0, le=360.0)
+    separation_bin_deg: float = Field(0.1, gt=0.0, le=90.0)
+
+
+class HausdorffAngular(_Product):
+    """Separations around each star (S5)."""
+
+    radius_deg: float | None = Field(
+        None, gt=0.0, le=90.0, description="default: 4/3 of half of the narrower field"
+    )
+
+
+class HausdorffL2(_Product):
+    """Planar distances around each star over the smallest one (S1)."""
+
+    radius_deg: float | None = Field(
+        None, gt=0.0, le=80.0, description="default: half of the narrower field"
+    )
+
+
+class Grid(_Product):
+    """Bit patterns of the grid method."""
+
+    radius_deg: float | None = Field(
+        None, gt=0.0, le=80.0, description="default: half of the narrower field"
+    )
+    buffer_deg: float = Field(0.3, ge=0.0, le=80.0, description="no alignment star nearer")
+    cells_per_side: int = Field(40, ge=2, le=1000)
+
+
+class Radial(_Product):
+    """Ring and sector features of the radial and cyclic method."""
+
+    radius_deg: float | None = Field(
+        None, gt=0.0, le=90.0, description="default: half of the narrower field"
+    )
+    rings: int = Field(60, ge=1, le=10_000)
+    sectors: int = Field(16, ge=1, le=30)
+
+
 class Products(_Section):
-    """Which products the artifact holds."""
+    """Which products the artifact holds, and their parameters."""
 
     pairs: Pairs = Pairs()
+    triangles: Triangles = Triangles()
+    neighbours: Neighbours = Neighbours()
+    hausdorff_angular: HausdorffAngular = HausdorffAngular()
+    hausdorff_l2: HausdorffL2 = HausdorffL2()
+    grid: Grid = Grid()
+    radial: Radial = Radial()
 
 
 class SelfTest(_Section):
@@ -232,7 +310,8 @@ def spec_from_dict(content: dict[str, Any], origin: str) -> BuildSpec:
         # A misspelt key is missing too: the spelling is what helps.
         wrong = sorted(error.errors(), key=lambda entry: entry["type"] != "extra_forbidden")
         first = wrong[0]
-        key = ".".join(str(part) for part in first["loc"]) or "spec"
+        names = (str(part) for part in first["loc"])
+        key = ".".join(name if name.isprintable() else repr(name) for name in names) or "spec"
         raise ConfigError(
             f"{origin}: {key}: {_explain(dict(first))}", key=key, value=first["input"]
         ) from error

@@ -68,7 +68,8 @@ def sao_lines() -> list[bytes]:
     for number, (ra, dec) in enumerate(zip(ra_rad, dec_rad, strict=True), start=1):
         mag = 2.0 + 4.4 * number / 600
         front = f"{number:6d}".ljust(80) + f"{mag:4.1f}A0V"
-        lines.append(f"{front.ljust(183)}{ra:10.8f}{dec:+11.8f}\n".encode())
+        motion = f"{front.ljust(160)} 0.0010".ljust(177) + "-0.012"
+        lines.append(f"{motion}{ra:10.8f}{dec:+11.8f}\n".encode())
     return lines
 
 

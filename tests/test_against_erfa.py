@@ -15,13 +15,13 @@ from starcat.sphere import directions_from_radec, radec_from_directions, separat
 ARCSEC = np.pi / (180.0 * 3600.0)
 MAS = 1e-3 * ARCSEC
 
-# Good for 0.001 of the smallest error of the best catalog; float64 gives 1e-10.
+# A thousandth of the error of the best star of the best catalog; measured 4e-10 arcsec.
 POSITION_TOLERANCE_RAD = 1e-6 * ARCSEC
-# ERFA carries space velocities in au/day, whose rounding costs it a few of its 16 digits.
+# The same in a year; measured 4e-10 mas/yr, beside a pole where ERFA divides by cos(dec).
 MOTION_TOLERANCE_MAS_YR = 1e-6
 
-# Straight-line motion has no light time. At this parallax ERFA's is below 1e-9 yr, and it does
-# not put a parallax of its own in place of one that would make the star too fast.
+# Straight-line motion has no light time and no relativity. A near and so a slow star has hardly
+# any, and ERFA does not put a parallax of its own in place of one that makes a star too fast.
 PARALLAX_ARCSEC = 1000.0
 
 EPOCHS_JYEAR = [(first, second) for first in (1991.25, 2000.0, 2016.0) for second in (1900.0, 2100)]
@@ -65,8 +65,8 @@ def test_propagation_is_that_of_erfa(kind, first, second):
     )
     assert apart_rad(moved, ra, dec).max() < POSITION_TOLERANCE_RAD
     pm_ra_cosdec = pm_ra * np.cos(dec) / MAS
-    assert np.abs(moved.pm_ra_cosdec_mas_yr - pm_ra_cosdec).max() < 10 * MOTION_TOLERANCE_MAS_YR
-    assert np.abs(moved.pm_dec_mas_yr - pm_dec / MAS).max() < 10 * MOTION_TOLERANCE_MAS_YR
+    assert np.abs(moved.pm_ra_cosdec_mas_yr - pm_ra_cosdec).max() < MOTION_TOLERANCE_MAS_YR
+    assert np.abs(moved.pm_dec_mas_yr - pm_dec / MAS).max() < MOTION_TOLERANCE_MAS_YR
 
 
 @pytest.mark.parametrize("kind", ["anywhere", "north pole", "south pole", "fast"])
@@ -80,7 +80,7 @@ def test_fk5_to_icrs_is_that_of_erfa(kind):
         np.radians(fk5.dec_deg),
         fk5.pm_ra_cosdec_mas_yr * MAS / np.cos(np.radians(fk5.dec_deg)),
         fk5.pm_dec_mas_yr * MAS,
-        0.1,  # arcsec; at a parallax of 0 it takes moving stars for faster than light
+        PARALLAX_ARCSEC,
         0.0,
     )
     icrs = Motion(ra_deg, dec_deg, pm_ra, pm_dec)

@@ -22,8 +22,10 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
-from starcat.artifact.reader import check_artifact
-from starcat.catalog.source import read_source
+from starcat.artifact.reader import open_artifact
+from starcat.artifact.verify import check_artifact
+from starcat.catalog.delimited import parse_delimited
+from starcat.catalog.source import data_source, read_source
 from starcat.errors import SourceError, StarcatError
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "errors.md"
@@ -197,7 +199,7 @@ def _(place: Place) -> Call:
 @case("another archive: bytes without line ends", 3)
 def _(place: Place) -> Call:
     path = place.write("sao.dat", b"")
-    os.truncate(path, 1 << 30)  # a hole: no bytes on the disk
+    os.truncate(path, 1 << 26)
     return place.ingest_file("sao", path)
 
 
@@ -361,6 +363,11 @@ def _(place: Place) -> Call:
     return ["selftest", place.artifact, "--frames", "many"]
 
 
+@case("option out of range", 2)
+def _(place: Place) -> Call:
+    return ["identify", place.artifact, place.folder / "frame.csv", "--tolerance-px", "1e9"]
+
+
 @case("option unknown", 2)
 def _(place: Place) -> Call:
     return ["build", "--ouput", place.out]
@@ -469,7 +476,7 @@ def _(place: Place) -> Call:
     folder = place.manifest(
         lambda content: content["products"]["pairs"].update(schema="pairs-2.0.0")
     )
-    return lambda: check_artifact(folder)
+    return lambda: open_artifact(folder).schema("pairs")
 
 
 @case("Parquet file damaged", 5)
@@ -640,6 +647,19 @@ def test_a_malformed_record_costs_only_itself(place: Place, starcat: Any) -> Non
     assert rejected["reason"].to_pylist() == ["malformed_record"] * 2
     assert rejected["source_line"].to_pylist() == [3, 10]
     assert "bytes 81-84, v_mag" in rejected["detail"][0].as_py()
+
+
+def test_bytes_that_are_no_text_cost_one_number_of_a_delimited_file() -> None:
+    layout = data_source("gcvs").files[0]
+    good = b"\t".join([b"1234", b"R And", b"M\xff", b"5.8", b"0", b"15.2", *[b""] * 6])
+    records = parse_delimited(
+        good + b"\n" + good.replace(b"\t0\t", b"\t\xfe\t"),
+        layout,
+        ["star_ref", "var_type", "mag_flag"],
+    )
+    assert len(records) == 1
+    assert records["var_type"][0] == b"M\xff"
+    assert str(records.problems[0]) == "line 2, mag_flag: found 'þ'; expected a number like I1"
 
 
 def test_debug_shows_where_an_error_comes_from(starcat: Any) -> None:

@@ -689,7 +689,7 @@ def test_binary_records(archive: Archive, tmp_path: Path, body: bytes, message: 
 )
 def test_damaged_gzip_is_refused(archive: Archive, tmp_path: Path, sent: bytes) -> None:
     url = archive.serve("/tiny.dat.gz", sent, says_length=False)
-    with pytest.raises(SourceError, match=r"damaged or cut off|not a gzip") as caught:
+    with pytest.raises(SourceError, match=r"data is (damaged|cut off)|not a gzip") as caught:
         fetch(tiny_source(url, layout="delimited", rows=None), tmp_path)
     assert caught.value.path == tmp_path / "tiny.dat.gz.rejected"
     assert str(caught.value.path) in str(caught.value)

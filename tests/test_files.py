@@ -8,6 +8,7 @@ import random
 import struct
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -84,7 +85,7 @@ def names_found(paths: list[Path], source: DataSource = SOURCE) -> list[tuple[st
 
 
 @pytest.fixture
-def small_blocks(monkeypatch):
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(files, "BLOCK_BYTES", 100)
 
 
@@ -92,7 +93,7 @@ def small_blocks(monkeypatch):
 @pytest.mark.parametrize("is_gzip", [False, True])
 @pytest.mark.parametrize("end", [b"\n", b""])
 def test_blocks_are_whole_lines_in_order_plain_or_gzipped(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes, is_gzip, end
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes: int, is_gzip: bool, end: bytes
 ) -> None:
     monkeypatch.setattr(files, "BLOCK_BYTES", block_bytes)
     content = LINES[:600].rstrip(b"\n") + end
@@ -107,7 +108,7 @@ def test_blocks_are_whole_lines_in_order_plain_or_gzipped(
 
 @pytest.mark.parametrize("is_gzip", [False, True])
 @pytest.mark.usefixtures("small_blocks")
-def test_digest_and_size_are_those_of_the_file_on_disk(tmp_path: Path, is_gzip) -> None:
+def test_digest_and_size_are_those_of_the_file_on_disk(tmp_path: Path, is_gzip: bool) -> None:
     path = tmp_path / "tiny.dat"
     path.write_bytes(gzip.compress(LINES) if is_gzip else LINES)
     _, (digest,) = read(path, text_file())
@@ -124,7 +125,7 @@ def test_gzip_members_one_after_another_are_one_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("is_named_gz", [False, True])
-def test_compression_is_recognised_by_content(tmp_path: Path, is_named_gz) -> None:
+def test_compression_is_recognised_by_content(tmp_path: Path, is_named_gz: bool) -> None:
     path = tmp_path / ("tiny.dat.gz" if is_named_gz else "tiny.dat")
     path.write_bytes(LINES if is_named_gz else gzip.compress(LINES))
     blocks, _ = read(path, text_file())
@@ -139,7 +140,7 @@ def test_truncated_gzip_names_the_file_and_the_last_line(tmp_path: Path) -> None
     compressed = gzip.compress(content)
     path.write_bytes(compressed[: len(compressed) // 2])
     seen, ends = [], []
-    with pytest.raises(ParseError, match=r"damaged or cut off after line \d+ .*fetch") as caught:
+    with pytest.raises(ParseError, match=r"cut off after line \d+ .*fetch") as caught:
         seen.extend(read_blocks(InputFile(path, text_file()), "tiny", ends.append))
     assert caught.value.path == path
     assert str(path) in str(caught.value)
@@ -164,8 +165,8 @@ def test_rubbish_behind_a_gzip_member(tmp_path: Path) -> None:
         read(path, text_file())
 
 
-@pytest.mark.parametrize("content", [b"", gzip.compress(b"")])
-def test_an_empty_file_is_refused(tmp_path: Path, content) -> None:
+@pytest.mark.parametrize("content", [b"", gzip.compress(b"", mtime=0)])
+def test_an_empty_file_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "tiny.dat"
     path.write_bytes(content)
     with pytest.raises(ParseError, match=r"tiny\.dat: the file is empty; expected records of tiny"):
@@ -179,7 +180,7 @@ def test_a_file_that_cannot_be_opened(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("small_blocks")
 @pytest.mark.parametrize("is_gzip", [False, True])
-def test_binary_blocks_are_whole_records(tmp_path: Path, is_gzip) -> None:
+def test_binary_blocks_are_whole_records(tmp_path: Path, is_gzip: bool) -> None:
     path = tmp_path / "packed.bin"
     path.write_bytes(gzip.compress(pack(50)) if is_gzip else pack(50))
     blocks, _ = read(path, BINARY)
@@ -210,7 +211,7 @@ def test_a_binary_record_that_is_cut_off_is_a_problem(tmp_path: Path) -> None:
         (LINES, "b'00001"),
     ],
 )
-def test_a_binary_file_of_another_kind(tmp_path: Path, content, found) -> None:
+def test_a_binary_file_of_another_kind(tmp_path: Path, content: bytes, found: str) -> None:
     path = tmp_path / "packed.bin"
     path.write_bytes(content)
     with pytest.raises(ParseError, match="expected b'PACK' and a header of 8 bytes") as caught:
@@ -229,7 +230,7 @@ def test_a_binary_file_with_only_its_header_is_empty(tmp_path: Path) -> None:
 def test_a_gzipped_binary_file_cut_off_in_its_header(tmp_path: Path) -> None:
     path = tmp_path / "packed.bin.gz"
     path.write_bytes(gzip.compress(pack(5))[:12])
-    with pytest.raises(ParseError, match="damaged or cut off"):
+    with pytest.raises(ParseError, match="cut off"):
         read(path, BINARY)
 
 
@@ -251,7 +252,7 @@ def test_parts_are_read_in_the_order_of_the_archive(tmp_path: Path) -> None:
         (["many.dat", "unrelated.txt"], ["many.dat"]),
     ],
 )
-def test_what_a_folder_gives(tmp_path: Path, present, expected) -> None:
+def test_what_a_folder_gives(tmp_path: Path, present: list[str], expected: object) -> None:
     for name in present:
         (tmp_path / name).write_bytes(b"")
     assert [name for name, _ in names_found([tmp_path])] == expected
@@ -272,7 +273,7 @@ def test_many_missing_parts_are_not_all_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("present", [[], ["extra.dat"], ["other.dat"]])
-def test_a_folder_without_the_file_that_is_needed(tmp_path: Path, present) -> None:
+def test_a_folder_without_the_file_that_is_needed(tmp_path: Path, present: list[str]) -> None:
     for name in present:
         (tmp_path / name).write_bytes(b"")
     with pytest.raises(SourceMissing, match="starcat fetch tiny") as caught:
@@ -296,7 +297,7 @@ def test_a_path_that_does_not_exist(tmp_path: Path) -> None:
         ("extraxdat", "many"),
     ],
 )
-def test_layout_of_a_file_by_its_name_or_the_first(tmp_path: Path, name, layout) -> None:
+def test_layout_of_a_file_by_its_name_or_the_first(tmp_path: Path, name: str, layout: str) -> None:
     (tmp_path / name).write_bytes(b"")
     assert names_found([tmp_path / name]) == [(name, layout)]
 
@@ -320,7 +321,7 @@ def test_files_named_one_by_one_keep_their_order(tmp_path: Path) -> None:
         ("", False),
     ],
 )
-def test_whether_a_folder_holds_a_source(tmp_path: Path, name, expected) -> None:
+def test_whether_a_folder_holds_a_source(tmp_path: Path, name: str, expected: object) -> None:
     if name:
         (tmp_path / name).write_bytes(b"")
     assert holds_source(SOURCE, tmp_path) is expected
@@ -332,11 +333,11 @@ def test_a_folder_of_the_name_of_a_file_is_not_the_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("workers", [1, 2, 5])
-def test_results_come_in_the_order_of_the_items(workers) -> None:
+def test_results_come_in_the_order_of_the_items(workers: int) -> None:
     delays = random.Random(7)
     waits = [delays.uniform(0.0, 0.004) for _ in range(60)]
 
-    def slow(item):
+    def slow(item: int) -> int:
         time.sleep(waits[item])
         return item * item
 
@@ -362,8 +363,8 @@ def test_no_items() -> None:
 
 
 @pytest.mark.parametrize("bad", [0, 3, 9])
-def test_an_error_in_the_function_reaches_the_caller_in_its_place(bad) -> None:
-    def fail(item):
+def test_an_error_in_the_function_reaches_the_caller_in_its_place(bad: int) -> None:
+    def fail(item: int) -> int:
         if item == bad:
             raise ZeroDivisionError
         return item
@@ -375,7 +376,7 @@ def test_an_error_in_the_function_reaches_the_caller_in_its_place(bad) -> None:
 
 
 def test_an_error_in_the_items_reaches_the_caller() -> None:
-    def items():
+    def items() -> Iterator[int]:
         yield from (1, 2, 3)
         raise ZeroDivisionError
 

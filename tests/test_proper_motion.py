@@ -37,10 +37,14 @@ spans = st.floats(-150.0, 150.0)
 def test_there_and_back(star, years):
     start = motion(star)
     back = propagate(propagate(start, years), -years)
-    assert separation(directions(back), directions(start)).max() < ROUNDING_RAD * 10
+    # Along its line the star gained a radial velocity that catalogs do not carry, so the way
+    # back misses by the cube of the angle: 0.2 mas after 200 arcsec, 1e-10 arcsec after 1.6.
+    angle = np.hypot(star[2], star[3]) * 1e-3 * ARCSEC * abs(years)
+    miss_rad = separation(directions(back), directions(start))[0]
+    assert miss_rad < 1.01 * angle**3 + ROUNDING_RAD
     # Beside a pole the axes turn by whole radians; only the speed is then worth comparing.
-    speed = np.hypot(back.pm_ra_cosdec_mas_yr, back.pm_dec_mas_yr)
-    assert speed == pytest.approx(np.hypot(*star[2:]), rel=1e-9, abs=1e-12)
+    speed = np.hypot(back.pm_ra_cosdec_mas_yr, back.pm_dec_mas_yr)[0]
+    assert speed == pytest.approx(np.hypot(*star[2:]), rel=2.01 * angle**2 + 1e-12, abs=1e-9)
 
 
 @given(stars, spans)

@@ -85,8 +85,12 @@ def _value_bytes(values: pa.Array, dtype: str) -> bytes:
     if dtype == "string":
         filled = pc.fill_null(values, "")
         lengths = pc.binary_length(filled).to_numpy().astype("<i8")
-        joined = "".join(filled.to_pylist()).encode()
-        return bytes(lengths.tobytes() + joined)
+        _, offsets, letters = filled.buffers()
+        if not lengths.sum():
+            return bytes(lengths.tobytes())
+        # The texts lie one behind the other already, in a part of the buffer.
+        ends = np.frombuffer(offsets, dtype=np.int32)[filled.offset :][[0, len(filled)]]
+        return bytes(lengths.tobytes() + memoryview(letters)[ends[0] : ends[1]])
     if dtype == "bool":
         return bytes(np.packbits(np.array(pc.fill_null(values, False))).tobytes())
     filled = pc.fill_null(values, 0) if values.null_count else values

@@ -1,7 +1,9 @@
 """The HDF5 file of an artifact: contiguous little-endian datasets that a matcher maps.
 
-A product is a group; each column is a dataset with its unit and meaning as attributes. A
-list column ``name`` is two datasets: ``name_offsets`` (rows + 1) and ``name_values``.
+A product is a group; each column that its schema marks ``in_database`` is a dataset with its
+unit and meaning as attributes. A list column ``name`` is two datasets: ``name_offsets`` (rows
++ 1) and ``name_values``. Columns that are rows of the stars are stored as uint16 where there are
+at most 65,536 stars, else as int32. A product's indices stand beside its columns.
 """
 
 from __future__ import annotations
@@ -17,11 +19,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from starcat.kvector import KVector
+from starcat.products.index import Index
 from starcat.schema import ProductSchema, SchemaColumn
-
-MATCHER_STAR_COLUMNS = ("star_id", "designation", "x", "y", "z", "mag")
-"""Columns of ``stars`` that the HDF5 file has; all of them are in the Parquet file."""
 
 LAYOUT_VERSION = "1.0.0"
 """Of the arrangement of groups, datasets and attributes described above."""
@@ -46,7 +45,8 @@ def write_product(
     file: h5py.File,
     table: pa.Table,
     schema: ProductSchema,
-    kvector: KVector | None = None,
+    index: Index,
+    star_count: int,
 ) -> None:
     """Write a product as a group of contiguous datasets.
 
@@ -58,39 +58,96 @@ def write_product(
         The product.
     schema : ProductSchema
         Its contract.
-    kvector : KVector, optional
-        The index over the product's sort key.
+    index : Index
+        Arrays and numbers beside the columns.
+    star_count : int
+        Stars of the artifact; says how wide their row numbers have to be.
     """
     group = file.create_group(schema.product)
     group.attrs["schema"] = schema.name
     group.attrs["description"] = schema.description
     group.attrs["rows"] = len(table)
     for column in schema.columns:
-        if schema.product == "stars" and column.name not in MATCHER_STAR_COLUMNS:
-            continue
-        _write_column(group, column, table[column.name].combine_chunks())
-    if kvector is not None:
-        group.attrs["kvector_intercept"] = kvector.intercept
-        group.attrs["kvector_slope"] = kvector.slope
-        dataset = group.create_dataset("kvector_counts", data=kvector.counts.astype("<i4"))
-        dataset.attrs["description"] = "number of values on or below the K-vector's line"
+        if column.in_database:
+            values = table[column.name].combine_chunks()
+            for name, data in column_datasets(column, values, star_count).items():
+                dataset = group.create_dataset(name, data=data)
+                for key, text in dataset_attributes(column, name).items():
+                    dataset.attrs[key] = text
+    for name, data in index.datasets.items():
+        group.create_dataset(name, data=data.astype(data.dtype.newbyteorder("<")))
+    for name, value in index.attributes.items():
+        group.attrs[name] = value
 
 
-def _write_column(group: h5py.Group, column: SchemaColumn, values: pa.Array) -> None:
-    if column.is_list:
-        lengths = pc.list_value_length(values).to_numpy()
-        offsets = np.concatenate([[0], np.cumsum(lengths)]).astype("<i8")
-        dataset = group.create_dataset(f"{column.name}_offsets", data=offsets)
-        dataset.attrs["description"] = f"where the {column.name} of each row begin"
-        data, name = _as_numpy(pc.list_flatten(values), column.item_dtype), f"{column.name}_values"
-    else:
-        data, name = _as_numpy(values, column.dtype), column.name
-    dataset = group.create_dataset(name, data=data)
-    dataset.attrs["description"] = column.description
-    if column.unit:
-        dataset.attrs["units"] = column.unit
-    if column.ucd:
-        dataset.attrs["ucd"] = column.ucd
+def stored_dtype(column: SchemaColumn, star_count: int) -> str:
+    """Return the dtype that a column's values have in the database.
+
+    Parameters
+    ----------
+    column : SchemaColumn
+        The column.
+    star_count : int
+        Stars of the artifact.
+
+    Returns
+    -------
+    str
+        Of a dataset: the schema's own, but ``uint16`` for rows of at most 65,536 stars.
+    """
+    if column.refers_to == "stars" and star_count <= 1 << 16:
+        return "uint16"
+    return column.item_dtype
+
+
+def column_datasets(
+    column: SchemaColumn, values: pa.Array, star_count: int
+) -> dict[str, NDArray[Any]]:
+    """Return the datasets that hold a column.
+
+    Parameters
+    ----------
+    column : SchemaColumn
+        The column.
+    values : pyarrow.Array
+        Its values.
+    star_count : int
+        Stars of the artifact.
+
+    Returns
+    -------
+    dict of str to ndarray
+        Little-endian; of a list column the offsets and the values, else one dataset.
+    """
+    dtype = stored_dtype(column, star_count)
+    if not column.is_list:
+        return {column.name: _as_numpy(values, dtype)}
+    lengths = pc.list_value_length(values).to_numpy()
+    return {
+        f"{column.name}_offsets": np.concatenate([[0], np.cumsum(lengths)]).astype("<i8"),
+        f"{column.name}_values": _as_numpy(pc.list_flatten(values), dtype),
+    }
+
+
+def dataset_attributes(column: SchemaColumn, dataset: str) -> dict[str, str]:
+    """Return the attributes of a column's dataset.
+
+    Parameters
+    ----------
+    column : SchemaColumn
+        The column.
+    dataset : str
+        A name that `column_datasets` gives.
+
+    Returns
+    -------
+    dict of str to str
+        Description, and units and ucd where the schema has them.
+    """
+    if column.is_list and dataset.endswith("_offsets"):
+        return {"description": f"where the {column.name} of each row begin"}
+    facts = {"description": column.description, "units": column.unit, "ucd": column.ucd}
+    return {name: text for name, text in facts.items() if text}
 
 
 def _as_numpy(values: pa.Array, dtype: str) -> NDArray[Any]:

@@ -6,15 +6,17 @@ give the same manifest.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import platform
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from starcat import __version__
+from starcat.artifact.content import json_bytes
 from starcat.catalog.ingest import FileFacts
 from starcat.errors import ProductError, SchemaVersionError
 from starcat.schema import ProductSchema
@@ -23,7 +25,7 @@ MANIFEST_NAME = "manifest.json"
 MANIFEST_VERSION = "1.0.0"
 DATABASE_NAME = "database.h5"
 PARTS = ("name", "version", "frame", "epoch_jyear", "spec", "sources", "products", "files")
-LIBRARIES = ("numpy", "scipy", "pyerfa", "pyarrow", "h5py", "pydantic")
+LIBRARIES = ("numpy", "scipy", "pyerfa", "pyarrow", "h5py", "pydantic", "matplotlib", "pillow")
 
 
 @dataclass(frozen=True)
@@ -109,6 +111,23 @@ def software_versions() -> dict[str, str]:
     """
     found = {name: version(name) for name in LIBRARIES}
     return {"starcat": __version__, "python": platform.python_version(), **found}
+
+
+def manifest_digest(manifest: Mapping[str, Any]) -> str:
+    """Return the digest that a manifest carries of itself.
+
+    Parameters
+    ----------
+    manifest : mapping
+        With or without its ``manifest_sha256``.
+
+    Returns
+    -------
+    str
+        SHA-256, hexadecimal, of the canonical JSON of all other keys.
+    """
+    others = {key: value for key, value in manifest.items() if key != "manifest_sha256"}
+    return hashlib.sha256(json_bytes(others)).hexdigest()
 
 
 def _lacks(error: Exception) -> str:

@@ -8,7 +8,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,11 +22,12 @@ from starcat.artifact.manifest import (
     MANIFEST_VERSION,
     ProductFacts,
     SourceFacts,
+    manifest_digest,
     software_versions,
 )
 from starcat.errors import OutputError, reason
-from starcat.kvector import KVector
 from starcat.parquet import write_parquet
+from starcat.products.index import Index
 from starcat.schema import product_schema
 
 Outcome = Literal["written", "unchanged", "replaced"]
@@ -42,15 +43,15 @@ class Product:
         Of its schema.
     table : pyarrow.Table
         With the columns of the schema, in the schema's order of rows.
-    kvector : KVector, optional
-        The index over its sort key.
+    index : Index
+        What a matcher needs beside the columns.
     in_database : bool
         Whether the matcher's HDF5 file holds it.
     """
 
     name: str
     table: pa.Table
-    kvector: KVector | None = None
+    index: Index = field(default_factory=Index)
     in_database: bool = True
 
 
@@ -121,6 +122,7 @@ def write_products(
         If a table does not follow its schema.
     """
     made: dict[str, ProductFacts] = {}
+    star_count = next(len(product.table) for product in products if product.name == "stars")
     with open_for_writing(folder / DATABASE_NAME) as database:
         write_root(database, facts)
         for product in products:
@@ -128,7 +130,7 @@ def write_products(
             schema.check(product.table)
             write_parquet(product.table, folder / f"{product.name}.parquet")
             if product.in_database:
-                write_product(database, product.table, schema, product.kvector)
+                write_product(database, product.table, schema, product.index, star_count)
             digest = content_sha256(product.table, schema)
             made[product.name] = ProductFacts(
                 schema, len(product.table), digest, product.in_database
@@ -180,6 +182,7 @@ def write_manifest(
         },
         "software": software_versions(),
     }
+    manifest["manifest_sha256"] = manifest_digest(manifest)
     (folder / MANIFEST_NAME).write_bytes(json_bytes(manifest))
     return manifest
 

@@ -85,7 +85,7 @@ def _read_csv(
     data: bytes, layout: RecordFile, chosen: Sequence[Column], *, as_text: bool
 ) -> pa.Table:
     nulls = sorted({"", *(text for column in chosen for text in column.null)})
-    kinds = {c.name: pa.string() if as_text or c.is_text else pa.float64() for c in chosen}
+    kinds = {c.name: pa.binary() if as_text or c.is_text else pa.float64() for c in chosen}
     return csv.read_csv(
         pa.BufferReader(data),
         read_options=csv.ReadOptions(
@@ -134,11 +134,11 @@ def _array_by_field(
     numbers = np.full(len(values), np.nan)
     for i, text in enumerate(values.to_pylist()):
         try:
-            numbers[i] = np.nan if text is None else number_from_text(text.encode())
+            numbers[i] = np.nan if text is None else number_from_text(text)
         except ValueError:
             if not bad[i]:
-                kind = f"a number like {column.format}"
-                problems.append(Problem(int(line[i]), column.name, None, repr(text), kind))
+                found, kind = repr(text.decode("latin-1")), f"a number like {column.format}"
+                problems.append(Problem(int(line[i]), column.name, None, found, kind))
             bad[i] = True
     apply_nulls(numbers, column)
     return numbers

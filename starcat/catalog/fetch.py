@@ -271,7 +271,7 @@ def _take_arrived(expected: ExpectedFile, path: Path, url: str, status: Status) 
         error.path = _beside(path, ".rejected")
         _rename(part, error.path)
         _forget(path)
-        error.args = (f"{error} The file is kept as {error.path}.",)
+        error.args = (f"{str(error).rstrip('.')}. The file is kept as {error.path}.",)
         raise
     _rename(part, path)
     _forget(path)

@@ -99,7 +99,7 @@ def _from_records(
     parts: Sequence[Records], files: tuple[FileFacts, ...], rejected: dict[str, int]
 ) -> Gcvs:
     def text(name: str) -> list[str]:
-        return [value.decode().strip() for part in parts for value in part[name].tolist()]
+        return [value.decode("latin-1").strip() for part in parts for value in part[name].tolist()]
 
     number = np.array(
         [int(ref) if ref.isdigit() else 0 for ref in text("star_ref")], dtype=np.int64

@@ -168,6 +168,7 @@ def ingest(
     epoch_jyear: float | None = None,
     read_limit_mag: float | None = None,
     neighbours: bool = True,
+    workers: int = 2,
     progress: Progress = no_progress,
 ) -> Ingested:
     """Read a star catalog into a star table.
@@ -187,6 +188,8 @@ def ingest(
         catalogs that do not fit into memory.
     neighbours : bool, default True
         Whether to find each star's nearest neighbour.
+    workers : int, default 2
+        Threads; the result is the same for any number.
     progress : Progress
         Called with ("read <source>", bytes done, bytes in all).
 
@@ -225,7 +228,7 @@ def ingest(
     blocks = _numbered_blocks(files, source, facts, progress)
     rows = [0] * len(files)
     problems: list[tuple[int, Problem]] = []
-    for part in map_in_order(to_part, blocks):
+    for part in map_in_order(to_part, blocks, workers):
         if part.problems and not rows[part.file_number] and part.rows == len(part.problems):
             raise not_this_archive(files[part.file_number], source, part.problems)
         rows[part.file_number] += part.rows
@@ -234,7 +237,7 @@ def ingest(
     check_malformed(files, rows, problems, source)
     stars, rejected = _join(parts, source_name, chosen)
     if neighbours:
-        stars = add_nearest_neighbours(stars)
+        stars = add_nearest_neighbours(stars, workers)
     return Ingested(
         source=source_name,
         band=chosen,

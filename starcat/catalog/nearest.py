@@ -9,13 +9,15 @@ from starcat.catalog.stars import directions_of, floats_of
 from starcat.proximity import nearest_neighbours
 
 
-def add_nearest_neighbours(stars: pa.Table) -> pa.Table:
+def add_nearest_neighbours(stars: pa.Table, workers: int = 2) -> pa.Table:
     """Return a star table with the columns of the nearest neighbour filled in.
 
     Parameters
     ----------
     stars : pyarrow.Table
         Of the stars schema, any number of rows.
+    workers : int, default 2
+        Threads; the result is the same for any number.
 
     Returns
     -------
@@ -24,7 +26,7 @@ def add_nearest_neighbours(stars: pa.Table) -> pa.Table:
     """
     if len(stars) < 2:
         return stars
-    angle, index = nearest_neighbours(directions_of(stars))
+    angle, index = nearest_neighbours(directions_of(stars), workers)
     mag = floats_of(stars, "mag")
     delta = mag[index] - mag
     columns = {

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 JOHNSON_COLOUR_RANGE_MAG = (-0.2, 1.8)
 """BT - VT between which the Johnson formula holds (ESA SP-1200, vol. 1, p. 57)."""
 
-_TERM = re.compile(r"^(?:(\d*\.?\d+)\*)?(J|H|Ks)$")
+_TERM = re.compile(r"(?:(\d*\.?\d+)\*)?(J|H|Ks)")
 
 
 @dataclass(frozen=True)
@@ -88,8 +88,8 @@ def blend_weights(band: str) -> dict[str, float]:
     {'J': 0.5, 'H': 0.5}
     """
     compact = band.replace(" ", "")
-    mean = re.fullmatch(r"\((.+)\)/(\d+)", compact)
-    terms = [_TERM.match(term) for term in (mean[1] if mean else compact).split("+")]
+    mean = re.fullmatch(r"\((.+)\)/([1-9]\d*)", compact)
+    terms = [_TERM.fullmatch(term) for term in (mean[1] if mean else compact).split("+")]
     divisor = float(mean[2]) if mean else 1.0
     weights: dict[str, float] = {}
     for term in terms:

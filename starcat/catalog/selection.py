@@ -1,7 +1,7 @@
 """Selection: which stars of a table become guide stars, and why the others do not.
 
-Filters are tried in a fixed order (magnitude, doubles, variables, count) and the first that
-applies is the verdict. Doubles are judged by separation and magnitude difference at the
+Filters are tried in a fixed order (magnitude, doubles, variables, count, density) and the first
+that applies is the verdict. Doubles are judged by separation and magnitude difference at the
 sensor's resolution and variables by amplitude; a bare flag of an archive is only one input.
 """
 
@@ -18,9 +18,10 @@ from scipy.sparse.csgraph import connected_components
 from starcat.catalog.ingest import reject_rows
 from starcat.catalog.photometry import combined_magnitude
 from starcat.catalog.quality import Quality
-from starcat.catalog.stars import directions_of, floats_of
+from starcat.catalog.stars import directions_of, floats_of, sort_rows
 from starcat.catalog.verdict import Reason, Verdicts
 from starcat.proximity import pairs_within
+from starcat.schema import product_schema
 from starcat.spec import Doubles, Selection, Variables
 from starcat.sphere import radec_from_directions
 
@@ -295,3 +296,32 @@ def beyond_brightest(stars: pa.Table, kept: Flags, count: int) -> Flags:
     beyond = np.zeros(len(stars), dtype=bool)
     beyond[rows[order[count:]]] = True
     return beyond
+
+
+def reject_dense(selected: Selected, kept: NDArray[np.integer]) -> Selected:
+    """Thin the guide stars to those that a tiling asks for.
+
+    Parameters
+    ----------
+    selected : Selected
+        Of `select_guide_stars`.
+    kept : ndarray of int, shape (K,)
+        Rows of the guide stars to keep, in any order, repeats allowed.
+
+    Returns
+    -------
+    Selected
+        The others are rejected for their density; one more step.
+    """
+    stars = selected.guide_stars
+    verdicts = Verdicts(len(stars))
+    wanted = np.zeros(len(stars), dtype=bool)
+    wanted[kept] = True
+    verdicts.reject(~wanted, Reason.density)
+    dense = reject_rows(stars.filter(pa.array(~wanted)), verdicts.reasons)
+    rejected = pa.concat_tables([selected.rejected, dense]).combine_chunks()
+    return Selected(
+        stars.filter(pa.array(wanted)).combine_chunks(),
+        sort_rows(rejected, product_schema("rejected").order),
+        (*selected.steps, Step("density", directions_of(stars)[wanted])),
+    )

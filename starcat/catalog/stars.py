@@ -148,7 +148,11 @@ def text_column(values: NDArray[Any]) -> pa.Array:
     pyarrow.Array
         Of strings.
     """
-    trimmed = pc.utf8_trim_whitespace(pa.array(values).cast(pa.string()))
+    try:
+        text = pa.array(values).cast(pa.string())
+    except pa.ArrowInvalid:  # archives are ASCII: a damaged byte is a letter, not an error
+        text = pa.array(np.char.decode(values, "latin-1"))
+    trimmed = pc.utf8_trim_whitespace(text)
     return pc.if_else(pc.equal(trimmed, ""), pa.scalar(None, pa.string()), trimmed)
 
 

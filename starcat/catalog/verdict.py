@@ -33,6 +33,7 @@ class Reason(Enum):
     variable = "amplitude above max_amplitude_mag"
     flagged_variable = "flagged variable, amplitude unknown"
     beyond_count = "fainter than the brightest max_stars"
+    density = "in no field among the brightest max_stars_per_field"
 
 
 _CODES = {reason: code for code, reason in enumerate(Reason, start=1)}

@@ -79,9 +79,18 @@ class Matcher:
         -------
         MatchResult
             ``no_match`` and ``too_few_stars`` are answers too.
+
+        Raises
+        ------
+        ValueError
+            If the centroids are not pairs of numbers.
         """
         camera = camera or self.database.camera
-        given = np.asarray(centroids_px, dtype=np.float64).reshape(-1, 2)
+        given = np.asarray(centroids_px, dtype=np.float64)
+        if given.size == 0:
+            given = given.reshape(0, 2)
+        if given.ndim != 2 or given.shape[1] != 2:
+            raise ValueError(f"centroids_px has shape {given.shape}; expected (N, 2)")
         # Sorted by distance from the centre, so that the answer does not depend on the order.
         offset = given - [0.5 * camera.width_px, 0.5 * camera.height_px]
         usable = np.flatnonzero(camera.contains(given))

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from starcat.camera import Camera
 from starcat.sphere import (
     chord_from_separation,
     radec_from_directions,
@@ -19,6 +18,32 @@ from starcat.sphere import (
 )
 
 Array = NDArray[np.float64]
+
+
+class FieldSize(Protocol):
+    """Anything with a full angle across its width and its height, such as a camera."""
+
+    @property
+    def fov_x_deg(self) -> float:
+        """Full angle across the width, degrees."""
+
+    @property
+    def fov_y_deg(self) -> float:
+        """Full angle across the height, degrees."""
+
+
+@dataclass(frozen=True)
+class NominalField:
+    """A field of view that is stated, not that of a detector.
+
+    Attributes
+    ----------
+    fov_x_deg, fov_y_deg : float
+        Full angles across width and height, degrees.
+    """
+
+    fov_x_deg: float
+    fov_y_deg: float
 
 
 @dataclass(frozen=True)
@@ -68,7 +93,7 @@ def stars_in_fields(
     boresights: Array,
     directions: Array,
     mag: Array,
-    camera: Camera,
+    size: FieldSize,
     field: Literal["rectangular", "circular"] = "rectangular",
 ) -> FieldStars:
     """Find the stars in the field of each boresight.
@@ -81,10 +106,10 @@ def stars_in_fields(
         ICRS directions of the stars.
     mag : ndarray of float64, shape (N,)
         Their magnitudes; equal ones go by row.
-    camera : Camera
-        Says how large the field is.
+    size : FieldSize
+        How large the field is: a camera or a stated field.
     field : {"rectangular", "circular"}
-        The camera's frame at roll 0 (rows along right ascension), or the circle whose radius
+        The frame at roll 0 (rows along right ascension), or the circle whose radius
         is half of the narrower side. Edges belong to the field.
 
     Returns
@@ -92,8 +117,9 @@ def stars_in_fields(
     FieldStars
         Stars by field, brightest first.
     """
-    narrow_rad = 0.5 * np.radians(min(camera.fov_x_deg, camera.fov_y_deg))
-    radius = narrow_rad if field == "circular" else 0.5 * camera.diagonal_rad
+    half_x, half_y = np.radians(0.5 * size.fov_x_deg), np.radians(0.5 * size.fov_y_deg)
+    corner = np.arctan(np.hypot(np.tan(half_x), np.tan(half_y)))
+    radius = float(min(half_x, half_y) if field == "circular" else corner)
     if not len(directions):
         none = np.zeros(len(boresights) + 1, dtype=np.int64)
         return FieldStars(boresights, none, np.empty(0, dtype=np.int32))
@@ -105,7 +131,7 @@ def stars_in_fields(
     if field == "circular":
         inside = separation(boresights[tile], directions[star]) <= radius
     else:
-        inside = _in_frame(boresights, tile, directions[star], camera)
+        inside = _in_frame(boresights, tile, directions[star], np.tan(half_x), np.tan(half_y))
     tile, star = tile[inside], star[inside]
     order = np.lexsort((star, mag[star], tile))
     count = np.bincount(tile, minlength=len(boresights))
@@ -114,15 +140,13 @@ def stars_in_fields(
 
 
 def _in_frame(
-    boresights: Array, tile: NDArray[np.int64], u: Array, camera: Camera
+    boresights: Array, tile: NDArray[np.int64], u: Array, half_x: float, half_y: float
 ) -> NDArray[np.bool_]:
     """Return which directions project into the frame of their tile at roll 0."""
     east, north = tangent_axes(*radec_from_directions(boresights))
     along = np.einsum("ij,ij->i", u, boresights[tile])
     x = np.einsum("ij,ij->i", u, east[tile])
     y = np.einsum("ij,ij->i", u, north[tile])
-    half_x = 0.5 * camera.width_px / camera.focal_length_px
-    half_y = 0.5 * camera.height_px / camera.focal_length_px
     return np.asarray((along > 0) & (np.abs(x) <= half_x * along) & (np.abs(y) <= half_y * along))
 
 
@@ -130,7 +154,7 @@ def tile_sphere(
     count: int,
     directions: Array,
     mag: Array,
-    camera: Camera,
+    size: FieldSize,
     field: Literal["rectangular", "circular"] = "rectangular",
 ) -> FieldStars:
     """Tile the sphere with Saff-Kuijlaars boresights and find the stars in each field.
@@ -143,8 +167,8 @@ def tile_sphere(
         ICRS directions of the stars.
     mag : ndarray of float64, shape (N,)
         Their magnitudes.
-    camera : Camera
-        Says how large the field is.
+    size : FieldSize
+        How large the field is.
     field : {"rectangular", "circular"}
         As for `stars_in_fields`.
 
@@ -153,4 +177,4 @@ def tile_sphere(
     FieldStars
         In spiral order.
     """
-    return stars_in_fields(saff_kuijlaars(count), directions, mag, camera, field)
+    return stars_in_fields(saff_kuijlaars(count), directions, mag, size, field)

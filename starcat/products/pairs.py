@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.kvector import KVector, build_kvector
+from starcat.products.index import Index, kvector_index
 from starcat.proximity import pairs_within
 
 
@@ -27,6 +28,11 @@ class StarPairs:
     i: NDArray[np.int32]
     j: NDArray[np.int32]
     kvector: KVector
+
+    @property
+    def index(self) -> Index:
+        """The K-vector as the database holds it."""
+        return kvector_index(self.kvector)
 
     @property
     def separation_rad(self) -> NDArray[np.float64]:
@@ -54,7 +60,9 @@ def find_pairs(
     found, angle = pairs_within(directions, max_separation_rad)
     far = angle >= min_separation_rad
     found, angle = found[far].astype(np.int32), angle[far]
-    # The pairs come in order of (i, j), which a stable sort keeps for equal separations.
-    order = np.argsort(angle, kind="stable")
+    order = np.argsort(angle)
+    if bool(np.any(np.diff(angle[order]) == 0.0)):
+        # The pairs come in order of (i, j), which a stable sort keeps for equal separations.
+        order = np.argsort(angle, kind="stable")
     i, j = found[order, 0], found[order, 1]
     return StarPairs(i, j, build_kvector(angle[order]))

@@ -1,0 +1,286 @@
+"""What differs between two artifacts: spec, sources, software, stars and products.
+
+Stars are matched by their permanent number, so that the answer says which star of the sky came,
+went or moved, and why, and not which row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from starcat.artifact.reader import Artifact
+from starcat.catalog.stars import directions_of, floats_of
+from starcat.sphere import separation
+
+MOVED_ARCSEC = 1e-3
+"""Stars that are further from where they were have moved."""
+
+NOT_READ = "not in that catalog"
+
+_NO_ROWS: NDArray[np.intp] = np.empty(0, dtype=np.intp)
+
+
+@dataclass(frozen=True)
+class Change:
+    """A value that differs.
+
+    Attributes
+    ----------
+    name : str
+        What it is; dotted for a key of the spec.
+    a, b : object
+        Its two values; None where one side has none.
+    """
+
+    name: str
+    a: object
+    b: object
+
+
+@dataclass(frozen=True)
+class OneSided:
+    """A guide star of one artifact that is none of the other.
+
+    Attributes
+    ----------
+    star_id : int
+        Permanent number.
+    designation : str
+        Name.
+    mag : float or None
+        Magnitude, where it is a guide star.
+    reason : str
+        Why the other artifact rejected it, or that it never read it.
+    """
+
+    star_id: int
+    designation: str
+    mag: float | None
+    reason: str
+
+
+@dataclass(frozen=True)
+class Moved:
+    """A guide star of both artifacts whose position or magnitude differs.
+
+    Attributes
+    ----------
+    star_id : int
+        Permanent number.
+    designation : str
+        Name.
+    moved_arcsec : float
+        Great-circle separation of the two positions.
+    mag_a, mag_b : float or None
+        Magnitudes.
+    """
+
+    star_id: int
+    designation: str
+    moved_arcsec: float
+    mag_a: float | None
+    mag_b: float | None
+
+
+@dataclass(frozen=True)
+class ProductChange:
+    """A product in both artifacts.
+
+    Attributes
+    ----------
+    product : str
+        Its name.
+    rows_a, rows_b : int or None
+        Records; None where an artifact does not have it.
+    is_same : bool
+        Whether schema and content digest are equal.
+    """
+
+    product: str
+    rows_a: int | None
+    rows_b: int | None
+    is_same: bool
+
+
+@dataclass(frozen=True)
+class Difference:
+    """What differs between artifact A and artifact B.
+
+    Attributes
+    ----------
+    spec, sources, software : tuple of Change
+        Keys of the spec; digests and counts of the sources; versions.
+    came, went : tuple of OneSided
+        Guide stars of B alone, and of A alone.
+    moved : tuple of Moved
+        Guide stars of both, elsewhere or of another magnitude.
+    products : tuple of ProductChange
+        Every product of either.
+    """
+
+    spec: tuple[Change, ...]
+    sources: tuple[Change, ...]
+    software: tuple[Change, ...]
+    came: tuple[OneSided, ...]
+    went: tuple[OneSided, ...]
+    moved: tuple[Moved, ...]
+    products: tuple[ProductChange, ...]
+
+    @property
+    def is_same(self) -> bool:
+        """Whether the two hold the same products, made from the same spec and sources."""
+        return not (self.spec or self.sources) and all(change.is_same for change in self.products)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything as plain values.
+
+        Returns
+        -------
+        dict
+            For JSON.
+        """
+        return {"is_same": self.is_same, **asdict(self)}
+
+
+def diff_artifacts(a: Artifact, b: Artifact) -> Difference:
+    """Compare two artifacts.
+
+    Parameters
+    ----------
+    a, b : Artifact
+        The earlier and the later one, as a rule.
+
+    Returns
+    -------
+    Difference
+        What differs, all of it.
+
+    Raises
+    ------
+    ProductError
+        If the stars or the rejected stars of one cannot be read.
+    """
+    tables = [(side.table("stars"), side.table("rejected")) for side in (a, b)]
+    (stars_a, rejected_a), (stars_b, rejected_b) = tables
+    # A number means the same star only within one catalog.
+    is_one_catalog = _catalog(a) == _catalog(b)
+    rows_a, rows_b = _common_rows(stars_a, stars_b) if is_one_catalog else (_NO_ROWS, _NO_ROWS)
+    known_a = rejected_a if is_one_catalog else rejected_a.slice(0, 0)
+    known_b = rejected_b if is_one_catalog else rejected_b.slice(0, 0)
+    return Difference(
+        spec=changes_between(_dotted(a.manifest["spec"]), _dotted(b.manifest["spec"])),
+        sources=changes_between(_source_facts(a), _source_facts(b)),
+        software=changes_between(a.manifest["software"], b.manifest["software"]),
+        came=_one_sided(stars_b, rows_b, known_a),
+        went=_one_sided(stars_a, rows_a, known_b),
+        moved=_moved(stars_a.take(rows_a), stars_b.take(rows_b)),
+        products=_products(a.manifest["products"], b.manifest["products"]),
+    )
+
+
+def _catalog(artifact: Artifact) -> str:
+    return str(artifact.manifest["spec"]["catalog"]["source"])
+
+
+def _common_rows(a: pa.Table, b: pa.Table) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    number_a, number_b = a["star_id"].to_numpy(), b["star_id"].to_numpy()
+    _, rows_a, rows_b = np.intersect1d(number_a, number_b, assume_unique=True, return_indices=True)
+    return rows_a, rows_b
+
+
+def _dotted(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested keys as one level of dotted ones."""
+    flat: dict[str, Any] = {}
+    for key, value in content.items():
+        if isinstance(value, dict):
+            flat |= _dotted(value, f"{prefix}{key}.")
+        else:
+            flat[prefix + key] = value
+    return flat
+
+
+def _source_facts(artifact: Artifact) -> dict[str, Any]:
+    """Return digests and counts by a name that both sides share."""
+    facts: dict[str, Any] = {}
+    for source in artifact.manifest["sources"]:
+        name = source["source"]
+        facts |= {f"{name} {key}": source[key] for key in ("rows_read", "kept")}
+        facts |= {f"{name} rejected {key}": count for key, count in source["rejected"].items()}
+        for file in source["files"]:
+            facts[f"{name} file {file['name']} sha256"] = file["sha256"]
+            facts[f"{name} file {file['name']} rows"] = file["rows"]
+    return facts
+
+
+def changes_between(a: Mapping[str, Any], b: Mapping[str, Any]) -> tuple[Change, ...]:
+    """Return the keys whose values differ.
+
+    Parameters
+    ----------
+    a, b : mapping of str to object
+        The two sides.
+
+    Returns
+    -------
+    tuple of Change
+        In the order of A, then what B alone has.
+
+    Examples
+    --------
+    >>> changes_between({"x": 1, "y": 2}, {"x": 1, "y": 3})
+    (Change(name='y', a=2, b=3),)
+    """
+    names = dict.fromkeys([*a, *b])
+    return tuple(
+        Change(name, a.get(name), b.get(name)) for name in names if a.get(name) != b.get(name)
+    )
+
+
+def _one_sided(
+    stars: pa.Table, common: NDArray[np.intp], rejected: pa.Table
+) -> tuple[OneSided, ...]:
+    alone = np.ones(len(stars), dtype=bool)
+    alone[common] = False
+    found = stars.filter(pa.array(alone)).select(["star_id", "designation", "mag"])
+    known = rejected.filter(pc.is_in(rejected["star_id"], found["star_id"].combine_chunks()))
+    reasons = dict(zip(known["star_id"].to_pylist(), known["reason"].to_pylist(), strict=True))
+    return tuple(
+        OneSided(**star, reason=reasons.get(star["star_id"], NOT_READ))
+        for star in found.to_pylist()
+    )
+
+
+def _moved(a: pa.Table, b: pa.Table) -> tuple[Moved, ...]:
+    arcsec = np.degrees(separation(directions_of(a), directions_of(b))) * 3600.0
+    mag_a, mag_b = floats_of(a, "mag"), floats_of(b, "mag")
+    same_mag = (mag_a == mag_b) | (np.isnan(mag_a) & np.isnan(mag_b))
+    rows = np.flatnonzero((arcsec > MOVED_ARCSEC) | ~same_mag)
+    both = zip(
+        a.take(rows).select(["star_id", "designation", "mag"]).to_pylist(),
+        b["mag"].take(pa.array(rows)).to_pylist(),
+        arcsec[rows].tolist(),
+        strict=True,
+    )
+    return tuple(
+        Moved(star["star_id"], star["designation"], off, star["mag"], later)
+        for star, later, off in both
+    )
+
+
+def _products(a: Mapping[str, Any], b: Mapping[str, Any]) -> tuple[ProductChange, ...]:
+    changes = []
+    for name in dict.fromkeys([*a, *b]):
+        one, other = a.get(name), b.get(name)
+        is_same = all(
+            one is not None and other is not None and one[key] == other[key]
+            for key in ("schema", "content_sha256")
+        )
+        changes.append(ProductChange(name, one and one["rows"], other and other["rows"], is_same))
+    return tuple(changes)

@@ -1,0 +1,340 @@
+"""Verification of an artifact: every file, every product, and what they say of each other.
+
+All problems are collected. Content is read only from files whose digest is that of the
+manifest, since a damaged file is not to be trusted to the libraries that would parse it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import h5py
+import numpy as np
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from starcat.artifact.content import file_sha256, json_bytes
+from starcat.artifact.database_checks import (
+    group_problems,
+    index_problems,
+    lost_columns,
+    root_problems,
+)
+from starcat.artifact.manifest import (
+    DATABASE_NAME,
+    MANIFEST_NAME,
+    manifest_digest,
+    read_manifest,
+)
+from starcat.artifact.reader import Artifact
+from starcat.artifact.table_checks import (
+    REFERENCE_CHECKS,
+    TABLE_CHECKS,
+    HeldProduct,
+    columns_follow_the_schema,
+)
+from starcat.catalog.stars import directions_of
+from starcat.errors import ProductError, StarcatError
+
+T = TypeVar("T")
+
+_NOT_CHECKED = "Nothing else was checked, as nothing else says what the files should be"
+
+MAX_NAMED = 5
+"""Findings that an error message repeats."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One problem of an artifact.
+
+    Attributes
+    ----------
+    file : str
+        Path within the artifact.
+    product : str
+        Of the file; ``database`` for the HDF5 file as a whole, empty where there is none.
+    problem : str
+        What was found and what was expected.
+    """
+
+    file: str
+    product: str
+    problem: str
+
+    def __str__(self) -> str:
+        """Return file, product and problem as one line."""
+        product = f" ({self.product})" if self.product else ""
+        return f"{self.file}{product}: {self.problem}"
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What a verification found.
+
+    Attributes
+    ----------
+    folder : Path
+        The artifact.
+    checks : int
+        How many were done.
+    findings : tuple of Finding
+        Every problem; none for a sound artifact.
+    """
+
+    folder: Path
+    checks: int
+    findings: tuple[Finding, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the result as plain values.
+
+        Returns
+        -------
+        dict
+            For JSON.
+        """
+        findings = [asdict(finding) for finding in self.findings]
+        return {"folder": str(self.folder), "checks": self.checks, "findings": findings}
+
+
+def verify_artifact(folder: Path) -> Verification:
+    """Check an artifact as a whole: files, schemas, contents, orders, indices, references, counts.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder ``<name>-<version>``.
+
+    Returns
+    -------
+    Verification
+        With every problem; whatever is damaged, missing or unreadable is one.
+
+    Raises
+    ------
+    ProductError
+        If there is no such folder.
+    """
+    if not folder.is_dir():
+        raise ProductError(
+            f"{folder}: no such artifact; give the folder <name>-<version> that 'starcat build' "
+            "made",
+            path=folder,
+        )
+    log = _Log()
+    # Held against a damaged manifest, files that are whole would get the blame.
+    if log.run(MANIFEST_NAME, "", _manifest_problems, folder / MANIFEST_NAME):
+        manifest = log.get(MANIFEST_NAME, "", read_manifest, folder)
+        if manifest:
+            log.get(MANIFEST_NAME, "", _check_all, Artifact(folder, manifest), log)
+    return Verification(folder, log.checks, tuple(log.findings))
+
+
+def check_artifact(folder: Path) -> Artifact:
+    """Check that an artifact is whole.
+
+    Parameters
+    ----------
+    folder : Path
+        The artifact.
+
+    Returns
+    -------
+    Artifact
+        The artifact, found whole.
+
+    Raises
+    ------
+    ProductError
+        With the first problems that `verify_artifact` finds.
+    """
+    found = verify_artifact(folder).findings
+    if found:
+        more = f"; and {len(found) - MAX_NAMED} more" if len(found) > MAX_NAMED else ""
+        raise ProductError(
+            f"{folder}: {'; '.join(str(finding) for finding in found[:MAX_NAMED])}{more}. "
+            "Build the artifact again, or fetch it again",
+            product=found[0].product or None,
+            path=folder / found[0].file,
+        )
+    return Artifact(folder, read_manifest(folder))
+
+
+@dataclass
+class _Log:
+    """Runs checks, counts them and keeps what they find; nothing that a check raises escapes."""
+
+    checks: int = 0
+    findings: list[Finding] = field(default_factory=list)
+
+    def get(self, file: str, product: str, function: Callable[..., T], *args: Any) -> T | None:
+        """Return what a function returns; None, and a finding, where it raises."""
+        self.checks += 1
+        try:
+            return function(*args)
+        except StarcatError as error:
+            self.findings.append(Finding(file, product, str(error)))
+        except Exception as error:  # whatever damage makes a library raise
+            why = f"cannot be read: {type(error).__name__}: {error}"
+            self.findings.append(Finding(file, product, why))
+        return None
+
+    def run(self, file: str, product: str, check: Callable[..., Iterable[str]], *args: Any) -> bool:
+        """Keep the problems that a check yields, and return whether there were none."""
+        problems = self.get(file, product, lambda: list(check(*args)))
+        self.findings += [Finding(file, product, problem) for problem in problems or ()]
+        return problems == []
+
+
+def _manifest_problems(path: Path) -> Iterator[str]:
+    if not path.is_file():
+        yield f"missing. {_NOT_CHECKED}"
+        return
+    data = path.read_bytes()
+    try:
+        manifest = json.loads(data)
+        if data != json_bytes(manifest):
+            yield f"changed since it was built: not as starcat writes it. {_NOT_CHECKED}"
+        elif manifest["manifest_sha256"] != manifest_digest(manifest):
+            yield f"changed since it was built: manifest_sha256 is not its digest. {_NOT_CHECKED}"
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        yield f"not a manifest of starcat ({type(error).__name__}: {error}). {_NOT_CHECKED}"
+
+
+def _check_all(artifact: Artifact, log: _Log) -> None:
+    damaged = _check_files(artifact, log)
+    held = _check_products(artifact, damaged, log)
+    log.run(MANIFEST_NAME, "", _count_problems, artifact.manifest, held)
+    if (artifact.folder / DATABASE_NAME).is_file():
+        check = _find_lost_columns if DATABASE_NAME in damaged else _check_database
+        log.get(DATABASE_NAME, "database", check, artifact, held, log)
+
+
+def _check_files(artifact: Artifact, log: _Log) -> set[str]:
+    """Return the names of the files that are not as the manifest says."""
+    folder, listed = artifact.folder, artifact.manifest["files"]
+    damaged = {
+        name
+        for name, facts in listed.items()
+        if not log.run(name, _product_of(name), _file_problems, folder / name, facts)
+    }
+    log.checks += 1
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        is_folder = path.is_dir() and not path.is_symlink()
+        if not is_folder and name not in listed and name != MANIFEST_NAME:
+            log.findings.append(Finding(name, _product_of(name), "not listed in the manifest"))
+    return damaged
+
+
+def _product_of(name: str) -> str:
+    """Return the product that a file holds."""
+    path = Path(name)
+    if path.name == DATABASE_NAME:
+        return "database"
+    return path.stem if path.suffix == ".parquet" else ""
+
+
+def _file_problems(path: Path, facts: dict[str, Any]) -> Iterator[str]:
+    if not path.is_file():
+        yield "missing; the manifest lists it"
+        return
+    size = path.stat().st_size
+    if size != facts["bytes"]:
+        yield f"{size} bytes; the manifest says {facts['bytes']}"
+        return
+    digest = file_sha256(path)
+    if digest != facts["sha256"]:
+        yield (
+            f"changed since it was built: its sha256 begins with {digest[:12]}; the manifest says "
+            f"{facts['sha256'][:12]}"
+        )
+
+
+def _check_products(artifact: Artifact, damaged: set[str], log: _Log) -> dict[str, HeldProduct]:
+    """Return the products whose columns follow their schemas, after checking what is in them."""
+    sound: dict[str, HeldProduct] = {}
+    directions = np.empty((0, 3))
+    for product in sorted(artifact.products, key=lambda name: name != "stars"):
+        file = artifact.manifest["products"][product]["parquet"]
+        if file in damaged:
+            continue
+        held = log.get(file, product, _hold, artifact, product, directions)
+        if held is None or not log.run(file, product, columns_follow_the_schema, held):
+            continue
+        sound[product] = held
+        for check in TABLE_CHECKS:
+            log.run(file, product, check, held)
+        if product == "stars":
+            directions = directions_of(held.table)
+        elif "stars" in sound:
+            all(log.run(file, product, check, held) for check in REFERENCE_CHECKS)
+    return sound
+
+
+def _hold(artifact: Artifact, product: str, directions: NDArray[np.float64]) -> HeldProduct:
+    facts = artifact.manifest["products"][product]
+    return HeldProduct(artifact.table(product), artifact.schema(product), facts, directions)
+
+
+def _count_problems(manifest: dict[str, Any], held: dict[str, HeldProduct]) -> Iterator[str]:
+    """Yield where the counts of sources, products and spec do not add up."""
+    spec, products = manifest["spec"], manifest["products"]
+    for key in ("name", "version", "epoch_jyear"):
+        if manifest[key] != spec[key]:
+            yield f"{key} is {manifest[key]!r}; its spec says {spec[key]!r}"
+    if [source["role"] for source in manifest["sources"]][:1] != ["stars"]:
+        yield "sources: no star catalog"
+    for source in manifest["sources"]:
+        read, kept = source["rows_read"], source["kept"]
+        rejected = sum(source["rejected"].values())
+        in_files = sum(file["rows"] for file in source["files"])
+        if not read == kept + rejected == in_files:
+            yield (
+                f"{source['source']}: {read} rows read, {in_files} in its files, {kept} kept and "
+                f"{rejected} rejected"
+            )
+        if source["role"] == "stars" and kept != products["stars"]["rows"]:
+            yield f"{source['source']}: {kept} kept, but {products['stars']['rows']} stars"
+        if source["role"] == "stars" and "rejected" in held:
+            counts = pc.value_counts(held["rejected"].table["reason"]).to_pylist()
+            counted = {entry["values"]: entry["counts"] for entry in counts}
+            if counted != source["rejected"]:
+                yield (
+                    f"{source['source']}: rejected {source['rejected']}, but the product rejected "
+                    f"holds {counted}"
+                )
+    for product, facts in products.items():
+        if facts["parquet"] not in manifest["files"]:
+            yield f"product {product}: {facts['parquet']} is not among the files"
+    fields = spec["boresights"]["count"]
+    if products["boresights"]["rows"] != fields:
+        yield f"{products['boresights']['rows']} boresights; the spec says {fields}"
+
+
+def _check_database(artifact: Artifact, held: dict[str, HeldProduct], log: _Log) -> None:
+    stars = artifact.manifest["products"]["stars"]["rows"]
+    with h5py.File(artifact.folder / DATABASE_NAME, "r") as file:
+        log.run(DATABASE_NAME, "database", root_problems, file, artifact.manifest)
+        for name, product in held.items():
+            if name in file:
+                for check in (group_problems, index_problems):
+                    parts = (file[name], product.table, product.schema, stars)
+                    log.run(DATABASE_NAME, name, check, *parts)
+
+
+def _find_lost_columns(artifact: Artifact, held: dict[str, HeldProduct], log: _Log) -> None:
+    """Say which products a damaged database has lost columns of."""
+    stars = artifact.manifest["products"]["stars"]["rows"]
+    data = (artifact.folder / DATABASE_NAME).read_bytes()
+    for name, product in held.items():
+        if product.facts["in_database"]:
+            lost = lost_columns(data, product.table, product.schema, stars)
+            if lost:
+                problem = f"does not hold {', '.join(lost)} as the Parquet file does"
+                log.findings.append(Finding(DATABASE_NAME, name, problem))

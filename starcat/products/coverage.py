@@ -1,0 +1,274 @@
+"""Coverage: what each field of the tiling holds, and how far apart the fields lie.
+
+Counts come from the tiling of the guide stars; a summary is made for the report and the
+command line. Nothing here draws or writes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from starcat.products.boresights import FieldStars
+from starcat.sphere import radec_from_directions, separation
+
+Array = NDArray[np.float64]
+Counts = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """What the field of each boresight holds.
+
+    Attributes
+    ----------
+    boresights : ndarray of float64, shape (F, 3)
+        ICRS directions.
+    stars : ndarray of int64, shape (F,)
+        Guide stars in the field.
+    pairs : ndarray of int64, shape (F,)
+        Pairs of them.
+    triangles : ndarray of int64, shape (F,)
+        Triangles of the brightest of them.
+    """
+
+    boresights: Array
+    stars: Counts
+    pairs: Counts
+    triangles: Counts
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How one count is spread over the fields.
+
+    Attributes
+    ----------
+    minimum, one_percent, median, maximum : int
+        Values that occur; at least 1 % and 50 % of the fields have no more than
+        ``one_percent`` and ``median``.
+    mean : float
+        Of all fields.
+    """
+
+    minimum: int
+    one_percent: int
+    median: int
+    maximum: int
+    mean: float
+
+
+@dataclass(frozen=True)
+class CoverageSummary:
+    """The coverage of the sphere in a few numbers.
+
+    Attributes
+    ----------
+    fields : int
+        Number of boresights.
+    stars, pairs, triangles : Spread
+        Of a field.
+    worst_boresight : int
+        The field with the fewest stars; the first along the spiral where several have.
+    worst_ra_deg, worst_dec_deg : float
+        Its direction, degrees, ICRS.
+    histogram : ndarray of int64, shape (maximum + 1,)
+        ``histogram[n]`` fields hold n stars.
+    """
+
+    fields: int
+    stars: Spread
+    pairs: Spread
+    triangles: Spread
+    worst_boresight: int
+    worst_ra_deg: float
+    worst_dec_deg: float
+    histogram: Counts
+
+
+@dataclass(frozen=True)
+class TilingGap:
+    """The direction that is farthest from all boresights.
+
+    Attributes
+    ----------
+    boresights : int
+        How many there are.
+    tile_radius_rad : float
+        Radius of the largest circle inside the field: seen whatever the roll.
+    covering_radius_rad : float
+        Every direction has a boresight within it, and this one none nearer.
+    ra_deg, dec_deg : float
+        The direction, degrees, ICRS.
+    """
+
+    boresights: int
+    tile_radius_rad: float
+    covering_radius_rad: float
+    ra_deg: float
+    dec_deg: float
+
+    @property
+    def has_holes(self) -> bool:
+        """Whether a direction lies outside the circle of every field."""
+        return self.covering_radius_rad > self.tile_radius_rad
+
+    @property
+    def boresights_needed(self) -> int:
+        """About how many boresights leave no hole: gaps shrink with the root of the number."""
+        ratio = self.covering_radius_rad / self.tile_radius_rad
+        return max(self.boresights, int(np.ceil(1.05 * self.boresights * ratio**2)))
+
+
+def field_coverage(fields: FieldStars, brightest: int) -> Coverage:
+    """Count stars, pairs and triangles of each field.
+
+    Parameters
+    ----------
+    fields : FieldStars
+        The tiling.
+    brightest : int
+        How many stars of a field make triangles.
+
+    Returns
+    -------
+    Coverage
+        By boresight.
+    """
+    return coverage_from_counts(fields.boresights, fields.count, brightest)
+
+
+def coverage_from_counts(boresights: Array, stars: Counts, brightest: int) -> Coverage:
+    """Return the coverage of fields whose stars are counted.
+
+    Parameters
+    ----------
+    boresights : ndarray of float64, shape (F, 3)
+        ICRS directions.
+    stars : ndarray of int64, shape (F,)
+        Stars in the field of each.
+    brightest : int
+        How many stars of a field make triangles.
+
+    Returns
+    -------
+    Coverage
+        n stars make n (n - 1) / 2 pairs; the m brightest make m (m - 1) (m - 2) / 6 triangles.
+
+    Examples
+    --------
+    >>> made = coverage_from_counts(np.eye(3), np.array([0, 4, 30]), 6)
+    >>> made.pairs, made.triangles
+    (array([  0,   6, 435]), array([ 0,  4, 20]))
+    """
+    stars = stars.astype(np.int64)
+    few = np.minimum(stars, brightest)
+    triangles = few * (few - 1) * (few - 2) // 6
+    return Coverage(boresights, stars, stars * (stars - 1) // 2, triangles)
+
+
+def summarise_coverage(coverage: Coverage) -> CoverageSummary:
+    """Return the coverage of the sphere in a few numbers.
+
+    Parameters
+    ----------
+    coverage : Coverage
+        Of at least one field.
+
+    Returns
+    -------
+    CoverageSummary
+        Least, 1 %, median and most, the worst field and the histogram of stars.
+    """
+    worst = int(np.argmin(coverage.stars))
+    ra_deg, dec_deg = radec_from_directions(coverage.boresights[worst])
+    return CoverageSummary(
+        len(coverage.stars),
+        _spread(coverage.stars),
+        _spread(coverage.pairs),
+        _spread(coverage.triangles),
+        worst,
+        float(ra_deg),
+        float(dec_deg),
+        np.bincount(coverage.stars).astype(np.int64),
+    )
+
+
+def _spread(counts: Counts) -> Spread:
+    percent, median = np.quantile(counts, [0.01, 0.5], method="inverted_cdf")
+    return Spread(
+        int(counts.min()), int(percent), int(median), int(counts.max()), float(counts.mean())
+    )
+
+
+def tiling_gap(boresights: Array, tile_radius_rad: float) -> TilingGap:
+    """Compare the gaps between boresights with what a field covers at any roll.
+
+    Parameters
+    ----------
+    boresights : ndarray of float64, shape (F, 3)
+        Unit vectors.
+    tile_radius_rad : float
+        Radians: of the largest circle inside a field, half of its narrower angle.
+
+    Returns
+    -------
+    TilingGap
+        The direction farthest from all boresights.
+
+    Examples
+    --------
+    >>> from starcat.sphere import saff_kuijlaars
+    >>> tiling_gap(saff_kuijlaars(10_000), np.radians(6.0)).has_holes
+    False
+    """
+    covering_rad, direction = covering_radius(boresights)
+    ra_deg, dec_deg = radec_from_directions(direction)
+    return TilingGap(
+        len(boresights), float(tile_radius_rad), covering_rad, float(ra_deg), float(dec_deg)
+    )
+
+
+def covering_radius(directions: Array) -> tuple[float, Array]:
+    """Return how far a direction can be from the nearest of some directions.
+
+    Parameters
+    ----------
+    directions : ndarray of float64, shape (N, 3)
+        Unit vectors.
+
+    Returns
+    -------
+    radius_rad : float
+        Radians; pi for fewer than 4 directions, and for those of one circle.
+    direction : ndarray of float64, shape (3,)
+        The unit vector that is so far away; away from the first one where nothing better is
+        known.
+
+    Notes
+    -----
+    The facets of the convex hull are the spherical Delaunay triangles, and the normal of a
+    facet is the centre of its circumcircle, which holds no other direction. The farthest
+    direction of all is the centre of the largest one.
+
+    Examples
+    --------
+    >>> octahedron = np.concatenate([np.eye(3), -np.eye(3)])
+    >>> round(float(np.degrees(covering_radius(octahedron)[0])), 3)
+    54.736
+    """
+    if len(directions) < 4:
+        return float(np.pi), -directions[0]
+    try:
+        hull = ConvexHull(directions)
+    except QhullError:
+        return float(np.pi), -directions[0]
+    centres = hull.equations[:, :3]
+    radii = separation(centres, directions[hull.simplices[:, 0]])
+    # Equal circles go by direction, so that the order of the facets does not matter.
+    rounded = [*np.round(centres.T, 9), -np.round(radii, 12)]
+    widest = int(np.lexsort(rounded)[0])
+    return float(radii[widest]), np.asarray(centres[widest])

@@ -1,0 +1,151 @@
+"""Grid patterns: the cells around every star that its neighbours occupy.
+
+The neighbours are projected onto the plane that touches the sphere at the star and turned so
+that a chosen one, the alignment star, lies on the +x axis. Which cells of a square grid are
+then occupied is the pattern, and a look-up leads from a cell to the patterns that have it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from starcat.products.hausdorff_angular import angular_reference_sets
+from starcat.products.index import Index, Ragged, row_offsets
+from starcat.products.neighbours import position_angles
+
+
+@dataclass(frozen=True)
+class GridPatterns:
+    """The pattern of every star that has an alignment star; a row is one star.
+
+    Attributes
+    ----------
+    star : ndarray of int32, shape (M,)
+        Rows of the star table, ascending.
+    alignment_star : ndarray of int32, shape (M,)
+        The nearest neighbour outside the buffer; of equally near ones the first.
+    cells : Ragged of int32, M lists
+        Occupied cells as `cell_of` numbers them, ascending, each once.
+    index : Index
+        Datasets ``cell_offsets``, int64, shape (cells + 1,) and ``cell_rows``, int32: the rows
+        whose pattern has cell c, ascending, are
+        ``cell_rows[cell_offsets[c]:cell_offsets[c + 1]]``. Attributes ``radius_rad``,
+        ``buffer_rad``, ``cells_per_side``.
+    """
+
+    star: NDArray[np.int32]
+    alignment_star: NDArray[np.int32]
+    cells: Ragged
+    index: Index
+
+
+def grid_patterns(
+    directions: NDArray[np.float64], radius_rad: float, *, buffer_rad: float, cells_per_side: int
+) -> GridPatterns:
+    """Find the grid pattern of every star.
+
+    Parameters
+    ----------
+    directions : ndarray of float64, shape (N, 3)
+        ICRS directions of the stars.
+    radius_rad : float
+        Largest separation of a neighbour, radians, itself included; below pi / 2.
+    buffer_rad : float
+        Neighbours within it, itself included, are passed over; radians, 0 or more.
+    cells_per_side : int
+        The grid has this many rows and columns, 1 to 46,340.
+
+    Returns
+    -------
+    GridPatterns
+        Sorted by star. A star without a neighbour between buffer and radius has no row.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of its range.
+
+    Notes
+    -----
+    The alignment star lies exactly on the +x axis, which in a grid of an even number of cells
+    is the lower edge of its row: an observed pattern has to put it at y = 0, not near it.
+
+    References
+    ----------
+    Padgett and Kreutz-Delgado 1997, "A grid algorithm for autonomous star identification",
+    IEEE Transactions on Aerospace and Electronic Systems 33, 202.
+    """
+    _check(radius_rad, buffer_rad, cells_per_side)
+    sets = angular_reference_sets(directions, radius_rad)
+    beyond = sets.separation_rad > buffer_rad
+    star, neighbour = sets.star[beyond], sets.neighbour[beyond]
+    # The nearest comes first.
+    with_pattern, first, row = np.unique(star, return_index=True, return_inverse=True)
+    angle = position_angles(directions, star, neighbour)
+    turn = angle - angle[first][row]
+    distance = np.tan(sets.separation_rad[beyond])
+    cell = cell_of(distance * np.cos(turn), distance * np.sin(turn), radius_rad, cells_per_side)
+    count = cells_per_side**2
+    row, cell = np.divmod(np.unique(row * count + cell), count)
+    cells = Ragged(row_offsets(row, len(with_pattern)), cell.astype(np.int32))
+    order = np.argsort(cell, kind="stable")
+    lookup: dict[str, NDArray[Any]] = {
+        "cell_offsets": row_offsets(cell[order], count),
+        "cell_rows": row[order].astype(np.int32),
+    }
+    parameters = {
+        "radius_rad": radius_rad,
+        "buffer_rad": buffer_rad,
+        "cells_per_side": cells_per_side,
+    }
+    return GridPatterns(with_pattern, neighbour[first], cells, Index(lookup, parameters))
+
+
+def cell_of(
+    x: ArrayLike, y: ArrayLike, radius_rad: float, cells_per_side: int
+) -> NDArray[np.int64]:
+    """Return the numbers of the grid's cells.
+
+    Parameters
+    ----------
+    x, y : array_like of float64, shape (M,)
+        Gnomonic coordinates about the star in units of the focal length, x towards the
+        alignment star and y counter-clockwise of it on the sky as seen.
+    radius_rad : float
+        The grid spans ``-tan(radius)`` to ``tan(radius)`` on both axes.
+    cells_per_side : int
+        Rows, and columns, of the grid.
+
+    Returns
+    -------
+    ndarray of int64, shape (M,)
+        ``row * cells_per_side + column``, rows along y and columns along x, both upwards from
+        0. A cell includes its lower edges and not its upper ones, but for the last of a row or
+        column; what lies outside the grid goes to its edge.
+
+    Examples
+    --------
+    >>> cell_of([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], np.pi / 4.0, 2)
+    array([0, 3, 3])
+    """
+    reach = np.tan(radius_rad)
+
+    def step(value: ArrayLike) -> NDArray[np.int64]:
+        part = (np.asarray(value, dtype=np.float64) + reach) / (2.0 * reach)
+        cell = np.floor(part * cells_per_side).astype(np.int64)
+        return np.asarray(np.clip(cell, 0, cells_per_side - 1))
+
+    return step(y) * cells_per_side + step(x)
+
+
+def _check(radius_rad: float, buffer_rad: float, cells_per_side: int) -> None:
+    if not 0.0 < radius_rad < 0.5 * np.pi:
+        raise ValueError(f"radius_rad is {radius_rad}; expected between 0 and pi / 2")
+    if not buffer_rad >= 0.0:
+        raise ValueError(f"buffer_rad is {buffer_rad}; expected 0 or more")
+    if not 1 <= cells_per_side <= 46_340:
+        raise ValueError(f"cells_per_side is {cells_per_side}; expected 1 to 46340")

@@ -1,0 +1,82 @@
+"""Angular reference sets: the separations from every star to its neighbours, nearest first.
+
+Separations do not change as the camera turns, so the set of them is a feature of a star. The
+other products of neighbours start from these rows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.products.index import Index, row_offsets
+from starcat.proximity import pairs_within
+
+
+@dataclass(frozen=True)
+class AngularReferenceSets:
+    """Every star's neighbours by separation; a row is one neighbour of one star.
+
+    Attributes
+    ----------
+    star : ndarray of int32, shape (M,)
+        Rows of the star table, ascending.
+    neighbour : ndarray of int32, shape (M,)
+        Rows of the star table.
+    separation_rad : ndarray of float64, shape (M,)
+        Great-circle separations of the two, radians, ascending within a star.
+    index : Index
+        Dataset ``star_offsets``, int64, shape (N + 1,): the rows of star n are
+        ``star_offsets[n]:star_offsets[n + 1]``. Attribute ``radius_rad``.
+    """
+
+    star: NDArray[np.int32]
+    neighbour: NDArray[np.int32]
+    separation_rad: NDArray[np.float64]
+    index: Index
+
+
+def angular_reference_sets(
+    directions: NDArray[np.float64], radius_rad: float
+) -> AngularReferenceSets:
+    """Find the neighbours of every star within a radius, nearest first.
+
+    Parameters
+    ----------
+    directions : ndarray of float64, shape (N, 3)
+        ICRS directions of the stars.
+    radius_rad : float
+        Largest separation of a neighbour, radians, itself included. The method takes 4/3 of
+        the field's half-angle, which is up to the caller.
+
+    Returns
+    -------
+    AngularReferenceSets
+        Sorted by (star, separation, neighbour).
+
+    Notes
+    -----
+    Every pair of stars makes two rows, one from either end. Stars at the same place are
+    neighbours at separation 0. The star itself is not in its set.
+
+    References
+    ----------
+    Rotation-invariant feature with modified Hausdorff distance (S5), the feature of a star.
+
+    Examples
+    --------
+    >>> found = angular_reference_sets(np.eye(3)[:2], 2.0)
+    >>> found.star, found.neighbour, found.separation_rad
+    (array([0, 1], dtype=int32), array([1, 0], dtype=int32), array([1.570..., 1.570...]))
+    """
+    pairs, angle = pairs_within(directions, radius_rad)
+    i, j = pairs.astype(np.int32).T
+    star, neighbour = np.concatenate([i, j]), np.concatenate([j, i])
+    both = np.concatenate([angle, angle])
+    order = np.lexsort((neighbour, both, star))
+    star = star[order]
+    offsets = row_offsets(star, len(directions))
+    index = Index({"star_offsets": offsets}, {"radius_rad": radius_rad})
+    return AngularReferenceSets(star, neighbour[order], both[order], index)

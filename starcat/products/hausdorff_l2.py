@@ -1,0 +1,91 @@
+"""Planar reference sets: gnomonic distances around every star over the smallest one.
+
+The distances are those in a frame that is centred on the star. Their ratios depend neither on
+how the camera is turned nor on its focal length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.products.hausdorff_angular import angular_reference_sets
+from starcat.products.index import Index, row_offsets
+
+
+@dataclass(frozen=True)
+class PlanarReferenceSets:
+    """Every star's neighbours by planar distance; a row is one neighbour of one star.
+
+    Attributes
+    ----------
+    star : ndarray of int32, shape (M,)
+        Rows of the star table, ascending.
+    neighbour : ndarray of int32, shape (M,)
+        Rows of the star table.
+    ratio : ndarray of float64, shape (M,)
+        Gnomonic distance over the star's smallest one, 1 or more, ascending within a star.
+    index : Index
+        Datasets ``star_offsets``, int64, shape (N + 1,): the rows of star n are
+        ``star_offsets[n]:star_offsets[n + 1]``; and ``smallest_distance``, float64, shape
+        (N,): the distance that was divided by, in units of the focal length, NaN for a star
+        without rows. Attribute ``radius_rad``.
+    """
+
+    star: NDArray[np.int32]
+    neighbour: NDArray[np.int32]
+    ratio: NDArray[np.float64]
+    index: Index
+
+
+def planar_reference_sets(
+    directions: NDArray[np.float64], radius_rad: float
+) -> PlanarReferenceSets:
+    """Find the ratios of the gnomonic distances around every star.
+
+    Parameters
+    ----------
+    directions : ndarray of float64, shape (N, 3)
+        ICRS directions of the stars.
+    radius_rad : float
+        Largest separation of a neighbour, radians, itself included; below pi / 2.
+
+    Returns
+    -------
+    PlanarReferenceSets
+        Sorted by (star, ratio, neighbour).
+
+    Raises
+    ------
+    ValueError
+        If the radius is not below pi / 2, where the tangent plane ends.
+
+    Notes
+    -----
+    On the plane that touches the sphere at the star, a neighbour lies at the tangent of its
+    separation. Stars at the same place have distance 0 and are left out: the method divides by
+    the smallest distance that is not 0. The star itself, the method's leading 0, has no row.
+
+    References
+    ----------
+    Wang et al. 2020 (S1), eqs. 6, 9 and 12.
+    """
+    if not radius_rad < 0.5 * np.pi:
+        raise ValueError(f"radius_rad is {radius_rad}; expected less than pi / 2")
+    sets = angular_reference_sets(directions, radius_rad)
+    apart = sets.separation_rad > 0.0
+    star, neighbour = sets.star[apart], sets.neighbour[apart]
+    distance = np.tan(sets.separation_rad[apart])
+    offsets = row_offsets(star, len(directions))
+    smallest = np.full(len(directions), np.nan)
+    # The nearest comes first.
+    smallest[np.diff(offsets) > 0] = distance[offsets[:-1][np.diff(offsets) > 0]]
+    ratio = distance / smallest[star]
+    # Rounding may make equals of what differed, and equal ratios go by neighbour.
+    order = np.lexsort((neighbour, ratio, star))
+    index = Index(
+        {"star_offsets": offsets, "smallest_distance": smallest}, {"radius_rad": radius_rad}
+    )
+    return PlanarReferenceSets(star, neighbour[order], ratio[order], index)

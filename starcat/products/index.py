@@ -1,0 +1,89 @@
+"""What a product is made of: columns named as its schema has them, and the matcher's indices.
+
+Every product function returns a frozen dataclass whose attributes carry the names of the
+schema's columns; a ragged column is a `Ragged`. What only a matcher needs (a K-vector, a
+look-up table, where each star's rows begin) is the attribute ``index``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.kvector import KVector
+
+
+@dataclass(frozen=True)
+class Ragged:
+    """A list a row.
+
+    Attributes
+    ----------
+    offsets : ndarray of int64, shape (N + 1,)
+        The list of row n is ``values[offsets[n]:offsets[n + 1]]``.
+    values : ndarray, shape (M,)
+        All lists, one behind the other.
+    """
+
+    offsets: NDArray[np.int64]
+    values: NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Index:
+    """Arrays and numbers beside a product's columns, kept in the HDF5 file alone.
+
+    Attributes
+    ----------
+    datasets : dict of str to ndarray
+        By name; descriptions are in the schema's text.
+    attributes : dict of str to float
+        By name, with units in the names.
+    """
+
+    datasets: dict[str, NDArray[Any]] = field(default_factory=dict)
+    attributes: dict[str, float] = field(default_factory=dict)
+
+
+def kvector_index(kvector: KVector) -> Index:
+    """Return a K-vector as an index.
+
+    Parameters
+    ----------
+    kvector : KVector
+        Over the product's sort key.
+
+    Returns
+    -------
+    Index
+        Dataset ``kvector_counts``; attributes ``kvector_intercept`` and ``kvector_slope``, in
+        the unit of the sort key.
+    """
+    line = {"kvector_intercept": kvector.intercept, "kvector_slope": kvector.slope}
+    return Index({"kvector_counts": kvector.counts}, line)
+
+
+def row_offsets(key: NDArray[np.integer[Any]], count: int) -> NDArray[np.int64]:
+    """Return where the rows of each key begin in a table sorted by it.
+
+    Parameters
+    ----------
+    key : ndarray of int, shape (M,)
+        Ascending, 0 to ``count - 1``.
+    count : int
+        Number of keys.
+
+    Returns
+    -------
+    ndarray of int64, shape (count + 1,)
+        The rows of key n are ``offsets[n]:offsets[n + 1]``.
+
+    Examples
+    --------
+    >>> row_offsets(np.array([0, 0, 2]), 3)
+    array([0, 2, 2, 3])
+    """
+    return np.searchsorted(key, np.arange(count + 1), side="left").astype(np.int64)

@@ -1,0 +1,199 @@
+"""Neighbours in counter-clockwise order, with a look-up table over angle and separation.
+
+The angle from one neighbour to the next and the separation of the neighbour do not change as
+the camera turns. The table leads from the two as observed to the rows that may be meant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from starcat.products.hausdorff_angular import angular_reference_sets
+from starcat.products.index import Index, row_offsets
+from starcat.sphere import radec_from_directions, tangent_axes
+
+Array = NDArray[np.float64]
+
+_TURN = 2.0 * np.pi
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """Every star's neighbours by position angle; a row is one neighbour of one star.
+
+    Attributes
+    ----------
+    star : ndarray of int32, shape (M,)
+        Rows of the star table, ascending.
+    neighbour : ndarray of int32, shape (M,)
+        Rows of the star table.
+    position_angle_rad : ndarray of float64, shape (M,)
+        Of the neighbour at the star, radians in [0, 2 pi), ascending within a star.
+    successive_angle_rad : ndarray of float64, shape (M,)
+        Angle to the star's next neighbour, from the last one to the first; radians, their sum
+        over a star is 2 pi.
+    separation_rad : ndarray of float64, shape (M,)
+        Great-circle separations of the two, radians.
+    index : Index
+        Datasets ``star_offsets``, int64, shape (N + 1,): the rows of star n are
+        ``star_offsets[n]:star_offsets[n + 1]``; ``lookup_offsets``, int64, shape (bins + 1,)
+        and ``lookup_rows``, int32, shape (M,): the rows in bin b of `bin_of`, ascending, are
+        ``lookup_rows[lookup_offsets[b]:lookup_offsets[b + 1]]``. Attributes
+        ``angle_bin_rad``, ``separation_bin_rad``, ``n_angle_bins``, ``n_separation_bins``.
+    """
+
+    star: NDArray[np.int32]
+    neighbour: NDArray[np.int32]
+    position_angle_rad: Array
+    successive_angle_rad: Array
+    separation_rad: Array
+    index: Index
+
+
+def find_neighbours(
+    directions: Array, radius_rad: float, *, angle_bin_rad: float, separation_bin_rad: float
+) -> Neighbours:
+    """Find the neighbours of every star within a radius, counter-clockwise.
+
+    Parameters
+    ----------
+    directions : ndarray of float64, shape (N, 3)
+        ICRS directions of the stars.
+    radius_rad : float
+        Largest separation of a neighbour, radians, itself included.
+    angle_bin_rad, separation_bin_rad : float
+        Widths of the look-up table's bins, radians.
+
+    Returns
+    -------
+    Neighbours
+        Sorted by (star, position angle, neighbour).
+
+    Raises
+    ------
+    ValueError
+        If a bin is not wider than 0.
+
+    Notes
+    -----
+    A star with one neighbour has one successive angle, 2 pi. A star at the same place is a
+    neighbour with position angle 0.
+
+    References
+    ----------
+    Sun et al. 2021 (S2), the feature of tables 1 and 2 and its look-up by angle and distance.
+    """
+    angle_bins = _bin_count(_TURN, angle_bin_rad, "angle_bin_rad")
+    separation_bins = _bin_count(radius_rad, separation_bin_rad, "separation_bin_rad")
+    sets = angular_reference_sets(directions, radius_rad)
+    angle = position_angles(directions, sets.star, sets.neighbour)
+    order = np.lexsort((sets.neighbour, angle, sets.star))
+    angle, separation_rad = angle[order], sets.separation_rad[order]
+    offsets = sets.index.datasets["star_offsets"]
+    successive = _successive_angles(angle, offsets)
+    bins = {
+        "angle_bin_rad": angle_bin_rad,
+        "separation_bin_rad": separation_bin_rad,
+        "n_angle_bins": angle_bins,
+        "n_separation_bins": separation_bins,
+    }
+    found = bin_of(
+        successive, separation_rad, angle_bin_rad, separation_bin_rad, angle_bins, separation_bins
+    )
+    rows = np.argsort(found, kind="stable")
+    lookup = {
+        "star_offsets": offsets,
+        "lookup_offsets": row_offsets(found[rows], angle_bins * separation_bins),
+        "lookup_rows": rows.astype(np.int32),
+    }
+    # Within a star the order changed; the column of stars did not.
+    return Neighbours(
+        sets.star, sets.neighbour[order], angle, successive, separation_rad, Index(lookup, bins)
+    )
+
+
+def position_angles(
+    directions: Array, star: NDArray[np.integer[Any]], neighbour: NDArray[np.integer[Any]]
+) -> Array:
+    """Return the position angles of neighbours at stars.
+
+    Parameters
+    ----------
+    directions : ndarray of float64, shape (N, 3)
+        ICRS directions.
+    star, neighbour : ndarray of int, shape (M,)
+        Rows of ``directions``.
+
+    Returns
+    -------
+    ndarray of float64, shape (M,)
+        Radians in [0, 2 pi), from north through east: counter-clockwise on the sky as seen
+        from inside. 0 where the two are at the same place. At a pole the star's own right
+        ascension says which way east is.
+
+    Examples
+    --------
+    >>> u = np.eye(3)
+    >>> position_angles(u, np.array([0, 0]), np.array([2, 1])) * 2.0 / np.pi
+    array([0., 1.])
+    """
+    east, north = tangent_axes(*radec_from_directions(directions))
+    # The difference of two close directions is exact, the components of each are not.
+    offset = directions[neighbour] - directions[star]
+    x = np.einsum("ij,ij->i", offset, east[star])
+    y = np.einsum("ij,ij->i", offset, north[star])
+    angle = np.arctan2(x, y)
+    angle = np.where(angle < 0.0, angle + _TURN, angle)
+    # A tiny negative angle plus a turn rounds to a turn.
+    return np.where(angle >= _TURN, 0.0, angle)
+
+
+def bin_of(
+    angle_rad: ArrayLike,
+    separation_rad: ArrayLike,
+    angle_bin_rad: float,
+    separation_bin_rad: float,
+    n_angle_bins: int,
+    n_separation_bins: int,
+) -> NDArray[np.int64]:
+    """Return the bins of successive angles and separations in the look-up table.
+
+    Parameters
+    ----------
+    angle_rad, separation_rad : array_like of float64, shape (M,)
+        Radians, 0 to 2 pi and 0 to the radius.
+    angle_bin_rad, separation_bin_rad : float
+        Widths of the bins, radians.
+    n_angle_bins, n_separation_bins : int
+        Their numbers.
+
+    Returns
+    -------
+    ndarray of int64, shape (M,)
+        ``angle bin * n_separation_bins + separation bin``. A bin includes its lower end and
+        not its upper one, but for the last, which includes all that lies above.
+    """
+    a = np.floor(np.asarray(angle_rad, dtype=np.float64) / angle_bin_rad)
+    s = np.floor(np.asarray(separation_rad, dtype=np.float64) / separation_bin_rad)
+    a, s = np.minimum(a, n_angle_bins - 1), np.minimum(s, n_separation_bins - 1)
+    return np.asarray(a * n_separation_bins + s).astype(np.int64)
+
+
+def _bin_count(extent: float, width: float, name: str) -> int:
+    if not width > 0.0:
+        raise ValueError(f"{name} is {width}; expected more than 0")
+    return max(1, int(np.ceil(extent / width)))
+
+
+def _successive_angles(angle: Array, offsets: NDArray[np.int64]) -> Array:
+    """Return the angle from each neighbour to the next of its star, the last one's to the first."""
+    step = np.empty_like(angle)
+    step[:-1] = angle[1:] - angle[:-1]
+    some = np.diff(offsets) > 0
+    first, last = offsets[:-1][some], offsets[1:][some] - 1
+    step[last] = _TURN - (angle[last] - angle[first])
+    return step

@@ -1,0 +1,170 @@
+"""Radial and cyclic patterns: the rings and the sectors around every star with neighbours in.
+
+Rings do not change as the camera turns. Sectors turn with it, so their bit pattern is brought
+to the smallest of its cyclic shifts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from starcat.products.hausdorff_angular import AngularReferenceSets, angular_reference_sets
+from starcat.products.index import Index, Ragged, row_offsets
+from starcat.products.neighbours import position_angles
+
+
+@dataclass(frozen=True)
+class RadialPatterns:
+    """The pattern of every star; a row is one star.
+
+    Attributes
+    ----------
+    star : ndarray of int32, shape (N,)
+        Rows of the star table, ascending: all of them.
+    rings : Ragged of int32, N lists
+        Occupied rings as `ring_of` numbers them, ascending, each once.
+    sector_pattern : ndarray of int32, shape (N,)
+        A bit per occupied sector, the smallest of the cyclic shifts; 0 without neighbours.
+    index : Index
+        Datasets ``ring_offsets``, int64, shape (rings + 1,) and ``ring_rows``, int32: the rows
+        with ring r, ascending, are ``ring_rows[ring_offsets[r]:ring_offsets[r + 1]]``.
+        Attributes ``radius_rad``, ``rings``, ``sectors``.
+    """
+
+    star: NDArray[np.int32]
+    rings: Ragged
+    sector_pattern: NDArray[np.int32]
+    index: Index
+
+
+def radial_patterns(
+    directions: NDArray[np.float64], radius_rad: float, *, rings: int, sectors: int
+) -> RadialPatterns:
+    """Find the radial and the cyclic pattern of every star.
+
+    Parameters
+    ----------
+    directions : ndarray of float64, shape (N, 3)
+        ICRS directions of the stars.
+    radius_rad : float
+        Largest separation of a neighbour, radians, itself included; more than 0.
+    rings : int
+        Number of rings of equal width, 1 or more.
+    sectors : int
+        Number of sectors of equal angle, 1 to 31.
+
+    Returns
+    -------
+    RadialPatterns
+        Sorted by star.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of its range.
+
+    Notes
+    -----
+    Sectors are counted counter-clockwise from the nearest neighbour, of equally near ones the
+    first. A star at the same place is in ring 0 and, having no position angle, in no sector.
+
+    References
+    ----------
+    Zhang, Wei and Jiang 2008, "Full-sky autonomous star identification based on radial and
+    cyclic features of star pattern", Image and Vision Computing 26, 891.
+    """
+    if not radius_rad > 0.0:
+        raise ValueError(f"radius_rad is {radius_rad}; expected more than 0")
+    if rings < 1:
+        raise ValueError(f"rings is {rings}; expected at least 1")
+    if not 1 <= sectors <= 31:
+        raise ValueError(f"sectors is {sectors}; expected 1 to 31")
+    count = len(directions)
+    sets = angular_reference_sets(directions, radius_rad)
+    ring = ring_of(sets.separation_rad, radius_rad, rings)
+    row, ring = np.divmod(np.unique(sets.star * np.int64(rings) + ring), rings)
+    order = np.argsort(ring, kind="stable")
+    lookup: dict[str, NDArray[Any]] = {
+        "ring_offsets": row_offsets(ring[order], rings),
+        "ring_rows": row[order].astype(np.int32),
+    }
+    return RadialPatterns(
+        np.arange(count, dtype=np.int32),
+        Ragged(row_offsets(row, count), ring.astype(np.int32)),
+        smallest_shift(_sectors(directions, sets, sectors), sectors).astype(np.int32),
+        Index(lookup, {"radius_rad": radius_rad, "rings": rings, "sectors": sectors}),
+    )
+
+
+def ring_of(separation_rad: ArrayLike, radius_rad: float, rings: int) -> NDArray[np.int64]:
+    """Return the rings that separations fall in.
+
+    Parameters
+    ----------
+    separation_rad : array_like of float64, shape (M,)
+        Radians, 0 to the radius.
+    radius_rad : float
+        Outer end of the last ring, radians.
+    rings : int
+        Their number.
+
+    Returns
+    -------
+    ndarray of int64, shape (M,)
+        From 0, the innermost. A ring includes its inner end and not its outer one, but for the
+        last, which includes both.
+
+    Examples
+    --------
+    >>> ring_of([0.0, 0.5, 0.99, 1.0], 1.0, 2)
+    array([0, 1, 1, 1])
+    """
+    part = np.asarray(separation_rad, dtype=np.float64) / radius_rad
+    return np.minimum(np.floor(part * rings), rings - 1).astype(np.int64)
+
+
+def smallest_shift(pattern: NDArray[np.int64], sectors: int) -> NDArray[np.int64]:
+    """Return the smallest of all cyclic shifts of bit patterns.
+
+    Parameters
+    ----------
+    pattern : ndarray of int64, shape (N,)
+        Bit s stands for sector s.
+    sectors : int
+        Length of the cycle in bits.
+
+    Returns
+    -------
+    ndarray of int64, shape (N,)
+        Equal for patterns that are turned into each other.
+
+    Examples
+    --------
+    >>> smallest_shift(np.array([0b0000, 0b1001, 0b0110]), 4)
+    array([0, 3, 3])
+    """
+    every = (1 << sectors) - 1
+    smallest = pattern
+    for shift in range(1, sectors):
+        turned = (pattern >> shift) | ((pattern << (sectors - shift)) & every)
+        smallest = np.minimum(smallest, turned)
+    return smallest
+
+
+def _sectors(
+    directions: NDArray[np.float64], sets: AngularReferenceSets, sectors: int
+) -> NDArray[np.int64]:
+    """Return the occupied sectors of every star, bit 0 from its nearest neighbour on."""
+    apart = sets.separation_rad > 0.0
+    star = sets.star[apart]
+    _, first, row = np.unique(star, return_index=True, return_inverse=True)
+    angle = position_angles(directions, star, sets.neighbour[apart])
+    part = np.mod(angle - angle[first][row], 2.0 * np.pi) / (2.0 * np.pi)
+    sector = np.minimum(np.floor(part * sectors), sectors - 1).astype(np.int64)
+    occupied = np.zeros((len(directions), sectors), dtype=np.bool_)
+    occupied[star, sector] = True
+    return np.asarray(occupied @ (1 << np.arange(sectors, dtype=np.int64)))

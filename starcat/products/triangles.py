@@ -1,0 +1,174 @@
+"""Triangles of the brightest stars of each field: area, circumradius, inradius.
+
+The sides are great-circle separations and the triangle is the plane one with those sides, so
+the features do not depend on where in a frame it lies.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.kvector import build_kvector
+from starcat.products.boresights import FieldStars
+from starcat.products.index import Index, kvector_index
+from starcat.sphere import separation
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Triangles:
+    """Distinct triangles, by area.
+
+    Attributes
+    ----------
+    i, j, k : ndarray of int32, shape (M,)
+        Rows of the star table, i < j < k.
+    area_rad2, circumradius_rad, inradius_rad : ndarray of float32, shape (M,)
+        Of the plane triangle, square radians and radians.
+    times_seen : ndarray of int32, shape (M,)
+        Number of boresights whose brightest stars include the three.
+    index : Index
+        The K-vector over ``area_rad2``, and the attribute ``records``.
+    """
+
+    i: NDArray[np.int32]
+    j: NDArray[np.int32]
+    k: NDArray[np.int32]
+    area_rad2: NDArray[np.float32]
+    circumradius_rad: NDArray[np.float32]
+    inradius_rad: NDArray[np.float32]
+    times_seen: NDArray[np.int32]
+    index: Index
+
+    @property
+    def records(self) -> int:
+        """Triangles over all boresights, repeats included: the papers' count of features."""
+        return int(self.times_seen.sum())
+
+
+def find_triangles(fields: FieldStars, directions: Array, brightest: int) -> Triangles:
+    """Find all triangles of the brightest stars of each field.
+
+    Parameters
+    ----------
+    fields : FieldStars
+        The tiling, stars brightest first.
+    directions : ndarray of float64, shape (N, 3)
+        ICRS directions of the stars.
+    brightest : int
+        How many stars of a field take part; n of them make n (n - 1) (n - 2) / 6 triangles.
+
+    Returns
+    -------
+    Triangles
+        Sorted by (area, i, j, k). Collinear triangles have area 0, inradius 0 and an infinite
+        circumradius.
+
+    References
+    ----------
+    Liao and Zhang 2024 (S4), eqs. 4 and 7.
+    """
+    stars, seen = distinct_triangles(fields, len(directions), brightest)
+    u, v, w = (directions[stars[:, n]] for n in range(3))
+    a, b, c = separation(v, w), separation(u, w), separation(u, v)
+    area = triangle_area(a, b, c)
+    circumradius = np.full(len(area), np.inf)
+    inradius = np.zeros(len(area))
+    real = area > 0.0
+    np.divide(a * b * c, 4.0 * area, out=circumradius, where=real)
+    np.divide(2.0 * area, a + b + c, out=inradius, where=real)
+    narrow = area.astype(np.float32)
+    # The triangles come in order of (i, j, k), which a stable sort keeps for equal areas.
+    order = np.argsort(narrow, kind="stable")
+    kvector = kvector_index(build_kvector(narrow[order].astype(np.float64)))
+    i, j, k = np.ascontiguousarray(stars[order].astype(np.int32).T)
+    return Triangles(
+        i,
+        j,
+        k,
+        narrow[order],
+        circumradius[order].astype(np.float32),
+        inradius[order].astype(np.float32),
+        seen[order].astype(np.int32),
+        Index(kvector.datasets, {**kvector.attributes, "records": float(seen.sum())}),
+    )
+
+
+def distinct_triangles(
+    fields: FieldStars, count: int, brightest: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the distinct triangles of all fields.
+
+    Parameters
+    ----------
+    fields : FieldStars
+        The tiling.
+    count : int
+        Number of stars in the table, below 2**21.
+    brightest : int
+        Stars of a field that take part.
+
+    Returns
+    -------
+    stars : ndarray of int64, shape (M, 3)
+        Rows i < j < k, in order.
+    times_seen : ndarray of int64, shape (M,)
+        Fields that have the triangle.
+
+    Raises
+    ------
+    ValueError
+        If there are more stars than a packed key can hold.
+    """
+    if count > 1 << 21:
+        raise ValueError(f"{count} stars; triangles hold at most {1 << 21}")
+    offsets, star_index = fields.brightest(brightest)
+    size = np.diff(offsets)
+    keys = [np.empty(0, dtype=np.int64)]
+    for length in range(3, brightest + 1):
+        start = offsets[:-1][size == length]
+        members = star_index[start[:, None] + np.arange(length)].astype(np.int64)
+        choices = np.array(list(combinations(range(length), 3)))
+        triples = np.sort(members[:, choices].reshape(-1, 3), axis=1)
+        keys.append((triples[:, 0] << 42) | (triples[:, 1] << 21) | triples[:, 2])
+    packed, seen = np.unique(np.concatenate(keys), return_counts=True)
+    low = (1 << 21) - 1
+    return np.stack([packed >> 42, (packed >> 21) & low, packed & low], axis=-1), seen
+
+
+def triangle_area(a: Array, b: Array, c: Array) -> Array:
+    """Return the area of plane triangles from their sides.
+
+    Parameters
+    ----------
+    a, b, c : ndarray of float64, shape (M,)
+        Sides, any unit, in any order.
+
+    Returns
+    -------
+    ndarray of float64, shape (M,)
+        The unit squared; 0 where the sides do not close.
+
+    References
+    ----------
+    Heron's formula in the order of operations of Kahan 2014, which keeps its digits for
+    needle-like triangles.
+
+    Examples
+    --------
+    >>> triangle_area(np.array([3.0]), np.array([5.0]), np.array([4.0]))
+    array([6.])
+    """
+    short, middle, long = np.sort(np.stack([a, b, c]), axis=0)
+    product = (
+        (long + (middle + short))
+        * (short - (long - middle))
+        * (short + (long - middle))
+        * (long + (middle - short))
+    )
+    return np.asarray(0.25 * np.sqrt(np.maximum(product, 0.0)))

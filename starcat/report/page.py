@@ -1,0 +1,228 @@
+"""The report as one HTML page that needs no other file and no network."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from typing import Any
+
+_STYLE = """
+:root { color-scheme: light dark; --line: #d5dbe0; --soft: #5b6770; --head: #f1f4f6; }
+@media (prefers-color-scheme: dark) {
+  :root { --line: #3a444c; --soft: #a3b0ba; --head: #20272d; }
+}
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
+h1 { margin-bottom: 0; }
+h2 { margin: 2.2rem 0 0.5rem; font-size: 1.2rem; }
+p.lead { color: var(--soft); margin-top: 0.2rem; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; margin: 0.5rem 0 1rem; font-size: 0.92rem; }
+caption { text-align: left; color: var(--soft); padding-bottom: 0.25rem; }
+th, td { padding: 0.2rem 0.8rem 0.2rem 0.4rem; border-bottom: 1px solid var(--line); }
+th { background: var(--head); text-align: left; font-weight: 600; }
+td.number, th.number { text-align: right; font-variant-numeric: tabular-nums; }
+code { font-size: 0.85em; overflow-wrap: anywhere; }
+pre { background: var(--head); padding: 0.8rem; overflow-x: auto; font-size: 0.85rem; }
+figure { margin: 1rem 0; }
+figure img { max-width: 100%; height: auto; background: #fff; border-radius: 6px; }
+.warning { border-left: 4px solid #d1495b; padding: 0.3rem 0.8rem; background: var(--head); }
+"""
+
+_ALT = {
+    "coverage_map": "All-sky map in Mollweide's projection: guide stars in the field of view",
+    "coverage_histogram": "Histogram: how many fields hold how many guide stars",
+    "stars_by_magnitude": "Bar chart: records read and guide stars by magnitude",
+}
+
+
+def report_page(content: Mapping[str, Any], plots: Mapping[str, bytes]) -> str:
+    """Return the report of a build as an HTML page.
+
+    Parameters
+    ----------
+    content : mapping
+        Of `report_content`.
+    plots : mapping of str to bytes
+        SVG by name.
+
+    Returns
+    -------
+    str
+        HTML5; the plots and the style are inside.
+    """
+    title = f"{content['name']}-{content['version']}"
+    parts = [
+        f"<h1>{escape(title)}</h1>",
+        f'<p class="lead">{escape(content["description"])}</p>',
+        *(f'<p class="warning">Warning: {escape(text)}.</p>' for text in content["warnings"]),
+        _summary(content),
+        "<h2>Sources</h2>",
+        *(_source(source, content["reasons"]) for source in content["sources"]),
+        "<h2>Selection</h2>",
+        _filters(content["filters"]),
+        _plot("stars_by_magnitude", plots),
+        "<h2>Coverage</h2>",
+        _coverage(content["coverage"]),
+        _plot("coverage_map", plots),
+        _plot("coverage_histogram", plots),
+        "<h2>Products</h2>",
+        _products(content["products"], content["database_bytes"]),
+        "<h2>Self-test</h2>",
+        _self_test(content["self_test"]),
+        "<h2>Spec</h2>",
+        f"<pre>{escape(json.dumps(content['spec'], indent=2, ensure_ascii=False))}</pre>",
+        "<h2>Made by</h2>",
+        table("", ("software", "version"), sorted(content["software"].items())),
+        "<p>Seconds and memory of each build are in the file <code>"
+        f"{escape(title)}.build.json</code> beside the database: they differ from run to run.</p>",
+    ]
+    body = "\n".join(parts)
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{escape(title)}: build report</title>\n<style>{_STYLE}</style>\n</head>\n"
+        f"<body>\n{body}\n</body>\n</html>\n"
+    )
+
+
+def table(
+    caption: str,
+    columns: Sequence[str],
+    rows: Iterable[Sequence[Any]],
+    numbers: Sequence[int] = (),
+) -> str:
+    """Return a table.
+
+    Parameters
+    ----------
+    caption : str
+        Above it; none if empty.
+    columns : sequence of str
+        Headings.
+    rows : iterable of sequence
+        Cells; whole numbers get separators, digests are cut by nobody.
+    numbers : sequence of int
+        Columns to align at the right.
+
+    Returns
+    -------
+    str
+        HTML, escaped.
+    """
+    kinds = [' class="number"' if k in numbers else "" for k in range(len(columns))]
+    head = "".join(
+        f'<th scope="col"{kind}>{escape(name)}</th>'
+        for name, kind in zip(columns, kinds, strict=True)
+    )
+    lines = []
+    for row in rows:
+        cells = (
+            f"<td{kind}>{escape(_text(cell))}</td>" for cell, kind in zip(row, kinds, strict=True)
+        )
+        lines.append(f"<tr>{''.join(cells)}</tr>")
+    above = f"<caption>{escape(caption)}</caption>\n" if caption else ""
+    body = "\n".join(lines)
+    return (
+        f'<div class="scroll"><table>\n{above}<thead><tr>{head}</tr></thead>\n'
+        f"<tbody>\n{body}\n</tbody></table></div>"
+    )
+
+
+def _text(cell: Any) -> str:
+    if isinstance(cell, bool) or not isinstance(cell, int | float):
+        return str(cell)
+    return f"{cell:,}" if isinstance(cell, int) else f"{cell:,.6g}"
+
+
+def _plot(name: str, plots: Mapping[str, bytes]) -> str:
+    data = base64.b64encode(plots[name]).decode()
+    return (
+        f'<figure><img alt="{escape(_ALT[name])}" src="data:image/svg+xml;base64,{data}"></figure>'
+    )
+
+
+def _summary(content: Mapping[str, Any]) -> str:
+    camera, stars = content["spec"]["camera"], content["products"]["stars"]["rows"]
+    clean = content["self_test"][0]
+    rows = [
+        ("guide stars", f"{stars:,}"),
+        ("positions", f"{content['frame']}, epoch J{content['epoch_jyear']:g}"),
+        ("camera", f"{camera['width_px']} x {camera['height_px']} px"),
+        ("fewest guide stars in a field", f"{content['coverage']['stars']['minimum']:,}"),
+        ("identified in the self-test", f"{clean['identified_share']:.2%} of the clean frames"),
+    ]
+    return table("", ("", ""), rows)
+
+
+def _source(source: Mapping[str, Any], reasons: Mapping[str, str]) -> str:
+    rows = [("read", "", source["rows_read"]), ("kept", "", source["kept"])]
+    rows += [(name, reasons[name], count) for name, count in source["rejected"].items()]
+    if "joined" in source:
+        rows.append(("joined", "stars whose amplitude is from here", source["joined"]))
+    files = [(f["name"], f["bytes"], f["rows"], f["sha256"]) for f in source["files"]]
+    name = f"{source['source']} ({source['role']})"
+    return "\n".join(
+        (
+            table(f"{name}: files", ("file", "bytes", "records", "SHA-256"), files, (1, 2)),
+            table(f"{name}: records", ("verdict", "meaning", "records"), rows, (2,)),
+        )
+    )
+
+
+def _filters(filters: Sequence[Mapping[str, Any]]) -> str:
+    rows = [
+        (
+            step["step"],
+            step["stars"],
+            step["median_per_field"],
+            step["min_per_field"],
+            f"{step['share_below_4']:.2%}",
+        )
+        for step in filters
+    ]
+    heads = ("after", "stars", "median a field", "fewest in a field", "fields below 4")
+    return table("What each filter leaves in the fields of the tiling", heads, rows, (1, 2, 3, 4))
+
+
+def _coverage(coverage: Mapping[str, Any]) -> str:
+    names = ("minimum", "one_percent", "median", "mean", "maximum")
+    rows = [
+        (kind, *(coverage[kind][name] for name in names))
+        for kind in ("stars", "pairs", "triangles")
+    ]
+    heads = ("in a field", "fewest", "1 % of the fields", "median", "mean", "most")
+    worst, tiling = coverage["worst_field"], coverage["tiling"]
+    reach = "Some directions lie outside of it" if tiling["holes"] else "No direction lies outside"
+    return (
+        table(f"{coverage['fields']:,} fields of the tiling", heads, rows, range(1, 6))
+        + f"\n<p>The field with the fewest stars is boresight {worst['boresight']:,} at right "
+        f"ascension {worst['ra_deg']:.3f}°, declination {worst['dec_deg']:+.3f}°. At any roll a "
+        f"field reaches {tiling['tile_radius_deg']:.3f}° from its boresight. {reach}: the "
+        f"direction farthest from all boresights is {tiling['covering_radius_deg']:.3f}° away from "
+        "the nearest.</p>"
+    )
+
+
+def _products(products: Mapping[str, Mapping[str, Any]], database_bytes: int) -> str:
+    rows: list[Sequence[Any]] = [
+        (name, facts["schema"], facts["rows"], facts["bytes"], facts["content_sha256"])
+        for name, facts in products.items()
+    ]
+    rows.append(("database.h5", "", "", database_bytes, ""))
+    heads = ("product", "schema", "rows", "bytes", "SHA-256 of the content")
+    return table("", heads, rows, (2, 3))
+
+
+def _self_test(rates: Sequence[Mapping[str, Any]]) -> str:
+    names = (
+        "name", "noise_px", "drop_probability", "false_stars", "frames", "identifiable",
+        "identified", "wrong", "median_residual_arcsec",
+    )  # fmt: skip
+    rows = [(*(rate[name] for name in names), f"{rate['identified_share']:.2%}") for rate in rates]
+    heads = (
+        "fields", "noise, px", "missing", "false", "tried", "4 stars or more", "right", "wrong",
+        "residual, arcsec", "rate",
+    )  # fmt: skip
+    return table("Simulated fields", heads, rows, range(1, 10))

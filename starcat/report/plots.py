@@ -1,0 +1,279 @@
+"""Plots of a report, as PNG and SVG: the same bytes whatever the machine is set to.
+
+Every function takes numbers and returns a drawing; nothing here computes coverage. A drawing
+uses matplotlib's own defaults and font, never the user's settings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.products.coverage import Coverage, CoverageSummary
+from starcat.report.sky_map import (
+    HALF_HEIGHT,
+    HALF_WIDTH,
+    galactic_equator,
+    nearest_raster,
+    project,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_STYLE: dict[Any, Any] = {
+    "font.family": "DejaVu Sans",  # comes with matplotlib
+    "font.size": 9.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "svg.hashsalt": "starcat",
+    "path.simplify": True,
+}
+_DPI = 100
+_BLUE, _GREY, _RED = "#2c6e9e", "#b9c4cc", "#d1495b"
+MAG_BIN = 0.5
+"""Width of a bin of magnitudes."""
+_RASTER_WIDTH = 720
+_COLOURS = 24
+
+Array = NDArray[np.float64]
+
+
+@contextmanager
+def _own_style() -> Iterator[None]:
+    """Draw with matplotlib's defaults and the style above, then put everything back."""
+    import matplotlib
+
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(_STYLE)
+        yield
+
+
+def draw_map(title: str, coverage: Coverage, summary: CoverageSummary) -> Figure:
+    """Draw the number of stars in each field over the whole sky.
+
+    Parameters
+    ----------
+    title : str
+        Name of the database.
+    coverage : Coverage
+        By boresight.
+    summary : CoverageSummary
+        Of it; says which field is the worst.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Mollweide's projection, ICRS, right ascension to the left; colours end at the 99.5 %
+        of the fields, so that one cluster does not take them all.
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Ellipse
+
+    raster = nearest_raster(coverage.boresights, coverage.stars, _RASTER_WIDTH)
+    least = summary.stars.minimum
+    most = max(int(np.quantile(coverage.stars, 0.995, method="inverted_cdf")), least + 1)
+    with _own_style():
+        figure = Figure(figsize=(8.4, 5.2))
+        _headline(figure, f"{title}: guide stars in the field", _map_legend(summary))
+        axes = figure.add_axes((0.05, 0.17, 0.92, 0.7))
+        edge = Ellipse((0, 0), 2 * HALF_WIDTH, 2 * HALF_HEIGHT, fill=False, color="#333", lw=1)
+        axes.add_patch(edge)
+        colours = colour_map(min(most - least + 1, _COLOURS))
+        extent = (-HALF_WIDTH, HALF_WIDTH, -HALF_HEIGHT, HALF_HEIGHT)
+        image = axes.imshow(
+            raster, colours, vmin=least - 0.5, vmax=most + 0.5, extent=extent,
+            interpolation="nearest",
+        )  # fmt: skip
+        image.set_clip_path(edge)
+        _graticule(axes)
+        axes.plot(*_cut(*project(*galactic_equator())), color="white", lw=1.0, ls=(0, (4, 3)))
+        x, y = project(summary.worst_ra_deg, summary.worst_dec_deg)
+        axes.plot(x, y, "o", ms=11, mfc="none", mec=_RED, mew=2.2)
+        axes.set(xlim=(-3.02, 2.88), ylim=(-1.46, 1.46), aspect="equal")
+        axes.set_axis_off()
+        place = figure.add_axes((0.27, 0.1, 0.48, 0.025))
+        extend = "max" if summary.stars.maximum > most else "neither"
+        bar = figure.colorbar(image, cax=place, orientation="horizontal", extend=extend)
+        bar.ax.xaxis.set_major_locator(_whole_ticks())
+        bar.set_label("guide stars in the field of the nearest boresight")
+    return figure
+
+
+def _map_legend(summary: CoverageSummary) -> str:
+    place = f"RA {summary.worst_ra_deg:.1f}°, Dec {summary.worst_dec_deg:+.1f}°"
+    return (
+        f"{summary.fields:,} fields. Ring: the fewest stars, {summary.stars.minimum}, at {place}. "
+        "Dashed: galactic equator."
+    )
+
+
+def _headline(figure: Figure, title: str, below: str) -> None:
+    """Write title and legend at fixed places: nothing has to be measured."""
+    height = figure.get_figheight()
+    figure.text(0.03, 1.0 - 0.3 / height, title, fontsize=11)
+    figure.text(0.03, 1.0 - 0.52 / height, below, color="#555")
+
+
+def colour_map(steps: int) -> Any:
+    """Return a colour map for counts.
+
+    Parameters
+    ----------
+    steps : int
+        Number of colours.
+
+    Returns
+    -------
+    matplotlib.colors.Colormap
+        Viridis: even in lightness, and safe for the colour-blind.
+    """
+    import matplotlib
+
+    return matplotlib.colormaps["viridis"].resampled(steps)
+
+
+def _graticule(axes: Axes) -> None:
+    """Draw meridians and parallels every 60 and 30 deg, labelled."""
+    line: dict[str, Any] = {"color": "white", "lw": 0.5, "alpha": 0.55}
+    dec = np.linspace(-90.0, 90.0, 91)
+    for ra in (0, 60, 120, 240, 300):
+        x, y = project(np.full(91, ra), dec)
+        axes.plot(x, y, **line)
+        axes.text(float(x[45]), 0.02, f"{ra}°", color="white", ha="center", va="bottom", size=8)
+    for value in range(-60, 90, 30):
+        x, y = project([180.0, 180.0], [value, value])
+        end = abs(float(x[0]))
+        axes.plot([-end, end], y, **line)
+        label = f"{value:+d}°" if value else "0°"
+        axes.text(-end - 0.03, float(y[0]), label, ha="right", va="center", size=8)
+
+
+def _cut(x: Array, y: Array) -> tuple[Array, Array]:
+    """Break a line where it leaves the map at one side and comes back at the other."""
+    jumps = np.flatnonzero(np.abs(np.diff(x)) > 0.5 * HALF_WIDTH) + 1
+    return np.insert(x, jumps, np.nan), np.insert(y, jumps, np.nan)
+
+
+def _chart(title: str, below: str) -> tuple[Figure, Axes]:
+    """Return an empty chart with a headline and horizontal lines."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.2, 4.0))
+    _headline(figure, title, below)
+    axes = figure.add_axes((0.12, 0.13, 0.85, 0.69))
+    axes.grid(axis="y", color="#e3e7ea")
+    return figure, axes
+
+
+def draw_histogram(title: str, summary: CoverageSummary) -> Figure:
+    """Draw how many fields hold how many stars.
+
+    Parameters
+    ----------
+    title : str
+        Name of the database.
+    summary : CoverageSummary
+        With the histogram.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Bars of one star each, or of several where fields hold more than 100.
+    """
+    width = -(-len(summary.histogram) // 100)
+    padded = np.append(summary.histogram, np.zeros(-len(summary.histogram) % width, dtype=int))
+    fields = padded.reshape(-1, width).sum(axis=1)
+    marks = {
+        "fewest": summary.stars.minimum,
+        "1 %": summary.stars.one_percent,
+        "median": summary.stars.median,
+    }
+    with _own_style():
+        figure, axes = _chart(f"{title}: guide stars per field", f"{summary.fields:,} fields")
+        left = np.arange(len(fields)) * width - 0.5
+        axes.bar(left, fields, width * 0.92, align="edge", color=_BLUE)
+        top = float(fields.max())
+        # Each mark ends at its own label, below the label of the one before.
+        for step, (name, value) in enumerate(marks.items()):
+            height = top * (1.22 - 0.08 * step)
+            axes.vlines(value, 0.0, height, color=_RED, lw=1.2)
+            axes.text(value, height, f" {name}: {value}", color=_RED, va="top")
+        axes.set_ylim(0.0, 1.25 * top)
+        several = f" ({width} a bar)" if width > 1 else ""
+        axes.set(xlabel=f"guide stars in the field{several}", ylabel="fields of the tiling")
+        axes.xaxis.set_major_locator(_whole_ticks())
+        axes.yaxis.set_major_locator(_whole_ticks())
+    return figure
+
+
+def draw_magnitudes(title: str, band: str, counts: Mapping[str, Any]) -> Figure:
+    """Draw how many stars of each magnitude were read and how many were kept.
+
+    Parameters
+    ----------
+    title : str
+        Name of the database.
+    band : str
+        Of the magnitudes.
+    counts : mapping of str to sequence
+        ``from_mag``, ``to_mag``, ``guide_stars`` and ``rejected``, a bin each.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Counts on a logarithmic axis.
+    """
+    left, right = np.asarray(counts["from_mag"]), np.asarray(counts["to_mag"])
+    kept = np.asarray(counts["guide_stars"])
+    read = kept + np.asarray(counts["rejected"])
+    with _own_style():
+        below = f"{kept.sum():,} guide stars of {read.sum():,} records with a magnitude"
+        figure, axes = _chart(f"{title}: guide stars by magnitude", below)
+        width = right - left
+        axes.bar(left, read, width, align="edge", color=_GREY, label="records read")
+        axes.bar(left, kept, 0.86 * width, align="edge", color=_BLUE, label="guide stars")
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:,.0f}")
+        axes.minorticks_off()
+        axes.set_ylim(0.7, 2.0 * max(10, int(read.max(initial=1))))
+        axes.set(xlabel=f"magnitude ({band})", ylabel=f"stars per {MAG_BIN:g} mag")
+        axes.legend(loc="upper left", frameon=False)
+    return figure
+
+
+def _whole_ticks() -> Any:
+    from matplotlib.ticker import MaxNLocator
+
+    return MaxNLocator(nbins=9, steps=[1, 2, 5, 10], integer=True)
+
+
+def save_plot(figure: Figure, folder: Path, name: str) -> None:
+    """Write a drawing as PNG and as SVG.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+        The drawing.
+    folder : Path
+        Where to.
+    name : str
+        Of the files, without a suffix.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+    with _own_style():
+        FigureCanvasAgg(figure).print_figure(
+            folder / f"{name}.png", dpi=_DPI, metadata={"Software": None}
+        )
+        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        FigureCanvasSVG(figure).print_figure(folder / f"{name}.svg", metadata=nothing)

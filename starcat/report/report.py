@@ -1,0 +1,175 @@
+"""The report of a build: what went in, what came out, and how good it is.
+
+All of it is plain data of the stages before; the files hold neither clock nor host nor path.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.artifact.content import json_bytes
+from starcat.report.coverage import CoverageReport, holes_warning, write_coverage
+from starcat.report.page import report_page
+from starcat.report.plots import MAG_BIN, draw_magnitudes, save_plot
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class BuildFacts:
+    """What a report is made of.
+
+    Attributes
+    ----------
+    spec : mapping
+        The whole build spec.
+    sources : sequence of mapping
+        As in the manifest.
+    reasons : mapping of str to str
+        What each reason means.
+    products : mapping of str to mapping
+        As in the manifest, by product, with ``bytes``.
+    database_bytes : int
+        Size of the matcher's file.
+    filters : sequence of mapping
+        What each filter left in the fields of the tiling, in order.
+    coverage : CoverageReport
+        Of the guide stars.
+    self_test : sequence of mapping
+        Rates.
+    software : mapping of str to str
+        Versions.
+    band : str
+        Of the magnitudes.
+    guide_star_mag, rejected_mag : ndarray of float64, shape (N,) and (M,)
+        Magnitudes; NaN where there is none.
+    """
+
+    spec: Mapping[str, Any]
+    sources: Sequence[Mapping[str, Any]]
+    reasons: Mapping[str, str]
+    products: Mapping[str, Mapping[str, Any]]
+    database_bytes: int
+    filters: Sequence[Mapping[str, Any]]
+    coverage: CoverageReport
+    self_test: Sequence[Mapping[str, Any]]
+    software: Mapping[str, str]
+    band: str
+    guide_star_mag: Array
+    rejected_mag: Array
+
+    @property
+    def title(self) -> str:
+        """Name and version of the database."""
+        return f"{self.spec['name']}-{self.spec['version']}"
+
+
+def count_magnitudes(guide_star_mag: Array, rejected_mag: Array) -> dict[str, list[Any]]:
+    """Count guide stars and rejected stars by magnitude.
+
+    Parameters
+    ----------
+    guide_star_mag, rejected_mag : ndarray of float64, shape (N,) and (M,)
+        Magnitudes; NaN is left out.
+
+    Returns
+    -------
+    dict of str to list
+        ``from_mag`` (does not belong to the bin), ``to_mag`` (does, as a faint limit does),
+        ``guide_stars``, ``rejected``; bins are half a magnitude wide, none is left out between.
+
+    Examples
+    --------
+    >>> count_magnitudes(np.array([1.0, 1.2]), np.array([2.1, np.nan]))["guide_stars"]
+    [1, 1, 0, 0]
+    """
+    bins = [np.ceil(mag[~np.isnan(mag)] / MAG_BIN) - 1.0 for mag in (guide_star_mag, rejected_mag)]
+    every = np.concatenate(bins)
+    if not len(every):
+        return {"from_mag": [], "to_mag": [], "guide_stars": [], "rejected": []}
+    first, count = int(every.min()), int(every.max() - every.min()) + 1
+    kept, rejected = (
+        np.bincount((one - first).astype(np.int64), minlength=count).tolist() for one in bins
+    )
+    edges = ((first + np.arange(count + 1)) * MAG_BIN).tolist()
+    return {
+        "from_mag": edges[:-1],
+        "to_mag": edges[1:],
+        "guide_stars": kept,
+        "rejected": rejected,
+    }
+
+
+def report_content(facts: BuildFacts) -> dict[str, Any]:
+    """Return the report as JSON holds it.
+
+    Parameters
+    ----------
+    facts : BuildFacts
+        Of the build.
+
+    Returns
+    -------
+    dict
+        Plain values: every table of the page, and the whole spec.
+    """
+    coverage = facts.coverage.as_dict()
+    warning = holes_warning(facts.coverage.gap)
+    return {
+        "name": facts.spec["name"],
+        "version": facts.spec["version"],
+        "description": facts.spec["description"],
+        "frame": "ICRS",
+        "epoch_jyear": facts.spec["epoch_jyear"],
+        "warnings": [warning] if warning else [],
+        "sources": [dict(source) for source in facts.sources],
+        "reasons": dict(facts.reasons),
+        "products": {name: dict(product) for name, product in facts.products.items()},
+        "database_bytes": facts.database_bytes,
+        "filters": [dict(step) for step in facts.filters],
+        "coverage": coverage,
+        "magnitudes": {
+            "band": facts.band,
+            **count_magnitudes(facts.guide_star_mag, facts.rejected_mag),
+        },
+        "self_test": [dict(rates) for rates in facts.self_test],
+        "spec": dict(facts.spec),
+        "software": dict(facts.software),
+    }
+
+
+def write_report(folder: Path, facts: BuildFacts) -> None:
+    """Write all files of a report.
+
+    Parameters
+    ----------
+    folder : Path
+        An existing folder.
+    facts : BuildFacts
+        Of the build.
+    """
+    content = report_content(facts)
+    write_coverage(folder, facts.title, facts.coverage)
+    counts = content["magnitudes"]
+    (folder / "stars_by_magnitude.csv").write_bytes(_magnitude_csv(counts))
+    save_plot(draw_magnitudes(facts.title, facts.band, counts), folder, "stars_by_magnitude")
+    (folder / "self_test.json").write_bytes(json_bytes(content["self_test"]))
+    (folder / "report.json").write_bytes(json_bytes(content))
+    plots = {
+        name: (folder / f"{name}.svg").read_bytes()
+        for name in ("coverage_map", "coverage_histogram", "stars_by_magnitude")
+    }
+    (folder / "index.html").write_text(report_page(content, plots), encoding="utf-8")
+
+
+def _magnitude_csv(counts: Mapping[str, Any]) -> bytes:
+    names = ("from_mag", "to_mag", "guide_stars", "rejected")
+    rows = zip(*(counts[name] for name in names), strict=True)
+    lines = [",".join(names), *(f"{a:g},{b:g},{kept},{out}" for a, b, kept, out in rows)]
+    return ("\n".join(lines) + "\n").encode()

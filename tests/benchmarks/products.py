@@ -1,0 +1,142 @@
+"""Time, memory and bytes of each product, and how they grow with the number of stars.
+
+Run with ``make bench``. Each growth step is a fresh process, so that its peak memory is its own.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from starcat.artifact.database import open_for_writing, write_product
+from starcat.catalog.gaia import embedded_sky
+from starcat.catalog.ingest import ingest
+from starcat.catalog.selection import select_guide_stars
+from starcat.catalog.stars import directions_of
+from starcat.parquet import write_parquet
+from starcat.recipes import RECIPES, Sky, cook, tile_guide_stars
+from starcat.schema import product_schema
+from starcat.spec import BuildSpec, preset
+
+LIMITS_MAG = (6.0, 7.0, 8.0, 9.0)
+STARS_A_FIELD = 16
+SKY_DEG2 = 41_252.96
+
+
+def measure(spec: BuildSpec) -> dict[str, dict[str, float]]:
+    """Make every product of a Gaia spec; return seconds, rows and bytes of each."""
+    read = ingest("gaia", [embedded_sky()], epoch_jyear=spec.epoch_jyear, neighbours=False)
+    stars = select_guide_stars(read.stars, spec.selection).guide_stars
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    start = time.perf_counter()
+    sky = Sky(directions_of(stars), tile_guide_stars(stars, spec), spec)
+    found = {"tiling": {"seconds": time.perf_counter() - start, "rows": float(len(stars))}}
+    with tempfile.TemporaryDirectory() as folder:
+        for name in RECIPES:
+            start = time.perf_counter()
+            product = cook(name, sky)
+            seconds = time.perf_counter() - start
+            parquet, database = Path(folder, f"{name}.parquet"), Path(folder, f"{name}.h5")
+            write_parquet(product.table, parquet)
+            with open_for_writing(database) as file:
+                write_product(file, product.table, product_schema(name), product.index, len(stars))
+            with h5py.File(database) as file:
+                stored = sum(item.id.get_storage_size() for item in file[name].values())
+            lists = [pc.list_flatten(c) for c in product.table if pa.types.is_list(c.type)]
+            found[name] = {
+                "seconds": seconds,
+                # Of a product with one row a star, what it stores about the star's neighbours.
+                "rows": float(len(lists[0] if lists else product.table)),
+                "hdf5": float(stored),
+                "parquet": float(parquet.stat().st_size),
+            }
+    after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    found["memory"] = {"stars": float(len(stars)), "peak_mib": after / 1024, "base": before / 1024}
+    return found
+
+
+def spec_at(limit_mag: float) -> BuildSpec:
+    """Return gaia-12deg at a limit, its field shrunk to hold about 16 stars."""
+    base = preset("gaia-12deg")
+    counts = {6.0: 6_834, 7.0: 18_600, 8.0: 52_000, 9.0: 150_000}
+    fov_deg = float(np.sqrt(STARS_A_FIELD / counts[limit_mag] * SKY_DEG2))
+    content = base.model_dump(mode="json")
+    content["selection"]["faint_limit_mag"] = limit_mag
+    content["selection"]["doubles"]["min_separation_deg"] = 0.047 * fov_deg / 12.0
+    content["camera"]["fov_x_deg"] = fov_deg
+    content["boresights"]["count"] = int(1.5 * SKY_DEG2 / fov_deg**2 * 10)
+    products = content["products"]
+    products["neighbours"]["separation_bin_deg"] = fov_deg / 120.0
+    products["grid"]["buffer_deg"] = fov_deg / 40.0
+    return BuildSpec.model_validate(content)
+
+
+def print_products(found: dict[str, dict[str, float]]) -> None:
+    """Print one row a product."""
+    print(f"  {'product':<18}{'rows':>10}{'ms':>9}{'ns/row':>9}{'HDF5 MB':>9}{'B/row':>7}", end="")
+    print(f"{'Parquet MB':>12}")
+    for name, facts in found.items():
+        if "hdf5" in facts:
+            rows = max(1.0, facts["rows"])
+            print(
+                f"  {name:<18}{facts['rows']:>10,.0f}{facts['seconds'] * 1e3:>9.1f}"
+                f"{facts['seconds'] / rows * 1e9:>9.0f}{facts['hdf5'] / 1e6:>9.2f}"
+                f"{facts['hdf5'] / rows:>7.1f}{facts['parquet'] / 1e6:>12.2f}"
+            )
+
+
+def main() -> None:
+    """Print the products of gaia-12deg, then their growth; plot it into dist/."""
+    print("\nProducts of gaia-12deg, one process")
+    print_products(measure(preset("gaia-12deg")))
+    growth = {}
+    for limit in LIMITS_MAG:
+        done = subprocess.run(
+            [sys.executable, __file__, str(limit)], capture_output=True, text=True, check=True
+        )
+        growth[limit] = json.loads(done.stdout)
+        fov = spec_at(limit).camera.fov_x_deg
+        stars = growth[limit]["memory"]["stars"]
+        print(f"\nG <= {limit:g}: {stars:,.0f} stars, field {fov:.1f} deg", end="")
+        print(f", peak {growth[limit]['memory']['peak_mib']:.0f} MiB")
+        print_products(growth[limit])
+    print("\nNanoseconds a row, smallest and largest over the four")
+    for name in RECIPES:
+        each = [g[name]["seconds"] / max(1.0, g[name]["rows"]) * 1e9 for g in growth.values()]
+        print(f"  {name:<18}{min(each):>8.0f}{max(each):>8.0f}{max(each) / min(each):>7.2f} x")
+    plot(growth)
+
+
+def plot(growth: dict[float, dict[str, dict[str, float]]]) -> None:
+    """Draw time and bytes against stars."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    stars = [g["memory"]["stars"] for g in growth.values()]
+    for name in RECIPES:
+        left.loglog(stars, [g[name]["seconds"] for g in growth.values()], "o-", label=name)
+        right.loglog(stars, [g[name]["hdf5"] / 1e6 for g in growth.values()], "o-", label=name)
+    left.set(xlabel="guide stars", ylabel="seconds")
+    right.set(xlabel="guide stars", ylabel="MB in HDF5")
+    left.legend(fontsize=7)
+    Path("dist").mkdir(exist_ok=True)
+    figure.savefig("dist/growth.png", dpi=110)
+    print("\nplot: dist/growth.png")
+
+
+if __name__ == "__main__":
+    if len(sys.argv) > 1:
+        print(json.dumps(measure(spec_at(float(sys.argv[1])))))
+    else:
+        main()

@@ -1,0 +1,1191 @@
+"""The star catalogs: what each one's records mean, on genuine records and on edited ones."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import erfa
+import numpy as np
+import pytest
+
+from starcat.catalog.gaia import embedded_sky
+from starcat.catalog.ingest import Ingested, ingest
+from starcat.catalog.proper_motion import Motion, propagate
+from starcat.catalog.quality import Quality
+from starcat.catalog.sao import PRINTED_PM_DEC_ARCSEC_YR, icrs_from_fk5
+from starcat.catalog.source import data_source
+from starcat.catalog.stars import directions_of, floats_of
+from starcat.errors import ConfigError, ParseError, SourceMissing
+from starcat.schema import product_schema
+from starcat.sphere import directions_from_radec, separation
+
+MAS = 1.0 / 3.6e6  # degrees in a milliarcsecond
+ARCSEC_RAD = np.radians(1.0 / 3600.0)
+
+# Genuine records, from samples/ and the excerpts.
+TYC_MAIN = [
+    b"T|   1    13 1| |00 04 30.12|+02 16 02.6| 8.50| | |001.12551719|+02.26739188| |   9.6 "
+    b"|   28.7 |  -10.5 | 10.3 |  7.5 | 11.9 | 14.4 | 11.6 |+0.21|+0.18|-0.07|-0.21|+0.00|+0.00"
+    b"|+0.01|-0.12|+0.04|+0.28|116|-0.72|      |10.555|0.041| 8.682|0.016|N| 1.560|0.039| |3|10.6"
+    b"| | 90|0.108| 8.57| 8.79| | |Y|B|  |143110|225210|B+01 4824 |          |          | ",
+    b"T|   1    17 1| |00 00 12.20|+01 46 17.4| 9.80| | |000.05081860|+01.77149877|X|  35.1 "
+    b"|  -66.2 |   -1.2 | 44.0 | 19.6 | 42.2 | 49.9 | 22.7 |+0.02|+0.26|+0.10|+0.04|+0.11|+0.12"
+    b"|+0.16|-0.13|+0.20|+0.10| 98| 4.68|      |10.635|0.049| 9.874|0.039|N| 0.677|0.051| |4| 6.7"
+    b"| |112|0.436| 9.46|10.63| | |S|B|  |143038|224725|B+00 5079 |          |          | ",
+]
+TYC2 = [
+    b"0001 00008 1| |  2.31750494|  2.23184345|  -16.3|   -9.0| 68| 73| 1.7| 1.8|1958.89|1951.94"
+    b"| 4|1.0|1.0|0.9|1.0|12.146|0.158|12.146|0.223|999| |         |  2.31754222|  2.23186444|1.67"
+    b"|1.54| 88.0|100.8| |-0.2",
+    b"0001 00013 1| |  1.12558209|  2.26739400|   27.7|   -0.5|  9| 12| 1.2| 1.2|1990.76|1989.25"
+    b"| 8|1.0|0.8|1.0|0.7|10.488|0.038| 8.670|0.015|999|T|         |  1.12551889|  2.26739556|1.81"
+    b"|1.52|  9.3| 12.7| |-0.2",
+    b"0001 00033 1|X|            |            |       |       |   |   |    |    |       |       "
+    b"|  |   |   |   |   |12.512|0.228|      |     |  5|T|         |  1.58432611|  0.94286667|1.69"
+    b"|1.58|115.5|125.1| | 0.0",
+]
+SUPPL_1 = [
+    b"0002 00580 1|T|003.03708871|+01.57351477|       |       | 42.9| 39.5|     |     | |11.688"
+    b"|0.122|11.171|0.121|999|T|       ",
+    b"0002 01127 2|H|004.36837051|+00.31948829|  -32.1|   -9.1| 13.6|  8.3|  8.2|  5.0|H|      "
+    b"|     |10.279|0.041| 75| |  1397B",
+]
+PSC = (
+    rb"1.119851|-89.91861|0.11|0.06|90|00042876-8955069 |12.467|0.018|0.021|359.4|12.131|0.025|"
+    rb"0.026|224.7|11.963|0.023|0.025|133.7|AAA|222|111|000|666666|37.2|245|1329023254|0|0|"
+    rb"1101364107|s|2000-09-22|64|302.951|-27.208|1.6|2451809.7124|1.07|1.18|0.81|12.481|0.014|"
+    rb"12.112|0.028|11.98|0.012|332|251|sw|1|1|0|\N|\N|\N|\N|0|\N|59038|1357874|267"
+)
+SAO = (
+    b"   106 003554.451-0.0577                 +821305.64 0.078                   99.9 6.4F6V  "
+    b"     01                       34400     0.15667611 1.43497888003947.119-0.0598+822937.80 "
+    b"0.0780.17359618 1.43978899"
+)
+
+FILES = {
+    "sao": "sao.dat",
+    "hipparcos": "hip_main.dat",
+    "tycho1": "tyc_main.dat",
+    "tycho2": "tyc2.dat",
+    "2mass": "psc_aaa",
+}
+
+
+@cache
+def _ingest_excerpt(source: str, path: Path) -> Ingested:
+    return ingest(source, [path])
+
+
+@pytest.fixture
+def excerpt(catalogs: Path) -> Callable[[str, str], Ingested]:
+    """Ingest a file of the excerpts, once."""
+    return lambda source, name: _ingest_excerpt(source, catalogs / name)
+
+
+@pytest.fixture
+def read(tmp_path: Path) -> Callable[..., Ingested]:
+    """Ingest literal records."""
+
+    def run(source: str, *lines: bytes, name: str | None = None, **options: Any) -> Ingested:
+        path = tmp_path / (name or FILES[source])
+        path.write_bytes(b"\n".join(lines) + b"\n")
+        return ingest(source, [path], **options)
+
+    return run
+
+
+@pytest.fixture
+def row(read: Callable[..., Ingested]) -> Callable[..., dict[str, Any]]:
+    """The star that a record gives."""
+
+    def run(source: str, line: bytes, **options: Any) -> dict[str, Any]:
+        (star,) = read(source, line, **options).stars.to_pylist()
+        return star
+
+    return run
+
+
+def with_fields(source: str, line: bytes, **texts: str) -> bytes:
+    """A fixed-width record with some of its fields replaced."""
+    layout = next(file for file in data_source(source).files if file.record_bytes == len(line))
+    edited = bytearray(line)
+    for name, text in texts.items():
+        first, last = layout.column(name).bytes or (0, 0)
+        assert len(text) == last - first + 1, (name, text)
+        edited[first - 1 : last] = text.encode()
+    return bytes(edited)
+
+
+def psc(**texts: str) -> bytes:
+    """The record of 2MASS with some of its fields replaced."""
+    fields = PSC.split(b"|")
+    names = [column.name for column in data_source("2mass").files[0].columns]
+    for name, text in texts.items():
+        fields[names.index(name)] = text.encode()
+    return b"|".join(fields)
+
+
+def parts_of(star: dict[str, Any], expected: dict[str, Any]) -> dict[str, Any]:
+    return {name: star[name] for name in expected}
+
+
+# Whole excerpts
+
+
+@pytest.mark.parametrize(
+    ("source", "name", "kept", "rejected"),
+    [
+        ("sao", "sao.dat.gz", 15_935, {}),
+        ("hipparcos", "hip_main.dat.gz", 9_928, {"no_position": 5}),
+        ("tycho1", "tyc_main.dat.gz", 45_978, {}),
+        ("tycho2", "tyc2.dat.gz", 44_626, {}),
+        ("2mass", "psc_measured.gz", 3_122, {}),
+        ("2mass", "psc_estimated.gz", 48_717, {}),
+    ],
+)
+def test_every_record_is_kept_or_rejected(
+    catalogs: Path,
+    excerpt: Callable[[str, str], Ingested],
+    source: str,
+    name: str,
+    kept: int,
+    rejected: dict[str, int],
+) -> None:
+    read = excerpt(source, name)
+    with gzip.open(catalogs / name) as file:
+        assert read.rows_read == sum(1 for _ in file)
+    assert len(read.stars) == kept
+    assert read.rejected_by_reason == rejected
+    assert read.rows_read == kept + sum(rejected.values()) == kept + len(read.rejected)
+    assert read.problems == ()
+    assert [file.name for file in read.files] == [name]
+    product_schema("stars").check(read.stars)
+    product_schema("rejected").check(read.rejected)
+    assert (np.diff(read.stars["star_id"].to_numpy()) > 0).all()
+    length = np.linalg.norm(directions_of(read.stars), axis=1)
+    np.testing.assert_allclose(length, 1.0, atol=4e-16)
+
+
+def test_the_embedded_sky_of_gaia() -> None:
+    read = ingest("gaia", [embedded_sky()], neighbours=False)
+    assert len(read.stars) == read.rows_read == 482_176
+    assert read.rejected_by_reason == {}
+    assert read.files[0].sha256 == data_source("gaia").files[0].sha256
+    number, flags = (read.stars[name].to_numpy() for name in ("star_id", "quality_flags"))
+    from_hipparcos = number < 0
+    assert from_hipparcos.sum() == 70
+    np.testing.assert_array_equal((flags & Quality.NO_PROPER_MOTION) > 0, from_hipparcos)
+    hip = np.nan_to_num(floats_of(read.stars, "hip_number"))
+    np.testing.assert_array_equal(hip, np.where(from_hipparcos, -number, 0))
+    row = int(np.flatnonzero(number == -32349)[0])
+    assert read.stars["designation"][row].as_py() == "HIP 32349"
+    assert read.stars["designation"][len(number) - 1].as_py() == f"Gaia DR3 {number[-1]}"
+    assert set(read.stars["epoch_jyear"].to_pylist()) == {2016.0}
+
+
+def test_number_of_naked_eye_stars_of_sao(excerpt: Callable[[str, str], Ingested]) -> None:
+    mag = floats_of(excerpt("sao", "sao.dat.gz").stars, "mag")
+    assert (mag <= 6.0).sum() == 5_103
+    assert (mag <= 6.9).sum() == 14_195
+
+
+def test_the_digests_are_those_of_the_files(
+    catalogs: Path, excerpt: Callable[[str, str], Ingested]
+) -> None:
+    (fact,) = excerpt("sao", "sao.dat.gz").files
+    content = (catalogs / "sao.dat.gz").read_bytes()
+    assert (fact.sha256, fact.bytes) == (hashlib.sha256(content).hexdigest(), len(content))
+    assert fact.rows == 15_935
+
+
+def test_sao_positions_are_those_of_the_fk5(
+    catalogs: Path, excerpt: Callable[[str, str], Ingested]
+) -> None:
+    text = (catalogs / "fk5_sao_cross_index.txt").read_text(encoding="ascii")
+    assert "  1   0  8 23.265 +01.039 +29  5 25.58 -016.33" in text  # Alpheratz, SAO 73765
+    fk5 = {
+        int(line[79:85]): (
+            15.0 * (int(line[4:8]) + int(line[8:11]) / 60 + float(line[11:18]) / 3600),
+            (-1 if line[27] == "-" else 1)
+            * (int(line[28:30]) + int(line[30:33]) / 60 + float(line[33:39]) / 3600),
+        )
+        for line in text.splitlines()
+        if line[79:85].strip()
+    }
+    assert fk5[73765] == pytest.approx((2.0969375, 29.0904389), abs=1e-7)
+    stars = excerpt("sao", "sao.dat.gz").stars
+    number = stars["star_id"].to_numpy()
+    common = np.isin(number, list(fk5))
+    positions = np.array([fk5[n] for n in number[common]])
+    found = directions_of(stars)[common]
+    apart = separation(found, directions_from_radec(positions[:, 0], positions[:, 1]))
+    assert common.sum() == 1_512
+    assert np.median(apart) < 0.2 * ARCSEC_RAD
+    assert (apart < 1.0 * ARCSEC_RAD).mean() >= 0.98
+
+
+@pytest.mark.parametrize(
+    ("source", "name"),
+    [
+        ("sao", "sao.dat.gz"),
+        ("hipparcos", "hip_main.dat.gz"),
+        ("tycho2", "tyc2.dat.gz"),
+        ("2mass", "psc_measured.gz"),
+    ],
+)
+def test_epoch_moves_every_star_by_its_own_years(
+    catalogs: Path, excerpt: Callable[[str, str], Ingested], source: str, name: str
+) -> None:
+    own = excerpt(source, name).stars
+    moved = ingest(source, [catalogs / name], epoch_jyear=2026.5).stars
+    start = Motion(
+        *(
+            floats_of(own, column)
+            for column in ("ra_deg", "dec_deg", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")
+        )
+    )
+    end = propagate(start, 2026.5 - floats_of(own, "epoch_jyear"))
+    assert moved["star_id"].equals(own["star_id"])
+    for column, values in vars(end).items():
+        np.testing.assert_allclose(floats_of(moved, column), values, rtol=0, atol=1e-11)
+    expected = directions_from_radec(end.ra_deg, end.dec_deg)
+    # Half a unit in the last place of 360 degrees is 5e-16 rad.
+    np.testing.assert_allclose(directions_of(moved), expected, rtol=0, atol=2e-15)
+    has_motion = ~np.isnan(start.pm_dec_mas_yr)
+    epoch = np.where(has_motion, 2026.5, floats_of(own, "epoch_jyear"))
+    np.testing.assert_array_equal(floats_of(moved, "epoch_jyear"), epoch)
+    no_motion = (moved["quality_flags"].to_numpy() & Quality.NO_PROPER_MOTION) > 0
+    np.testing.assert_array_equal(no_motion, ~has_motion)
+
+
+def test_a_blank_position_of_hipparcos_is_the_reason(
+    excerpt: Callable[[str, str], Ingested],
+) -> None:
+    rejected = excerpt("hipparcos", "hip_main.dat.gz").rejected
+    assert rejected["reason"].to_pylist() == ["no_position"] * 5
+    assert rejected["ra_deg"].null_count == 5
+    assert rejected["mag"].null_count == 1
+
+
+# Tycho-1
+
+
+def test_the_literal_records_are_the_samples(catalogs: Path) -> None:
+    samples = catalogs / "samples"
+    for name, lines in (
+        ("tycho1_I239_records.txt", TYC_MAIN),
+        ("tycho2_I259_records.txt", TYC2),
+        ("tycho2_I259_suppl_records.txt", SUPPL_1),
+        ("twomass_psc_record.txt", [PSC]),
+    ):
+        assert (samples / name).read_bytes().splitlines()[: len(lines)] == lines
+    with gzip.open(catalogs / "sao.dat.gz") as file:
+        assert file.readline().rstrip(b"\n") == SAO
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        (
+            TYC_MAIN[0],
+            {
+                "star_id": 1_000_131,
+                "catalog": "tycho1",
+                "designation": "TYC 1-13-1",
+                "ra_deg": 1.12551719,
+                "dec_deg": 2.26739188,
+                "epoch_jyear": 1991.25,
+                "pm_ra_cosdec_mas_yr": 28.7,
+                "pm_dec_mas_yr": -10.5,
+                "mag": 8.50,
+                "band": "V",
+                "second_mag": 8.682,
+                "second_band": "VT",
+                "colour_mag": 1.560,
+                "colour_bands": "B-V",
+                "double_flag": "T49=Y",
+                "is_flagged_double": False,
+                "variable_flag": None,
+                "is_flagged_variable": False,
+                "amplitude_mag": None,
+                "amplitude_source": None,
+                "hip_number": None,
+                "hd_number": 225210,
+                "quality_flags": 0,
+            },
+        ),
+        (
+            TYC_MAIN[1],
+            {
+                "star_id": 1_000_171,
+                "ra_deg": 0.05081860,
+                "pm_ra_cosdec_mas_yr": -66.2,
+                "pm_dec_mas_yr": -1.2,
+                "mag": 9.80,
+                "double_flag": "T49=S",
+                "is_flagged_double": True,
+                "hd_number": 224725,
+                "quality_flags": Quality.DUBIOUS_POSITION,
+            },
+        ),
+    ],
+)
+def test_genuine_records_of_tycho1(
+    row: Callable[..., dict[str, Any]], line: bytes, expected: dict[str, Any]
+) -> None:
+    assert parts_of(row("tycho1", line), expected) == expected
+
+
+@pytest.mark.parametrize(
+    ("fields", "expected"),
+    [
+        ({"mult_flag": "D"}, {"double_flag": "T49=D", "is_flagged_double": True}),
+        ({"mult_flag": "R"}, {"double_flag": "T49=R", "is_flagged_double": True}),
+        ({"mult_flag": "Z"}, {"double_flag": "T49=Z", "is_flagged_double": False}),
+        ({"q": "6"}, {"double_flag": "T49=Y;T40=6", "is_flagged_double": True}),
+        ({"proxy": "T"}, {"double_flag": "T49=Y;Proxy=T", "is_flagged_double": False}),
+        ({"q": "7"}, {"quality_flags": Quality.POOR_PHOTOMETRY}),
+        ({"q": "8"}, {"quality_flags": Quality.PERHAPS_NOT_A_STAR}),
+        ({"q": "9"}, {"quality_flags": Quality.POOR_PHOTOMETRY}),
+        ({"var": "G"}, {"variable_flag": "T47=G", "amplitude_mag": None}),
+        (
+            {"var_flag": "V"},
+            {
+                "variable_flag": "T48=V",
+                "is_flagged_variable": True,
+                "amplitude_mag": pytest.approx(0.22),
+                "amplitude_source": "tycho1",
+            },
+        ),
+        ({"hip": "   416"}, {"hip_number": 416}),
+        (
+            {"pm_ra": "        ", "pm_de": "        "},
+            {"pm_ra_cosdec_mas_yr": None, "quality_flags": Quality.NO_PROPER_MOTION},
+        ),
+    ],
+)
+def test_flags_of_tycho1(
+    row: Callable[..., dict[str, Any]], fields: dict[str, Any], expected: dict[str, Any]
+) -> None:
+    star = row("tycho1", with_fields("tycho1", TYC_MAIN[0], **fields))
+    assert parts_of(star, expected) == expected
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({"r_bt_mag": "T"}, "uncertain_magnitude"),
+        ({"remark": "M"}, "uncertain_magnitude"),
+        ({"ra_deg": " " * 12}, "no_position"),
+        ({"ra_deg": " " * 12, "remark": "M"}, "no_position"),
+        ({"tyc2": "     "}, "malformed_record"),
+    ],
+)
+def test_records_of_tycho1_that_are_no_stars(
+    read: Callable[..., Ingested], fields: dict[str, Any], reason: str
+) -> None:
+    found = read("tycho1", TYC_MAIN[1], with_fields("tycho1", TYC_MAIN[0], **fields))
+    assert len(found.stars) == 1
+    assert found.rejected_by_reason == {reason: 1}
+
+
+@pytest.mark.parametrize(("band", "mag", "second"), [("BT", 10.555, 8.682), ("VT", 8.682, 10.555)])
+def test_bands_of_tycho1(
+    row: Callable[..., dict[str, Any]], band: str | None, mag: float | None, second: float | None
+) -> None:
+    star = row("tycho1", TYC_MAIN[0], band=band)
+    assert (star["mag"], star["band"], star["second_mag"]) == (mag, band, second)
+
+
+# Tycho-2
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        (
+            TYC2[0],
+            {
+                "star_id": 1_000_081,
+                "designation": "TYC 1-8-1",
+                "ra_deg": 2.31750494,
+                "dec_deg": 2.23184345,
+                "epoch_jyear": 2000.0,
+                "pm_ra_cosdec_mas_yr": -16.3,
+                "pm_dec_mas_yr": -9.0,
+                "mag": 12.146,
+                "band": "V",
+                "second_mag": 12.146,
+                "second_band": "BT",
+                "colour_mag": 0.0,
+                "double_flag": None,
+                "is_flagged_double": False,
+                "companion_separation_arcsec": None,
+                "hip_number": None,
+                "quality_flags": 0,
+            },
+        ),
+        (
+            TYC2[1],
+            {
+                "star_id": 1_000_131,
+                "ra_deg": 1.12558209,
+                "dec_deg": 2.26739400,
+                # BT - VT is 1.818: the formula is held at 1.8, 8.670 - 0.09 * 1.8.
+                "mag": pytest.approx(8.508, abs=1e-12),
+                "colour_mag": pytest.approx(1.818, abs=1e-12),
+                "quality_flags": Quality.COLOUR_OUT_OF_RANGE,
+            },
+        ),
+        (
+            TYC2[2],
+            {
+                "star_id": 1_000_331,
+                "designation": "TYC 1-33-1",
+                "ra_deg": 1.58432611,
+                "dec_deg": 0.94286667,
+                "epoch_jyear": pytest.approx(1991.635, abs=1e-9),
+                "pm_ra_cosdec_mas_yr": None,
+                "pm_dec_mas_yr": None,
+                "mag": 12.512,
+                "colour_mag": None,
+                "companion_separation_arcsec": 0.5,
+                "double_flag": None,
+                "quality_flags": Quality.ESTIMATED_MAGNITUDE | Quality.NO_PROPER_MOTION,
+            },
+        ),
+    ],
+)
+def test_genuine_records_of_tycho2(
+    row: Callable[..., dict[str, Any]], line: bytes, expected: dict[str, Any]
+) -> None:
+    assert parts_of(row("tycho2", line), expected) == expected
+
+
+def test_a_star_without_mean_position_stays_at_its_own_epoch(
+    row: Callable[..., dict[str, Any]],
+) -> None:
+    star = row("tycho2", TYC2[2], epoch_jyear=2030.0)
+    assert (star["ra_deg"], star["dec_deg"]) == (1.58432611, 0.94286667)
+    assert star["epoch_jyear"] == pytest.approx(1991.635, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        (
+            SUPPL_1[0],
+            {
+                "star_id": 2_005_801,
+                "designation": "TYC 2-580-1",
+                "ra_deg": 3.03708871,
+                "dec_deg": 1.57351477,
+                "epoch_jyear": 1991.25,
+                "pm_ra_cosdec_mas_yr": None,
+                "mag": pytest.approx(11.171 - 0.09 * (11.688 - 11.171), abs=1e-12),
+                "second_mag": 11.688,
+                "hip_number": None,
+                "quality_flags": Quality.NO_PROPER_MOTION,
+            },
+        ),
+        (
+            SUPPL_1[1],
+            {
+                "star_id": 2_011_272,
+                "designation": "TYC 2-1127-2",
+                "ra_deg": 4.36837051,
+                "dec_deg": 0.31948829,
+                "epoch_jyear": 1991.25,
+                "pm_ra_cosdec_mas_yr": -32.1,
+                "pm_dec_mas_yr": -9.1,
+                "mag": 10.279,  # Hp
+                "second_mag": None,
+                "double_flag": "CCDM=B",
+                "is_flagged_double": True,
+                "companion_separation_arcsec": 7.5,
+                "hip_number": 1397,
+                "quality_flags": Quality.ESTIMATED_MAGNITUDE,
+            },
+        ),
+    ],
+)
+def test_genuine_records_of_the_supplement(
+    row: Callable[..., dict[str, Any]], line: bytes, expected: dict[str, Any]
+) -> None:
+    assert parts_of(row("tycho2", line, name="suppl_1.dat"), expected) == expected
+
+
+@pytest.mark.parametrize(("band", "mag"), [("VT", None), ("BT", None), ("V", 10.279)])
+def test_hp_is_neither_bt_nor_vt(
+    row: Callable[..., dict[str, Any]], band: str | None, mag: float | None
+) -> None:
+    star = row("tycho2", SUPPL_1[1], name="suppl_1.dat", band=band)
+    assert (star["mag"], star["band"]) == (mag, band)
+
+
+@pytest.mark.parametrize("is_supplement_first", [False, True])
+def test_tycho2_and_its_supplement_are_one_table(tmp_path: Path, is_supplement_first: bool) -> None:
+    (tmp_path / "tyc2.dat").write_bytes(b"\n".join(TYC2) + b"\n")
+    (tmp_path / "suppl_1.dat").write_bytes(b"\n".join(SUPPL_1) + b"\n")
+    paths = [tmp_path / "tyc2.dat", tmp_path / "suppl_1.dat"]
+    read = ingest("tycho2", paths[::-1] if is_supplement_first else [tmp_path], epoch_jyear=2010.0)
+    stars = read.stars
+    assert stars["star_id"].to_pylist() == [1_000_081, 1_000_131, 1_000_331, 2_005_801, 2_011_272]
+    assert [file.rows for file in read.files] == ([2, 3] if is_supplement_first else [3, 2])
+    expected = [2010.0, 2010.0, pytest.approx(1991.635), 1991.25, 2010.0]
+    assert stars["epoch_jyear"].to_pylist() == expected
+    # 18.75 years from J1991.25 for the supplement, 10 from J2000 for tyc2.
+    dec = stars["dec_deg"].to_pylist()
+    assert dec[4] == pytest.approx(0.31948829 - 18.75 * 9.1 * MAS, abs=1e-9)
+    assert dec[0] == pytest.approx(2.23184345 - 10.0 * 9.0 * MAS, abs=1e-9)
+    ra = stars["ra_deg"].to_pylist()
+    moved = 18.75 * 32.1 * MAS / np.cos(np.radians(0.31948829))
+    assert ra[4] == pytest.approx(4.36837051 - moved, abs=1e-9)
+
+
+def test_a_star_in_both_files_is_read_once(tmp_path: Path) -> None:
+    again = with_fields("tycho2", SUPPL_1[0], tyc1="0001", tyc2="00008")
+    (tmp_path / "tyc2.dat").write_bytes(TYC2[0] + b"\n")
+    (tmp_path / "suppl_1.dat").write_bytes(again + b"\n")
+    read = ingest("tycho2", [tmp_path])
+    assert read.stars["mag"].to_pylist() == [12.146]
+    assert read.rejected_by_reason == {"duplicate_record": 1}
+    assert read.rejected["source_file"].to_pylist() == [1]
+
+
+@pytest.mark.parametrize(
+    ("fields", "expected"),
+    [
+        (
+            {"pflag": "P"},
+            {
+                "double_flag": "pflag=P",
+                "is_flagged_double": True,
+                "quality_flags": Quality.PHOTOCENTRE,
+            },
+        ),
+        ({"posflg": "D"}, {"double_flag": "posflg=D", "quality_flags": 0}),
+        ({"posflg": "P"}, {"double_flag": "posflg=P", "quality_flags": Quality.PHOTOCENTRE}),
+        ({"hip": "  1397", "ccdm": "AB "}, {"hip_number": 1397, "double_flag": "CCDM=AB"}),
+        ({"prox": "998"}, {"companion_separation_arcsec": pytest.approx(99.8)}),
+        ({"vt_mag": "      "}, {"mag": 12.146, "quality_flags": Quality.ESTIMATED_MAGNITUDE}),
+        ({"bt_mag": "      "}, {"mag": 12.146, "quality_flags": Quality.ESTIMATED_MAGNITUDE}),
+        ({"bt_mag": "      ", "vt_mag": "      "}, {"mag": None, "quality_flags": 0}),
+        ({"bt_mag": "13.146"}, {"mag": pytest.approx(12.056), "quality_flags": 0}),
+    ],
+)
+def test_flags_of_tycho2(
+    row: Callable[..., dict[str, Any]], fields: dict[str, Any], expected: dict[str, Any]
+) -> None:
+    star = row("tycho2", with_fields("tycho2", TYC2[0], **fields))
+    assert parts_of(star, expected) == expected
+
+
+def test_a_record_of_tycho2_without_any_position(read: Callable[..., Ingested]) -> None:
+    nowhere = with_fields("tycho2", TYC2[2], ra_deg=" " * 12, de_deg=" " * 12)
+    found = read("tycho2", TYC2[0], nowhere)
+    assert found.rejected_by_reason == {"no_position": 1}
+    assert found.rejected["designation"].to_pylist() == ["TYC 1-33-1"]
+
+
+# Hipparcos
+
+
+@pytest.fixture(scope="module")
+def hipparcos_line(catalogs: Path) -> bytes:
+    with gzip.open(catalogs / "hip_main.dat.gz") as file:
+        return file.readline().rstrip(b"\r\n")
+
+
+@pytest.mark.parametrize(
+    ("fields", "expected"),
+    [
+        ({"var_flag": " ", "hp_max": " 5.00", "hp_min": " 5.03"}, {"amplitude_mag": 0.03}),
+        ({"var_flag": "1", "hp_max": " 5.00", "hp_min": " 5.03"}, {"amplitude_mag": 0.03}),
+        ({"var_flag": "2", "hp_max": " 5.00", "hp_min": " 5.03"}, {"amplitude_mag": 0.06}),
+        ({"var_flag": "2", "hp_max": " 5.00", "hp_min": " 5.40"}, {"amplitude_mag": 0.40}),
+        ({"var_flag": "3", "hp_max": " 5.00", "hp_min": " 5.40"}, {"amplitude_mag": 0.61}),
+        ({"var_flag": "3", "hp_max": " 5.00", "hp_min": " 9.40"}, {"amplitude_mag": 4.40}),
+        ({"var_flag": "3", "hp_max": "     ", "hp_min": "     "}, {"amplitude_mag": 0.61}),
+        ({"var_flag": " ", "hp_max": "     ", "hp_min": "     "}, {"amplitude_mag": None}),
+    ],
+)
+def test_amplitudes_of_hipparcos(
+    row: Callable[..., dict[str, Any]],
+    hipparcos_line: bytes,
+    fields: dict[str, Any],
+    expected: dict[str, Any],
+) -> None:
+    star = row("hipparcos", with_fields("hipparcos", hipparcos_line, **fields))
+    known = expected["amplitude_mag"]
+    assert star["amplitude_mag"] == (None if known is None else pytest.approx(known))
+    assert star["amplitude_source"] == (None if known is None else "hipparcos")
+    assert star["is_flagged_variable"] is (fields["var_flag"] in "23")
+
+
+@pytest.mark.parametrize(
+    ("fields", "flag", "is_double"),
+    [
+        ({}, None, False),
+        ({"mult_flag": "C"}, "H59=C", True),
+        ({"mult_flag": "X", "ccdm": "00003-4417"}, "CCDM=00003-4417;H59=X", True),
+        ({"n_comp": " 2"}, None, True),
+        ({"n_comp": " 1", "ccdm": "00003-4417"}, "CCDM=00003-4417", False),
+        ({"proxy": "H"}, "Proxy=H", False),
+    ],
+)
+def test_duplicity_of_hipparcos(
+    row: Callable[..., dict[str, Any]],
+    hipparcos_line: bytes,
+    fields: dict[str, Any],
+    flag: str | None,
+    is_double: bool,
+) -> None:
+    blank = {"mult_flag": " ", "ccdm": " " * 10, "n_comp": "  ", "proxy": " "}
+    star = row("hipparcos", with_fields("hipparcos", hipparcos_line, **{**blank, **fields}))
+    assert (star["double_flag"], star["is_flagged_double"]) == (flag, is_double)
+
+
+@pytest.mark.parametrize(
+    ("hvar", "is_variable"), [("P", True), ("U", True), ("C", False), ("M", False)]
+)
+def test_types_of_variability_of_hipparcos(
+    row: Callable[..., dict[str, Any]], hipparcos_line: bytes, hvar: str, is_variable: bool
+) -> None:
+    line = with_fields("hipparcos", hipparcos_line, hvar_type=hvar, var_flag=" ")
+    star = row("hipparcos", line)
+    assert star["is_flagged_variable"] is is_variable
+    assert star["variable_flag"] == (f"H52={hvar}" if is_variable else None)
+
+
+def test_columns_of_hipparcos(row: Callable[..., dict[str, Any]], hipparcos_line: bytes) -> None:
+    line = with_fields(
+        "hipparcos",
+        hipparcos_line,
+        hip=" 12345",
+        ra_deg="359.99999999",
+        de_deg="-00.00000001",
+        pm_ra="-1234.56",
+        pm_de="    0.01",
+        v_mag="-1.44",
+        hp_mag="-1.0876",
+        b_v="-0.123",
+        rho="  0.250",
+        dhp=" 1.75",
+        hd=" 48915",
+    )
+    expected = {
+        "star_id": 12345,
+        "designation": "HIP 12345",
+        "ra_deg": 359.99999999,
+        "dec_deg": -0.00000001,
+        "epoch_jyear": 1991.25,
+        "pm_ra_cosdec_mas_yr": -1234.56,
+        "pm_dec_mas_yr": 0.01,
+        "mag": -1.44,
+        "band": "V",
+        "second_mag": -1.0876,
+        "second_band": "Hp",
+        "colour_mag": -0.123,
+        "companion_separation_arcsec": 0.25,
+        "companion_delta_mag": 1.75,
+        "hip_number": 12345,
+        "hd_number": 48915,
+    }
+    assert parts_of(row("hipparcos", line), expected) == expected
+    star = row("hipparcos", line, band="Hp")
+    assert (star["mag"], star["second_mag"], star["second_band"]) == (-1.0876, -1.44, "V")
+
+
+# 2MASS
+
+
+def test_the_genuine_record_of_2mass(row: Callable[..., dict[str, Any]]) -> None:
+    expected = {
+        "star_id": 1101364107,
+        "designation": "2MASS J00042876-8955069",
+        "ra_deg": 1.119851,
+        "dec_deg": -89.91861,
+        "epoch_jyear": pytest.approx(2000.0 + 264.7124 / 365.25, abs=1e-9),
+        "pm_ra_cosdec_mas_yr": None,
+        "pm_dec_mas_yr": None,
+        "mag": 11.963,
+        "band": "Ks",
+        "second_mag": 12.131,
+        "second_band": "H",
+        "colour_mag": pytest.approx(12.467 - 11.963),
+        "colour_bands": "J-Ks",
+        "double_flag": None,
+        "is_flagged_double": False,
+        "is_flagged_variable": False,
+        "quality_flags": Quality.NO_PROPER_MOTION,
+    }
+    assert parts_of(row("2mass", PSC), expected) == expected
+
+
+@pytest.mark.parametrize(
+    ("band", "mag", "second_band", "colour_bands"),
+    [
+        ("Ks", 11.963, "H", "J-Ks"),
+        ("J", 12.467, "Ks", "J-H"),
+        ("H", 12.131, "Ks", "J-H"),
+        ("(J+H)/2", 12.299, "Ks", "J-H"),
+        ("0.5*J+0.5*Ks", 12.215, "H", "J-Ks"),
+    ],
+)
+def test_bands_of_2mass(
+    row: Callable[..., dict[str, Any]],
+    band: str | None,
+    mag: float | None,
+    second_band: str,
+    colour_bands: str,
+) -> None:
+    star = row("2mass", PSC, band=band)
+    assert star["mag"] == pytest.approx(mag, abs=1e-12)
+    assert (star["band"], star["second_band"]) == (band, second_band)
+    assert star["colour_bands"] == colour_bands
+
+
+@pytest.mark.parametrize(
+    ("fields", "band", "expected"),
+    [
+        ({"ph_qual": "AAU"}, "Ks", {"mag": None}),
+        ({"ph_qual": "AAX"}, "Ks", {"mag": None}),
+        ({"ph_qual": "UUA"}, "Ks", {"mag": 11.963, "second_mag": None, "colour_mag": None}),
+        ({"ph_qual": "AUA"}, "(J+H)/2", {"mag": None}),
+        ({"rd_flg": "220"}, "Ks", {"mag": None}),
+        ({"rd_flg": "226"}, "Ks", {"mag": None}),
+        ({"rd_flg": "229"}, "Ks", {"mag": None}),
+        ({"k_m": r"\N"}, "Ks", {"mag": None}),
+        ({"rd_flg": "223"}, "Ks", {"mag": 11.963, "quality_flags": Quality.SATURATED}),
+        ({"rd_flg": "332"}, "Ks", {"quality_flags": 0}),
+        ({"rd_flg": "322"}, "(J+H)/2", {"quality_flags": Quality.SATURATED}),
+        ({"ph_qual": "AAD"}, "Ks", {"mag": 11.963, "quality_flags": Quality.POOR_PHOTOMETRY}),
+        ({"ph_qual": "AAE"}, "Ks", {"quality_flags": Quality.POOR_PHOTOMETRY}),
+        ({"ph_qual": "AAF"}, "Ks", {"quality_flags": Quality.POOR_PHOTOMETRY}),
+        ({"ph_qual": "EFC"}, "Ks", {"quality_flags": 0}),
+        ({"cc_flg": "00c"}, "Ks", {"quality_flags": Quality.CONTAMINATED}),
+        ({"cc_flg": "pd0"}, "Ks", {"quality_flags": 0}),
+        ({"cc_flg": "pd0"}, "J", {"quality_flags": Quality.CONTAMINATED}),
+        ({"gal_contam": "2"}, "Ks", {"quality_flags": Quality.CONTAMINATED}),
+        (
+            {"bl_flg": "112"},
+            "Ks",
+            {
+                "quality_flags": Quality.BLENDED,
+                "is_flagged_double": True,
+                "double_flag": "bl_flg=112",
+            },
+        ),
+        ({"bl_flg": "221"}, "Ks", {"quality_flags": 0, "is_flagged_double": False}),
+        ({"bl_flg": "221"}, "H", {"quality_flags": Quality.BLENDED, "is_flagged_double": True}),
+        ({"ph_qual": r"\N", "rd_flg": r"\N"}, "Ks", {"mag": 11.963, "quality_flags": 0}),
+        ({"jdate": "2451545.0"}, "Ks", {"epoch_jyear": 2000.0}),
+        ({"jdate": "2450814.5"}, "Ks", {"epoch_jyear": 1998.0}),
+    ],
+)
+def test_flags_of_2mass(
+    row: Callable[..., dict[str, Any]],
+    fields: dict[str, Any],
+    band: str | None,
+    expected: dict[str, Any],
+) -> None:
+    star = row("2mass", psc(**fields), band=band)
+    if "quality_flags" in expected:
+        expected = {
+            **expected,
+            "quality_flags": expected["quality_flags"] | Quality.NO_PROPER_MOTION,
+        }
+    assert parts_of(star, expected) == expected
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({"use_src": "0"}, "duplicate_record"),
+        ({"mp_flg": "1"}, "minor_planet"),
+        ({"gal_contam": "1"}, "extended"),
+        ({"cc_flg": "00P"}, "artifact"),
+        ({"pts_key": r"\N", "designation": "no name"}, "no_identity"),
+        ({"designation": r"\N"}, "malformed_record"),
+        ({"ra": r"\N"}, "malformed_record"),
+        ({"use_src": "0", "mp_flg": "1"}, "duplicate_record"),
+        ({"gal_contam": "1", "mp_flg": "1"}, "minor_planet"),
+    ],
+)
+def test_records_of_2mass_that_are_no_stars(
+    read: Callable[..., Ingested], fields: dict[str, Any], reason: str
+) -> None:
+    bad = psc(**{"pts_key": "7", **fields})
+    found = read("2mass", PSC, bad)
+    assert found.stars["star_id"].to_pylist() == [1101364107]
+    assert found.rejected_by_reason == {reason: 1}
+
+
+def test_an_artifact_in_another_band_does_not_matter(row: Callable[..., dict[str, Any]]) -> None:
+    assert row("2mass", psc(cc_flg="P00"))["mag"] == 11.963
+
+
+@pytest.mark.parametrize(
+    ("designation", "packed"),
+    [
+        ("00042876-8955069 ", 2_000_000_428_768_955_069),
+        ("00042876-8955069", 2_000_000_428_768_955_069),
+        ("00042876+8955069 ", 1_000_000_428_768_955_069),
+        ("00042876+8955069A", 1_001_000_428_768_955_069),
+        ("00042876+8955069B", 1_002_000_428_768_955_069),
+        ("23595999-0000000Z", 2_026_235_959_990_000_000),
+    ],
+)
+def test_designation_packed_into_a_number(
+    row: Callable[..., dict[str, Any]], designation: str, packed: int
+) -> None:
+    star = row("2mass", psc(pts_key=r"\N", designation=designation))
+    assert star["star_id"] == packed
+    assert star["designation"] == "2MASS J" + designation.strip()
+
+
+def test_a_part_without_component_letters_packs_as_one_with(read: Callable[..., Ingested]) -> None:
+    short = psc(pts_key=r"\N", designation="00042876+8955069")
+    both = read("2mass", short, psc(pts_key=r"\N", designation="00042876+8955069A"))
+    assert both.stars["star_id"].to_pylist() == [
+        1_000_000_428_768_955_069,
+        1_001_000_428_768_955_069,
+    ]
+
+
+# SAO
+
+
+def sao(**texts: str) -> bytes:
+    """The record of SAO 106 with some of its fields replaced."""
+    return with_fields("sao", SAO, **texts)
+
+
+def test_the_genuine_record_of_sao(row: Callable[..., dict[str, Any]]) -> None:
+    star = row("sao", SAO)
+    expected = {
+        "star_id": 106,
+        "designation": "SAO 106",
+        "epoch_jyear": 2000.0,
+        "mag": 6.4,
+        "band": "V",
+        "second_mag": None,  # 99.9
+        "second_band": "P",
+        "double_flag": None,
+        "is_flagged_double": False,
+        "variable_flag": None,
+        "is_flagged_variable": False,
+        "hd_number": 3440,
+        "quality_flags": 0,
+    }
+    assert parts_of(star, expected) == expected
+    # The rotation from FK5 to ICRS moves a star by 32 mas at most.
+    assert star["ra_deg"] == pytest.approx(15 * (0 + 39 / 60 + 47.119 / 3600), abs=3e-4)
+    assert star["dec_deg"] == pytest.approx(82 + 29 / 60 + 37.80 / 3600, abs=2e-5)
+    # Seconds of time a year: 15 arcsec each, on a circle that cos(dec) makes smaller.
+    cos_dec = np.cos(np.radians(82 + 29 / 60 + 37.80 / 3600))
+    assert star["pm_ra_cosdec_mas_yr"] == pytest.approx(-0.0598 * 15_000 * cos_dec, abs=1.0)
+    assert star["pm_dec_mas_yr"] == pytest.approx(78.0, abs=1.0)
+
+
+def test_fk5_to_icrs_is_that_of_sofa(catalogs: Path) -> None:
+    with gzip.open(catalogs / "sao.dat.gz") as file:
+        lines = [file.readline().rstrip(b"\n") for _ in range(500)]
+    places = [(184, 193), (194, 204), (161, 167), (178, 183)]
+    ra, dec, pm_ra, pm_dec = (
+        np.array([float(line[first - 1 : last].strip() or b"nan") for line in lines])
+        for first, last in places
+    )
+    known = ~np.isnan(pm_ra + pm_dec)
+    ra, dec, pm_ra, pm_dec = ra[known], dec[known], pm_ra[known], pm_dec[known]
+    made = icrs_from_fk5(
+        np.degrees(ra), np.degrees(dec), pm_ra * 15_000.0 * np.cos(dec), pm_dec * 1_000.0
+    )
+    # A parallax of 1 arcsec keeps SOFA's velocities small, where its relativity has no effect.
+    sofa = erfa.fk52h(ra, dec, pm_ra * 15 * ARCSEC_RAD, pm_dec * ARCSEC_RAD, 1.0, 0.0)
+    assert known.sum() > 300
+    np.testing.assert_allclose(made[0], np.degrees(sofa[0]) % 360.0, rtol=0, atol=1e-3 * MAS)
+    np.testing.assert_allclose(made[1], np.degrees(sofa[1]), rtol=0, atol=1e-3 * MAS)
+    in_mas = 1_000.0 / ARCSEC_RAD
+    np.testing.assert_allclose(made[2], sofa[2] * np.cos(sofa[1]) * in_mas, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(made[3], sofa[3] * in_mas, rtol=0, atol=1e-3)
+
+
+def test_a_deleted_record_of_sao(read: Callable[..., Ingested]) -> None:
+    found = read("sao", SAO, sao(sao="   107", del_flag="D"))
+    assert found.stars["star_id"].to_pylist() == [106]
+    assert found.rejected_by_reason == {"deleted": 1}
+    assert found.rejected["star_id"].to_pylist() == [107]
+
+
+@pytest.mark.parametrize(
+    ("fields", "band", "mag", "second"),
+    [
+        ({"v_mag": "99.9", "p_mag": " 9.1"}, "V", None, 9.1),
+        ({"v_mag": "    ", "p_mag": " 9.1"}, "V", None, 9.1),
+        ({"v_mag": "-1.6", "p_mag": "99.9"}, "V", -1.6, None),
+        ({"v_mag": " 6.4", "p_mag": " 7.2"}, "P", 7.2, 6.4),
+    ],
+)
+def test_magnitudes_of_sao(
+    row: Callable[..., dict[str, Any]],
+    fields: dict[str, Any],
+    band: str | None,
+    mag: float | None,
+    second: float | None,
+) -> None:
+    star = row("sao", sao(**fields), band=band)
+    assert (star["mag"], star["second_mag"], star["band"]) == (mag, second, band)
+
+
+NO_RADIANS = {"ra2000_rad": " " * 10, "de2000_rad": " " * 11}
+
+
+@pytest.mark.parametrize(
+    ("fields", "ra", "dec"),
+    [
+        ({}, 15 * (39 / 60 + 47.119 / 3600), 82 + 29 / 60 + 37.80 / 3600),
+        ({"de2000_sign": "-"}, 15 * (39 / 60 + 47.119 / 3600), -(82 + 29 / 60 + 37.80 / 3600)),
+        ({"de2000_sign": "-", "de2000_d": "00"}, 9.946329166666667, -(29 / 60 + 37.80 / 3600)),
+        ({"de2000_sign": "+", "de2000_d": "00"}, 9.946329166666667, 29 / 60 + 37.80 / 3600),
+        ({"ra2000_h": "23"}, 15 * (23 + 39 / 60 + 47.119 / 3600), 82 + 29 / 60 + 37.80 / 3600),
+    ],
+)
+def test_sexagesimal_position_where_the_radians_are_blank(
+    row: Callable[..., dict[str, Any]], fields: dict[str, Any], ra: float, dec: float
+) -> None:
+    star = row("sao", sao(**NO_RADIANS, **fields))
+    found = directions_from_radec(star["ra_deg"], star["dec_deg"])
+    # FK5 against ICRS: at most 32 mas.
+    assert separation(found, directions_from_radec(ra, dec)) < 0.032 * ARCSEC_RAD
+
+
+def test_the_radians_come_first(row: Callable[..., dict[str, Any]]) -> None:
+    star = row("sao", sao(ra2000_h="11", de2000_sign="-"))
+    assert star["ra_deg"] == pytest.approx(9.9463, abs=1e-3)
+    assert star["dec_deg"] == pytest.approx(82.4938, abs=1e-3)
+
+
+def test_a_record_of_sao_without_position(read: Callable[..., Ingested]) -> None:
+    nowhere = sao(sao="   107", **NO_RADIANS, ra2000_h="  ")
+    assert read("sao", SAO, nowhere).rejected_by_reason == {"no_position": 1}
+
+
+@pytest.mark.parametrize("number", PRINTED_PM_DEC_ARCSEC_YR)
+def test_proper_motions_that_only_the_printed_catalog_has(
+    row: Callable[..., dict[str, Any]], number: int
+) -> None:
+    printed = {208759: -180.0, 208795: -42.0, 212470: -72.0}[number]
+    star = row("sao", sao(sao=str(number), pm_de2000="      "))
+    assert star["pm_dec_mas_yr"] == pytest.approx(printed, abs=1.0)  # FK5 spin: below 1 mas/yr
+    assert star["quality_flags"] == 0
+    given = row("sao", sao(sao=str(number), pm_de2000=" 0.500"))
+    assert given["pm_dec_mas_yr"] == pytest.approx(500.0, abs=1.0)
+
+
+def test_a_blank_proper_motion_of_any_other_star(row: Callable[..., dict[str, Any]]) -> None:
+    star = row("sao", sao(pm_de2000="      "))
+    assert star["pm_dec_mas_yr"] is None
+    assert star["quality_flags"] == Quality.NO_PROPER_MOTION
+
+
+@pytest.mark.parametrize(
+    ("rem", "is_double", "is_variable"),
+    [
+        ("0", False, False),
+        ("1", True, False),
+        ("2", True, False),
+        ("3", True, False),
+        ("4", False, True),
+        ("5", False, True),
+        ("6", False, True),
+        ("7", True, True),
+        (" ", False, False),
+    ],
+)
+def test_remarks_of_sao(
+    row: Callable[..., dict[str, Any]], rem: str, is_double: bool, is_variable: bool
+) -> None:
+    star = row("sao", sao(rem=rem))
+    assert star["is_flagged_double"] is is_double
+    assert star["double_flag"] == (f"Rem={rem}" if is_double else None)
+    assert star["is_flagged_variable"] is is_variable
+    assert star["variable_flag"] == (f"Rem={rem}" if is_variable else None)
+
+
+@pytest.mark.parametrize(
+    ("fields", "double", "variable", "delta_mag"),
+    [
+        ({"m_hd": "1"}, "m_HD=1", None, 0.3),
+        ({"m_hd": "2"}, "m_HD=2", None, 0.3),
+        ({"m_hd": "9"}, "m_HD=9", None, None),
+        ({"sp_type": "+++"}, "Sp=+++", None, None),
+        ({"dm_component": " B"}, "DM=B", None, None),
+        ({"r_vmag": "16"}, "r_Vmag=16", None, None),
+        ({"r_vmag": "17"}, None, "r_Vmag=17", None),
+        ({"rem": "1", "m_hd": "2"}, "Rem=1;m_HD=2", None, 0.3),
+        ({"rem": "7", "r_vmag": "17"}, "Rem=7", "Rem=7;r_Vmag=17", None),
+    ],
+)
+def test_other_flags_of_sao(
+    row: Callable[..., dict[str, Any]],
+    fields: dict[str, Any],
+    double: str | None,
+    variable: str | None,
+    delta_mag: float | None,
+) -> None:
+    star = row("sao", sao(**{"rem": "0", **fields}))
+    assert (star["double_flag"], star["variable_flag"]) == (double, variable)
+    assert star["is_flagged_double"] is (double is not None)
+    assert star["is_flagged_variable"] is (variable is not None)
+    assert star["companion_delta_mag"] == delta_mag
+
+
+# All of them
+
+
+GENUINE = {"sao": SAO, "tycho1": TYC_MAIN[0], "tycho2": TYC2[0], "2mass": PSC}
+
+
+@pytest.mark.parametrize("source", GENUINE)
+def test_a_file_cut_off_in_its_last_line(read: Callable[..., Ingested], source: str) -> None:
+    found = read(source, GENUINE[source], GENUINE[source][:30])
+    assert len(found.stars) == 1
+    assert found.rejected_by_reason == {"malformed_record": 1}
+    assert found.rejected["source_line"].to_pylist() == [2]
+    assert found.problems[0].startswith(f"{FILES[source]} line 2, record: found ")
+    assert found.rejected["detail"].to_pylist() == [
+        found.problems[0].removeprefix(f"{FILES[source]} ")
+    ]
+
+
+@pytest.mark.parametrize("source", GENUINE)
+def test_a_block_without_a_good_record(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str
+) -> None:
+    monkeypatch.setattr("starcat.catalog.files.BLOCK_BYTES", 600)
+    path = tmp_path / FILES[source]
+    path.write_bytes((GENUINE[source] + b"\n") * 4 + b"bad\n" * 9)
+    read = ingest(source, [path])
+    assert read.rejected_by_reason == {"malformed_record": 9, "duplicate_record": 3}
+
+
+@pytest.mark.parametrize("source", FILES)
+@pytest.mark.parametrize("content", [b"hello\n", b"<html>\n<body>\n", b"\x00\xff\n"])
+def test_another_file_is_not_taken_for_the_catalog(
+    read: Callable[..., Ingested], source: str, content: bytes
+) -> None:
+    with pytest.raises(ParseError, match="Is this the right archive") as caught:
+        read(source, content)
+    assert caught.value.line == 1
+    assert caught.value.source == source
+
+
+@pytest.mark.parametrize("source", FILES)
+def test_a_file_of_empty_lines_has_no_records(read: Callable[..., Ingested], source: str) -> None:
+    with pytest.raises(ParseError, match="no record in the file"):
+        read(source, b"", b"")
+
+
+@pytest.mark.parametrize(
+    ("bad", "rows", "is_refused"),
+    [(10, 100, False), (11, 100, True), (11, 1_100, False), (12, 1_100, True)],
+)
+def test_more_than_ten_malformed_records_and_one_percent(
+    read: Callable[..., Ingested], bad: int, rows: int, is_refused: bool
+) -> None:
+    lines = [sao(sao=f"{n:6d}") for n in range(1, rows + 1)]
+    for n in range(bad):
+        lines[7 + 8 * n] = lines[n][:-1]
+    if is_refused:
+        message = f"{bad} of {rows} records are malformed.*line 8"
+        with pytest.raises(ParseError, match=message) as caught:
+            read("sao", *lines)
+        assert caught.value.line == 8
+    else:
+        assert read("sao", *lines).rejected_by_reason == {"malformed_record": bad}
+
+
+def test_the_same_star_twice_in_a_file(read: Callable[..., Ingested]) -> None:
+    found = read("sao", sao(v_mag=" 5.0"), sao(v_mag=" 6.0"))
+    assert found.stars["mag"].to_pylist() == [5.0]
+    assert found.rejected_by_reason == {"duplicate_record": 1}
+    assert found.rejected["mag"].to_pylist() == [6.0]
+
+
+def test_rows_are_sorted_and_remember_their_line(read: Callable[..., Ingested]) -> None:
+    stars = read("sao", *(sao(sao=f"{n:6d}") for n in (30, 10, 20))).stars
+    assert stars["star_id"].to_pylist() == [10, 20, 30]
+    assert stars["source_line"].to_pylist() == [2, 3, 1]
+
+
+@pytest.mark.parametrize(
+    ("limit", "kept", "reasons"), [(6.4, [1, 3], {"too_faint": 1}), (6.3, [3], {"too_faint": 2})]
+)
+def test_read_limit_keeps_the_limit_itself_and_stars_without_magnitude(
+    read: Callable[..., Ingested], limit: float, kept: list[int], reasons: dict[str, int]
+) -> None:
+    mags = {1: " 6.4", 2: " 6.5", 3: "99.9"}
+    lines = [sao(sao=f"{n:6d}", v_mag=mag) for n, mag in mags.items()]
+    found = read("sao", *lines, read_limit_mag=limit)
+    assert found.stars["star_id"].to_pylist() == kept
+    assert found.rejected_by_reason == reasons
+
+
+def test_nearest_neighbours_are_those_of_all_that_was_read(read: Callable[..., Ingested]) -> None:
+    apart = {1: "37.80", 2: "47.80", 3: "07.80"}  # seconds of declination
+    mags = {1: " 5.0", 2: " 7.5", 3: "99.9"}
+    lines = [sao(sao=f"{n:6d}", de2000_s=apart[n], v_mag=mags[n], **NO_RADIANS) for n in (1, 2, 3)]
+    stars = read("sao", *lines).stars
+    assert stars["nearest_separation_arcsec"].to_pylist() == pytest.approx([10.0, 10.0, 30.0])
+    assert stars["nearest_delta_mag"].to_pylist() == [2.5, -2.5, None]
+    without = read("sao", *lines, neighbours=False).stars
+    assert without["nearest_separation_arcsec"].null_count == 3
+    assert read("sao", lines[0]).stars["nearest_separation_arcsec"].null_count == 1
+
+
+def test_blocks_do_not_matter(catalogs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = ingest("sao", [catalogs / "sao.dat.gz"], neighbours=False)
+    monkeypatch.setattr("starcat.catalog.files.BLOCK_BYTES", 200_001)
+    parts = ingest("sao", [catalogs / "sao.dat.gz"], neighbours=False)
+    for name in ("star_id", "source_line", "mag", "designation", "double_flag"):
+        assert parts.stars[name].equals(whole.stars[name]), name
+    found, expected = directions_of(parts.stars), directions_of(whole.stars)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=4e-16)
+
+
+def test_progress_ends_with_all_bytes(catalogs: Path) -> None:
+    calls: list[tuple[str, int, int | None]] = []
+    path = catalogs / "sao.dat.gz"
+    ingest("sao", [path], neighbours=False, progress=lambda *call: calls.append(call))
+    assert calls[-1] == ("read sao", path.stat().st_size, path.stat().st_size)
+
+
+@pytest.mark.parametrize(
+    ("source", "band", "message"),
+    [
+        ("sao", "B", "sao has no band 'B'; it has V, P"),
+        ("gaia", "V", "gaia has no band 'V'; it has G"),
+        ("2mass", "L", "unknown band 'L' of 2mass"),
+        ("2mass", "0.6*J+0.6*H", "weights"),
+        ("gcvs", None, "gcvs is not a star catalog"),
+        ("soa", None, "did you mean 'sao'"),
+    ],
+)
+def test_sources_and_bands_that_there_are_not(
+    tmp_path: Path, source: str, band: str | None, message: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        ingest(source, [tmp_path], band=band)
+    assert message in str(caught.value)
+
+
+def test_no_files() -> None:
+    with pytest.raises(SourceMissing, match="no input files"):
+        ingest("sao", [])

@@ -1,0 +1,356 @@
+"""The command line: help, exit codes, tables, JSON, and the way from archive to attitude."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+import typer
+
+import starcat as package
+from starcat.artifact.content import content_sha256
+from starcat.catalog.source import source_names
+from starcat.cli import app
+from starcat.schema import product_schema
+from starcat.spec import preset_names
+
+COMMANDS = tuple(sorted(typer.main.get_command(app).commands))  # type: ignore[attr-defined]
+
+Run = Callable[[list[Any]], Any]
+
+
+@pytest.fixture
+def stars(tmp_path: Path, sao_lines: list[bytes]) -> Path:
+    path = tmp_path / "sao.dat"
+    path.write_bytes(b"".join(sao_lines))
+    return path
+
+
+@pytest.fixture
+def frame(starcat: Run, small_artifact: Path, tmp_path: Path) -> Path:
+    path = tmp_path / "frame.csv"
+    made = starcat(["simulate", small_artifact, "-o", path, "--seed", "7"])
+    assert (made.code, made.out) == (0, "")
+    return path
+
+
+def fits(text: str) -> bool:
+    return all(len(line) <= 100 for line in text.splitlines())
+
+
+# Help ---------------------------------------------------------------------------------------
+
+
+def test_commands() -> None:
+    expected = "build coverage fetch identify ingest inspect presets selftest simulate sources"
+    assert set(COMMANDS) >= set(expected.split())
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_each_command_has_help_with_an_example(name: str, starcat: Run) -> None:
+    run = starcat([name, "--help"])
+    assert run.code == 0
+    assert re.search(rf"Example: starcat {name}\b", run.out)
+    assert run.err == ""
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_each_option_says_what_it_does(name: str) -> None:
+    command = typer.main.get_command(app).commands[name]  # type: ignore[attr-defined]
+    for parameter in command.params:
+        assert getattr(parameter, "help", None), f"{name} {parameter.name}"
+
+
+def test_help_lists_every_command(starcat: Run) -> None:
+    run = starcat(["--help"])
+    assert run.code == 0
+    assert all(re.search(rf"^  {name} ", run.out, re.MULTILINE) for name in COMMANDS)
+
+
+def test_no_command_shows_the_help(starcat: Run) -> None:
+    run = starcat([])
+    assert "Commands:" in run.out + run.err
+    assert run.code == 2
+
+
+def test_version(starcat: Run) -> None:
+    assert starcat(["--version"]).out == f"starcat {package.__version__}\n"
+
+
+@pytest.mark.parametrize(
+    "arguments", [["biuld"], ["build", "--ouput", "x"], ["inspect"], ["identify", "x"]]
+)
+def test_usage_errors_exit_with_2(arguments: list[str], starcat: Run) -> None:
+    run = starcat(arguments)
+    assert (run.code, run.out) == (2, "")
+    assert "Usage: starcat" in run.err
+
+
+def test_the_module_is_the_command() -> None:
+    run = subprocess.run(
+        [sys.executable, "-m", "starcat", "--version"], capture_output=True, text=True, check=True
+    )
+    assert run.stdout == f"starcat {package.__version__}\n"
+
+
+# Lists --------------------------------------------------------------------------------------
+
+
+def test_sources(starcat: Run) -> None:
+    run = starcat(["sources"])
+    assert run.code == 0
+    assert fits(run.out)
+    assert all(re.search(rf"^{name} ", run.out, re.MULTILINE) for name in source_names())
+    assert "not found" in run.out
+
+
+def test_sources_as_json(starcat: Run, stars: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STARCAT_CATALOGS", str(stars.parent))
+    found = {entry["name"]: entry for entry in json.loads(starcat(["sources", "--json"]).out)}
+    assert tuple(sorted(found)) == source_names()
+    for entry in found.values():
+        assert list(entry) == [
+            "name", "kind", "identifier", "rows", "bands", "epoch_jyear", "licence", "citation",
+            "found_at",
+        ]  # fmt: skip
+    assert found["sao"]["found_at"] == str(stars.parent)
+    assert found["hipparcos"]["found_at"] is None
+    assert found["sao"]["rows"] == 258_997
+
+
+def test_presets(starcat: Run) -> None:
+    run = starcat(["presets"])
+    assert run.code == 0
+    assert fits(run.out)
+    assert all(re.search(rf"^{name} ", run.out, re.MULTILINE) for name in preset_names())
+
+
+def test_presets_as_json(starcat: Run) -> None:
+    specs = json.loads(starcat(["presets", "--json"]).out)
+    assert [spec["name"] for spec in specs] == list(preset_names())
+    assert all(spec["selection"]["faint_limit_mag"] > 0 for spec in specs)
+
+
+# Ingest -------------------------------------------------------------------------------------
+
+
+def test_ingest_writes_a_star_table(starcat: Run, stars: Path, tmp_path: Path) -> None:
+    out = tmp_path / "made" / "out.parquet"
+    run = starcat(["ingest", "sao", "--input", stars, "-o", out, "--epoch", "2026"])
+    assert run.code == 0
+    assert run.err == f"wrote {out}\n"
+    assert re.search(r"^kept +600$", run.out, re.MULTILINE)
+    table, schema = pq.read_table(out), product_schema("stars")
+    schema.check(table)
+    assert set(table["epoch_jyear"].to_pylist()) == {2026.0}
+    assert table["star_id"].to_pylist() == list(range(1, 601))
+    assert table.schema.field("ra_deg").metadata[b"unit"] == b"deg"
+    assert sorted(path.name for path in out.parent.iterdir()) == ["out.parquet"]
+
+
+def test_ingest_writes_the_rejected_rows_beside_it(
+    starcat: Run, stars: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out.parquet"
+    stars.write_bytes(stars.read_bytes() + b"short\n")
+    run = starcat(["ingest", "sao", "--input", stars, "-o", out, "--read-limit-mag", "6.0"])
+    assert run.code == 0
+    assert "malformed: sao.dat line 601, record: found 5 bytes; expected 204 bytes" in run.err
+    assert run.err.endswith(f"wrote {out} and out.rejected.parquet\n")
+    rejected = pq.read_table(tmp_path / "out.rejected.parquet")
+    product_schema("rejected").check(rejected)
+    assert sorted(set(rejected["reason"].to_pylist())) == ["malformed_record", "too_faint"]
+    assert len(rejected) + len(pq.read_table(out)) == 601
+    assert fits(run.out)
+    # A second run without malformed records takes the old file of them away.
+    stars.write_bytes(stars.read_bytes().removesuffix(b"short\n"))
+    assert starcat(["ingest", "sao", "--input", stars, "-o", out]).code == 0
+    assert not (tmp_path / "out.rejected.parquet").exists()
+
+
+def test_ingest_as_json(starcat: Run, stars: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.parquet"
+    run = starcat(["ingest", "sao", "--input", stars, "-o", out, "--json", "--band", "V"])
+    facts = json.loads(run.out)
+    assert run.err == ""
+    assert facts["rows_read"] == facts["kept"] == facts["files"][0]["rows"] == 600
+    assert facts["files"][0]["name"] == "sao.dat"
+    assert (facts["source"], facts["band"], facts["rejected"]) == ("sao", "V", {})
+    assert (facts["stars"], facts["rejected_rows"], facts["problems"]) == (str(out), None, [])
+
+
+def test_ingest_of_several_files(starcat: Run, sao_lines: list[bytes], tmp_path: Path) -> None:
+    parts = [tmp_path / "a.dat", tmp_path / "b.dat"]
+    parts[0].write_bytes(b"".join(sao_lines[:300]))
+    parts[1].write_bytes(b"".join(sao_lines[300:]))
+    out = tmp_path / "out.parquet"
+    run = starcat(["ingest", "sao", "--input", parts[0], "--input", parts[1], "-o", out])
+    assert run.code == 0
+    table = pq.read_table(out)
+    assert len(table) == 600
+    assert sorted(set(table["source_file"].to_pylist())) == [0, 1]
+    assert table["source_line"][300].as_py() == 1
+
+
+def test_ingest_of_the_excerpt(starcat: Run, catalogs: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.parquet"
+    archive = catalogs / "sao.dat.gz"
+    run = starcat(["ingest", "sao", "--input", archive, "-o", out, "--epoch", "2026", "--json"])
+    assert json.loads(run.out)["rows_read"] == 15_935
+    product_schema("stars").check(pq.read_table(out))
+
+
+# Build, inspect, identify -------------------------------------------------------------------
+
+
+def test_build_prints_what_it_made(
+    starcat: Run, stars: Path, small_spec: str, tmp_path: Path
+) -> None:
+    spec = tmp_path / "spec.toml"
+    spec.write_text(small_spec)
+    arguments = ["build", spec, "--input", f"sao={stars}", "-o", tmp_path / "dist"]
+    run = starcat(arguments)
+    assert run.code == 0
+    assert run.err == f"written: {tmp_path / 'dist' / 'small-1.0.0'}\n"
+    assert fits(run.out)
+    for words in ("read", "kept", "rejected: too_faint", "fields below 4", "pairs-1.0.0", "clean"):
+        assert words in run.out
+    again = starcat([*arguments, "--json"])
+    made = json.loads(again.out)
+    assert again.err == ""
+    assert made["outcome"] == "unchanged"
+    assert list(made) == [
+        "artifact", "outcome", "filters", "coverage", "self_test", "warnings", "times_s",
+        "sources", "products", "files",
+    ]  # fmt: skip
+    assert made["artifact"] == str(tmp_path / "dist" / "small-1.0.0")
+    assert [step["step"] for step in made["filters"]] == ["magnitude", "doubles", "variables"]
+    assert made["self_test"][0]["identified_share"] == 1.0
+
+
+def test_inspect(starcat: Run, small_artifact: Path) -> None:
+    run = starcat(["inspect", small_artifact])
+    assert run.code == 0
+    assert fits(run.out)
+    for words in ("small-1.0.0", "ICRS, J2026", "512 x 512 px", "sao from sao.dat", "pairs-1.0.0"):
+        assert words in run.out
+
+
+def test_inspect_as_json_is_the_manifest(starcat: Run, small_artifact: Path) -> None:
+    manifest = json.loads(starcat(["inspect", small_artifact, "--json"]).out)
+    assert manifest == json.loads((small_artifact / "manifest.json").read_bytes())
+    table = pq.read_table(small_artifact / "stars.parquet")
+    digest = content_sha256(table, product_schema("stars"))
+    assert manifest["products"]["stars"]["content_sha256"] == digest
+
+
+def test_simulate_depends_on_the_seed(
+    starcat: Run, frame: Path, small_artifact: Path, tmp_path: Path
+) -> None:
+    assert frame.read_text().startswith("x_px,y_px\n")
+    texts = []
+    for seed in ("7", "8"):
+        path = tmp_path / f"{seed}.csv"
+        assert starcat(["simulate", small_artifact, "-o", path, "--seed", seed]).code == 0
+        texts.append(path.read_text())
+    assert texts[0] == frame.read_text() != texts[1]
+
+
+def test_a_simulated_frame_is_identified(starcat: Run, frame: Path, small_artifact: Path) -> None:
+    run = starcat(["identify", small_artifact, frame])
+    assert run.code == 0
+    assert fits(run.out)
+    assert re.search(r"status +identified", run.out)
+    assert re.search(r"SAO \d+ +\d\.\d\d$", run.out, re.MULTILINE)
+
+
+def test_identify_as_json(starcat: Run, frame: Path, small_artifact: Path) -> None:
+    answer = json.loads(starcat(["identify", small_artifact, frame, "--json"]).out)
+    assert list(answer) == [
+        "status", "n_matched", "boresight_ra_deg", "boresight_dec_deg", "roll_deg",
+        "q_body_from_icrs", "residual_arcsec", "false_match_probability", "stars",
+    ]  # fmt: skip
+    assert answer["status"] == "identified"
+    assert len(answer["stars"]) == len(frame.read_text().splitlines()) - 1
+    assert answer["n_matched"] == sum(star["star"] is not None for star in answer["stars"])
+    assert sum(part**2 for part in answer["q_body_from_icrs"]) == pytest.approx(1.0)
+
+
+def test_a_frame_of_no_stars_is_not_identified(
+    starcat: Run, small_artifact: Path, tmp_path: Path
+) -> None:
+    frame = tmp_path / "frame.csv"
+    places = ["10,10", "500,20", "30,480", "250,250", "400,333"]
+    frame.write_text("\n".join(["x_px,y_px", *places]) + "\n")
+    run = starcat(["identify", small_artifact, frame, "--json"])
+    answer = json.loads(run.out)
+    assert run.code == 0
+    assert answer["status"] != "identified"
+    assert "q_body_from_icrs" not in answer
+    assert [star["star"] for star in answer["stars"]] == [None] * 5
+
+
+def test_centroid_files_of_spreadsheets_are_read(
+    starcat: Run, frame: Path, small_artifact: Path
+) -> None:
+    before = starcat(["identify", small_artifact, frame, "--json"]).out
+    lines = frame.read_text().splitlines()
+    rows = [",".join(["flux", *lines[0].split(",")]), *(f"1,{line}" for line in lines[1:])]
+    frame.write_bytes(b"\xef\xbb\xbf" + "\r\n".join(rows).encode())
+    assert starcat(["identify", small_artifact, frame, "--json"]).out == before
+
+
+def test_selftest(starcat: Run, small_artifact: Path) -> None:
+    arguments = ["selftest", small_artifact, "--frames", "20", "--seed", "3"]
+    run = starcat(arguments)
+    assert run.code == 0
+    assert fits(run.out)
+    assert re.search(r"^clean +0\.5 +0% +0 +20 ", run.out, re.MULTILINE)
+    rates = json.loads(starcat([*arguments, "--json"]).out)
+    assert [rate["name"] for rate in rates] == ["clean", "hard"]
+    assert [rate["frames"] for rate in rates] == [20, 20]
+    assert all(rate["wrong"] == 0 for rate in rates)
+
+
+def test_progress_is_drawn_for_terminals_only(starcat: Run, small_artifact: Path) -> None:
+    run = starcat(["selftest", small_artifact, "--frames", "5"])
+    assert run.err == ""
+
+
+def test_progress_is_drawn_on_a_terminal(small_artifact: Path) -> None:
+    pty = pytest.importorskip("pty")
+    import os
+
+    leader, follower = pty.openpty()
+    arguments = [sys.executable, "-m", "starcat", "selftest", str(small_artifact), "--frames", "5"]
+    environment = {**os.environ, "TERM": "xterm"}
+    run = subprocess.run(
+        arguments, stdout=subprocess.PIPE, stderr=follower, check=True, env=environment
+    )
+    os.close(follower)
+    drawn = os.read(leader, 1 << 16).decode()
+    os.close(leader)
+    assert "self-test" in drawn
+    assert "self-test" not in run.stdout.decode()
+    assert "Simulated fields" in run.stdout.decode()
+
+
+def test_a_closed_pipe_is_no_traceback(small_artifact: Path) -> None:
+    run = subprocess.Popen(
+        [sys.executable, "-m", "starcat", "inspect", str(small_artifact), "--json"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    assert run.stdout is not None
+    run.stdout.close()
+    assert run.stderr is not None
+    assert b"Traceback" not in run.stderr.read()
+    run.stderr.close()
+    run.wait(timeout=20)

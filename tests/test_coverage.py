@@ -1,0 +1,327 @@
+"""Coverage: what the fields hold, how far apart they lie, and what a spec can ask of them."""
+
+from __future__ import annotations
+
+import json
+import logging
+import tomllib
+from collections.abc import Callable
+from math import comb
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial import SphericalVoronoi, cKDTree
+
+from starcat.artifact.reader import open_artifact
+from starcat.catalog.ingest import count_by_reason
+from starcat.catalog.selection import Selected, reject_dense, select_guide_stars
+from starcat.catalog.stars import directions_of, floats_of
+from starcat.errors import BuildError, ConfigError
+from starcat.guide_stars import check_fields
+from starcat.pipeline import Built, build
+from starcat.products.boresights import FieldStars, NominalField, tile_sphere
+from starcat.products.coverage import (
+    coverage_from_counts,
+    covering_radius,
+    field_coverage,
+    summarise_coverage,
+    tiling_gap,
+)
+from starcat.recipes import tile_guide_stars
+from starcat.spec import BuildSpec, preset, spec_from_dict
+from starcat.sphere import saff_kuijlaars, separation
+
+Array = NDArray[np.float64]
+Draw = Callable[[int, int], Array]
+
+
+# What a field holds -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("brightest", [1, 3, 6, 100])
+def test_counts_are_those_of_counting(brightest: int, random_directions: Draw) -> None:
+    stars = random_directions(400, 1)
+    mag = np.arange(400.0)
+    fields = tile_sphere(40, stars, mag, NominalField(30.0, 30.0), "circular")
+    made = field_coverage(fields, brightest)
+    for tile, boresight in enumerate(fields.boresights):
+        inside = int(np.sum(separation(stars, boresight) <= np.radians(15.0)))
+        assert made.stars[tile] == inside
+        assert made.pairs[tile] == comb(inside, 2)
+        assert made.triangles[tile] == comb(min(inside, brightest), 3)
+
+
+def test_an_empty_sky_has_a_coverage() -> None:
+    fields = tile_sphere(5, np.empty((0, 3)), np.empty(0), NominalField(10.0, 10.0))
+    made = field_coverage(fields, 6)
+    summary = summarise_coverage(made)
+    assert not made.stars.any()
+    assert not made.pairs.any()
+    assert not made.triangles.any()
+    assert (summary.fields, summary.stars.maximum, summary.histogram.tolist()) == (5, 0, [5])
+
+
+def test_a_summary_by_hand() -> None:
+    boresights = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
+    summary = summarise_coverage(coverage_from_counts(boresights, np.array([7, 2, 2, 5]), 6))
+    assert (summary.stars.minimum, summary.stars.median, summary.stars.maximum) == (2, 2, 7)
+    assert summary.stars.mean == 4.0
+    # The first of the two worst fields along the spiral.
+    assert (summary.worst_boresight, summary.worst_ra_deg, summary.worst_dec_deg) == (1, 90.0, 0.0)
+    assert summary.histogram.tolist() == [0, 0, 2, 0, 0, 1, 0, 1]
+    assert (summary.pairs.maximum, summary.triangles.maximum) == (21, 20)
+
+
+def test_one_per_cent_is_the_count_that_one_field_in_a_hundred_does_not_exceed() -> None:
+    counts = np.arange(1000)[::-1]
+    summary = summarise_coverage(coverage_from_counts(saff_kuijlaars(1000), counts, 6))
+    assert summary.stars.one_percent == 9
+    assert np.mean(counts <= summary.stars.one_percent) == 0.01
+
+
+# How far apart fields lie -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [10, 100, 10_000])
+def test_nobody_is_farther_than_the_covering_radius(count: int, random_directions: Draw) -> None:
+    boresights = saff_kuijlaars(count)
+    radius, direction = covering_radius(boresights)
+    sample = random_directions(1_000_000 if count == 10_000 else 200_000, count)
+    chord, _ = cKDTree(boresights).query(sample, workers=2)
+    farthest = float(2.0 * np.arcsin(0.5 * chord.max()))
+    assert farthest <= radius
+    assert farthest > 0.93 * radius
+    nearest = separation(boresights, direction).min()
+    assert nearest == pytest.approx(radius, rel=1e-12)
+    assert np.linalg.norm(direction) == pytest.approx(1.0, rel=1e-14)
+
+
+def test_default_tiling_leaves_no_hole(random_directions: Draw) -> None:
+    boresights = saff_kuijlaars(10_000)
+    gap = tiling_gap(boresights, np.radians(6.0))
+    assert not gap.has_holes
+    assert np.degrees(gap.covering_radius_rad) == pytest.approx(1.50026, abs=1e-5)
+
+
+@pytest.mark.parametrize("rotation", range(3))
+def test_covering_radius_of_solids(rotation: int, random_directions: Draw) -> None:
+    """Known angles, in any position; a cube's facets have four corners on one circle."""
+    turn, _ = np.linalg.qr(random_directions(3, rotation))
+    octahedron = np.concatenate([np.eye(3), -np.eye(3)]) @ turn
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    cube = signs / np.sqrt(3.0) @ turn
+    half = np.arccos(1.0 / np.sqrt(3.0))
+    assert covering_radius(octahedron)[0] == pytest.approx(half, rel=1e-12)
+    assert covering_radius(cube)[0] == pytest.approx(half, rel=1e-12)
+
+
+def test_directions_of_one_side_leave_the_other_uncovered(random_directions: Draw) -> None:
+    u = random_directions(500, 4)
+    cap = u[u[:, 2] > 0.9]
+    radius, direction = covering_radius(cap)
+    assert direction[2] < -0.95
+    assert radius > np.radians(150.0)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_few_directions_cover_nothing(count: int) -> None:
+    radius, direction = covering_radius(saff_kuijlaars(count))
+    assert radius == np.pi
+    assert np.linalg.norm(direction) == pytest.approx(1.0)
+
+
+def test_directions_of_one_circle_cover_nothing() -> None:
+    angle = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
+    equator = np.stack([np.cos(angle), np.sin(angle), np.zeros(8)], axis=-1)
+    assert covering_radius(equator)[0] == np.pi
+
+
+@pytest.mark.parametrize("count", [1, 10, 100, 500])
+def test_holes_are_said_and_so_is_what_closes_them(count: int) -> None:
+    tile = np.radians(6.0)
+    gap = tiling_gap(saff_kuijlaars(count), tile)
+    assert gap.has_holes
+    assert gap.boresights_needed > count
+    assert not tiling_gap(saff_kuijlaars(gap.boresights_needed), tile).has_holes
+
+
+@pytest.mark.parametrize("count", [10, 100, 10_000])
+def test_boresights_are_spread_evenly(count: int) -> None:
+    """No two nearer than 2 / sqrt(N), and no cell far from its share of the sphere.
+
+    The first and last step of the spiral leave cells of 0.72 of a share beside the poles.
+    """
+    points = saff_kuijlaars(count)
+    chord, _ = cKDTree(points).query(points, k=2)
+    assert 2.0 * np.arcsin(0.5 * chord[:, 1].min()) >= 2.0 / np.sqrt(count)
+    share = SphericalVoronoi(points).calculate_areas() * count / (4.0 * np.pi)
+    assert share.sum() == pytest.approx(count, rel=1e-6)
+    assert share.min() > 0.72
+    assert share.max() < 1.26
+    assert np.std(share) < 0.53 / np.sqrt(count)
+
+
+# What a spec can ask ------------------------------------------------------------------------
+
+
+@pytest.fixture
+def make(tmp_path: Path, sao_lines: list[bytes], small_spec: str) -> Callable[..., Built]:
+    """Build the small spec with some keys of its selection and boresights set."""
+    path = tmp_path / "sao.dat"
+    path.write_bytes(b"".join(sao_lines))
+
+    def run(folder: str = "dist", **changes: dict[str, Any]) -> Built:
+        content = tomllib.loads(small_spec)
+        for section, keys in changes.items():
+            content[section] = {**content[section], **keys}
+        return build(spec_from_dict(content, "small.toml"), {"sao": [path]}, tmp_path / folder)
+
+    return run
+
+
+def test_too_few_stars_in_a_field_fail_the_build(
+    make: Callable[..., Built], small_artifact: Path, tmp_path: Path
+) -> None:
+    table = open_artifact(small_artifact).table("boresights").to_pylist()
+    counts = np.array([row["star_count"] for row in table])
+    wanted = int(counts.min()) + 2
+    short = np.flatnonzero(counts < wanted)
+    with pytest.raises(BuildError) as caught:
+        make(boresights={"min_stars_per_field": wanted})
+    message = str(caught.value)
+    assert message.startswith(f"small: {len(short)} of 200 fields have fewer than {wanted} ")
+    worst = table[int(counts.argmin())]
+    assert (
+        f"boresight {worst['boresight']} (RA {worst['ra_deg']:.2f}, Dec {worst['dec_deg']:+.2f} "
+        f"deg): {worst['star_count']}"
+    ) in message
+    assert message.count("boresight ") == min(len(short), 5)
+    assert list((tmp_path / "dist").iterdir()) == []
+    made = make(boresights={"min_stars_per_field": int(counts.min())})
+    assert made.coverage.summary.stars.minimum == counts.min()
+
+
+def test_only_some_of_many_short_fields_are_named() -> None:
+    spec = preset("sao-12deg").model_copy(
+        update={"boresights": preset("sao-12deg").boresights.model_copy(
+            update={"min_stars_per_field": 3})}
+    )  # fmt: skip
+    none = FieldStars(saff_kuijlaars(50), np.zeros(51, dtype=np.int64), np.empty(0, dtype=np.int32))
+    with pytest.raises(BuildError, match=r"50 of 50 fields .*boresight 4 .*, \.\.\.\. A fainter"):
+        check_fields(none, spec)
+
+
+@pytest.mark.parametrize(
+    "path", ["boresights.min_stars_per_field", "selection.max_stars_per_field"]
+)
+@pytest.mark.parametrize("value", [0, -1, 2.5, "six", True, 10_001])
+def test_keys_have_a_range(path: str, value: object, small_spec: str) -> None:
+    content = tomllib.loads(small_spec)
+    section, _, key = path.partition(".")
+    content[section] = {**content[section], key: value}
+    with pytest.raises(ConfigError, match=path):
+        spec_from_dict(content, "small.toml")
+
+
+def dense_spec(small_spec: str, most: int) -> BuildSpec:
+    content = tomllib.loads(small_spec)
+    content["selection"]["max_stars_per_field"] = most
+    return spec_from_dict(content, "small.toml")
+
+
+@pytest.mark.parametrize("most", [3, 6, 12])
+def test_thinning_keeps_the_brightest_of_every_field(
+    most: int, small_artifact: Path, small_spec: str
+) -> None:
+    spec = dense_spec(small_spec, most)
+    stars = open_artifact(small_artifact).table("stars")
+    before = tile_guide_stars(stars, spec)
+    selected = select_guide_stars(stars, spec.selection)
+    thinned = reject_dense(selected, before.brightest(most)[1])
+    after = tile_guide_stars(thinned.guide_stars, spec)
+    names = stars["star_id"].to_numpy(), thinned.guide_stars["star_id"].to_numpy()
+    for tile in range(len(before.count)):
+        was = names[0][before.star_index[before.offsets[tile] : before.offsets[tile + 1]]]
+        now = names[1][after.star_index[after.offsets[tile] : after.offsets[tile + 1]]]
+        assert np.array_equal(now[:most], was[:most])
+        assert set(now) <= set(was)
+    assert after.count.max() < before.count.max()
+    assert np.std(after.count) < np.std(before.count)
+    assert_nothing_is_lost(selected, thinned)
+
+
+def assert_nothing_is_lost(before: Selected, after: Selected) -> None:
+    gone = count_by_reason(after.rejected).get("density", 0)
+    assert len(after.guide_stars) + gone == len(before.guide_stars)
+    assert len(after.rejected) == len(before.rejected) + gone
+    ids = [
+        np.sort(np.concatenate([s.guide_stars["star_id"], s.rejected["star_id"]]))
+        for s in (before, after)
+    ]
+    assert np.array_equal(*ids)
+    assert np.all(np.diff(after.rejected["star_id"].to_numpy()) > 0)
+    assert (after.steps[-1].name, len(after.steps[-1].directions)) == (
+        "density",
+        len(after.guide_stars),
+    )
+
+
+def test_a_thinned_build_counts_density(make: Callable[..., Built], small_artifact: Path) -> None:
+    made = make(selection={"max_stars_per_field": 8})
+    (source,) = made.manifest["sources"]
+    whole = open_artifact(small_artifact).manifest["sources"][0]
+    assert source["rejected"]["density"] == whole["kept"] - source["kept"] > 0
+    assert source["rows_read"] == source["kept"] + sum(source["rejected"].values())
+    assert list(source["rejected"])[-1] == "density"
+    assert [step.step for step in made.filters][-2:] == ["variables", "density"]
+    assert made.filters[-1].stars == source["kept"]
+    assert made.coverage.summary.stars.minimum >= min(8, made.filters[-2].min_per_field)
+    rejected = open_artifact(made.folder).table("rejected")
+    assert count_by_reason(rejected) == source["rejected"]
+
+
+def test_thinning_makes_a_real_sky_even(catalogs: Path) -> None:
+    from starcat.pipeline import read_sources
+    from starcat.progress import no_progress
+
+    base = preset("sao-12deg")
+    selection = base.selection.model_copy(update={"max_stars_per_field": 10})
+    spec = base.model_copy(update={"selection": selection})
+    inputs = {"sao": [catalogs / "sao.dat.gz"], "hipparcos": [catalogs / "hip_main.dat.gz"]}
+    catalog, _ = read_sources(spec, inputs, no_progress)
+    selected = select_guide_stars(catalog.stars, spec.selection)
+    before = tile_guide_stars(selected.guide_stars, spec)
+    thinned = reject_dense(selected, before.brightest(10)[1])
+    after = tile_guide_stars(thinned.guide_stars, spec)
+    assert np.array_equal(np.minimum(after.count, 10), np.minimum(before.count, 10))
+    assert np.quantile(after.count, 0.99) < 0.75 * np.quantile(before.count, 0.99)
+    kept = directions_of(thinned.guide_stars)
+    assert len(kept) == len(np.unique(before.brightest(10)[1]))
+    assert floats_of(thinned.guide_stars, "mag").max() <= 6.0
+
+
+def test_a_build_says_that_its_tiling_has_holes(
+    make: Callable[..., Built], caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING, logger="starcat"):
+        made = make(boresights={"count": 20})
+    (warning,) = made.warnings
+    assert warning.startswith("boresights.count = 20 leaves holes: RA ")
+    assert "a field reaches 20.000 deg at any roll" in warning
+    assert warning in caplog.text
+    report = json.loads((made.folder / "report" / "report.json").read_bytes())
+    assert report["warnings"] == [warning]
+    assert report["coverage"]["tiling"]["holes"] is True
+    assert warning.split(":")[0] in (made.folder / "report" / "index.html").read_text()
+
+
+def test_a_build_without_holes_is_silent(
+    make: Callable[..., Built], caplog: pytest.LogCaptureFixture
+) -> None:
+    made = make()
+    assert made.warnings == ()
+    assert not caplog.records
+    assert made.coverage.as_dict()["tiling"]["holes"] is False

@@ -1,0 +1,144 @@
+"""The difference between artifacts: which stars came, went and moved, and why."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from starcat.artifact.diff import MOVED_ARCSEC, NOT_READ, Change, Difference, diff_artifacts
+from starcat.artifact.reader import Artifact, open_artifact
+from starcat.artifact.verify import check_artifact
+from starcat.pipeline import build
+from starcat.spec import spec_from_dict
+
+Make = Callable[..., Artifact]
+
+
+@pytest.fixture
+def make(tmp_path: Path, sao_lines: list[bytes], small_spec: str) -> Make:
+    """Build the small spec from some lines, with some of its keys replaced."""
+
+    def run(name: str, lines: list[bytes] = sao_lines, **changes: Any) -> Artifact:
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / "sao.dat").write_bytes(b"".join(lines))
+        content = {**tomllib.loads(small_spec), **changes}
+        spec = spec_from_dict(content, "small.toml")
+        return check_artifact(build(spec, {"sao": [folder / "sao.dat"]}, folder).folder)
+
+    return run
+
+
+def with_text(line: bytes, place: int, text: bytes) -> bytes:
+    return line[:place] + text + line[place + len(text) :]
+
+
+def test_an_artifact_does_not_differ_from_itself(small_artifact: Path) -> None:
+    artifact = open_artifact(small_artifact)
+    found = diff_artifacts(artifact, artifact)
+    assert found.is_same
+    assert (found.spec, found.sources, found.software) == ((), (), ())
+    assert (found.came, found.went, found.moved) == ((), (), ())
+    assert [product.product for product in found.products] == artifact.products
+    assert all(product.is_same for product in found.products)
+
+
+def test_a_brighter_limit_lets_stars_go(small_artifact: Path, make: Make) -> None:
+    a, b = open_artifact(small_artifact), make("b", selection={"faint_limit_mag": 5.5})
+    found = diff_artifacts(a, b)
+    assert found.spec == (Change("selection.faint_limit_mag", 6.0, 5.5),)
+    assert not found.is_same
+    assert not found.came
+    assert not found.moved
+    rows_a, rows_b = (len(side.table("stars")) for side in (a, b))
+    assert len(found.went) == rows_a - rows_b > 20
+    # Stars of the two close pairs that the fainter limit made doubles may come back.
+    assert {star.reason for star in found.went} == {"too_faint"}
+    assert all(star.mag is not None and 5.5 < star.mag <= 6.0 for star in found.went)
+    assert Change("sao kept", rows_a, rows_b) in found.sources
+    back = diff_artifacts(b, a)
+    assert {star.star_id for star in back.came} == {star.star_id for star in found.went}
+    assert {star.reason for star in back.came} == {"too_faint"}
+    assert not back.went
+
+
+def test_every_star_is_accounted_for(
+    small_artifact: Path, make: Make, sao_lines: list[bytes]
+) -> None:
+    """One star leaves the catalog, one fades, one shifts, one brightens, one is new."""
+    lines = list(sao_lines)
+    gone, faded, shifted, brighter = 99, 199, 299, 399
+    lines[faded] = with_text(lines[faded], 80, b" 9.9")
+    lines[brighter] = with_text(lines[brighter], 80, b" 3.1")
+    dec = float(lines[shifted][193:204])
+    lines[shifted] = with_text(lines[shifted], 193, f"{dec + 1e-6:+11.8f}".encode())
+    lines.append(with_text(lines[gone], 0, b"   601"))
+    del lines[gone]
+    found = diff_artifacts(open_artifact(small_artifact), make("b", lines))
+    assert [(s.star_id, s.designation, s.reason) for s in found.came] == [
+        (601, "SAO 601", NOT_READ)
+    ]
+    assert {(s.star_id, s.reason) for s in found.went} == {
+        (gone + 1, NOT_READ), (faded + 1, "too_faint")
+    }  # fmt: skip
+    moved = {star.star_id: star for star in found.moved}
+    assert moved.keys() == {shifted + 1, brighter + 1}
+    assert moved[shifted + 1].moved_arcsec == pytest.approx(0.20626, rel=1e-3)
+    assert moved[shifted + 1].mag_a == moved[shifted + 1].mag_b
+    assert moved[brighter + 1].moved_arcsec < MOVED_ARCSEC
+    assert moved[brighter + 1].mag_b == 3.1
+    assert found.spec == ()
+    assert {change.name for change in found.sources} == {
+        "sao file sao.dat sha256", "sao kept", "sao rejected too_faint"
+    }  # fmt: skip
+    assert not any(p.is_same for p in found.products if p.product != "report")
+
+
+def test_products_of_one_side(small_artifact: Path, make: Make) -> None:
+    without = make("b", products={"triangles": {"enabled": False}})
+    a = open_artifact(small_artifact)
+    found = diff_artifacts(a, without)
+    by_name = {product.product: product for product in found.products}
+    assert by_name["triangles"].rows_a == len(a.table("triangles"))
+    assert by_name["triangles"].rows_b is None
+    assert [product.product for product in found.products if not product.is_same] == ["triangles"]
+    assert diff_artifacts(without, a).products[-1].rows_a is None
+    assert found.spec == (Change("products.triangles.enabled", True, False),)
+
+
+def test_numbers_of_two_catalogs_are_not_the_same_star(small_artifact: Path) -> None:
+    a, b = open_artifact(small_artifact), open_artifact(small_artifact)
+    b.manifest["spec"]["catalog"]["source"] = "tycho2"
+    b.manifest["software"]["numpy"] = "1.0"
+    found = diff_artifacts(a, b)
+    count = len(a.table("stars"))
+    assert (len(found.came), len(found.went), len(found.moved)) == (count, count, 0)
+    assert {star.reason for star in found.came + found.went} == {NOT_READ}
+    assert [(change.name, change.b) for change in found.software] == [("numpy", "1.0")]
+
+
+def test_the_command_prints_some_and_json_has_all(
+    small_artifact: Path, make: Make, starcat: Any
+) -> None:
+    b = make("b", selection={"faint_limit_mag": 5.0}, version="1.1.0")
+    ran = starcat(["diff", small_artifact, b.folder])
+    assert ran.code == 0
+    found: Difference = diff_artifacts(open_artifact(small_artifact), b)
+    assert f"{len(found.went)} stars went (first 20)" in ran.out
+    assert ran.out.count("too_faint") == 20 + ("sao rejected too_faint" in ran.out)
+    assert "selection.faint_limit_mag" in ran.out
+    ran = starcat(["diff", small_artifact, b.folder, "--json"])
+    content = json.loads(ran.out)
+    assert (content["a"], content["b"]) == ("small-1.0.0", "small-1.1.0")
+    assert len(content["went"]) == len(found.went)
+    assert content["is_same"] is False
+    assert starcat(["diff", small_artifact, small_artifact, "--json"]).out.count('"is_same": true')
+
+
+def test_a_damaged_artifact_is_an_error(small_artifact: Path, tmp_path: Path, starcat: Any) -> None:
+    assert starcat(["diff", small_artifact, tmp_path]).code == 5

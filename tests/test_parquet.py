@@ -1,0 +1,147 @@
+"""Parquet files: what other programs see in them."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import duckdb
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from starcat.artifact.reader import open_artifact
+from starcat.parquet import read_parquet, write_parquet
+from starcat.schema import product_schema
+from starcat.votable import VOTABLE_NAMESPACE, votable_xml
+
+HAS_PANDAS = importlib.util.find_spec("pandas") is not None
+
+
+@pytest.fixture(scope="module")
+def files(small_artifact: Path) -> list[Path]:
+    return sorted(small_artifact.glob("*.parquet"))
+
+
+def table() -> pa.Table:
+    """A column of every type that a schema can have, with nulls and texts that are not ASCII."""
+    return pa.table(
+        {
+            "flag": pa.array([True, None]),
+            "number": pa.array([1, None], pa.int32()),
+            "long": pa.array([1, None], pa.int64()),
+            "single": pa.array([1.5, None], pa.float32()),
+            "double": pa.array([1.5, None]),
+            "text": pa.array(["α Cen", None]),
+            "empty": pa.array([None, None], pa.string()),
+            "list": pa.array([[1, 2], []], pa.list_(pa.int32())),
+        }
+    )
+
+
+def test_what_is_written_is_read(tmp_path: Path) -> None:
+    write_parquet(table(), tmp_path / "a.parquet")
+    assert read_parquet(tmp_path / "a.parquet").equals(table())
+
+
+def test_the_same_table_has_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_parquet(table(), tmp_path / name)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_duckdb_reads_a_whole_artifact(files: list[Path]) -> None:
+    for path in files:
+        counted = duckdb.sql(f"SELECT count(*) FROM '{path}'").fetchall()
+        assert counted == [(pq.read_metadata(path).num_rows,)]
+    everything = duckdb.sql(
+        f"SELECT DISTINCT filename FROM read_parquet('{files[0].parent}/*.parquet', "
+        "filename = true, union_by_name = true)"
+    ).fetchall()
+    assert sorted(name for (name,) in everything) == [str(path) for path in files]
+
+
+def test_duckdb_joins_products(small_artifact: Path) -> None:
+    query = f"""
+        SELECT max(abs(p.separation_rad - 2 * asin(sqrt(
+            (a.x - b.x) ** 2 + (a.y - b.y) ** 2 + (a.z - b.z) ** 2) / 2)))
+        FROM '{small_artifact}/pairs.parquet' p
+        JOIN (SELECT *, row_number() OVER (ORDER BY star_id) - 1 AS row
+              FROM '{small_artifact}/stars.parquet') a ON a.row = p.i
+        JOIN (SELECT *, row_number() OVER (ORDER BY star_id) - 1 AS row
+              FROM '{small_artifact}/stars.parquet') b ON b.row = p.j"""
+    ((off,),) = duckdb.sql(query).fetchall()
+    assert off < 1e-12
+
+
+def test_duckdb_sees_the_footer(files: list[Path]) -> None:
+    for path in files:
+        rows = duckdb.sql(f"SELECT key, value FROM parquet_kv_metadata('{path}')").fetchall()
+        footer = dict(rows)
+        assert footer[b"IVOA.VOTable-Parquet.version"] == b"1.0"
+        assert footer[b"starcat.schema"].startswith(path.stem.encode())
+
+
+def test_the_votable_is_one_without_data(files: list[Path]) -> None:
+    """As VOParquet 1.0 asks: one TABLE whose FIELDs are the columns, in their order."""
+    from astropy import units
+    from astropy.io import votable
+
+    for path in files:
+        footer = pq.ParquetFile(path).metadata.metadata
+        xml = footer[b"IVOA.VOTable-Parquet.content"]
+        (described,) = votable.parse(io.BytesIO(xml), verify="exception").iter_tables()
+        schema = open_artifact(path.parent).schema(path.stem)
+        assert [field.name for field in described.fields] == [c.name for c in schema.columns]
+        for field, column in zip(described.fields, schema.columns, strict=True):
+            assert (field.description or "").split() == column.description.split()
+            assert (field.ucd or "") == column.ucd
+            assert field.unit == (units.Unit(column.unit) if column.unit else None)
+        root = ElementTree.fromstring(xml)
+        assert root.find(f".//{{{VOTABLE_NAMESPACE}}}DATA") is None
+
+
+def test_types_in_the_votable() -> None:
+    root = ElementTree.fromstring(votable_xml(table()))
+    fields = [dict(field.attrib) for field in root.iter(f"{{{VOTABLE_NAMESPACE}}}FIELD")]
+    assert fields == [
+        {"name": "flag", "datatype": "boolean"},
+        {"name": "number", "datatype": "int"},
+        {"name": "long", "datatype": "long"},
+        {"name": "single", "datatype": "float"},
+        {"name": "double", "datatype": "double"},
+        {"name": "text", "datatype": "char", "arraysize": "5"},
+        {"name": "empty", "datatype": "char", "arraysize": "1"},
+        {"name": "list", "datatype": "int", "arraysize": "*"},
+    ]
+
+
+@pytest.mark.skipif(not HAS_PANDAS, reason="astropy reads Parquet with pandas")
+@pytest.mark.parametrize("form", ["parquet", "parquet.votable"])
+def test_astropy_reads_units(form: str, files: list[Path]) -> None:
+    from astropy.table import Table
+
+    for path in files:
+        found = Table.read(path, format=form)
+        schema = product_schema(path.stem)
+        assert len(found) == pq.read_metadata(path).num_rows
+        for column in schema.columns:
+            unit = found[column.name].unit
+            assert (str(unit).replace(" ", "") if unit else "") == column.unit
+            assert found[column.name].description.split() == column.description.split()
+
+
+def test_what_astropy_looks_for_is_there(files: list[Path]) -> None:
+    """Units and the lengths of texts, without which it warns."""
+    from astropy.table.meta import get_header_from_yaml
+
+    for path in files:
+        metadata = pq.read_schema(path).metadata
+        header = get_header_from_yaml(metadata[b"table_meta_yaml"].decode().split("\n"))
+        columns = {entry["name"]: entry for entry in header["datatype"]}
+        for column in product_schema(path.stem).columns:
+            assert columns[column.name].get("unit", "") == column.unit
+            if column.dtype == "string":
+                assert int(metadata[f"table::len::{column.name}".encode()]) >= 1

@@ -1,0 +1,364 @@
+"""Whole builds: what they count, that they repeat byte for byte, and that they can be killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import tomllib
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from starcat.artifact.verify import check_artifact
+from starcat.artifact.writer import publish
+from starcat.errors import BuildError, OutputError, ProductError, StarcatError
+from starcat.pipeline import Built, build
+from starcat.spec import preset, spec_from_dict
+
+FILES = {
+    "database.h5",
+    "manifest.json",
+    "report/index.html",
+    "rejected.parquet",
+    "report/self_test.json",
+    "stars.parquet",
+}
+"""Every artifact has these; each other product adds a Parquet file."""
+
+LOG = "small-1.0.0.build.json"
+
+
+@pytest.fixture
+def stars(tmp_path: Path, sao_lines: list[bytes]) -> Path:
+    path = tmp_path / "sao.dat"
+    path.write_bytes(b"".join(sao_lines))
+    return path
+
+
+@pytest.fixture
+def build_small(tmp_path: Path, stars: Path, small_spec: str) -> Callable[..., Built]:
+    """Build the small spec, with some of its sections replaced."""
+
+    def run(output: Path = tmp_path / "dist", *, replace: bool = False, **changes: Any) -> Built:
+        spec = spec_from_dict({**tomllib.loads(small_spec), **changes}, "small.toml")
+        return build(spec, {"sao": [stars]}, output, replace=replace)
+
+    return run
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """Every file but the logs beside artifacts: their times differ."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != LOG)
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+
+def visible(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.glob("*") if not path.name.startswith("."))
+
+
+def command(spec: Path, stars: Path, output: Path) -> list[str]:
+    run = [sys.executable, "-m", "starcat", "build", str(spec)]
+    return [*run, "--input", f"sao={stars}", "-o", str(output)]
+
+
+# What a build counts ------------------------------------------------------------------------
+
+
+def test_sao_preset_on_the_excerpt(catalogs: Path, tmp_path: Path) -> None:
+    inputs = {"sao": [catalogs / "sao.dat.gz"], "hipparcos": [catalogs / "hip_main.dat.gz"]}
+    built = build(preset("sao-12deg"), inputs, tmp_path)
+    sao, hipparcos = built.manifest["sources"]
+    assert (sao["rows_read"], sao["kept"]) == (15_935, 4_959)
+    assert sao["rejected"] == {"too_faint": 10_832, "double": 112, "variable": 32}
+    assert (hipparcos["rows_read"], hipparcos["kept"]) == (9_933, 9_928)
+    for source in (sao, hipparcos):
+        assert source["rows_read"] == source["kept"] + sum(source["rejected"].values())
+        assert source["rows_read"] == sum(file["rows"] for file in source["files"])
+    assert [step.stars for step in built.filters] == [5_103, 4_991, 4_959]
+    assert built.rates[0].identified_share >= 0.99
+    assert not built.problems
+
+
+def test_products_hold_what_the_sources_count(build_small: Callable[..., Built]) -> None:
+    manifest = build_small().manifest
+    (source,) = manifest["sources"]
+    rows = {name: facts["rows"] for name, facts in manifest["products"].items()}
+    assert rows["stars"] == source["kept"]
+    assert rows["rejected"] == sum(source["rejected"].values())
+    assert rows["boresights"] == 200
+    assert source["rows_read"] == 600
+
+
+def test_files_are_those_of_the_manifest(build_small: Callable[..., Built]) -> None:
+    built = build_small()
+    assert built.outcome == "written"
+    assert set(content(built.folder)) == {*built.manifest["files"], "manifest.json"} >= FILES
+    assert {facts["parquet"] for facts in built.manifest["products"].values()} == {
+        name for name in built.manifest["files"] if name.endswith(".parquet")
+    }
+    assert json.loads((built.folder / "manifest.json").read_bytes()) == built.manifest
+    assert check_artifact(built.folder).manifest == built.manifest
+    assert visible(built.folder.parent) == sorted(os.listdir(built.folder.parent))
+    assert visible(built.folder.parent) == ["small-1.0.0", LOG]
+
+
+def test_a_malformed_record_is_counted(build_small: Callable[..., Built], stars: Path) -> None:
+    stars.write_bytes(stars.read_bytes() + b"too short\n")
+    built = build_small()
+    (source,) = built.manifest["sources"]
+    assert source["rejected"]["malformed_record"] == 1
+    assert source["rows_read"] == 601 == source["kept"] + sum(source["rejected"].values())
+    assert built.problems[0].startswith("sao.dat line 601")
+
+
+def test_progress_only_goes_forward(stars: Path, small_spec: str, tmp_path: Path) -> None:
+    events: list[tuple[str, int, int | None]] = []
+    spec = spec_from_dict(tomllib.loads(small_spec), "small.toml")
+    build(spec, {"sao": [stars]}, tmp_path, progress=lambda *event: events.append(event))
+    stages = list(dict.fromkeys(stage for stage, _, _ in events))
+    assert (stages[0], stages[-3:]) == ("read sao", ["self-test", "report", "verify"])
+    for stage in stages:
+        done = [done for name, done, _ in events if name == stage]
+        totals = {total for name, _, total in events if name == stage}
+        assert done == sorted(done)
+        assert len(totals) == 1
+        total = totals.pop()
+        assert total is None or done[-1] == total
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"selection": {"faint_limit_mag": 1.0}},
+        {"camera": {"width_px": 512, "height_px": 512, "fov_x_deg": 4.0}},
+    ],
+    ids=["no stars", "no field can be identified"],
+)
+def test_a_build_without_a_result_leaves_nothing(
+    changes: dict[str, Any], build_small: Callable[..., Built], tmp_path: Path
+) -> None:
+    with pytest.raises(BuildError):
+        build_small(**changes)
+    assert os.listdir(tmp_path / "dist") == []
+
+
+# Byte for byte ------------------------------------------------------------------------------
+
+
+def test_the_same_build_has_the_same_bytes(stars: Path, small_spec: str, tmp_path: Path) -> None:
+    """Whatever the hash seed, folders, time zone, locale, home folder and workers are."""
+    made = []
+    for seed, zone, locale in (("1", "UTC", "C"), ("2", "Asia/Tokyo", "C.UTF-8")):
+        folder = tmp_path / f"run-{seed}"
+        folder.mkdir()
+        (folder / "spec.toml").write_text(small_spec)
+        shutil.copy(stars, folder)
+        environment = {"PYTHONHASHSEED": seed, "TZ": zone, "LC_ALL": locale, "HOME": str(folder)}
+        subprocess.run(
+            [
+                *command(folder / "spec.toml", folder / "sao.dat", folder / "dist"),
+                "--workers",
+                seed,
+            ],
+            env={**os.environ, **environment},
+            check=True,
+            capture_output=True,
+        )
+        made.append(content(folder / "dist"))
+    assert set(made[0]) >= {f"small-1.0.0/{name}" for name in FILES}
+    assert made[0] == made[1]
+
+
+def test_nothing_of_the_machine_is_in_the_files(
+    build_small: Callable[..., Built], tmp_path: Path
+) -> None:
+    host, today = socket.gethostname(), datetime.now(UTC).strftime("%Y-%m-%d")
+    secrets = [str(tmp_path), tmp_path.name, str(Path.home()), str(Path.cwd()), today]
+    secrets += [host] if len(host) > 4 else []
+    for name, data in content(build_small().folder).items():
+        for secret in secrets:
+            assert secret.encode() not in data, (name, secret)
+
+
+def test_the_second_build_changes_nothing(build_small: Callable[..., Built]) -> None:
+    first = build_small().folder
+    before = {path: path.stat().st_mtime_ns for path in first.rglob("*")}
+    assert build_small().outcome == "unchanged"
+    assert {path: path.stat().st_mtime_ns for path in first.rglob("*")} == before
+
+
+def test_another_artifact_is_kept_unless_told(build_small: Callable[..., Built]) -> None:
+    first = build_small()
+    before = content(first.folder)
+    fainter = {"selection": {"faint_limit_mag": 5.9}}
+    with pytest.raises(OutputError, match="already exists and differs"):
+        build_small(**fainter)
+    assert content(first.folder) == before
+    assert build_small(replace=True, **fainter).outcome == "replaced"
+    assert content(first.folder) != before
+    assert sorted(os.listdir(first.folder.parent)) == ["small-1.0.0", LOG]
+
+
+def test_a_damaged_artifact_is_not_unchanged(build_small: Callable[..., Built]) -> None:
+    folder = build_small().folder
+    before = content(folder)
+    (folder / "pairs.parquet").write_bytes(b"PAR1")
+    with pytest.raises(OutputError):
+        build_small()
+    assert build_small(replace=True).outcome == "replaced"
+    assert content(folder) == before
+
+
+def test_a_changed_byte_is_found(small_artifact: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(small_artifact, tmp_path / "copy"))
+    for name in check_artifact(folder).manifest["files"]:
+        whole = (folder / name).read_bytes()
+        for place in random.Random(name).sample(range(len(whole)), 3):
+            data = bytearray(whole)
+            data[place] ^= 1
+            (folder / name).write_bytes(data)
+            with pytest.raises(ProductError, match=Path(name).name):
+                check_artifact(folder)
+        (folder / name).write_bytes(whole)
+    check_artifact(folder)
+
+
+# Stopped in the middle ----------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def slower(
+    tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes], small_spec: str
+) -> tuple[Path, Path, dict[str, bytes], float]:
+    """Spec, stars, content and seconds of a build that takes long enough to be hit."""
+    folder = tmp_path_factory.mktemp("slower")
+    spec, stars = folder / "spec.toml", folder / "sao.dat"
+    spec.write_text(small_spec.replace("frames = 5", "frames = 40"))
+    stars.write_bytes(b"".join(sao_lines))
+    began = time.monotonic()
+    subprocess.run(command(spec, stars, folder / "dist"), check=True, capture_output=True)
+    return spec, stars, content(folder / "dist"), time.monotonic() - began
+
+
+@pytest.mark.parametrize(
+    ("number", "attempts"), [(signal.SIGKILL, 6), (signal.SIGTERM, 4)], ids=["kill", "terminate"]
+)
+def test_a_stopped_build_leaves_no_half_artifact(
+    number: signal.Signals,
+    attempts: int,
+    slower: tuple[Path, Path, dict[str, bytes], float],
+    tmp_path: Path,
+) -> None:
+    spec, stars, whole, seconds = slower
+    generator = random.Random(int(number))
+    stopped = 0
+    for attempt in range(attempts):
+        output = tmp_path / str(attempt)
+        output.mkdir()
+        run = subprocess.Popen(
+            command(spec, stars, output), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+        )
+        moment = time.monotonic() + generator.uniform(0.1, 0.9) * seconds
+        # Most of the time goes into the start; half of the attempts wait for the first file.
+        while attempt % 2 and run.poll() is None and not os.listdir(output):
+            time.sleep(0.001)
+        if attempt % 2:
+            moment = time.monotonic() + generator.uniform(0.0, 0.3) * seconds
+        time.sleep(max(0.0, moment - time.monotonic()))
+        run.send_signal(number)
+        _, error = run.communicate(timeout=30)
+        assert run.returncode in {0, -number, 128 + number}
+        assert b"Traceback" not in error
+        stopped += run.returncode != 0
+        if visible(output):
+            assert content(output / "small-1.0.0") == {
+                name.partition("/")[2]: data for name, data in whole.items()
+            }
+        assert all(name.endswith(".partial") for name in os.listdir(output) if name[0] == ".")
+    subprocess.run(command(spec, stars, output), check=True, capture_output=True)
+    assert content(output / "small-1.0.0") == {
+        name.partition("/")[2]: data for name, data in whole.items()
+    }
+    assert stopped >= 2
+
+
+def test_termination_cleans_up(stars: Path, small_spec: str, tmp_path: Path) -> None:
+    from starcat.cli import _stop
+
+    seen: list[list[str]] = []
+
+    def terminate(stage: str, done: int, total: int | None) -> None:
+        if stage == "self-test":
+            seen.append(os.listdir(tmp_path / "dist"))
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    spec = spec_from_dict(tomllib.loads(small_spec), "small.toml")
+    before = signal.signal(signal.SIGTERM, _stop)
+    try:
+        with pytest.raises(SystemExit) as stop:
+            build(spec, {"sao": [stars]}, tmp_path / "dist", progress=terminate)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert stop.value.code == 128 + signal.SIGTERM
+    assert [len(names) for names in seen] == [1]
+    assert os.listdir(tmp_path / "dist") == []
+
+
+def test_leftovers_of_a_killed_build_do_not_disturb(
+    build_small: Callable[..., Built], tmp_path: Path
+) -> None:
+    stale = tmp_path / "dist" / ".small-1.0.0.abcdefgh.partial"
+    stale.mkdir(parents=True)
+    (stale / "database.h5").write_bytes(b"\x89HDF")
+    built = build_small()
+    assert built.outcome == "written"
+    assert "stars.parquet" in content(built.folder)
+    assert visible(tmp_path / "dist") == ["small-1.0.0", LOG]
+
+
+def test_two_builds_at_once(
+    slower: tuple[Path, Path, dict[str, bytes], float], tmp_path: Path
+) -> None:
+    spec, stars, whole, _ = slower
+    both = [
+        subprocess.Popen(command(spec, stars, tmp_path), stdout=subprocess.DEVNULL)
+        for _ in range(2)
+    ]
+    assert [run.wait(timeout=30) for run in both] == [0, 0]
+    assert content(tmp_path) == whole
+
+
+def test_replacing_is_undone_if_it_is_interrupted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    final, partial = tmp_path / "small-1.0.0", tmp_path / ".small-1.0.0.x.partial"
+    for folder in (final, partial):
+        folder.mkdir()
+        (folder / "manifest.json").write_text(folder.name)
+    rename = Path.rename
+
+    def stop_before_the_new(self: Path, target: Path) -> Path:
+        if self == partial:
+            raise SystemExit(143)
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", stop_before_the_new)
+    with pytest.raises(SystemExit):
+        publish(partial, final, replace=True)
+    assert (final / "manifest.json").read_text() == "small-1.0.0"
+
+
+def test_errors_are_starcats_own(build_small: Callable[..., Built], stars: Path) -> None:
+    stars.unlink()
+    with pytest.raises(StarcatError):
+        build_small()

@@ -1,0 +1,170 @@
+"""Rebuilding: the same bytes from the manifest, or what differs."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from starcat.artifact import manifest as manifest_module
+from starcat.artifact.content import json_bytes
+from starcat.artifact.diff import Change
+from starcat.artifact.manifest import MANIFEST_NAME, manifest_digest
+from starcat.errors import ChecksumMismatch, ConfigError, ProductError, SourceMissing
+from starcat.parquet import read_parquet, write_parquet
+from starcat.rebuild import rebuild
+
+
+@pytest.fixture
+def stars(tmp_path: Path, sao_lines: list[bytes]) -> Path:
+    path = tmp_path / "sao.dat"
+    path.write_bytes(b"".join(sao_lines))
+    return path
+
+
+@pytest.fixture
+def copy(small_artifact: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(small_artifact, tmp_path / "artifacts" / small_artifact.name))
+
+
+def edit_manifest(folder: Path, change: Any) -> None:
+    manifest = json.loads((folder / MANIFEST_NAME).read_bytes())
+    change(manifest)
+    manifest["manifest_sha256"] = manifest_digest(manifest)
+    (folder / MANIFEST_NAME).write_bytes(json_bytes(manifest))
+
+
+def test_the_same_inputs_give_the_same_bytes(
+    small_artifact: Path, stars: Path, tmp_path: Path
+) -> None:
+    rebuilt = rebuild(small_artifact, {"sao": [stars]}, tmp_path / "again")
+    assert rebuilt.is_identical
+    assert rebuilt.name == "small-1.0.0"
+    assert rebuilt.files == sum(path.is_file() for path in small_artifact.rglob("*"))
+    assert (rebuilt.changes, rebuilt.software) == ((), ())
+    made = tmp_path / "again" / "small-1.0.0" / MANIFEST_NAME
+    assert made.read_bytes() == (small_artifact / MANIFEST_NAME).read_bytes()
+
+
+def test_nothing_is_left_without_an_output(
+    small_artifact: Path, stars: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
+    events: list[str] = []
+    assert rebuild(
+        small_artifact, {"sao": [stars]}, progress=lambda stage, *_: events.append(stage)
+    ).is_identical
+    assert list(temporary.iterdir()) == []
+    assert events[0] == "check inputs"
+    assert "self-test" in events
+
+
+def test_another_input_is_refused(small_artifact: Path, stars: Path) -> None:
+    data = bytearray(stars.read_bytes())
+    data[83] ^= 1
+    stars.write_bytes(data)
+    with pytest.raises(
+        ChecksumMismatch, match=r"sao.dat: sha256 .* was made from sao.dat"
+    ) as error:
+        rebuild(small_artifact, {"sao": [stars]})
+    assert (error.value.source, error.value.path) == ("sao", stars)
+
+
+def test_another_number_of_inputs_is_refused(small_artifact: Path, stars: Path) -> None:
+    with pytest.raises(ChecksumMismatch, match=r"2 input files; .* was made from 1"):
+        rebuild(small_artifact, {"sao": [stars, stars]})
+
+
+def test_a_missing_input_is_an_error(
+    small_artifact: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STARCAT_CACHE", str(tmp_path / "none"))
+    monkeypatch.delenv("STARCAT_CATALOGS", raising=False)
+    with pytest.raises(SourceMissing):
+        rebuild(small_artifact, {})
+
+
+def test_an_input_that_is_not_used_is_an_error(small_artifact: Path, stars: Path) -> None:
+    with pytest.raises(ConfigError, match="does not read gaia"):
+        rebuild(small_artifact, {"sao": [stars], "gaia": [stars]})
+
+
+def test_no_artifact_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(ProductError):
+        rebuild(tmp_path, {})
+
+
+def test_other_libraries_are_named(
+    copy: Path, stars: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = manifest_module.version
+
+    def version(name: str) -> str:
+        return "99.0" if name == "numpy" else found(name)
+
+    monkeypatch.setattr(manifest_module, "version", version)
+    rebuilt = rebuild(copy, {"sao": [stars]})
+    assert not rebuilt.is_identical
+    changes = {change.file: change.what for change in rebuilt.changes}
+    assert changes.pop(MANIFEST_NAME).endswith("software")
+    assert {Path(name).parts[0] for name in changes} <= {"report"}
+    assert rebuilt.software == (Change("numpy", found("numpy"), "99.0"),)
+
+
+def test_what_was_changed_afterwards_is_named(copy: Path, stars: Path) -> None:
+    (copy / "pairs.parquet").write_bytes(b"PAR1")
+    (copy / "triangles.parquet").unlink()
+    (copy / "notes.txt").write_text("mine")
+    rebuilt = rebuild(copy, {"sao": [stars]})
+    assert [(change.file, change.what) for change in rebuilt.changes] == [
+        ("notes.txt", "not made by the rebuild"),
+        ("pairs.parquet", "changed since it was built"),
+        ("triangles.parquet", "missing in the artifact"),
+    ]
+
+
+def test_columns_that_came_out_differently_are_named(copy: Path, stars: Path) -> None:
+    """An artifact that is sound by its own manifest, and still not what the inputs give."""
+    path = copy / "stars.parquet"
+    table = read_parquet(path)
+    place = table.schema.get_field_index("mag")
+    write_parquet(table.set_column(place, table.schema.field(place), table["z"]), path)
+    short = read_parquet(copy / "pairs.parquet").slice(1)
+    write_parquet(short, copy / "pairs.parquet")
+
+    def change(manifest: dict[str, Any]) -> None:
+        from starcat.artifact.content import file_sha256
+
+        for name in ("stars.parquet", "pairs.parquet"):
+            manifest["files"][name]["sha256"] = file_sha256(copy / name)
+
+    edit_manifest(copy, change)
+    changes = {change.file: change.what for change in rebuild(copy, {"sao": [stars]}).changes}
+    assert changes == {
+        MANIFEST_NAME: "differs in files",
+        "pairs.parquet": f"built differently: {len(short)} rows before, {len(short) + 1} now",
+        "stars.parquet": "built differently: mag",
+    }
+
+
+def test_the_command(copy: Path, stars: Path, starcat: Any) -> None:
+    ran = starcat(["rebuild", copy, "--input", f"sao={stars}"])
+    assert ran.code == 0
+    assert "every byte the same" in ran.out
+    (copy / "pairs.parquet").write_bytes(b"PAR1")
+    ran = starcat(["rebuild", copy, "--input", f"sao={stars}"])
+    assert ran.code == 5
+    assert "1 of " in ran.out
+    assert "changed since it was built" in ran.out
+    ran = starcat(["rebuild", copy, "--input", f"sao={stars}", "--json"])
+    assert ran.code == 5
+    content = json.loads(ran.out)
+    assert content["is_identical"] is False
+    assert [change["file"] for change in content["changes"]] == ["pairs.parquet"]
+    stars.write_bytes(b"")
+    assert starcat(["rebuild", copy, "--input", f"sao={stars}"]).code == 3

@@ -1,0 +1,294 @@
+"""Schemas: the files are well-formed, and a table that breaks its contract is refused."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pytest
+from jsonschema import Draft202012Validator
+
+from starcat.artifact.manifest import MANIFEST_VERSION
+from starcat.artifact.reader import open_artifact
+from starcat.catalog.source import UNITS
+from starcat.errors import SchemaError, SchemaVersionError
+from starcat.resources import resource_folder
+from starcat.schema import ProductSchema, product_schema, read_schema
+
+FOLDER = resource_folder("schemas")
+MANIFEST = FOLDER / f"manifest-{MANIFEST_VERSION}.json"
+FILES = sorted(path for path in FOLDER.glob("*.json") if not path.stem.startswith("manifest-"))
+PRODUCTS = sorted({path.stem.rpartition("-")[0] for path in FILES})
+
+SCALAR = "(bool|int8|int16|int32|int64|uint8|uint16|uint32|uint64|float32|float64|string)"
+VERSION = r"\d+\.\d+\.\d+"
+PRODUCT_FILE = {
+    "type": "object",
+    "properties": {
+        "product": {"type": "string", "pattern": "^[a-z][a-z0-9_]*$"},
+        "version": {"type": "string", "pattern": f"^{VERSION}$"},
+        "description": {"type": "string", "minLength": 20},
+        "order": {"type": "array", "minItems": 1, "uniqueItems": True, "items": {"type": "string"}},
+        "extends": {"type": "string", "pattern": f"^[a-z_]+-{VERSION}$"},
+        "extends_as_nullable": {"type": "boolean"},
+        "extends_without": {"type": "array", "items": {"type": "string"}},
+        "columns": {
+            "type": "array",
+            "minItems": 1,
+            "items": {
+                "type": "object",
+                "properties": {
+                    "name": {"type": "string", "pattern": "^[a-z][a-z0-9_]*$"},
+                    "dtype": {"type": "string", "pattern": f"^({SCALAR}|list<{SCALAR}>)$"},
+                    "unit": {"type": "string", "minLength": 1},
+                    "ucd": {"type": "string", "pattern": r"^[a-z.;A-Z]+$"},
+                    "nullable": {"type": "boolean"},
+                    "in_database": {"type": "boolean"},
+                    "refers_to": {"type": "string"},
+                    "description": {"type": "string", "minLength": 8, "pattern": r"[^.]$"},
+                },
+                "required": ["name", "dtype", "description"],
+                "additionalProperties": False,
+            },
+        },
+    },
+    "required": ["product", "version", "description", "order", "columns"],
+    "additionalProperties": False,
+}
+SUFFIXES = {
+    "deg": "_deg", "rad": "_rad", "arcsec": "_arcsec", "mas/yr": "_mas_yr", "mag": "_mag",
+    "px": "_px", "rad2": "_rad2",
+}  # fmt: skip
+
+
+def ids(path: Path) -> str:
+    return path.stem
+
+
+def table_of(schema: ProductSchema) -> pa.Table:
+    """Two rows with a value in every column."""
+    values: dict[str, Any] = {"bool": True, "string": "a"}
+    arrays = []
+    for column, field in zip(schema.columns, schema.arrow_schema, strict=True):
+        value = values.get(column.item_dtype, 1)
+        arrays.append(pa.array([[value], []] if column.is_list else [value, value], field.type))
+    return pa.Table.from_arrays(arrays, schema=schema.arrow_schema)
+
+
+def with_column(table: pa.Table, name: str, values: pa.Array) -> pa.Table:
+    place = table.column_names.index(name)
+    return table.set_column(place, pa.field(name, values.type), values)
+
+
+# The files ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", FILES, ids=ids)
+def test_file_is_well_formed(path: Path) -> None:
+    content = json.loads(path.read_text())
+    Draft202012Validator(PRODUCT_FILE).validate(content)
+    assert path.name == f"{content['product']}-{content['version']}.json"
+
+
+@pytest.mark.parametrize("path", FILES, ids=ids)
+def test_columns_are_named_once_and_order_names_them(path: Path) -> None:
+    schema = read_schema(path)
+    names = [column.name for column in schema.columns]
+    assert len(names) == len(set(names))
+    assert set(schema.order) <= set(names)
+    assert schema.name == path.stem
+
+
+@pytest.mark.parametrize("path", FILES, ids=ids)
+def test_units_stand_in_the_names(path: Path) -> None:
+    for column in read_schema(path).columns:
+        if column.unit in SUFFIXES:
+            suffix = SUFFIXES[column.unit]
+            assert column.name.endswith(suffix) or column.name == suffix[1:], column.name
+        for unit, suffix in SUFFIXES.items():
+            if column.name.endswith(suffix):
+                assert column.unit == unit, column.name
+        assert not column.unit or column.unit in UNITS | {"rad2", "px"}
+
+
+@pytest.mark.parametrize("path", FILES, ids=ids)
+def test_arrow_schema_carries_units_and_meanings(path: Path) -> None:
+    schema = read_schema(path)
+    assert schema.arrow_schema.metadata == {b"starcat.schema": path.stem.encode()}
+    for column, field in zip(schema.columns, schema.arrow_schema, strict=True):
+        assert field.nullable == column.nullable
+        assert field.metadata[b"description"].decode() == column.description
+        assert field.metadata.get(b"unit", b"").decode() == column.unit
+
+
+def test_rejected_has_the_columns_of_stars() -> None:
+    stars, rejected = product_schema("stars"), product_schema("rejected")
+    known = {column.name: column for column in stars.columns}
+    shared = [column for column in rejected.columns if column.name in known]
+    assert len(shared) > 20
+    for column in shared:
+        assert column.nullable
+        assert column.dtype == known[column.name].dtype
+
+
+# The contract -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("product", PRODUCTS)
+def test_a_table_as_the_schema_says_is_accepted(product: str) -> None:
+    schema = product_schema(product)
+    schema.check(table_of(schema))
+    schema.check(schema.arrow_schema.empty_table())
+
+
+def drop_last(table: pa.Table) -> pa.Table:
+    return table.drop_columns(table.column_names[-1:])
+
+
+def add_one(table: pa.Table) -> pa.Table:
+    return table.append_column("surplus", pa.array([1, 2]))
+
+
+def swap(table: pa.Table) -> pa.Table:
+    return table.select(table.column_names[::-1])
+
+
+@pytest.mark.parametrize("product", PRODUCTS)
+@pytest.mark.parametrize("change", [drop_last, add_one, swap])
+def test_other_columns_are_refused(product: str, change: Callable[[pa.Table], pa.Table]) -> None:
+    schema = product_schema(product)
+    table = change(table_of(schema))
+    with pytest.raises(SchemaError, match=f"{product}: columns differ") as caught:
+        schema.check(table)
+    assert caught.value.found == table.column_names
+    assert caught.value.exit_code == 4
+    odd = set(table.column_names) ^ {column.name for column in schema.columns}
+    assert all(name in str(caught.value) for name in odd)
+
+
+def test_each_column_of_another_type_is_refused() -> None:
+    for product in PRODUCTS:
+        schema = product_schema(product)
+        for column in schema.columns:
+            other = pa.array([1, 2], pa.int8())
+            table = with_column(table_of(schema), column.name, other)
+            with pytest.raises(SchemaError, match=rf"{product}\.{column.name}: found int8"):
+                schema.check(table)
+
+
+def test_a_row_without_a_value_is_refused_unless_nullable() -> None:
+    for product in PRODUCTS:
+        schema = product_schema(product)
+        for column in schema.columns:
+            kind = column.arrow_field.type
+            table = with_column(table_of(schema), column.name, pa.nulls(2, kind))
+            if column.nullable:
+                schema.check(table)
+                continue
+            with pytest.raises(SchemaError, match="2 rows have no value") as caught:
+                schema.check(table)
+            assert caught.value.field == column.name
+
+
+# Versions -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("product", "version"), [("stars", "9.0.0"), ("stars", "one")])
+def test_unknown_versions_name_both(product: str, version: str) -> None:
+    with pytest.raises(SchemaVersionError) as caught:
+        product_schema(product, version)
+    assert version in str(caught.value)
+    assert product_schema(product).version in str(caught.value)
+    assert (caught.value.found, caught.value.product) == (version, product)
+
+
+def test_unknown_products_are_refused() -> None:
+    with pytest.raises(SchemaVersionError, match="reads: none"):
+        product_schema("constellations")
+
+
+def test_the_newest_version_is_the_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    content = json.loads((FOLDER / "pairs-1.0.0.json").read_text())
+    for version in ("1.0.0", "1.9.0", "1.10.0"):
+        changed = json.dumps({**content, "version": version})
+        (tmp_path / f"pairs-{version}.json").write_text(changed)
+    monkeypatch.setattr("starcat.schema.resource_folder", lambda name: tmp_path)
+    newest = product_schema.__wrapped__("pairs")
+    assert newest.version == "1.10.0"
+    assert product_schema.__wrapped__("pairs", "1.9.0").version == "1.9.0"
+
+
+# The manifest -------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def validator() -> Draft202012Validator:
+    schema = json.loads(MANIFEST.read_text())
+    Draft202012Validator.check_schema(schema)
+    return Draft202012Validator(schema)
+
+
+@pytest.fixture
+def manifest(small_artifact: Path) -> dict[str, Any]:
+    return copy.deepcopy(open_artifact(small_artifact).manifest)
+
+
+def test_a_built_manifest_follows_its_schema(
+    validator: Draft202012Validator, manifest: dict[str, Any]
+) -> None:
+    validator.validate(manifest)
+    assert json.loads(MANIFEST.read_text())["title"] == MANIFEST.stem
+
+
+def test_every_product_follows_a_schema_that_ships(manifest: dict[str, Any]) -> None:
+    for name, facts in manifest["products"].items():
+        assert (FOLDER / f"{facts['schema']}.json").is_file()
+        assert facts["schema"].rpartition("-")[0] == name
+        assert facts["parquet"] in manifest["files"]
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("built_at",), "2026-01-01T00:00:00Z"),
+        (("frame",), "FK5"),
+        (("manifest_version",), "1.0"),
+        (("version",), "1.0"),
+        (("sources", 0, "kept"), -1),
+        (("sources", 0, "role"), "guide"),
+        (("sources", 0, "rejected", "double"), 0),
+        (("sources", 0, "files", 0, "name"), "/home/me/sao.dat"),
+        (("sources", 0, "files", 0, "sha256"), "0"),
+        (("products", "stars", "rows"), 1.5),
+        (("products", "stars", "schema"), "stars"),
+        (("files", "/etc/passwd"), {"bytes": 1, "sha256": 64 * "0"}),
+        (("files", "../up.parquet"), {"bytes": 1, "sha256": 64 * "0"}),
+        (("software", "numpy"), 2),
+    ],
+    ids=str,
+)
+def test_other_manifests_are_refused(
+    path: tuple[Any, ...], value: object, validator: Draft202012Validator, manifest: dict[str, Any]
+) -> None:
+    place: Any = manifest
+    for part in path[:-1]:
+        place = place[part]
+    place[path[-1]] = value
+    assert not validator.is_valid(manifest)
+
+
+def test_each_part_of_a_manifest_is_required(
+    validator: Draft202012Validator, manifest: dict[str, Any]
+) -> None:
+    for part in manifest:
+        assert not validator.is_valid({key: manifest[key] for key in manifest if key != part})
+
+
+def test_the_manifest_is_no_product() -> None:
+    assert "manifest" not in PRODUCTS
+    with pytest.raises(KeyError):
+        read_schema(MANIFEST)

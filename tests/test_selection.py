@@ -1,0 +1,482 @@
+"""Selection on skies of a few stars: every star is kept or has the one reason it should have."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from starcat.catalog.ingest import count_by_reason
+from starcat.catalog.quality import Quality
+from starcat.catalog.selection import Selected, select_guide_stars
+from starcat.catalog.stars import directions_of, floats_of, table_from_columns
+from starcat.spec import Doubles, Selection, Variables
+from starcat.sphere import directions_from_radec, radec_from_directions, separation
+
+ALONE = 10.0  # degrees between stars that have nothing to do with each other
+
+
+def sky_of(directions: NDArray[np.float64], mag: Sequence[float], **columns: Any) -> pa.Table:
+    ra, dec = radec_from_directions(directions)
+    given_columns: dict[str, Any] = {
+        "star_id": np.arange(1, len(mag) + 1),
+        "ra_deg": ra,
+        "dec_deg": dec,
+        "x": directions[:, 0],
+        "y": directions[:, 1],
+        "z": directions[:, 2],
+        "mag": np.array(mag, dtype=float),
+        "quality_flags": 0,
+    }
+    given_columns |= {name: np.array(values) for name, values in columns.items()}
+    return table_from_columns("stars", given_columns, len(mag))
+
+
+def sky(ra_deg: Sequence[float], mag: Sequence[float], **columns: Any) -> pa.Table:
+    """Stars on the equator, numbered from 1."""
+    return sky_of(directions_from_radec(ra_deg, np.zeros(len(ra_deg))), mag, **columns)
+
+
+def alone(mag: Sequence[float], **columns: Any) -> pa.Table:
+    """Stars on the equator, far from one another."""
+    return sky(ALONE * np.arange(len(mag)), mag, **columns)
+
+
+def rules(
+    faint: float = 6.0,
+    *,
+    bright: float = -30.0,
+    max_stars: int | None = None,
+    variables: Variables | None = None,
+    **doubles: Any,
+) -> Selection:
+    return Selection(
+        bright_limit_mag=bright,
+        faint_limit_mag=faint,
+        max_stars=max_stars,
+        doubles=Doubles(**doubles),
+        variables=variables or Variables(),
+    )
+
+
+def verdicts(selected: Selected) -> dict[int, str]:
+    kept = dict.fromkeys(selected.guide_stars["star_id"].to_pylist(), "kept")
+    number, reason = (selected.rejected[name].to_pylist() for name in ("star_id", "reason"))
+    return dict(sorted((kept | dict(zip(number, reason, strict=True))).items()))
+
+
+def judge(stars: pa.Table, selection: Selection) -> list[str]:
+    """The verdicts in the order of the stars."""
+    return list(verdicts(select_guide_stars(stars, selection)).values())
+
+
+# Magnitude
+
+
+@pytest.mark.parametrize(
+    ("mag", "verdict"),
+    [
+        (2.0, "kept"),
+        (6.0, "kept"),
+        (np.nextafter(6.0, 7.0), "too_faint"),
+        (np.nextafter(2.0, 1.0), "too_bright"),
+        (np.nan, "no_magnitude"),
+    ],
+)
+def test_both_limits_are_kept_themselves(mag: float, verdict: str) -> None:
+    assert judge(alone([mag]), rules(6.0, bright=2.0)) == [verdict]
+
+
+def test_no_stars() -> None:
+    selected = select_guide_stars(alone([]), rules())
+    assert (len(selected.guide_stars), len(selected.rejected)) == (0, 0)
+
+
+# Doubles
+
+
+def limits_around(angle_rad: float) -> tuple[float, float]:
+    """Two neighbouring floats, in degrees, below and at (or above) an angle."""
+    limit = float(np.degrees(angle_rad))
+    while np.radians(limit) >= angle_rad:
+        limit = float(np.nextafter(limit, 0.0))
+    return limit, float(np.nextafter(limit, 1.0))
+
+
+def test_the_separation_itself_is_too_close() -> None:
+    stars = sky([20.0, 20.05], [3.0, 4.0])
+    angle = float(separation(*directions_of(stars)))
+    below, at = limits_around(angle)
+    assert judge(stars, rules(min_separation_deg=below)) == ["kept", "kept"]
+    assert judge(stars, rules(min_separation_deg=at)) == ["double", "double"]
+
+
+@pytest.mark.parametrize("dec", [0.0, 60.0, 89.99, -90.0])
+def test_separation_is_on_the_sphere_and_across_zero_hours(dec: float) -> None:
+    close = directions_from_radec([359.99, 0.01], [dec, dec])
+    expected = "double" if 0.02 * np.cos(np.radians(dec)) <= 0.015 else "kept"
+    stars = sky_of(close, [3.0, 3.0])
+    assert judge(stars, rules(min_separation_deg=0.015)) == [expected] * 2
+
+
+@pytest.mark.parametrize(
+    ("max_delta_mag", "expected"),
+    [
+        (None, ["double", "double"]),
+        (2.0, ["double", "double"]),
+        (1.9, ["kept", "double"]),
+        (0.0, ["kept", "double"]),
+    ],
+)
+def test_a_faint_companion_does_not_count_but_a_bright_one_does(
+    max_delta_mag: float | None, expected: list[str]
+) -> None:
+    stars = sky([0.0, 0.01], [3.0, 5.0])
+    assert judge(stars, rules(max_delta_mag=max_delta_mag)) == expected
+
+
+@pytest.mark.parametrize(
+    ("companion_limit_mag", "expected"),
+    [
+        (None, ["kept", "too_faint"]),
+        (6.4, ["kept", "too_faint"]),
+        (6.5, ["double", "too_faint"]),
+        (9.0, ["double", "too_faint"]),
+    ],
+)
+def test_companions_up_to_their_own_limit(
+    companion_limit_mag: float | None, expected: list[str]
+) -> None:
+    stars = sky([0.0, 0.01], [5.0, 6.5])
+    assert judge(stars, rules(companion_limit_mag=companion_limit_mag)) == expected
+
+
+def test_a_companion_limit_above_the_faint_limit_takes_companions_away() -> None:
+    stars = sky([0.0, 0.01], [5.0, 5.5])
+    assert judge(stars, rules(companion_limit_mag=5.2)) == ["kept", "kept"]
+
+
+def test_a_bright_star_that_is_rejected_is_still_a_companion() -> None:
+    stars = sky([0.0, 0.01], [1.0, 4.0])
+    assert judge(stars, rules(bright=2.0)) == ["too_bright", "double"]
+
+
+def test_a_star_without_magnitude_is_nobodys_companion() -> None:
+    assert judge(sky([0.0, 0.01], [4.0, np.nan]), rules()) == ["kept", "no_magnitude"]
+
+
+@pytest.mark.parametrize("action", ["remove", "merge"])
+def test_separation_zero_takes_only_stars_at_the_same_place(action: str) -> None:
+    stars = sky([5.0, 5.0, 5.0001], [3.0, 4.0, 4.5])
+    expected = ["double", "double", "kept"] if action == "remove" else ["kept", "merged", "kept"]
+    assert judge(stars, rules(min_separation_deg=0.0, action=action)) == expected
+
+
+def test_doubles_can_be_kept() -> None:
+    stars = sky([0.0, 0.01], [3.0, 3.0], is_flagged_double=[True, False])
+    assert judge(stars, rules(action="keep", flags="strict")) == ["kept", "kept"]
+
+
+# Merging
+
+
+def merged(ra_deg: Sequence[float], mag: Sequence[float], **options: Any) -> Selected:
+    return select_guide_stars(sky(ra_deg, mag), rules(action="merge", **options))
+
+
+def test_two_equal_stars_become_one_between_them() -> None:
+    selected = merged([359.99, 0.01], [5.0, 5.0])
+    (star,) = selected.guide_stars.to_pylist()
+    assert star["star_id"] == 1
+    assert star["mag"] == pytest.approx(5.0 - 2.5 * np.log10(2.0))
+    assert (star["x"], star["y"], star["z"]) == pytest.approx((1.0, 0.0, 0.0), abs=1e-15)
+    assert star["ra_deg"] % 360.0 == pytest.approx(0.0, abs=1e-12)
+    assert star["quality_flags"] == Quality.MERGED | Quality.PHOTOCENTRE
+    assert verdicts(selected) == {1: "kept", 2: "merged"}
+    assert selected.rejected["mag"].to_pylist() == [5.0]
+
+
+def test_the_photocentre_is_nearer_to_the_brighter_star_whose_number_stays() -> None:
+    mag = 4.0 + 2.5 * np.log10(3.0)  # a third of the light
+    selected = merged([10.04, 10.0], [mag, 4.0])
+    (star,) = selected.guide_stars.to_pylist()
+    assert star["star_id"] == 2
+    assert star["ra_deg"] == pytest.approx(10.01, abs=1e-8)
+    assert star["dec_deg"] == pytest.approx(0.0, abs=1e-12)
+    assert star["mag"] == pytest.approx(4.0 - 2.5 * np.log10(4.0 / 3.0))
+
+
+def test_a_chain_of_three_is_one_star() -> None:
+    selected = merged([0.0, 0.04, 0.08, 1.0], [5.0, 5.0, 5.0, 5.0], min_separation_deg=0.05)
+    assert verdicts(selected) == {1: "kept", 2: "merged", 3: "merged", 4: "kept"}
+    assert count_by_reason(selected.rejected) == {"merged": 2}
+    assert selected.guide_stars["mag"][0].as_py() == pytest.approx(5.0 - 2.5 * np.log10(3.0))
+    assert selected.guide_stars["ra_deg"].to_pylist() == pytest.approx([0.04, 1.0], abs=1e-9)
+    assert selected.guide_stars["quality_flags"].to_pylist()[1] == 0
+
+
+def test_two_groups_do_not_mix() -> None:
+    selected = merged([0.0, 5.0, 0.01, 5.01], [5.0, 4.0, 4.5, 4.5])
+    assert verdicts(selected) == {1: "merged", 2: "kept", 3: "kept", 4: "merged"}
+
+
+def test_a_merged_star_is_compared_with_the_limits_as_one() -> None:
+    both = [5.0, 5.0]  # together 4.25
+    assert list(verdicts(merged([0.0, 0.01], both, bright=4.5)).values()) == [
+        "too_bright",
+        "merged",
+    ]
+    faint = merged([0.0, 0.01], [6.5, 6.5], companion_limit_mag=7.0)  # together 5.75
+    assert list(verdicts(faint).values()) == ["kept", "merged"]
+    apart = merged([0.0, 0.01], [6.5, 6.5])
+    assert list(verdicts(apart).values()) == ["too_faint", "too_faint"]
+
+
+@pytest.mark.parametrize(
+    ("max_delta_mag", "expected"), [(1.9, ["kept", "kept"]), (2.0, ["kept", "merged"])]
+)
+def test_stars_too_different_are_not_merged(max_delta_mag: float, expected: list[str]) -> None:
+    selected = merged([0.0, 0.01], [3.0, 5.0], max_delta_mag=max_delta_mag)
+    assert list(verdicts(selected).values()) == expected
+
+
+def test_a_star_without_magnitude_is_not_merged() -> None:
+    selected = merged([0.0, 0.01], [3.0, np.nan])
+    assert verdicts(selected) == {1: "kept", 2: "no_magnitude"}
+    assert selected.guide_stars["quality_flags"].to_pylist() == [0]
+
+
+# Flags of the archive
+
+
+CLOSE, WIDE, UNKNOWN = 10.0, 1000.0, np.nan  # arcsec; the limit is 0.047 deg = 169.2 arcsec
+
+
+@pytest.mark.parametrize(
+    ("flags", "flagged", "apart", "delta", "is_kept"),
+    [
+        ("ignore", True, CLOSE, 0.0, True),
+        ("strict", True, WIDE, 9.0, False),
+        ("strict", True, UNKNOWN, UNKNOWN, False),
+        ("strict", False, CLOSE, 0.0, True),
+        ("unresolved", True, CLOSE, 1.5, False),
+        ("unresolved", True, CLOSE, 2.0, False),
+        ("unresolved", True, CLOSE, 2.1, True),
+        ("unresolved", True, WIDE, 1.5, True),
+        ("unresolved", True, UNKNOWN, 1.5, False),
+        ("unresolved", True, 169.1, 1.5, False),
+        ("unresolved", True, 169.3, 1.5, True),
+        ("unresolved", True, CLOSE, UNKNOWN, True),
+        ("unresolved", False, CLOSE, 0.0, True),
+    ],
+)
+def test_flagged_doubles(
+    flags: str, flagged: bool, apart: float, delta: float, is_kept: bool
+) -> None:
+    stars = alone(
+        [4.0],
+        is_flagged_double=[flagged],
+        companion_separation_arcsec=[apart],
+        companion_delta_mag=[delta],
+    )
+    found = judge(stars, rules(flags=flags, max_delta_mag=2.0))
+    assert found == ["kept" if is_kept else "flagged_double"]
+
+
+def test_without_a_largest_difference_any_that_is_stated_counts() -> None:
+    columns = {"is_flagged_double": [True] * 2, "companion_delta_mag": [9.0, np.nan]}
+    assert judge(alone([4.0, 4.0], **columns), rules()) == ["flagged_double", "kept"]
+
+
+# Variables
+
+
+@pytest.mark.parametrize(
+    ("limit", "amplitude", "verdict"),
+    [
+        (0.6, 0.6, "kept"),
+        (0.6, np.nextafter(0.6, 1.0), "variable"),
+        (0.6, 0.0, "kept"),
+        (0.6, np.nan, "kept"),
+        (None, 9.0, "kept"),
+        (0.0, 0.0, "kept"),
+        (0.0, 0.01, "variable"),
+    ],
+)
+def test_the_largest_amplitude_is_kept_itself(
+    limit: float | None, amplitude: float, verdict: str
+) -> None:
+    stars = alone([4.0], amplitude_mag=[amplitude], is_flagged_variable=[True])
+    assert judge(stars, rules(variables=Variables(max_amplitude_mag=limit))) == [verdict]
+
+
+@pytest.mark.parametrize(
+    ("flags", "flagged", "amplitude", "verdict"),
+    [
+        ("ignore", True, np.nan, "kept"),
+        ("ignore", True, 0.9, "variable"),
+        ("known", True, np.nan, "flagged_variable"),
+        ("known", True, 0.1, "kept"),
+        ("known", True, 0.9, "variable"),
+        ("known", False, np.nan, "kept"),
+        ("strict", True, np.nan, "flagged_variable"),
+        ("strict", True, 0.1, "flagged_variable"),
+        ("strict", True, 0.9, "variable"),
+        ("strict", False, 0.1, "kept"),
+        ("strict", False, 0.9, "variable"),
+    ],
+)
+def test_flagged_variables(flags: str, flagged: bool, amplitude: float, verdict: str) -> None:
+    stars = alone([4.0], amplitude_mag=[amplitude], is_flagged_variable=[flagged])
+    assert judge(stars, rules(variables=Variables(flags=flags))) == [verdict]
+
+
+# Count
+
+
+def test_of_equal_stars_the_lowest_numbers_stay() -> None:
+    stars = alone([5.0, 3.0, 5.0, 5.0, 2.0])
+    expected = ["kept", "kept", "beyond_count", "beyond_count", "kept"]
+    assert judge(stars, rules(max_stars=3)) == expected
+
+
+@pytest.mark.parametrize("max_stars", [5, 6])
+def test_fewer_stars_than_allowed(max_stars: int) -> None:
+    assert judge(alone([5.0] * 5), rules(max_stars=max_stars)) == ["kept"] * 5
+
+
+def test_the_count_is_of_the_stars_that_are_left() -> None:
+    stars = alone([1.0, 3.0, 4.0, 5.0], amplitude_mag=[2.0, np.nan, np.nan, np.nan])
+    expected = ["variable", "kept", "kept", "beyond_count"]
+    assert judge(stars, rules(max_stars=2)) == expected
+
+
+# All together
+
+
+def test_the_first_reason_that_applies_is_the_verdict() -> None:
+    """One star more each time lacks the fault that stopped the one before."""
+    ra = np.array([0, 0, 1, 1, 2, 2, 3, 4, 5, 6, 7]) * ALONE
+    ra[[1, 3, 5]] += 0.01
+    stars = sky(
+        ra,
+        [np.nan, np.nan, 1.0, 1.0, 6.5, 5.0, 4.0, 4.0, 4.0, 4.0, 3.0],
+        is_flagged_double=[True] * 7 + [False] * 4,
+        companion_delta_mag=[0.0] * 11,
+        amplitude_mag=[2.0] * 8 + [0.1, np.nan, np.nan],
+        is_flagged_variable=[True] * 9 + [False] * 2,
+    )
+    selection = rules(
+        bright=2.0,
+        max_stars=1,
+        variables=Variables(flags="strict"),
+        flags="strict",
+        companion_limit_mag=7.0,
+    )
+    assert judge(stars, selection) == [
+        "no_magnitude",
+        "no_magnitude",
+        "too_bright",
+        "too_bright",
+        "too_faint",
+        "double",
+        "flagged_double",
+        "variable",
+        "flagged_variable",
+        "beyond_count",
+        "kept",
+    ]
+
+
+def test_steps_count_down_to_the_guide_stars() -> None:
+    ra = [0.0, 0.01, 10.0, 20.0, 30.0, 40.0]
+    amplitude = [np.nan, np.nan, np.nan, 1.0, np.nan, np.nan]
+    stars = sky(ra, [5.0, 5.0, 6.5, 4.0, 4.0, 4.5], amplitude_mag=amplitude)
+    selected = select_guide_stars(stars, rules(max_stars=1))
+    counted = [(step.name, len(step.directions)) for step in selected.steps]
+    assert counted == [("magnitude", 5), ("doubles", 3), ("variables", 2), ("count", 1)]
+    np.testing.assert_array_equal(
+        selected.steps[-1].directions, directions_of(selected.guide_stars)
+    )
+    without = select_guide_stars(stars, rules())
+    assert [step.name for step in without.steps] == ["magnitude", "doubles", "variables"]
+
+
+def test_stars_that_are_kept_are_kept_as_they_are() -> None:
+    stars = alone([5.0, 7.0, 4.0])
+    selected = select_guide_stars(stars, rules())
+    assert selected.guide_stars.equals(stars.take([0, 2]))
+
+
+@st.composite
+def crowded_skies(draw: st.DrawFn) -> tuple[pa.Table, Selection]:
+    """Up to 20 stars on a grid of 0.02 degrees, and rules for them."""
+    count = draw(st.integers(0, 20))
+
+    def column(values: st.SearchStrategy[Any]) -> NDArray[Any]:
+        return np.array(draw(st.lists(values, min_size=count, max_size=count)))
+
+    place = column(st.integers(0, 8)) * 0.02
+    mag = column(st.sampled_from([np.nan, 1.0, 3.0, 4.0, 5.5, 6.0, 6.5, 8.0])).astype(float)
+    stars = sky(
+        place.astype(float),
+        mag,
+        is_flagged_double=column(st.booleans()).astype(bool),
+        companion_delta_mag=column(st.sampled_from([np.nan, 0.0, 3.0])).astype(float),
+        amplitude_mag=column(st.sampled_from([np.nan, 0.1, 0.9])).astype(float),
+        is_flagged_variable=column(st.booleans()).astype(bool),
+    )
+    selection = rules(
+        6.0,
+        bright=draw(st.sampled_from([-30.0, 2.0])),
+        max_stars=draw(st.sampled_from([None, 1, 3])),
+        variables=Variables(flags=draw(st.sampled_from(["ignore", "known", "strict"]))),
+        min_separation_deg=draw(st.sampled_from([0.0, 0.015, 0.03])),
+        max_delta_mag=draw(st.sampled_from([None, 1.0])),
+        companion_limit_mag=draw(st.sampled_from([None, 7.0])),
+        action=draw(st.sampled_from(["remove", "merge", "keep"])),
+        flags=draw(st.sampled_from(["ignore", "unresolved", "strict"])),
+    )
+    return stars, selection
+
+
+@given(crowded_skies())
+def test_every_star_is_kept_or_rejected_and_never_both(case: tuple[pa.Table, Selection]) -> None:
+    stars, selection = case
+    selected = select_guide_stars(stars, selection)
+    kept = selected.guide_stars["star_id"].to_pylist()
+    rejected = selected.rejected["star_id"].to_pylist()
+    assert sorted(kept + rejected) == stars["star_id"].to_pylist()
+    assert kept == sorted(kept)
+    assert rejected == sorted(rejected)
+    assert selected.rejected["reason"].null_count == 0
+    mag = floats_of(selected.guide_stars, "mag")
+    assert ((mag >= selection.bright_limit_mag) & (mag <= selection.faint_limit_mag)).all()
+    assert selection.max_stars is None or len(kept) <= selection.max_stars
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("action", ["remove", "merge"])
+def test_a_turned_sky_has_the_same_verdicts(seed: int, action: str) -> None:
+    generator = np.random.default_rng(seed)
+    ra, dec = generator.uniform(-0.3, 0.3, (2, 60))
+    place = directions_from_radec(ra % 360.0, dec)
+    mag = generator.uniform(2.0, 7.0, 60)
+    turn = Rotation.random(rng=generator)
+    selection = rules(action=action, max_delta_mag=3.0, max_stars=20)
+    before = select_guide_stars(sky_of(place, mag), selection)
+    after = select_guide_stars(sky_of(turn.apply(place), mag), selection)
+    assert verdicts(after) == verdicts(before)
+    assert len(set(verdicts(before).values())) >= 3
+    turned = turn.apply(directions_of(before.guide_stars))
+    np.testing.assert_allclose(directions_of(after.guide_stars), turned, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        floats_of(after.guide_stars, "mag"), floats_of(before.guide_stars, "mag"), atol=1e-13
+    )

@@ -1,0 +1,273 @@
+"""Specs: what is accepted, and that every key refuses what lies outside its range."""
+
+from __future__ import annotations
+
+import copy
+import math
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import BaseModel, ValidationError
+
+from starcat.catalog.ingest import check_band
+from starcat.catalog.source import data_source, source_names
+from starcat.errors import ConfigError
+from starcat.spec import BuildSpec, CameraSpec, preset, preset_names, read_spec, spec_from_dict
+
+JSON_SCHEMA = BuildSpec.model_json_schema()
+
+
+def resolved(entry: dict[str, Any]) -> dict[str, Any]:
+    """An entry of the JSON schema, with its reference followed and null left out."""
+    if "$ref" in entry:
+        return dict(JSON_SCHEMA["$defs"][entry["$ref"].rpartition("/")[2]])
+    if "anyOf" in entry:
+        return resolved(next(part for part in entry["anyOf"] if part.get("type") != "null"))
+    return entry
+
+
+def walk(entry: dict[str, Any], path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
+    """Every section and every key, with its dotted path."""
+    yield path, entry
+    for name, part in entry.get("properties", {}).items():
+        yield from walk(resolved(part), f"{path}.{name}".lstrip("."))
+
+
+SECTIONS = {path: entry for path, entry in walk(JSON_SCHEMA) if "properties" in entry}
+KEYS = {path: entry for path, entry in walk(JSON_SCHEMA) if "properties" not in entry}
+WRONG_TYPES = {
+    "number": ["six", True, [1.0], math.nan, math.inf],
+    "integer": ["six", True, 1.5],
+    "boolean": ["yes", 1],
+    "string": [5],
+    "array": ["hipparcos", ["no-such-source"]],
+}
+
+
+def outside(entry: dict[str, Any]) -> list[Any]:
+    """Values that a key has to refuse."""
+    below = [entry["minimum"] - 1] if "minimum" in entry else []
+    above = [entry["maximum"] + 1] if "maximum" in entry else []
+    ends = [entry[key] for key in ("exclusiveMinimum", "exclusiveMaximum") if key in entry]
+    other = ["no such"] if "enum" in entry or "pattern" in entry else []
+    return [*below, *above, *ends, *other, *WRONG_TYPES[entry["type"]]]
+
+
+def good() -> dict[str, Any]:
+    return copy.deepcopy(preset("sao-12deg").model_dump(mode="json"))
+
+
+def changed(path: str, value: object) -> dict[str, Any]:
+    """A good spec with one key set."""
+    spec = good()
+    *sections, name = path.split(".")
+    place = spec
+    for section in sections:
+        place = place[section]
+    place[name] = value
+    return spec
+
+
+def refusal(content: dict[str, Any]) -> ConfigError | None:
+    """What a spec is refused with; None where it is accepted."""
+    try:
+        spec_from_dict(content, "spec.toml")
+    except ConfigError as error:
+        return error
+    return None
+
+
+# Presets ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_preset(name: str) -> None:
+    spec = preset(name)
+    assert spec.name == name
+    assert spec.description
+    source = data_source(spec.catalog.source)
+    assert source.kind == "stars"
+    check_band(source, spec.catalog.band)
+    assert set(spec.selection.variables.join) <= set(source_names())
+    assert spec.camera.camera().fov_x_deg < 120.0
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_a_spec_survives_being_written(name: str) -> None:
+    spec = preset(name)
+    assert spec_from_dict(spec.model_dump(mode="json"), "manifest") == spec
+    assert BuildSpec.model_validate_json(spec.model_dump_json()) == spec
+
+
+def test_unknown_preset_names_the_nearest() -> None:
+    with pytest.raises(ConfigError, match="did you mean 'sao-6deg'") as caught:
+        preset("sao-6degree")
+    assert caught.value.key == "preset"
+
+
+def test_a_spec_cannot_be_changed() -> None:
+    with pytest.raises(ValidationError):
+        preset("sao-12deg").name = "other"
+
+
+# Every key ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [(path, value) for path, entry in KEYS.items() for value in outside(entry)],
+    ids=str,
+)
+def test_values_outside_are_refused(path: str, value: object) -> None:
+    with pytest.raises(ConfigError) as caught:
+        spec_from_dict(changed(path, value), "spec.toml")
+    assert caught.value.key is not None
+    assert caught.value.key.startswith(path)
+    assert str(caught.value).startswith(f"spec.toml: {path}")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [(p, e[end]) for p, e in KEYS.items() for end in ("minimum", "maximum") if end in e],
+    ids=str,
+)
+def test_ends_of_a_range_belong_to_it(path: str, value: float) -> None:
+    # Two keys may contradict each other at the end of a range: that is for their section.
+    error = refusal(changed(path, value))
+    assert error is None or error.key != path
+
+
+@pytest.mark.parametrize("path", SECTIONS, ids=lambda path: path or "top")
+def test_unknown_keys_name_the_nearest_and_all(path: str) -> None:
+    known = sorted(SECTIONS[path]["properties"])
+    wrong = f"{known[0]}s_"
+    with pytest.raises(ConfigError, match=f"did you mean {known[0]!r}") as caught:
+        spec_from_dict(changed(f"{path}.{wrong}".lstrip("."), 1), "spec.toml")
+    assert str(caught.value).endswith(f"known keys here: {', '.join(known)}")
+    assert caught.value.key == f"{path}.{wrong}".lstrip(".")
+
+
+def test_a_misspelt_key_is_named_before_the_one_it_leaves_missing() -> None:
+    spec = good()
+    spec["selection"]["faint_limit"] = spec["selection"].pop("faint_limit_mag")
+    with pytest.raises(ConfigError, match="did you mean 'faint_limit_mag'"):
+        spec_from_dict(spec, "spec.toml")
+
+
+def test_an_unknown_key_like_no_other_gets_no_suggestion() -> None:
+    with pytest.raises(ConfigError, match="unknown key; known keys here") as caught:
+        spec_from_dict(changed("xyzzyx", 1), "spec.toml")
+    assert "did you mean" not in str(caught.value)
+
+
+@pytest.mark.parametrize("path", [path for path in SECTIONS if path])
+def test_a_section_is_no_value(path: str) -> None:
+    with pytest.raises(ConfigError, match=path):
+        spec_from_dict(changed(path, 3), "spec.toml")
+
+
+@pytest.mark.parametrize("key", sorted(JSON_SCHEMA["required"]))
+def test_missing_keys(key: str) -> None:
+    spec = good()
+    del spec[key]
+    with pytest.raises(ConfigError, match=f"{key}: missing; every spec needs it"):
+        spec_from_dict(spec, "spec.toml")
+
+
+def test_every_key_has_its_unit_in_its_name() -> None:
+    units = ("_deg", "_px", "_mag", "_jyear", "_mm", "_um", "_rad", "_arcsec")
+    plain = {"min_identified"}
+    for path, entry in KEYS.items():
+        if entry["type"] == "number" and path.rpartition(".")[2] not in plain:
+            assert path.endswith(units), path
+
+
+ANYTHING = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.dictionaries(st.text(), inner, max_size=3) | st.lists(inner, max_size=3),
+)
+
+
+@given(st.sampled_from([*KEYS, *filter(None, SECTIONS)]), ANYTHING)
+def test_anything_else_is_refused_in_one_printable_line(path: str, value: object) -> None:
+    assert str(refusal(changed(path, value))).isprintable()
+
+
+# Keys that speak of one another -------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bright", [6.0, 7.0])
+def test_limits_are_in_order(bright: float) -> None:
+    with pytest.raises(ConfigError, match="larger is fainter, so they may be swapped"):
+        spec_from_dict(changed("selection.bright_limit_mag", bright), "spec.toml")
+
+
+@pytest.mark.parametrize(
+    "scale",
+    [
+        {},
+        {"focal_length_mm": 40.0},
+        {"pixel_um": 16.0},
+        {"fov_x_deg": 12.0, "pixel_um": 16.0},
+        {"fov_x_deg": 12.0, "focal_length_mm": 40.0, "pixel_um": 16.0},
+    ],
+)
+def test_a_camera_has_one_scale(scale: dict[str, float]) -> None:
+    camera = {"width_px": 512, "height_px": 512, **scale}
+    with pytest.raises(ConfigError, match="either fov_x_deg, or focal_length_mm and pixel_um"):
+        spec_from_dict(changed("camera", camera), "spec.toml")
+
+
+def test_a_lens_and_its_field_are_the_same_camera() -> None:
+    lens = CameraSpec(width_px=512, height_px=512, focal_length_mm=40.0, pixel_um=16.0).camera()
+    # Half a detector of 512 * 0.016 mm over 40 mm.
+    assert lens.fov_x_deg == pytest.approx(2.0 * math.degrees(math.atan(4.096 / 40.0)), rel=1e-14)
+    field = CameraSpec(width_px=512, height_px=512, fov_x_deg=lens.fov_x_deg).camera()
+    assert field.focal_length_px == pytest.approx(lens.focal_length_px, rel=1e-14)
+    assert lens.focal_length_px == pytest.approx(2500.0)
+
+
+def test_a_lens_in_the_wrong_unit_is_noticed() -> None:
+    camera = {"width_px": 512, "height_px": 512, "focal_length_mm": 0.04, "pixel_um": 16.0}
+    with pytest.raises(ConfigError, match="field of 120 deg or more; check its units"):
+        spec_from_dict(changed("camera", camera), "spec.toml")
+
+
+# Files --------------------------------------------------------------------------------------
+
+
+def test_a_whole_number_will_do_for_a_magnitude(tmp_path: Path, small_spec: str) -> None:
+    path = tmp_path / "spec.toml"
+    path.write_text(small_spec.replace("faint_limit_mag = 6.0", "faint_limit_mag = 6"))
+    assert read_spec(path) == spec_from_dict(tomllib.loads(small_spec), "small.toml")
+
+
+@pytest.mark.parametrize("content", [b"", b"name", b"\xff\xfe", b'name = "a"\nname = "b"'])
+def test_files_that_are_no_spec(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "spec.toml"
+    path.write_bytes(content)
+    with pytest.raises(ConfigError, match=r"spec\.toml"):
+        read_spec(path)
+
+
+@pytest.mark.parametrize("name", [".", "none.toml"])
+def test_paths_that_are_no_file(name: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError):
+        read_spec(tmp_path / name)
+
+
+def test_all_sections_are_models_that_refuse_unknown_keys() -> None:
+    def check(model: type[BaseModel]) -> None:
+        assert model.model_config["extra"] == "forbid"
+        assert model.model_config["frozen"]
+        for part in model.model_fields.values():
+            if isinstance(part.annotation, type) and issubclass(part.annotation, BaseModel):
+                check(part.annotation)
+
+    check(BuildSpec)

@@ -1,0 +1,486 @@
+"""Verification: a good artifact passes, and nothing that is done to one goes unnoticed."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pytest
+
+from starcat.artifact.content import content_sha256, file_sha256, json_bytes
+from starcat.artifact.manifest import DATABASE_NAME, MANIFEST_NAME, manifest_digest
+from starcat.artifact.reader import open_artifact
+from starcat.artifact.verify import Finding, check_artifact, verify_artifact
+from starcat.errors import ProductError
+from starcat.parquet import read_parquet, write_parquet
+
+Change = Callable[[dict[str, Any]], object]
+
+
+@pytest.fixture
+def copy(small_artifact: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(small_artifact, tmp_path / small_artifact.name))
+
+
+@pytest.fixture(scope="module")
+def files(small_artifact: Path) -> list[str]:
+    paths = (path for path in small_artifact.rglob("*") if path.is_file())
+    return sorted(path.relative_to(small_artifact).as_posix() for path in paths)
+
+
+def product_of(file: str) -> str:
+    if file == DATABASE_NAME:
+        return "database"
+    return Path(file).stem if file.endswith(".parquet") else ""
+
+
+def seal(folder: Path, change: Change = lambda manifest: None) -> None:
+    """Write a manifest whose digests are right, whatever the artifact holds."""
+    manifest = json.loads((folder / MANIFEST_NAME).read_bytes())
+    for name, facts in manifest["files"].items():
+        if (folder / name).is_file():
+            facts["bytes"] = (folder / name).stat().st_size
+            facts["sha256"] = file_sha256(folder / name)
+    artifact = open_artifact(folder)
+    for product, facts in manifest["products"].items():
+        table, schema = artifact.table(product), artifact.schema(product)
+        facts["rows"] = len(table)
+        if table.column_names == [column.name for column in schema.columns]:
+            facts["content_sha256"] = content_sha256(table, schema)
+    change(manifest)
+    manifest["manifest_sha256"] = manifest_digest(manifest)
+    (folder / MANIFEST_NAME).write_bytes(json_bytes(manifest))
+
+
+def rewrite(folder: Path, product: str, change: Callable[[pa.Table], pa.Table]) -> None:
+    """Change a product's Parquet file, with digests that are right again."""
+    path = folder / f"{product}.parquet"
+    write_parquet(change(read_parquet(path)), path)
+    seal(folder)
+
+
+def edit_database(folder: Path, change: Callable[[h5py.File], object]) -> None:
+    with h5py.File(folder / DATABASE_NAME, "r+") as file:
+        change(file)
+    seal(folder)
+
+
+def with_value(name: str, row: int, value: object) -> Callable[[pa.Table], pa.Table]:
+    def change(table: pa.Table) -> pa.Table:
+        values = table[name].to_pylist()
+        values[row] = value
+        field = table.schema.field(name)
+        column = pa.array(values, field.type)
+        return table.set_column(table.schema.get_field_index(name), field, column)
+
+    return change
+
+
+def expect(folder: Path, file: str, product: str, words: str) -> tuple[Finding, ...]:
+    """Check that verification finds a problem, and return all that it finds."""
+    found = verify_artifact(folder).findings
+    named = [f for f in found if (f.file, f.product) == (file, product)]
+    assert any(words in f.problem for f in named), f"{words!r} is in none of {found}"
+    return found
+
+
+# Whole and damaged files --------------------------------------------------------------------
+
+
+def test_a_good_artifact_passes(small_artifact: Path) -> None:
+    found = verify_artifact(small_artifact)
+    assert found.findings == ()
+    assert found.checks > 60
+    assert found.as_dict() == {
+        "folder": str(small_artifact), "checks": found.checks, "findings": []
+    }  # fmt: skip
+    assert check_artifact(small_artifact).manifest["name"] == "small"
+
+
+def test_every_file_is_of_a_known_kind(files: Sequence[str]) -> None:
+    assert {MANIFEST_NAME, DATABASE_NAME, "stars.parquet", "pairs.parquet"} <= set(files)
+
+
+def test_200_flipped_bytes_are_all_found(copy: Path, files: Sequence[str]) -> None:
+    """Some in every file, the places drawn at random; each is put back before the next."""
+    generator = random.Random(200)
+    drawn = [files[n % len(files)] for n in range(200)]
+    for name in drawn:
+        path = copy / name
+        whole = path.read_bytes()
+        place = generator.randrange(len(whole))
+        data = bytearray(whole)
+        data[place] ^= 1 << generator.randrange(8)
+        path.write_bytes(data)
+        found = verify_artifact(copy).findings
+        path.write_bytes(whole)
+        assert (name, product_of(name)) in {(f.file, f.product) for f in found}, (name, place)
+        assert {f.file for f in found} == {name}, (name, place, found)
+    assert verify_artifact(copy).findings == ()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_every_truncated_file_is_found(share: float, copy: Path, files: Sequence[str]) -> None:
+    for name in files:
+        whole = (copy / name).read_bytes()
+        os.truncate(copy / name, int(share * len(whole)))
+        found = verify_artifact(copy).findings
+        (copy / name).write_bytes(whole)
+        assert (name, product_of(name)) in {(f.file, f.product) for f in found}
+        assert {f.file for f in found} == {name}
+    assert verify_artifact(copy).findings == ()
+
+
+def test_every_missing_file_is_found(copy: Path, files: Sequence[str]) -> None:
+    for name in files:
+        whole = (copy / name).read_bytes()
+        (copy / name).unlink()
+        (finding,) = verify_artifact(copy).findings
+        (copy / name).write_bytes(whole)
+        assert (finding.file, finding.product) == (name, product_of(name))
+        assert finding.problem.startswith("missing")
+
+
+def test_a_damaged_database_names_the_products_that_lost_values(copy: Path) -> None:
+    with h5py.File(copy / DATABASE_NAME, "r") as file:
+        place = file["pairs/separation_rad"].id.get_offset() + 801
+    path = copy / DATABASE_NAME
+    data = bytearray(path.read_bytes())
+    data[place] ^= 4
+    path.write_bytes(data)
+    found = expect(copy, DATABASE_NAME, "pairs", "does not hold separation_rad")
+    assert {f.product for f in found} == {"database", "pairs"}
+
+
+def test_all_damaged_files_are_found_at_once(copy: Path) -> None:
+    for name in ("pairs.parquet", "stars.parquet", DATABASE_NAME):
+        os.truncate(copy / name, 100)
+    (copy / "triangles.parquet").unlink()
+    (copy / "notes.txt").write_text("mine")
+    found = verify_artifact(copy).findings
+    assert {f.file for f in found} == {
+        "pairs.parquet", "stars.parquet", DATABASE_NAME, "triangles.parquet", "notes.txt"
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "report/late.json", "grid2.parquet"])
+def test_an_unlisted_file_is_found(name: str, copy: Path) -> None:
+    (copy / name).write_bytes(b"{}")
+    (finding,) = verify_artifact(copy).findings
+    assert (finding.file, finding.problem) == (name, "not listed in the manifest")
+
+
+def test_a_dangling_link_is_found(copy: Path) -> None:
+    (copy / "link").symlink_to(copy / "nowhere")
+    expect(copy, "link", "", "not listed")
+
+
+def test_a_folder_in_place_of_a_file_is_found(copy: Path) -> None:
+    (copy / "pairs.parquet").unlink()
+    (copy / "pairs.parquet").mkdir()
+    expect(copy, "pairs.parquet", "pairs", "missing")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root reads everything")
+def test_an_unreadable_file_is_found(copy: Path) -> None:
+    (copy / "pairs.parquet").chmod(0)
+    expect(copy, "pairs.parquet", "pairs", "cannot be read: PermissionError")
+
+
+def test_no_folder_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(ProductError, match="no such artifact"):
+        verify_artifact(tmp_path / "nothing")
+
+
+def test_a_check_stops_with_the_first_problems(copy: Path) -> None:
+    for path in copy.glob("*.parquet"):
+        os.truncate(path, 10)
+    count = len(list(copy.glob("*.parquet")))
+    with pytest.raises(
+        ProductError, match=rf"boresights.parquet .*; and {count - 5} more"
+    ) as error:
+        check_artifact(copy)
+    assert (error.value.product, error.value.path) == ("boresights", copy / "boresights.parquet")
+
+
+# The manifest -------------------------------------------------------------------------------
+
+
+def test_an_edited_manifest_is_found_by_its_own_digest(copy: Path) -> None:
+    manifest = json.loads((copy / MANIFEST_NAME).read_bytes())
+    manifest["products"]["pairs"]["rows"] += 1
+    (copy / MANIFEST_NAME).write_bytes(json_bytes(manifest))
+    (finding,) = expect(copy, MANIFEST_NAME, "", "manifest_sha256 is not its digest")
+    assert finding.product == ""
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"null", b"[]", b'"name"', b"{}", b'{"manifest_version": "1.0.0"}', b"\xff", b"[" * 9999],
+    ids=range(8),
+)
+def test_a_manifest_of_something_else_is_found(data: bytes, copy: Path) -> None:
+    (copy / MANIFEST_NAME).write_bytes(data)
+    expect(copy, MANIFEST_NAME, "", "")
+
+
+@pytest.mark.parametrize("key", ["files", "products", "sources", "spec", "name"])
+@pytest.mark.parametrize("value", [None, [], {}, 3, "text", {"x": None}], ids=str)
+def test_a_senseless_manifest_with_a_right_digest_is_found(
+    key: str, value: object, copy: Path
+) -> None:
+    seal(copy, lambda manifest: manifest.update({key: value}))
+    assert MANIFEST_NAME in {f.file for f in verify_artifact(copy).findings} or key == "files"
+    assert verify_artifact(copy).findings
+
+
+def test_newer_versions_are_named_with_the_known_ones(copy: Path) -> None:
+    def newer(manifest: dict[str, Any]) -> None:
+        manifest["products"]["pairs"]["schema"] = "pairs-2.0.0"
+
+    seal(copy, newer)
+    expect(copy, "pairs.parquet", "pairs", "version 2.0.0 found; this starcat reads: 1.0.0")
+
+
+def test_a_newer_manifest_is_named_with_the_known_version(copy: Path) -> None:
+    seal(copy, lambda manifest: manifest.update(manifest_version="2.0.0"))
+    expect(copy, MANIFEST_NAME, "", "manifest version 2.0.0; this starcat reads 1.0.0")
+
+
+def manifest_case(words: str, change: Change) -> Any:
+    return pytest.param(words, change, id=words)
+
+
+@pytest.mark.parametrize(
+    ("words", "change"),
+    [
+        manifest_case("rows read", lambda m: m["sources"][0].update(rows_read=601)),
+        manifest_case("kept, but", lambda m: m["sources"][0].update(kept=600, rejected={})),
+        manifest_case("in its files", lambda m: m["sources"][0]["files"][0].update(rows=5)),
+        manifest_case("product rejected holds", lambda m: swap_reason(m["sources"][0]["rejected"])),
+        manifest_case("the spec says 201", lambda m: m["spec"]["boresights"].update(count=201)),
+        manifest_case("its spec says", lambda m: m.update(epoch_jyear=2000.0)),
+        manifest_case("not among the files", lambda m: m["files"].pop("pairs.parquet")),
+    ],
+)
+def test_counts_that_do_not_add_up(words: str, change: Change, copy: Path) -> None:
+    seal(copy, change)
+    expect(copy, MANIFEST_NAME, "", words)
+
+
+def swap_reason(rejected: dict[str, int]) -> None:
+    rejected["too_bright"] = rejected.pop("too_faint")
+
+
+# Products whose files are whole but whose content is not right -------------------------------
+
+
+def test_the_sealing_of_these_tests_is_not_what_is_found(copy: Path) -> None:
+    before = (copy / MANIFEST_NAME).read_bytes()
+    seal(copy)
+    assert (copy / MANIFEST_NAME).read_bytes() == before
+
+
+def test_unsorted_rows(copy: Path) -> None:
+    def swap(table: pa.Table) -> pa.Table:
+        return table.take(pa.array([1, 0, *range(2, len(table))]))
+
+    rewrite(copy, "pairs", swap)
+    found = expect(copy, "pairs.parquet", "pairs", "row 1 does not come after row 0")
+    assert (DATABASE_NAME, "pairs") in {(f.file, f.product) for f in found}
+
+
+def test_a_repeated_row(copy: Path) -> None:
+    rewrite(copy, "triangles", lambda t: t.take(pa.array([0, 0, *range(1, len(t))])))
+    expect(copy, "triangles.parquet", "triangles", "row 1 does not come after row 0")
+
+
+def test_nulls_come_last_in_the_order(copy: Path) -> None:
+    def last_without_number(table: pa.Table) -> pa.Table:
+        return with_value("star_id", len(table) - 1, None)(table)
+
+    rewrite(copy, "rejected", last_without_number)
+    assert verify_artifact(copy).findings == ()
+    first = [("star_id", "ascending", "at_start")]
+    rewrite(copy, "rejected", lambda table: table.take(pc.sort_indices(table, sort_keys=first)))
+    expect(copy, "rejected.parquet", "rejected", "row 1 does not come after row 0")
+
+
+@pytest.mark.parametrize(
+    ("product", "column", "value"),
+    [("pairs", "j", 100_000), ("pairs", "i", -1), ("boresights", "brightest", [100_000])],
+)
+def test_an_index_out_of_range(product: str, column: str, value: object, copy: Path) -> None:
+    rewrite(copy, product, with_value(column, 5, value))
+    expect(copy, f"{product}.parquet", product, f"{column} refers to rows")
+
+
+@pytest.mark.parametrize(
+    ("product", "column", "words"),
+    [
+        ("stars", "x", "is not a unit vector"),
+        ("stars", "ra_deg", "is not the direction of its ra_deg"),
+        ("boresights", "dec_deg", "is not the direction of its ra_deg"),
+        ("pairs", "separation_rad", "separation_rad of row 0 is not that of its stars"),
+    ],
+)
+def test_a_wrong_number(product: str, column: str, words: str, copy: Path) -> None:
+    value = read_parquet(copy / f"{product}.parquet")[column][0].as_py()
+    rewrite(copy, product, with_value(column, 0, value - 1e-9 * (1.0 + abs(value))))
+    expect(copy, f"{product}.parquet", product, words)
+
+
+def test_values_that_are_not_those_of_the_content_digest(copy: Path) -> None:
+    rewrite(copy, "stars", with_value("mag", 3, 9.0))
+    seal(copy, lambda m: m["products"]["stars"].update(content_sha256="0" * 64))
+    expect(copy, "stars.parquet", "stars", "not those of the manifest's content_sha256")
+    expect(copy, DATABASE_NAME, "stars", "/stars/mag differs from the Parquet file")
+    seal(copy, lambda m: m["products"]["stars"].update(rows=7))
+    expect(copy, "stars.parquet", "stars", "rows; the manifest says 7")
+
+
+@pytest.mark.parametrize(
+    ("words", "change"),
+    [
+        ("columns differ", lambda t: t.drop_columns(["mag"])),
+        ("says int64", lambda t: t.cast(pa.schema([*map(as_float, t.schema)]))),
+        ("rows have no value", lambda t: t.set_column(
+            1, pa.field("catalog", pa.string()), pa.nulls(len(t), pa.string()))),
+    ],
+)  # fmt: skip
+def test_columns_that_break_the_schema(
+    words: str, change: Callable[[pa.Table], pa.Table], copy: Path
+) -> None:
+    path = copy / "stars.parquet"
+    write_parquet(change(read_parquet(path)), path)
+    seal(copy, lambda manifest: None) if words == "columns differ" else seal_file(copy, path)
+    expect(copy, "stars.parquet", "stars", words)
+
+
+def as_float(field: pa.Field) -> pa.Field:
+    return pa.field(field.name, pa.float64()) if field.name == "star_id" else field
+
+
+def seal_file(folder: Path, path: Path) -> None:
+    manifest = json.loads((folder / MANIFEST_NAME).read_bytes())
+    facts = {"bytes": path.stat().st_size, "sha256": file_sha256(path)}
+    manifest["files"][path.name] = facts
+    manifest["manifest_sha256"] = manifest_digest(manifest)
+    (folder / MANIFEST_NAME).write_bytes(json_bytes(manifest))
+
+
+@pytest.mark.parametrize("name", ["pairs.parquet", "stars.parquet", DATABASE_NAME])
+def test_rubbish_with_a_right_digest(name: str, copy: Path) -> None:
+    (copy / name).write_bytes(b"PAR1" + bytes(range(256)) + b"PAR1")
+    seal_file(copy, copy / name)
+    expect(copy, name, product_of(name), "cannot be read")
+
+
+# The database -------------------------------------------------------------------------------
+
+
+def put(place: str, row: int, value: float) -> Callable[[h5py.File], object]:
+    def change(file: h5py.File) -> None:
+        file[place][row] = value
+
+    return change
+
+
+def attribute(place: str, name: str, value: object) -> Callable[[h5py.File], object]:
+    return lambda file: file[place].attrs.__setitem__(name, value)
+
+
+def replace(place: str, change: Callable[[Any], Any]) -> Callable[[h5py.File], object]:
+    def run(file: h5py.File) -> None:
+        values = change(file[place][()])
+        del file[place]
+        file[place] = values
+
+    return run
+
+
+def remove(place: str) -> Callable[[h5py.File], object]:
+    return lambda file: file.__delitem__(place)
+
+
+@pytest.mark.parametrize(
+    ("product", "words", "change"),
+    [
+        ("pairs", "/pairs/i differs from the Parquet file", put("pairs/i", 3, 0)),
+        ("pairs", "/pairs/i holds int32; expected uint16",
+         replace("pairs/i", lambda v: v.astype("i4"))),
+        ("pairs", "/pairs/j is missing", remove("pairs/j")),
+        ("stars", "/stars/x differs", replace("stars/x", lambda v: v[:-1])),
+        ("pairs", "attribute units is 'deg'", attribute("pairs/separation_rad", "units", "deg")),
+        ("pairs", "attribute description", attribute("pairs/i", "description", "a star")),
+        ("pairs", "attribute rows is 3", attribute("pairs", "rows", 3)),
+        ("stars", "attribute schema", attribute("stars", "schema", "stars-0.9.0")),
+        ("database", "attribute name is 'other'", attribute("/", "name", "other")),
+        ("database", "attribute layout_version", attribute("/", "layout_version", "9.0.0")),
+        ("database", "group extra is not in the manifest", lambda f: f.create_group("extra")),
+        ("database", "group pairs is missing", remove("pairs")),
+        ("pairs", "kvector_counts[2] is 9", put("pairs/kvector_counts", 2, 9)),
+        ("pairs", "is not ascending", put("pairs/kvector_counts", 2, 9)),
+        ("pairs", "ends with 5", put("pairs/kvector_counts", -1, 5)),
+        ("pairs", "entries for", replace("pairs/kvector_counts", lambda v: v[1:])),
+        ("pairs", "/pairs/kvector_counts is missing", remove("pairs/kvector_counts")),
+        ("pairs", "values lie on or below", attribute("pairs", "kvector_slope", 1e-3)),
+        ("triangles", "values lie on or below", attribute("triangles", "kvector_intercept", 1e-3)),
+        ("neighbours", "does not say where", put("neighbours/star_offsets", 1, 99)),
+        ("neighbours", "does not ascend from 0", put("neighbours/lookup_offsets", 0, 1)),
+        ("neighbours", "lookup_rows has rows -7", put("neighbours/lookup_rows", 0, -7)),
+        ("neighbours", "does not ascend within its bin",
+         replace("neighbours/lookup_rows", lambda v: v[::-1])),
+        ("neighbours", "lookup_rows is missing", remove("neighbours/lookup_rows")),
+        ("grid", "cells_values differs", put("grid/cells_values", 0, 0)),
+    ],
+)  # fmt: skip
+def test_a_wrong_database(
+    product: str, words: str, change: Callable[[h5py.File], object], copy: Path
+) -> None:
+    edit_database(copy, change)
+    expect(copy, DATABASE_NAME, product, words)
+
+
+def test_an_empty_product_is_sound(copy: Path) -> None:
+    """No pair at all: an empty table, an empty K-vector."""
+    empty = {"i": np.empty(0, "<u2"), "j": np.empty(0, "<u2"), "separation_rad": np.empty(0)}
+
+    def change(file: h5py.File) -> None:
+        for name, values in {**empty, "kvector_counts": np.empty(0, "<i4")}.items():
+            kept = dict(file[f"pairs/{name}"].attrs)
+            del file[f"pairs/{name}"]
+            file[f"pairs/{name}"] = values
+            file[f"pairs/{name}"].attrs.update(kept)
+        file["pairs"].attrs["rows"] = 0
+
+    rewrite(copy, "pairs", lambda table: table.slice(0, 0))
+    edit_database(copy, change)
+    assert verify_artifact(copy).findings == ()
+
+
+# The command --------------------------------------------------------------------------------
+
+
+def test_the_command_says_what_it_found(small_artifact: Path, copy: Path, starcat: Any) -> None:
+    ran = starcat(["verify", small_artifact])
+    assert ran.code == 0
+    assert "small-1.0.0: sound (" in ran.out
+    os.truncate(copy / "pairs.parquet", 10)
+    ran = starcat(["verify", copy])
+    assert ran.code == 5
+    assert "1 problem" in ran.out
+    assert "pairs.parquet" in ran.out
+    ran = starcat(["verify", copy, "--json"])
+    assert ran.code == 5
+    (finding,) = json.loads(ran.out)["findings"]
+    assert (finding["file"], finding["product"]) == ("pairs.parquet", "pairs")
