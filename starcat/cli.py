@@ -384,7 +384,7 @@ def main() -> None:
     """
     signal.signal(signal.SIGTERM, _stop)
     try:
-        app()
+        app(prog_name="starcat")
     except StarcatError as error:
         if "--debug" in sys.argv:
             raise
