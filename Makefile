@@ -35,13 +35,14 @@ test-all: $(READY) ## the fast tests and the sky-scale ones
 
 demo: $(READY) ## build a database from the embedded sky, check it, identify simulated fields
 	$(BIN)/starcat build --preset gaia-12deg --output dist --replace
-	$(BIN)/starcat inspect dist/gaia-12deg-1.0.0
+	$(BIN)/starcat verify dist/gaia-12deg-1.0.0
 	$(BIN)/starcat simulate dist/gaia-12deg-1.0.0 --output dist/frame.csv --seed 7
 	$(BIN)/starcat identify dist/gaia-12deg-1.0.0 dist/frame.csv
 	$(BIN)/starcat selftest dist/gaia-12deg-1.0.0 --frames 500
 
 bench: $(READY) ## time and memory beside bare parsers, in one run
 	$(BIN)/python tests/benchmarks/ingest.py
+	$(BIN)/python tests/benchmarks/products.py
 
 docs: $(READY) ## rewrite the generated pages of docs/
 	$(BIN)/python tests/builders/docs.py

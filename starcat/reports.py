@@ -185,6 +185,8 @@ def print_built(built: Built, *, as_json: bool) -> None:
         Whether to print JSON.
     """
     manifest = built.manifest
+    for warning in built.warnings:
+        say(f"warning: {warning}")
     if as_json:
         print_json(
             {
@@ -227,8 +229,6 @@ def print_built(built: Built, *, as_json: bool) -> None:
     seconds = [(stage, f"{taken:.2f}") for stage, taken in built.times_s.items()]
     print_table("Times", ("stage", "seconds"), seconds, numbers=(1,))
     print_problems(built.problems)
-    for warning in built.warnings:
-        say(f"warning: {warning}")
     say(f"{built.outcome}: {built.folder}")
 
 
@@ -242,11 +242,17 @@ def print_products(manifest: dict[str, Any]) -> None:
     """
     files = manifest["files"]
     rows = [
-        (name, facts["schema"], f"{facts['rows']:,}", f"{files[facts['parquet']]['bytes']:,}")
+        (
+            name,
+            facts["schema"],
+            f"{facts['rows']:,}",
+            f"{files[facts['parquet']]['bytes']:,}",
+            f"{facts['records']:,} over all fields" if "records" in facts else "",
+        )
         for name, facts in manifest["products"].items()
     ]
-    rows.append(("database.h5", "", "", f"{files['database.h5']['bytes']:,}"))
-    print_table("Products", ("product", "schema", "rows", "bytes"), rows, numbers=(2, 3))
+    rows.append(("database.h5", "", "", f"{files['database.h5']['bytes']:,}", ""))
+    print_table("Products", ("product", "schema", "rows", "bytes", ""), rows, numbers=(2, 3))
 
 
 def print_rates(rates: Sequence[Rates], *, as_json: bool) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import SphericalVoronoi, cKDTree
 
 from starcat.artifact.reader import open_artifact
-from starcat.catalog.ingest import count_by_reason
+from starcat.catalog.ingest import count_by_reason, ingest
 from starcat.catalog.selection import Selected, reject_dense, select_guide_stars
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.errors import BuildError, ConfigError
@@ -284,14 +284,10 @@ def test_a_thinned_build_counts_density(make: Callable[..., Built], small_artifa
 
 
 def test_thinning_makes_a_real_sky_even(catalogs: Path) -> None:
-    from starcat.pipeline import read_sources
-    from starcat.progress import no_progress
-
     base = preset("sao-12deg")
     selection = base.selection.model_copy(update={"max_stars_per_field": 10})
     spec = base.model_copy(update={"selection": selection})
-    inputs = {"sao": [catalogs / "sao.dat.gz"], "hipparcos": [catalogs / "hip_main.dat.gz"]}
-    catalog, _ = read_sources(spec, inputs, no_progress)
+    catalog = ingest("sao", [catalogs / "sao.dat.gz"], epoch_jyear=spec.epoch_jyear)
     selected = select_guide_stars(catalog.stars, spec.selection)
     before = tile_guide_stars(selected.guide_stars, spec)
     thinned = reject_dense(selected, before.brightest(10)[1])

@@ -13,9 +13,10 @@ from starcat.artifact import manifest as manifest_module
 from starcat.artifact.content import json_bytes
 from starcat.artifact.diff import Change
 from starcat.artifact.manifest import MANIFEST_NAME, manifest_digest
+from starcat.artifact_reports import print_rebuilt
 from starcat.errors import ChecksumMismatch, ConfigError, ProductError, SourceMissing
 from starcat.parquet import read_parquet, write_parquet
-from starcat.rebuild import rebuild
+from starcat.rebuild import FileChange, Rebuilt, rebuild
 
 
 @pytest.fixture
@@ -152,19 +153,24 @@ def test_columns_that_came_out_differently_are_named(copy: Path, stars: Path) ->
     }
 
 
-def test_the_command(copy: Path, stars: Path, starcat: Any) -> None:
+def test_the_command(
+    copy: Path, stars: Path, starcat: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
     ran = starcat(["rebuild", copy, "--input", f"sao={stars}"])
     assert ran.code == 0
     assert "every byte the same" in ran.out
     (copy / "pairs.parquet").write_bytes(b"PAR1")
-    ran = starcat(["rebuild", copy, "--input", f"sao={stars}"])
-    assert ran.code == 5
-    assert "1 of " in ran.out
-    assert "changed since it was built" in ran.out
     ran = starcat(["rebuild", copy, "--input", f"sao={stars}", "--json"])
     assert ran.code == 5
     content = json.loads(ran.out)
     assert content["is_identical"] is False
     assert [change["file"] for change in content["changes"]] == ["pairs.parquet"]
+    capsys.readouterr()
+    changes = (FileChange("pairs.parquet", "changed since it was built"),)
+    print_rebuilt(Rebuilt("a-1.0.0", 9, changes, (Change("numpy", "1", "2"),)), as_json=False)
+    printed = capsys.readouterr().out
+    assert "a-1.0.0: 1 of 9 files differ" in printed
+    assert "changed since it was built" in printed
+    assert "numpy" in printed
     stars.write_bytes(b"")
     assert starcat(["rebuild", copy, "--input", f"sao={stars}"]).code == 3

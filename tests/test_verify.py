@@ -46,16 +46,17 @@ def product_of(file: str) -> str:
 def seal(folder: Path, change: Change = lambda manifest: None) -> None:
     """Write a manifest whose digests are right, whatever the artifact holds."""
     manifest = json.loads((folder / MANIFEST_NAME).read_bytes())
-    for name, facts in manifest["files"].items():
-        if (folder / name).is_file():
-            facts["bytes"] = (folder / name).stat().st_size
-            facts["sha256"] = file_sha256(folder / name)
     artifact = open_artifact(folder)
-    for product, facts in manifest["products"].items():
-        table, schema = artifact.table(product), artifact.schema(product)
-        facts["rows"] = len(table)
-        if table.column_names == [column.name for column in schema.columns]:
-            facts["content_sha256"] = content_sha256(table, schema)
+    for name, facts in manifest["files"].items():
+        before, facts["sha256"] = facts["sha256"], file_sha256(folder / name)
+        facts["bytes"] = (folder / name).stat().st_size
+        product = product_of(name)
+        if facts["sha256"] != before and product in artifact.products:
+            table, schema = artifact.table(product), artifact.schema(product)
+            held = manifest["products"][product]
+            held["rows"] = len(table)
+            if table.column_names == [column.name for column in schema.columns]:
+                held["content_sha256"] = content_sha256(table, schema)
     change(manifest)
     manifest["manifest_sha256"] = manifest_digest(manifest)
     (folder / MANIFEST_NAME).write_bytes(json_bytes(manifest))
@@ -234,7 +235,7 @@ def test_a_manifest_of_something_else_is_found(data: bytes, copy: Path) -> None:
 
 
 @pytest.mark.parametrize("key", ["files", "products", "sources", "spec", "name"])
-@pytest.mark.parametrize("value", [None, [], {}, 3, "text", {"x": None}], ids=str)
+@pytest.mark.parametrize("value", [None, [], {"x": None}], ids=str)
 def test_a_senseless_manifest_with_a_right_digest_is_found(
     key: str, value: object, copy: Path
 ) -> None:

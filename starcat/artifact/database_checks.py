@@ -69,10 +69,10 @@ def group_problems(
             continue
         values = table[column.name].combine_chunks()
         for name, expected in column_datasets(column, values, star_count).items():
-            if name not in group:
+            stored = group.get(name)
+            if stored is None:
                 yield f"{group.name}/{name} is missing"
                 continue
-            stored = group[name]
             if stored.dtype != expected.dtype:
                 yield f"{stored.name} holds {stored.dtype}; expected {expected.dtype}"
             elif stored[()].tobytes() != expected.tobytes():

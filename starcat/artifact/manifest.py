@@ -77,12 +77,27 @@ class SourceFacts:
 
 @dataclass(frozen=True)
 class ProductFacts:
-    """One product of an artifact as the manifest records it."""
+    """One product of an artifact as the manifest records it.
+
+    Attributes
+    ----------
+    schema : ProductSchema
+        Its contract.
+    rows : int
+        Rows of its table.
+    content_sha256 : str
+        Digest of its values.
+    in_database : bool
+        Whether the HDF5 file has it too.
+    records : int, optional
+        Of triangles: the sum over all boresights, which the papers count.
+    """
 
     schema: ProductSchema
     rows: int
     content_sha256: str
     in_database: bool
+    records: int | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return the facts as the manifest holds them.
@@ -92,13 +107,16 @@ class ProductFacts:
         dict
             Plain values.
         """
-        return {
+        facts: dict[str, Any] = {
             "schema": self.schema.name,
             "rows": self.rows,
             "content_sha256": self.content_sha256,
             "parquet": f"{self.schema.product}.parquet",
             "in_database": self.in_database,
         }
+        if self.records is not None:
+            facts["records"] = self.records
+        return facts
 
 
 def software_versions() -> dict[str, str]:

@@ -131,9 +131,13 @@ def write_products(
             write_parquet(product.table, folder / f"{product.name}.parquet")
             if product.in_database:
                 write_product(database, product.table, schema, product.index, star_count)
-            digest = content_sha256(product.table, schema)
+            records = product.index.attributes.get("records")
             made[product.name] = ProductFacts(
-                schema, len(product.table), digest, product.in_database
+                schema,
+                len(product.table),
+                content_sha256(product.table, schema),
+                product.in_database,
+                None if records is None else int(records),
             )
     return made
 

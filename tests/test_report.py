@@ -1,0 +1,432 @@
+"""The report of a build: whole, the same every time, and saying what the products say."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from base64 import b64decode
+from collections.abc import Callable
+from html.parser import HTMLParser
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from starcat.artifact.reader import Artifact, open_artifact
+from starcat.coverage_tables import artifact_coverage, histogram_rows
+from starcat.pipeline import build
+from starcat.products.coverage import coverage_from_counts
+from starcat.report.coverage import report_coverage
+from starcat.report.page import table
+from starcat.report.plots import draw_histogram, draw_magnitudes, save_plot
+from starcat.report.report import count_magnitudes
+from starcat.report.sky_map import HALF_HEIGHT, HALF_WIDTH, nearest_raster, project
+from starcat.spec import BuildSpec, spec_from_dict
+from starcat.sphere import directions_from_radec, saff_kuijlaars
+
+FILES = {
+    "coverage.csv",
+    "coverage.json",
+    "coverage_histogram.csv",
+    "coverage_histogram.png",
+    "coverage_histogram.svg",
+    "coverage_map.png",
+    "coverage_map.svg",
+    "index.html",
+    "report.json",
+    "self_test.json",
+    "stars_by_magnitude.csv",
+    "stars_by_magnitude.png",
+    "stars_by_magnitude.svg",
+}
+PLOTS = ["coverage_histogram", "coverage_map", "stars_by_magnitude"]
+VOID = {"meta", "img", "br", "hr", "link", "input"}
+
+
+@pytest.fixture(scope="module")
+def spec() -> BuildSpec:
+    """SAO to V = 5.5 in 300 fields of 20 deg."""
+    text = """
+        name = "report"
+        version = "1.2.3"
+        description = "for <tests> & nothing else"
+        epoch_jyear = 2026.0
+        catalog.source = "sao"
+        selection = { faint_limit_mag = 5.5, max_stars_per_field = 12 }
+        camera = { width_px = 512, height_px = 512, fov_x_deg = 20.0 }
+        boresights.count = 300
+        self_test = { frames = 5, min_identified = 0.0 }
+    """
+    return spec_from_dict(tomllib.loads(text), "report.toml")
+
+
+@pytest.fixture(scope="module")
+def artifact(spec: BuildSpec, catalogs: Path, tmp_path_factory: pytest.TempPathFactory) -> Artifact:
+    folder = tmp_path_factory.mktemp("report")
+    return open_artifact(build(spec, {"sao": [catalogs / "sao.dat.gz"]}, folder).folder)
+
+
+@pytest.fixture(scope="module")
+def report(artifact: Artifact) -> dict[str, Any]:
+    content = json.loads((artifact.folder / "report" / "report.json").read_bytes())
+    assert isinstance(content, dict)
+    return content
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+# Files --------------------------------------------------------------------------------------
+
+
+def test_all_files_are_there_and_in_the_manifest(artifact: Artifact) -> None:
+    folder = artifact.folder / "report"
+    assert {path.name for path in folder.iterdir()} == FILES
+    assert {f"report/{name}" for name in FILES} <= set(artifact.manifest["files"])
+
+
+def test_a_second_build_elsewhere_has_the_same_bytes(
+    artifact: Artifact, spec: BuildSpec, catalogs: Path, tmp_path: Path
+) -> None:
+    """In a fresh process, in another time zone, with settings of matplotlib's user."""
+    (tmp_path / "spec.json").write_text(spec.model_dump_json())
+    settings = "font.size: 31\naxes.facecolor: red\nsavefig.transparent: True\nsvg.fonttype: none\n"
+    (tmp_path / "matplotlibrc").write_text(settings)
+    program = (
+        "import sys, pathlib\n"
+        "from starcat.pipeline import build\n"
+        "from starcat.spec import BuildSpec\n"
+        "spec = BuildSpec.model_validate_json(pathlib.Path('spec.json').read_text())\n"
+        "build(spec, {'sao': [pathlib.Path(sys.argv[1])]}, pathlib.Path('out'))\n"
+    )
+    subprocess.run(
+        [sys.executable, "-c", program, catalogs / "sao.dat.gz"],
+        cwd=tmp_path,
+        env={**os.environ, "TZ": "Asia/Tokyo", "PYTHONHASHSEED": "7", "SOURCE_DATE_EPOCH": "1"},
+        check=True,
+    )
+    for name in FILES:
+        again = tmp_path / "out" / "report-1.2.3" / "report" / name
+        assert again.read_bytes() == (artifact.folder / "report" / name).read_bytes(), name
+
+
+@pytest.mark.parametrize("name", PLOTS)
+def test_plots_open_and_are_small(name: str, artifact: Artifact) -> None:
+    png, svg = (artifact.folder / "report" / f"{name}.{kind}" for kind in ("png", "svg"))
+    image = matplotlib.image.imread(png)
+    assert image.shape[1] > image.shape[0] > 300
+    # Something is drawn, and the background is opaque and white.
+    assert len(np.unique(image.reshape(-1, image.shape[2]), axis=0)) > 20
+    assert image[0, 0].tolist() == [1.0, 1.0, 1.0, 1.0]
+    assert png.stat().st_size < 150_000
+    assert svg.stat().st_size < 400_000
+    assert ElementTree.parse(svg).getroot().tag.endswith("svg")
+    assert not re.search(r'(href|src)="(?!#|data:)', svg.read_text())
+    assert b"Software" not in png.read_bytes()
+    assert b"tIME" not in png.read_bytes()
+    assert "date" not in svg.read_text()[:2000]
+
+
+# What they say ------------------------------------------------------------------------------
+
+
+def test_csv_says_what_the_product_says(artifact: Artifact, report: dict[str, Any]) -> None:
+    rows = rows_of(artifact.folder / "report" / "coverage.csv")
+    product = artifact.table("boresights").to_pylist()
+    assert [int(row["boresight"]) for row in rows] == list(range(300))
+    assert [int(row["stars"]) for row in rows] == [row["star_count"] for row in product]
+    for name in ("ra_deg", "dec_deg"):
+        found = np.array([float(row[name]) for row in rows])
+        assert np.allclose(found, [row[name] for row in product], atol=5.1e-7, rtol=0)
+    for row in rows:
+        stars = int(row["stars"])
+        most = min(stars, 6)
+        assert int(row["pairs"]) == stars * (stars - 1) // 2
+        assert int(row["triangles"]) == most * (most - 1) * (most - 2) // 6
+    # Triangles of all fields, repeats included, are what the product has seen.
+    seen = sum(artifact.table("triangles")["times_seen"].to_pylist())
+    assert sum(int(row["triangles"]) for row in rows) == seen
+    coverage = report["coverage"]
+    worst = min(rows, key=lambda row: int(row["stars"]))
+    assert coverage["worst_field"]["boresight"] == int(worst["boresight"])
+    assert coverage["worst_field"]["ra_deg"] == pytest.approx(float(worst["ra_deg"]), abs=1e-6)
+    assert coverage["stars"]["minimum"] == coverage["worst_field"]["stars"] == int(worst["stars"])
+
+
+def test_histograms_add_up(artifact: Artifact, report: dict[str, Any]) -> None:
+    folder = artifact.folder / "report"
+    rows = rows_of(folder / "coverage_histogram.csv")
+    fields = [int(row["fields"]) for row in rows]
+    assert fields == report["coverage"]["fields_by_stars"]
+    assert sum(fields) == 300
+    stars = sum(artifact.table("boresights")["star_count"].to_pylist())
+    assert sum(n * count for n, count in enumerate(fields)) == stars
+    rows = rows_of(folder / "stars_by_magnitude.csv")
+    kept, rejected = (sum(int(row[name]) for row in rows) for name in ("guide_stars", "rejected"))
+    assert kept == report["sources"][0]["kept"]
+    assert kept + rejected == report["sources"][0]["rows_read"]
+    edges = [(float(row["from_mag"]), float(row["to_mag"])) for row in rows]
+    assert all(a[1] == b[0] for a, b in pairwise(edges))
+    # The faint limit belongs to the guide stars, and no fainter bin has any.
+    assert [int(row["guide_stars"]) > 0 for row in rows if float(row["to_mag"]) >= 5.5] == [
+        float(row["to_mag"]) == 5.5 for row in rows if float(row["to_mag"]) >= 5.5
+    ]
+
+
+def test_json_says_what_the_manifest_says(artifact: Artifact, report: dict[str, Any]) -> None:
+    manifest, folder = artifact.manifest, artifact.folder / "report"
+    for key in ("name", "version", "spec", "sources", "software", "frame", "epoch_jyear"):
+        assert report[key] == manifest[key], key
+    for name, facts in manifest["products"].items():
+        assert report["products"][name]["content_sha256"] == facts["content_sha256"]
+        assert report["products"][name]["rows"] == facts["rows"]
+        assert report["products"][name]["bytes"] == manifest["files"][facts["parquet"]]["bytes"]
+    assert report["database_bytes"] == manifest["files"]["database.h5"]["bytes"]
+    assert report["self_test"] == json.loads((folder / "self_test.json").read_bytes())
+    assert report["coverage"] == json.loads((folder / "coverage.json").read_bytes())
+    assert report["filters"][-1]["stars"] == report["products"]["stars"]["rows"]
+    assert set(report["reasons"]) == set(report["sources"][0]["rejected"]) >= {"density"}
+
+
+class Page(HTMLParser):
+    """The structure of a page: its tables, what it loads, and whether tags match."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.loads: list[str] = []
+        self.tables: list[list[list[str]]] = []
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        assert tag not in {"script", "link", "iframe", "object", "base"}
+        self.loads += [str(value) for name, value in attrs if name in {"src", "href", "srcset"}]
+        if tag == "img":
+            assert dict(attrs).get("alt")
+        if tag == "table":
+            self.tables.append([])
+        if tag == "tr":
+            self.tables[-1].append([])
+        if tag in {"td", "th"}:
+            self.tables[-1][-1].append("")
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+        if self.open and self.open[-1] in {"td", "th"}:
+            self.tables[-1][-1][-1] += data
+
+
+@pytest.fixture(scope="module")
+def page(artifact: Artifact) -> Page:
+    page = Page()
+    page.feed((artifact.folder / "report" / "index.html").read_text(encoding="utf-8"))
+    page.close()
+    return page
+
+
+def test_the_page_needs_nothing_else(page: Page, artifact: Artifact) -> None:
+    text = (artifact.folder / "report" / "index.html").read_text(encoding="utf-8")
+    assert text.startswith("<!DOCTYPE html>\n<html lang=")
+    assert page.open == []
+    assert "http:" not in text
+    assert "https:" not in text
+    assert "url(" not in text
+    assert "@import" not in text
+    kind = "data:image/svg+xml;base64,"
+    assert [source[: len(kind)] for source in page.loads] == [kind] * 3
+    drawn = {b64decode(source[len(kind) :]) for source in page.loads}
+    assert drawn == {(artifact.folder / "report" / f"{name}.svg").read_bytes() for name in PLOTS}
+
+
+def test_the_page_says_what_the_json_says(page: Page, report: dict[str, Any]) -> None:
+    def rows(heading: str) -> dict[str, list[str]]:
+        found = next(t for t in page.tables if t[0][0] == heading)
+        return {row[0]: row[1:] for row in found[1:]}
+
+    products = rows("product")
+    for name, facts in report["products"].items():
+        assert products[name] == [
+            facts["schema"], f"{facts['rows']:,}", f"{facts['bytes']:,}", facts["content_sha256"]
+        ]  # fmt: skip
+    verdicts = rows("verdict")
+    (source,) = report["sources"]
+    assert verdicts["read"][1] == f"{source['rows_read']:,}"
+    for reason, count in source["rejected"].items():
+        assert verdicts[reason] == [report["reasons"][reason], f"{count:,}"]
+    (file,) = rows("file").values()
+    assert file[2] == source["files"][0]["sha256"]
+    assert [row[0] for row in rows("after").values()] == [
+        f"{step['stars']:,}" for step in report["filters"]
+    ]
+    coverage = rows("in a field")
+    for kind in ("stars", "pairs", "triangles"):
+        spread = report["coverage"][kind]
+        assert coverage[kind][0] == f"{spread['minimum']:,}"
+        assert coverage[kind][1] == f"{spread['one_percent']:,}"
+        assert coverage[kind][4] == f"{spread['maximum']:,}"
+    rates = rows("fields")
+    for rate in report["self_test"]:
+        assert rates[rate["name"]][-1] == f"{rate['identified_share']:.2%}"
+    assert report["description"] in page.text
+    assert '"max_stars_per_field": 12' in page.text
+
+
+def test_a_table_escapes_what_it_is_given() -> None:
+    assert "<td>a&lt;b</td>" in table("", ("x",), [("a<b",)])
+    assert "1,234,567" in table("", ("x",), [(1234567,)], (0,))
+
+
+# Parts --------------------------------------------------------------------------------------
+
+
+def test_a_magnitude_at_an_edge_belongs_to_the_brighter_bin() -> None:
+    counts = count_magnitudes(np.array([5.0, 5.01, 5.5]), np.array([6.0, np.nan, -1.2]))
+    table = zip(counts["to_mag"], counts["guide_stars"], counts["rejected"], strict=True)
+    assert [row for row in table if row[1] or row[2]] == [
+        (-1.0, 0, 1),
+        (5.0, 1, 0),
+        (5.5, 2, 0),
+        (6.0, 0, 1),
+    ]
+
+
+def test_no_magnitudes_are_no_bins(tmp_path: Path) -> None:
+    counts = count_magnitudes(np.array([]), np.array([np.nan]))
+    assert counts == {"from_mag": [], "to_mag": [], "guide_stars": [], "rejected": []}
+    save_plot(draw_magnitudes("none", "V", counts), tmp_path, "none")
+    assert (tmp_path / "none.png").is_file()
+
+
+def test_the_map_is_of_equal_area() -> None:
+    """Bands of declination of the same area take the same share of the ellipse."""
+    raster = nearest_raster(saff_kuijlaars(2000), np.arange(2000), 400)
+    inside = ~np.isnan(raster)
+    assert inside.mean() == pytest.approx(np.pi / 4.0, abs=1e-3)
+    # Boresights go from south to north in steps of the same area.
+    share = np.histogram(raster[inside], bins=10, range=(0, 2000))[0] / inside.sum()
+    assert np.abs(share - 0.1).max() < 0.01
+
+
+def test_the_raster_is_where_the_projection_says() -> None:
+    generator = np.random.default_rng(3)
+    ra_deg, dec_deg = generator.uniform(0.0, 360.0, 50), generator.uniform(-85.0, 85.0, 50)
+    raster = nearest_raster(directions_from_radec(ra_deg, dec_deg), np.arange(50), 1200)
+    x, y = project(ra_deg, dec_deg)
+    column = np.floor((x / HALF_WIDTH + 1.0) * 600).astype(int)
+    row = np.floor((1.0 - y / HALF_HEIGHT) * 300).astype(int)
+    assert np.array_equal(raster[row, column], np.arange(50))
+
+
+def test_the_poles_have_a_place_on_the_map() -> None:
+    x, y = project([0.0, 123.0], [90.0, -90.0])
+    assert np.allclose(x, 0.0, atol=1e-4)
+    assert np.allclose(y, [HALF_HEIGHT, -HALF_HEIGHT])
+
+
+@pytest.mark.parametrize("counts", [[0, 0, 0, 0], [3, 3, 3, 3], [1, 900, 4, 250]])
+def test_histograms_of_any_counts_are_drawn(counts: list[int], tmp_path: Path) -> None:
+    coverage = coverage_from_counts(saff_kuijlaars(4), np.array(counts), 6)
+    made = report_coverage(coverage, 0.1)
+    rows = histogram_rows(made)
+    assert sum(int(row[1].replace(",", "")) for row in rows) == 4
+    assert len(rows) <= 20
+    assert rows[0][0].split("-")[0] == str(min(counts))
+    assert max(len(row[2]) for row in rows) == 50
+    save_plot(draw_histogram("any", made.summary), tmp_path, "any")
+    assert matplotlib.image.imread(tmp_path / "any.png").shape[1] == 720
+
+
+def test_drawing_leaves_the_users_settings_alone(tmp_path: Path) -> None:
+    with matplotlib.rc_context({"font.size": 23.0}):
+        before = dict(matplotlib.rcParams)
+        made = report_coverage(coverage_from_counts(saff_kuijlaars(4), np.arange(4), 6), 0.1)
+        save_plot(draw_histogram("any", made.summary), tmp_path, "any")
+        assert dict(matplotlib.rcParams) == before
+
+
+# Command line -------------------------------------------------------------------------------
+
+
+def test_coverage_prints_the_summary(starcat: Callable[..., Any], artifact: Artifact) -> None:
+    run = starcat(["coverage", artifact.folder])
+    assert run.code == 0
+    assert run.err == ""
+    assert all(len(line) <= 100 for line in run.out.splitlines())
+    for words in ("Coverage: 300 fields", "triangles", "fewest stars", "#####", "boresight"):
+        assert words in run.out
+
+
+def test_coverage_as_json_is_that_of_the_report(
+    starcat: Callable[..., Any], artifact: Artifact, report: dict[str, Any]
+) -> None:
+    run = starcat(["coverage", artifact.folder, "--json"])
+    assert json.loads(run.out) == report["coverage"] == artifact_coverage(artifact).as_dict()
+
+
+def test_coverage_writes_the_files_of_the_report(
+    starcat: Callable[..., Any], artifact: Artifact, tmp_path: Path
+) -> None:
+    run = starcat(["coverage", artifact.folder, "-o", tmp_path / "new" / "folder"])
+    assert run.code == 0
+    made = {path.name for path in (tmp_path / "new" / "folder").iterdir()}
+    assert made == {name for name in FILES if name.startswith("coverage")}
+    for name in made:
+        again = (tmp_path / "new" / "folder" / name).read_bytes()
+        assert again == (artifact.folder / "report" / name).read_bytes(), name
+        assert name in run.err
+
+
+def test_holes_go_to_stderr(
+    starcat: Callable[..., Any], small_spec: str, sao_lines: list[bytes], tmp_path: Path
+) -> None:
+    (tmp_path / "sao.dat").write_bytes(b"".join(sao_lines))
+    few = small_spec.replace("boresights.count = 200", "boresights.count = 20")
+    (tmp_path / "spec.toml").write_text(few)
+    arguments = ["build", tmp_path / "spec.toml", "--input", f"sao={tmp_path / 'sao.dat'}"]
+    run = starcat([*arguments, "-o", tmp_path, "--json"])
+    assert run.code == 0
+    assert json.loads(run.out)["coverage"]["tiling"]["holes"] is True
+    (warning,) = json.loads(run.out)["warnings"]
+    assert run.err == f"warning: {warning}\n"
+    run = starcat([*arguments, "-o", tmp_path])
+    assert run.err.startswith("warning: boresights.count = 20 leaves holes")
+    run = starcat(["coverage", tmp_path / "small-1.0.0", "--json"])
+    assert json.loads(run.out)["tiling"]["holes"] is True
+    assert "leaves holes" in run.err
+
+
+# Beside the artifact ------------------------------------------------------------------------
+
+
+def test_times_stand_beside_the_artifact(artifact: Artifact) -> None:
+    path = artifact.folder.with_name("report-1.2.3.build.json")
+    log = json.loads(path.read_bytes())
+    assert log["artifact"] == "report-1.2.3"
+    stages = set(log["times_s"]) - {"total"}
+    assert stages == {"read", "select", "products", "write", "self-test", "report", "verify"}
+    assert sum(log["times_s"][stage] for stage in stages) == pytest.approx(
+        log["times_s"]["total"], abs=1e-3
+    )
+    assert log["peak_memory_bytes"] > 10_000_000
+    assert log["software"] == artifact.manifest["software"]
+    assert path.name not in artifact.manifest["files"]
+    assert sorted(p.name for p in artifact.folder.parent.iterdir()) == [
+        "report-1.2.3",
+        "report-1.2.3.build.json",
+    ]
