@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from starcat.products.hausdorff_angular import angular_reference_sets
-from starcat.products.index import Index, Ragged, row_offsets
+from starcat.products.index import Index, Ragged, row_offsets, sorted_unique, stable_order
 from starcat.products.neighbours import position_angles
 
 
@@ -84,15 +84,18 @@ def grid_patterns(
     beyond = sets.separation_rad > buffer_rad
     star, neighbour = sets.star[beyond], sets.neighbour[beyond]
     # The nearest comes first.
-    with_pattern, first, row = np.unique(star, return_index=True, return_inverse=True)
+    is_first = np.ones(len(star), dtype=bool)
+    np.not_equal(star[1:], star[:-1], out=is_first[1:])
+    first = np.flatnonzero(is_first)
+    with_pattern, row = star[first], np.cumsum(is_first) - 1
     angle = position_angles(directions, star, neighbour)
     turn = angle - angle[first][row]
     distance = np.tan(sets.separation_rad[beyond])
     cell = cell_of(distance * np.cos(turn), distance * np.sin(turn), radius_rad, cells_per_side)
     count = cells_per_side**2
-    row, cell = np.divmod(np.unique(row * count + cell), count)
+    row, cell = np.divmod(sorted_unique(row * count + cell), count)
     cells = Ragged(row_offsets(row, len(with_pattern)), cell.astype(np.int32))
-    order = np.argsort(cell, kind="stable")
+    order = stable_order(cell, count)
     lookup: dict[str, NDArray[Any]] = {
         "cell_offsets": row_offsets(cell[order], count),
         "cell_rows": row[order].astype(np.int32),

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.products.index import Index, row_offsets
+from starcat.products.index import Index, row_offsets, stable_order
 from starcat.proximity import pairs_within
 
 
@@ -75,7 +75,12 @@ def angular_reference_sets(
     i, j = pairs.astype(np.int32).T
     star, neighbour = np.concatenate([i, j]), np.concatenate([j, i])
     both = np.concatenate([angle, angle])
-    order = np.lexsort((neighbour, both, star))
+    # Nearest first, then by star, which a stable sort leaves in that order.
+    nearest = np.argsort(angle)
+    order = np.stack([nearest, nearest + len(angle)], axis=-1).ravel()
+    order = order[stable_order(star[order].astype(np.int64), len(directions))]
+    if bool(np.any((np.diff(star[order]) == 0) & (np.diff(both[order]) == 0.0))):
+        order = np.lexsort((neighbour, both, star))
     star = star[order]
     offsets = row_offsets(star, len(directions))
     index = Index({"star_offsets": offsets}, {"radius_rad": radius_rad})

@@ -87,3 +87,57 @@ def row_offsets(key: NDArray[np.integer[Any]], count: int) -> NDArray[np.int64]:
     array([0, 2, 2, 3])
     """
     return np.searchsorted(key, np.arange(count + 1), side="left").astype(np.int64)
+
+
+def sorted_unique(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the distinct keys in order.
+
+    Parameters
+    ----------
+    keys : ndarray of int64, shape (M,)
+        In any order.
+
+    Returns
+    -------
+    ndarray of int64
+        Ascending. Sorting whole and dropping repeats is faster here than hashing.
+
+    Examples
+    --------
+    >>> sorted_unique(np.array([3, 1, 3]))
+    array([1, 3])
+    """
+    ordered = np.sort(keys)
+    fresh = np.ones(len(ordered), dtype=bool)
+    np.not_equal(ordered[1:], ordered[:-1], out=fresh[1:])
+    return np.asarray(ordered[fresh])
+
+
+def stable_order(labels: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Return the order that groups rows by a small label and keeps them in order within it.
+
+    Parameters
+    ----------
+    labels : ndarray of int64, shape (M,)
+        From 0 to ``count - 1``.
+    count : int
+        Number of labels.
+
+    Returns
+    -------
+    ndarray of int64, shape (M,)
+        As a stable argsort, in time linear in M: 16 bits of the labels at a time, which numpy
+        sorts by counting.
+
+    Examples
+    --------
+    >>> stable_order(np.array([1, 0, 1]), 2)
+    array([1, 0, 2])
+    """
+    order = np.argsort((labels & 0xFFFF).astype(np.uint16), kind="stable")
+    shift = 16
+    while count > 1 << shift:
+        digits = ((labels >> shift) & 0xFFFF).astype(np.uint16)
+        order = order[np.argsort(digits[order], kind="stable")]
+        shift += 16
+    return order

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from starcat.products.hausdorff_angular import AngularReferenceSets, angular_reference_sets
-from starcat.products.index import Index, Ragged, row_offsets
+from starcat.products.index import Index, Ragged, row_offsets, sorted_unique, stable_order
 from starcat.products.neighbours import position_angles
 
 
@@ -86,8 +86,8 @@ def radial_patterns(
     count = len(directions)
     sets = angular_reference_sets(directions, radius_rad)
     ring = ring_of(sets.separation_rad, radius_rad, rings)
-    row, ring = np.divmod(np.unique(sets.star * np.int64(rings) + ring), rings)
-    order = np.argsort(ring, kind="stable")
+    row, ring = np.divmod(sorted_unique(sets.star * np.int64(rings) + ring), rings)
+    order = stable_order(ring, rings)
     lookup: dict[str, NDArray[Any]] = {
         "ring_offsets": row_offsets(ring[order], rings),
         "ring_rows": row[order].astype(np.int32),
