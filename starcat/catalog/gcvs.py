@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from starcat.catalog.delimited import parse_delimited
 from starcat.catalog.files import DigestReader, find_files, read_blocks
-from starcat.catalog.ingest import FileFacts, check_malformed, not_this_archive
+from starcat.catalog.ingest import FileFacts
+from starcat.catalog.malformed import check_malformed, not_this_archive
 from starcat.catalog.records import Problem, Records
 from starcat.catalog.source import data_source
 from starcat.catalog.verdict import Reason

@@ -8,7 +8,7 @@ or in the rejected table, with one reason.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +27,7 @@ from starcat.catalog.files import (
     read_blocks,
 )
 from starcat.catalog.fixed_width import parse_fixed_width
+from starcat.catalog.malformed import check_malformed, malformed_rows, not_this_archive
 from starcat.catalog.nearest import add_nearest_neighbours
 from starcat.catalog.photometry import blend_weights
 from starcat.catalog.records import Problem, Records
@@ -38,12 +39,9 @@ from starcat.catalog.stars import (
     table_from_columns,
 )
 from starcat.catalog.verdict import Reason
-from starcat.errors import ConfigError, ParseError, SourceMissing
+from starcat.errors import ConfigError, SourceMissing
 from starcat.progress import Progress, no_progress
 from starcat.schema import product_schema
-
-MAX_MALFORMED_FRACTION = 0.01
-"""Above this share of malformed records (and more than 10 of them) a file is refused."""
 
 _PARSERS = {
     "fixed_width": parse_fixed_width,
@@ -218,23 +216,11 @@ def ingest(
     files = find_files(source, paths)
     if not files:
         raise SourceMissing(f"{source_name}: no input files given", source=source_name)
-    facts: list[FileFacts] = []
-    parts: list[_Part] = []
 
-    def to_part(item: tuple[int, Block]) -> _Part:
-        number, block = item
-        return _parse_block(number, block, source_name, chosen, epoch_jyear, read_limit_mag)
+    def parse(item: tuple[int, Block]) -> _Part:
+        return _parse_block(*item, source_name, chosen, epoch_jyear, read_limit_mag)
 
-    blocks = _numbered_blocks(files, source, facts, progress)
-    rows = [0] * len(files)
-    problems: list[tuple[int, Problem]] = []
-    for part in map_in_order(to_part, blocks, workers):
-        if part.problems and not rows[part.file_number] and part.rows == len(part.problems):
-            raise not_this_archive(files[part.file_number], source, part.problems)
-        rows[part.file_number] += part.rows
-        problems += [(part.file_number, problem) for problem in part.problems]
-        parts.append(part)
-    check_malformed(files, rows, problems, source)
+    facts, parts, problems = _read_parts(files, source, parse, workers, progress)
     stars, rejected = _join(parts, source_name, chosen)
     if neighbours:
         stars = add_nearest_neighbours(stars, workers)
@@ -243,12 +229,32 @@ def ingest(
         band=chosen,
         stars=stars,
         rejected=rejected,
-        files=tuple(
-            FileFacts(fact.name, fact.sha256, fact.bytes, count)
-            for fact, count in zip(facts, rows, strict=True)
-        ),
+        files=facts,
         problems=tuple(f"{files[n].path.name} {problem}" for n, problem in problems[:20]),
     )
+
+
+def _read_parts(
+    files: Sequence[InputFile],
+    source: DataSource,
+    parse: Callable[[tuple[int, Block]], _Part],
+    workers: int,
+    progress: Progress,
+) -> tuple[tuple[FileFacts, ...], list[_Part], list[tuple[int, Problem]]]:
+    """Read all files; return their facts, their parsed blocks and what is malformed in them."""
+    facts: list[FileFacts] = []
+    parts: list[_Part] = []
+    rows = [0] * len(files)
+    problems: list[tuple[int, Problem]] = []
+    for part in map_in_order(parse, _numbered_blocks(files, source, facts, progress), workers):
+        if part.problems and not rows[part.file_number] and part.rows == len(part.problems):
+            raise not_this_archive(files[part.file_number], source, part.problems)
+        rows[part.file_number] += part.rows
+        problems += [(part.file_number, problem) for problem in part.problems]
+        parts.append(part)
+    check_malformed(files, rows, problems, source)
+    counted = (replace(fact, rows=count) for fact, count in zip(facts, rows, strict=True))
+    return tuple(counted), parts, problems
 
 
 def check_band(source: DataSource, band: str | None) -> str:
@@ -327,7 +333,7 @@ def _parse_block(
         out = table.filter(pa.array(~kept))
         stars, rejected = table.filter(pa.array(kept)), [reject_rows(out, made.verdicts.reasons)]
     if records.problems:
-        rejected.append(_malformed_rows(records.problems, number, source_name, band))
+        rejected.append(malformed_rows(records.problems, number, source_name, band))
     empty = product_schema("rejected").arrow_schema.empty_table()
     return _Part(
         number,
@@ -359,23 +365,6 @@ def reject_rows(stars: pa.Table, reasons: pa.Array) -> pa.Table:
     return pa.Table.from_arrays(columns, schema=schema)
 
 
-def _malformed_rows(
-    problems: Sequence[Problem], number: int, source_name: str, band: str
-) -> pa.Table:
-    return table_from_columns(
-        "rejected",
-        {
-            "catalog": source_name,
-            "band": band,
-            "source_file": number,
-            "source_line": np.array([problem.line for problem in problems]),
-            "reason": Reason.malformed_record.name,
-            "detail": pa.array([str(problem) for problem in problems]),
-        },
-        len(problems),
-    )
-
-
 def _join(parts: Sequence[_Part], source_name: str, band: str) -> tuple[pa.Table, pa.Table]:
     """Join the blocks, sorted, and reject the records whose star was read before."""
     # Chunks stay as they are: joining them would hold the whole catalog in memory twice.
@@ -391,79 +380,3 @@ def _join(parts: Sequence[_Part], source_name: str, band: str) -> tuple[pa.Table
         rejected.append(reject_rows(again, reasons))
         stars = stars.filter(pa.array(~repeated)).combine_chunks()
     return stars, sort_rows(pa.concat_tables(rejected).combine_chunks(), keys)
-
-
-def not_this_archive(
-    file: InputFile, source: DataSource, problems: Sequence[Problem]
-) -> ParseError:
-    """Return the error for a file in whose first block no record is good.
-
-    Parameters
-    ----------
-    file : InputFile
-        The file.
-    source : DataSource
-        What it was taken for.
-    problems : sequence of Problem
-        Of its first records.
-
-    Returns
-    -------
-    ParseError
-        To be raised.
-    """
-    first = problems[0]
-    return ParseError(
-        f"{file.path}: none of the first {len(problems)} records is one of {source.name} "
-        f"({file.layout.name}): {first}. Is this the right archive?",
-        source=source.name,
-        path=file.path,
-        line=first.line,
-        byte_range=first.byte_range,
-        field=first.field,
-    )
-
-
-def check_malformed(
-    files: Sequence[InputFile],
-    rows: Sequence[int],
-    problems: Sequence[tuple[int, Problem]],
-    source: DataSource,
-) -> None:
-    """Refuse a file without records or with too many malformed ones.
-
-    Parameters
-    ----------
-    files : sequence of InputFile
-        What was read.
-    rows : sequence of int
-        Records in each.
-    problems : sequence of (int, Problem)
-        File number and problem of every malformed record.
-    source : DataSource
-        What they belong to.
-
-    Raises
-    ------
-    ParseError
-        If a file has no record, or more than 10 of them and 1 % are malformed.
-    """
-    for number, file in enumerate(files):
-        if not rows[number]:
-            raise ParseError(
-                f"{file.path}: no record in the file; expected records of {source.name} "
-                f"({file.layout.name}). Is this the right archive?",
-                source=source.name,
-                path=file.path,
-            )
-        bad = [problem for n, problem in problems if n == number]
-        if len(bad) > 10 and len(bad) > MAX_MALFORMED_FRACTION * rows[number]:
-            raise ParseError(
-                f"{file.path}: {len(bad)} of {rows[number]} records are malformed; at most "
-                f"{MAX_MALFORMED_FRACTION:.0%} may be. The first: {bad[0]}",
-                source=source.name,
-                path=file.path,
-                line=bad[0].line,
-                byte_range=bad[0].byte_range,
-                field=bad[0].field,
-            )
