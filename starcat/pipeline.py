@@ -158,7 +158,7 @@ def build(
         outcome = publish(partial, final, replace=replace)
         clock.lap("verify")
     write_build_log(final, outcome, clock.times_s)
-    warnings = tuple(filter(None, [holes_warning(report.gap)]))
+    warnings = (*catalog.notes, *filter(None, [holes_warning(report.gap)]))
     return Built(
         final, outcome, manifest, filters, report, rates, catalog.problems, warnings, clock.times_s
     )

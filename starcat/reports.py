@@ -143,7 +143,10 @@ def print_ingested(read: Ingested, output: Path, *, as_json: bool) -> None:
         "stars": str(output),
         "rejected_rows": str(rejected_path(output)) if len(read.rejected) else None,
         "problems": list(read.problems),
+        "notes": list(read.notes),
     }
+    for note in read.notes:
+        say(f"note: {note}")
     if as_json:
         print_json(facts)
         return

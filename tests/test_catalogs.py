@@ -1189,3 +1189,12 @@ def test_sources_and_bands_that_there_are_not(
 def test_no_files() -> None:
     with pytest.raises(SourceMissing, match="no input files"):
         ingest("sao", [])
+
+
+def test_a_missing_supplement_is_told(catalogs: Path) -> None:
+    """Without suppl_1 the sky lacks its brightest stars: whoever builds on it should know."""
+    read = ingest("tycho2", [catalogs / "tyc2.dat.gz"])
+    (note,) = read.notes
+    assert "suppl_1.dat" in note
+    assert "Sirius" in note
+    assert ingest("sao", [catalogs / "sao.dat.gz"]).notes == ()

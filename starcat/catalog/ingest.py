@@ -107,6 +107,8 @@ class Ingested:
         What was read, in order.
     problems : tuple of str
         The first malformed records, each with file, line and bytes.
+    notes : tuple of str
+        What a user should know of the inputs: optional files that are missing.
     """
 
     source: str
@@ -115,6 +117,7 @@ class Ingested:
     rejected: pa.Table
     files: tuple[FileFacts, ...]
     problems: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def rows_read(self) -> int:
@@ -231,6 +234,30 @@ def ingest(
         rejected=rejected,
         files=facts,
         problems=tuple(f"{files[n].path.name} {problem}" for n, problem in problems[:20]),
+        notes=missing_files(source, files),
+    )
+
+
+def missing_files(source: DataSource, files: Sequence[InputFile]) -> tuple[str, ...]:
+    """Return a note for each optional file of a source that is not among the inputs.
+
+    Parameters
+    ----------
+    source : DataSource
+        What is read.
+    files : sequence of InputFile
+        What it is read from.
+
+    Returns
+    -------
+    tuple of str
+        Naming the file and what is in it.
+    """
+    given = {file.layout.name for file in files}
+    return tuple(
+        f"{source.name}: {layout.file_names[0]} is not among the inputs ({layout.description})"
+        for layout in source.files
+        if layout.optional and layout.name not in given
     )
 
 

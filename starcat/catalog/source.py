@@ -131,6 +131,8 @@ class RecordFile(_Model):
         Values of ``{part}`` in order; empty for a single file.
     optional : bool
         The source is usable without this file.
+    description : str
+        What is in the file, where a source has several.
     layout : {"fixed_width", "delimited", "binary"}
         Which reader.
     record_bytes : int, optional
@@ -159,6 +161,7 @@ class RecordFile(_Model):
     file_names: tuple[str, ...] = Field(min_length=1)
     parts: tuple[str, ...] = ()
     optional: bool = False
+    description: str = ""
     layout: Literal["fixed_width", "delimited", "binary"]
     record_bytes: int | None = None
     header_bytes: int = 0

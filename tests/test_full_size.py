@@ -1,0 +1,73 @@
+"""Archives at full size: synthetic files with the true layout and number of records."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
+
+from synthetic import SAO_ROWS, TYCHO2_ROWS, make_sao, make_tycho2
+
+from starcat.catalog.ingest import Ingested, ingest
+from starcat.catalog.stars import directions_of
+from starcat.products.coverage import tiling_gap
+from starcat.sphere import directions_from_radec, saff_kuijlaars, separation
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+
+
+def check_neighbours(read: Ingested) -> None:
+    """Compare the nearest neighbours of some stars with a search over all."""
+    u = directions_of(read.stars)
+    stated = read.stars["nearest_separation_arcsec"].to_numpy()
+    for row in np.random.default_rng(5).integers(len(u), size=12):
+        angle = np.degrees(separation(u[row], u)) * 3600.0
+        angle[row] = np.inf
+        # Both are a few rounding errors of an arc of arcminutes.
+        assert stated[row] == pytest.approx(angle.min(), rel=1e-9, abs=1e-7)
+
+
+@pytest.mark.usefixtures("catalogs")
+def test_sao(tmp_path: Path) -> None:
+    read = ingest("sao", [make_sao(tmp_path)], epoch_jyear=2026.0)
+    assert read.rows_read == len(read.stars) == SAO_ROWS
+    assert read.stars["star_id"].to_pylist() == list(range(1, SAO_ROWS + 1))
+    check_neighbours(read)
+
+
+@pytest.mark.usefixtures("catalogs")
+def test_tycho2_in_parts_and_in_one_file(tmp_path: Path) -> None:
+    parts = make_tycho2(tmp_path / "parts", compress=False)
+    read = ingest("tycho2", [parts], epoch_jyear=2026.0)
+    number = read.stars["star_id"].to_numpy()
+    assert read.rows_read == len(read.stars) == TYCHO2_ROWS
+    assert [file.name for file in read.files] == [f"tyc2.dat.{part:02d}" for part in range(20)]
+    assert (np.diff(number) > 0).all()
+    check_neighbours(read)
+    whole = tmp_path / "tyc2.dat"
+    with whole.open("wb") as file:
+        for part in sorted(parts.iterdir()):
+            file.write(part.read_bytes())
+    again = ingest("tycho2", [whole], epoch_jyear=2026.0)
+    place = {"source_file", "source_line"}
+    names = [name for name in again.stars.column_names if name not in place]
+    assert again.stars.select(names).equals(read.stars.select(names))
+
+
+def test_no_direction_of_a_million_lies_outside_every_tile() -> None:
+    boresights = saff_kuijlaars(10_000)
+    sample = np.random.default_rng(6).normal(size=(1_000_000, 3))
+    sample /= np.linalg.norm(sample, axis=1)[:, None]
+    chord = cKDTree(boresights).query(sample)[0]
+    farthest = 2.0 * np.arcsin(0.5 * chord.max())
+    assert farthest <= np.radians(6.0)
+    # The exact covering radius bounds the sample and is reached in the direction stated.
+    gap = tiling_gap(boresights, np.radians(6.0))
+    assert farthest <= gap.covering_radius_rad
+    there = separation(directions_from_radec([gap.ra_deg], [gap.dec_deg]), boresights).min()
+    assert there == pytest.approx(gap.covering_radius_rad, rel=1e-9)
