@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
+from starcat.catalog.gunzip import MAGIC, GzipReader, Readable
 from starcat.catalog.source import DataSource, RecordFile
 from starcat.errors import ParseError, SourceError, SourceMissing
 
@@ -231,7 +232,7 @@ def _layout_in_folder(source: DataSource, layout: RecordFile, folder: Path) -> l
     return []
 
 
-def open_input(path: Path) -> tuple[DigestReader, io.BufferedIOBase]:
+def open_input(path: Path) -> tuple[DigestReader, Readable]:
     """Open a plain or gzipped file for reading, with the digest of its raw bytes.
 
     Parameters
@@ -251,12 +252,12 @@ def open_input(path: Path) -> tuple[DigestReader, io.BufferedIOBase]:
     """
     try:
         with path.open("rb") as file:
-            is_gzip = file.read(2) == b"\x1f\x8b"
+            is_gzip = file.read(2) == MAGIC
         raw = DigestReader(path)
     except OSError as error:
         raise SourceError(f"{path}: cannot be read: {error.strerror}", path=path) from error
     buffered = io.BufferedReader(raw, 1 << 20)
-    return raw, gzip.GzipFile(fileobj=buffered) if is_gzip else buffered
+    return raw, GzipReader(buffered) if is_gzip else buffered
 
 
 def read_blocks(
