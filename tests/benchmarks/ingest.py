@@ -68,7 +68,7 @@ def compare(title: str, source: str, path: Path, bare: list[str], runs: int, lim
         spread = "-".join(f"{s:.2f}" for s in sorted(run[1] for run in done)[:: max(1, runs - 1)])
         ratio = best[what] / fastest
         print(
-            f"  {what:<14}{rows:>10,} rows {best[what]:>7.2f} s ({spread}) {peak:>7.0f} MiB "
+            f"  {what:<18}{rows:>10,} rows {best[what]:>7.2f} s ({spread}) {peak:>7.0f} MiB "
             f"{ratio:>6.2f} x fastest bare" + (f"  (limit {limit} x)" if what == "ingest" else "")
         )
 
