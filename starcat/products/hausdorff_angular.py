@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 from starcat.products.index import Index, row_offsets, stable_order
 from starcat.proximity import pairs_within
 
+STARS_AT_ONCE = 4096
+"""Sorted together: their rows stay in the processor's cache, however large the sky is."""
+
 
 @dataclass(frozen=True)
 class AngularReferenceSets:
@@ -75,13 +78,25 @@ def angular_reference_sets(
     i, j = pairs.astype(np.int32).T
     star, neighbour = np.concatenate([i, j]), np.concatenate([j, i])
     both = np.concatenate([angle, angle])
-    # Nearest first, then by star, which a stable sort leaves in that order.
-    nearest = np.argsort(angle)
-    order = np.stack([nearest, nearest + len(angle)], axis=-1).ravel()
-    order = order[stable_order(star[order].astype(np.int64), len(directions))]
-    if bool(np.any((np.diff(star[order]) == 0) & (np.diff(both[order]) == 0.0))):
-        order = np.lexsort((neighbour, both, star))
-    star = star[order]
+    order = stable_order(star, len(directions))
+    star, neighbour, both = star[order], neighbour[order], both[order]
     offsets = row_offsets(star, len(directions))
+    for first in range(0, len(directions), STARS_AT_ONCE):
+        last = min(first + STARS_AT_ONCE, len(directions))
+        rows = slice(int(offsets[first]), int(offsets[last]))
+        nearest = _nearest_first(star[rows] - first, neighbour[rows], both[rows])
+        neighbour[rows], both[rows] = neighbour[rows][nearest], both[rows][nearest]
     index = Index({"star_offsets": offsets}, {"radius_rad": radius_rad})
-    return AngularReferenceSets(star, neighbour[order], both[order], index)
+    return AngularReferenceSets(star, neighbour, both, index)
+
+
+def _nearest_first(
+    star: NDArray[np.int32], neighbour: NDArray[np.int32], separation_rad: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Return the order of (star, separation, neighbour); the stars ascend already."""
+    order = np.argsort(separation_rad)
+    order = order[stable_order(star[order], STARS_AT_ONCE)]
+    same = np.diff(separation_rad[order]) == 0.0
+    if bool(np.any(same & (np.diff(star[order]) == 0))):
+        order = np.lexsort((neighbour, separation_rad, star))
+    return order

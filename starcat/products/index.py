@@ -113,12 +113,12 @@ def sorted_unique(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.asarray(ordered[fresh])
 
 
-def stable_order(labels: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+def stable_order(labels: NDArray[np.integer[Any]], count: int) -> NDArray[np.int64]:
     """Return the order that groups rows by a small label and keeps them in order within it.
 
     Parameters
     ----------
-    labels : ndarray of int64, shape (M,)
+    labels : ndarray of int, shape (M,)
         From 0 to ``count - 1``.
     count : int
         Number of labels.
