@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pyarrow as pa
 
-from starcat.catalog.stars import directions_of, floats_of
+from starcat.catalog.stars import directions_of, floats_of, with_columns
 from starcat.proximity import nearest_neighbours
 
 
@@ -28,12 +28,8 @@ def add_nearest_neighbours(stars: pa.Table, workers: int = 2) -> pa.Table:
         return stars
     angle, index = nearest_neighbours(directions_of(stars), workers)
     mag = floats_of(stars, "mag")
-    delta = mag[index] - mag
     columns = {
-        "nearest_separation_arcsec": pa.array(np.degrees(angle) * 3600.0),
-        "nearest_delta_mag": pa.array(delta, mask=np.isnan(delta)),
+        "nearest_separation_arcsec": np.degrees(angle) * 3600.0,
+        "nearest_delta_mag": mag[index] - mag,
     }
-    for name, values in columns.items():
-        place = stars.schema.get_field_index(name)
-        stars = stars.set_column(place, stars.schema.field(place), values)
-    return stars
+    return with_columns(stars, columns)

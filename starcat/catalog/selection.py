@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from starcat.catalog.ingest import reject_rows
 from starcat.catalog.photometry import combined_magnitude
 from starcat.catalog.quality import Quality
-from starcat.catalog.stars import directions_of, floats_of, sort_rows
+from starcat.catalog.stars import directions_of, floats_of, sort_rows, with_columns
 from starcat.catalog.verdict import Reason, Verdicts
 from starcat.proximity import pairs_within
 from starcat.schema import product_schema
@@ -215,11 +215,7 @@ def _with_photocentres(
         "mag": mag,
         "quality_flags": flags,
     }
-    for name, values in columns.items():
-        place = stars.schema.get_field_index(name)
-        array = pa.array(values, mask=np.isnan(values) if name == "mag" else None)
-        stars = stars.set_column(place, stars.schema.field(place), array)
-    return stars
+    return with_columns(stars, columns)
 
 
 def is_unresolved_double(stars: pa.Table, doubles: Doubles) -> Flags:

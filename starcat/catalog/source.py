@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
 from typing import Literal
@@ -331,8 +332,6 @@ def data_source(name: str) -> DataSource:
     258997
     """
     if name not in source_names():
-        from difflib import get_close_matches
-
         near = get_close_matches(name, source_names(), 1)
         hint = f"did you mean {near[0]!r}? " if near else ""
         raise ConfigError(

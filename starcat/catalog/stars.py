@@ -121,6 +121,28 @@ def table_from_columns(product: str, columns: Mapping[str, Values], count: int) 
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
+def with_columns(stars: pa.Table, columns: Mapping[str, Values]) -> pa.Table:
+    """Return a table with some of its columns replaced.
+
+    Parameters
+    ----------
+    stars : pyarrow.Table
+        The table.
+    columns : mapping of str to Values
+        Columns that it has, by name; NaN means null.
+
+    Returns
+    -------
+    pyarrow.Table
+        The same rows and schema.
+    """
+    for name, values in columns.items():
+        place = stars.schema.get_field_index(name)
+        field = stars.schema.field(place)
+        stars = stars.set_column(place, field, _as_array(values, field.type, len(stars)))
+    return stars
+
+
 def _as_array(value: Values, kind: pa.DataType, count: int) -> pa.Array:
     if isinstance(value, pa.Array | pa.ChunkedArray):
         return value if value.type == kind else value.cast(kind)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from starcat.catalog.gcvs import read_gcvs
 from starcat.catalog.ingest import FileFacts, ingest
-from starcat.catalog.stars import floats_of
+from starcat.catalog.stars import floats_of, with_columns
 from starcat.progress import Progress, no_progress
 
 Array = NDArray[np.float64]
@@ -134,15 +134,12 @@ def join_amplitudes(stars: pa.Table, table: AmplitudeTable) -> tuple[pa.Table, i
                 flag[s] = _with_code(flag[s], f"{table.source}:{table.flag[r]}")
                 is_variable[s] = True
     columns = {
-        "amplitude_mag": pa.array(amplitude, mask=np.isnan(amplitude)),
+        "amplitude_mag": amplitude,
         "amplitude_source": pa.array(origin, pa.string()),
         "variable_flag": pa.array(flag, pa.string()),
-        "is_flagged_variable": pa.array(is_variable),
+        "is_flagged_variable": is_variable,
     }
-    for name, values in columns.items():
-        place = stars.schema.get_field_index(name)
-        stars = stars.set_column(place, stars.schema.field(place), values)
-    return stars, int(matched.sum())
+    return with_columns(stars, columns), int(matched.sum())
 
 
 def _with_code(codes: str | None, code: str) -> str:
