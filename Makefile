@@ -40,9 +40,10 @@ demo: $(READY) ## build a database from the embedded sky, check it, identify sim
 	$(BIN)/starcat identify dist/gaia-12deg-1.0.0 dist/frame.csv
 	$(BIN)/starcat selftest dist/gaia-12deg-1.0.0 --frames 500
 
-bench: $(READY) ## time and memory beside bare parsers, in one run
+bench: $(READY) ## time and memory beside bare parsers and other star trackers, in one run
 	$(BIN)/python tests/benchmarks/ingest.py
 	$(BIN)/python tests/benchmarks/products.py
+	$(BIN)/python tests/benchmarks/matcher.py
 
 docs: $(READY) ## rewrite the generated pages of docs/
 	$(BIN)/python tests/builders/docs.py

@@ -7,6 +7,7 @@ two entries. Works over any sorted array: separations, triangle areas, anything.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,8 +57,8 @@ class KVector:
         if self.slope == 0.0:
             return slice(0, n)
         # The inverse line, clamped to its ends; rounding can put either a step inside.
-        first = int(np.clip(np.floor((low - self.intercept) / self.slope), 0, n - 1))
-        last = int(np.clip(np.ceil((high - self.intercept) / self.slope), 0, n - 1))
+        first = math.floor(min(max((low - self.intercept) / self.slope, 0.0), n - 1.0))
+        last = math.ceil(min(max((high - self.intercept) / self.slope, 0.0), n - 1.0))
         while first >= 0 and self.intercept + self.slope * first >= low:
             first -= 1
         while last < n and self.intercept + self.slope * last < high:

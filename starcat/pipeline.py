@@ -218,12 +218,11 @@ def check_inputs(spec: BuildSpec, inputs: Inputs) -> None:
     ConfigError
         Naming the source that would be ignored.
     """
-    used = (spec.catalog.source, *spec.selection.variables.join)
     for name in inputs:
-        if name not in used:
+        if name not in spec.sources:
             raise ConfigError(
-                f"--input {name}=...: {spec.name} does not read {name} but {', '.join(used)}; "
-                "choose another preset or spec, or leave the input out",
+                f"--input {name}=...: {spec.name} does not read {name} but "
+                f"{', '.join(spec.sources)}; choose another preset or spec, or leave the input out",
                 key="input",
                 value=name,
             )
@@ -348,7 +347,7 @@ def run_self_test(folder: Path, spec: BuildSpec, progress: Progress) -> tuple[Ra
         How they fared.
     """
     test = spec.self_test
-    matcher = Matcher.open(folder, tolerance_px=max(0.5, 4.0 * test.noise_px))
+    matcher = Matcher.open(folder, None, tolerance_px=max(0.5, 4.0 * test.noise_px))
     return self_test(matcher, test.frames, test.noise_px, test.seed, progress)
 
 

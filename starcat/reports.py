@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from starcat.console import print_json, print_table, say
 from starcat.coverage_tables import print_coverage_table
 from starcat.errors import SourceError
@@ -17,8 +15,6 @@ if TYPE_CHECKING:
     from starcat.catalog.fetch import FetchReport
     from starcat.catalog.ingest import Ingested
     from starcat.evaluation.selftest import Rates
-    from starcat.matcher.database import Database
-    from starcat.matcher.result import MatchResult
     from starcat.pipeline import Built
 
 
@@ -324,61 +320,3 @@ def print_artifact(artifact: Artifact, *, as_json: bool) -> None:
         files = ", ".join(f"{file['name']} ({file['sha256'][:12]})" for file in source["files"])
         print_table(f"{source['source']} from {files}", ("records", "rows"), _balance(source), (1,))
     print_products(manifest)
-
-
-def print_match(
-    result: MatchResult,
-    centroids_px: np.ndarray[Any, np.dtype[np.float64]],
-    database: Database,
-    *,
-    as_json: bool,
-) -> None:
-    """Print the answer to a frame.
-
-    Parameters
-    ----------
-    result : MatchResult
-        The answer.
-    centroids_px : ndarray of float64, shape (N, 2)
-        The frame.
-    database : Database
-        Names and magnitudes.
-    as_json : bool
-        Whether to print JSON.
-    """
-    is_identified = result.status == "identified"
-    facts: dict[str, Any] = {"status": result.status, "n_matched": result.n_matched}
-    if is_identified:
-        facts |= {
-            "boresight_ra_deg": result.boresight_ra_deg,
-            "boresight_dec_deg": result.boresight_dec_deg,
-            "roll_deg": result.roll_deg,
-            "q_body_from_icrs": result.q_body_from_icrs.tolist(),
-            "residual_arcsec": result.residual_arcsec,
-            "false_match_probability": result.false_match_probability,
-        }
-    stars = []
-    for (x, y), row in zip(centroids_px, result.star_index, strict=True):
-        star: dict[str, Any] = {"x_px": float(x), "y_px": float(y), "star": None, "mag": None}
-        if row >= 0:
-            star |= {"star": database.designation[row].decode(), "mag": float(database.mag[row])}
-        stars.append(star)
-    if as_json:
-        print_json({**facts, "stars": stars})
-        return
-    rows = [
-        (name, f"{value:.9g}" if isinstance(value, float) else value)
-        for name, value in facts.items()
-    ]
-    print_table(f"{len(centroids_px)} centroids, {database.name}", ("", ""), rows)
-    if is_identified:
-        print_table(
-            "Stars",
-            ("x px", "y px", "star", "mag"),
-            [
-                (f"{s['x_px']:.2f}", f"{s['y_px']:.2f}", s["star"] or "-",
-                 "" if s["mag"] is None else f"{s['mag']:.2f}")
-                for s in stars
-            ],
-            numbers=(0, 1, 3),
-        )  # fmt: skip

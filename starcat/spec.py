@@ -130,7 +130,7 @@ class CameraSpec(_Section):
             With its focal length in pixels.
         """
         if self.fov_x_deg is not None:
-            return Camera.from_fov(self.width_px, self.height_px, self.fov_x_deg)
+            return Camera(self.width_px, self.height_px, fov_x_deg=self.fov_x_deg)
         focal_length_px = (self.focal_length_mm or 1.0) * 1000.0 / (self.pixel_um or 1.0)
         return Camera(self.width_px, self.height_px, focal_length_px)
 
@@ -146,7 +146,7 @@ class Boresights(_Section):
     field: Literal["rectangular", "circular"] = Field(
         "rectangular", description="the camera's frame at roll 0, or the circle inside it"
     )
-    brightest: int = Field(6, ge=1, le=100, description="length of each field's list of stars")
+    brightest: int = Field(8, ge=1, le=100, description="length of each field's list of stars")
     min_stars_per_field: int | None = Field(
         None, ge=1, le=10_000, description="the build fails if a field of the tiling has fewer"
     )
@@ -253,6 +253,11 @@ class BuildSpec(_Section):
     boresights: Boresights = Boresights()
     products: Products = Products()
     self_test: SelfTest = SelfTest()
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Names of all sources that the build reads, the stars' first."""
+        return (self.catalog.source, *self.selection.variables.join)
 
 
 def read_spec(path: Path) -> BuildSpec:

@@ -96,10 +96,10 @@ def test_find_pairs(kind, limits_deg, random_directions):
 
 
 CAMERAS = {
-    "square": Camera.from_fov(512, 512, 12.0),
-    "wide": Camera.from_fov(800, 200, 20.0),
-    "tall": Camera.from_fov(200, 800, 5.0),
-    "very wide": Camera.from_fov(1000, 1000, 120.0),
+    "square": Camera(512, 512, fov_x_deg=12.0),
+    "wide": Camera(800, 200, fov_x_deg=20.0),
+    "tall": Camera(200, 800, fov_x_deg=5.0),
+    "very wide": Camera(1000, 1000, fov_x_deg=120.0),
 }
 
 
@@ -154,7 +154,7 @@ def test_stars_in_a_stated_field(kind, random_directions):
 @pytest.mark.parametrize("field", ["rectangular", "circular"])
 def test_a_star_on_the_boresight_is_in_its_field(field):
     points = saff_kuijlaars(20)
-    found = stars_in_fields(points, points, np.zeros(20), Camera.from_fov(100, 100, 5.0), field)
+    found = stars_in_fields(points, points, np.zeros(20), Camera(100, 100, fov_x_deg=5.0), field)
     assert found.star_index.tolist() == list(range(20))
 
 

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from starcat.attitude import (
+    determinant,
     matrix_from_quaternion,
     matrix_from_radec_roll,
     quaternion_from_matrix,
     radec_roll_from_matrix,
     random_attitudes,
+    solve_wahba_quest,
     solve_wahba_svd,
 )
 from starcat.sphere import directions_from_radec, separation, tangent_axes
@@ -67,6 +71,27 @@ def test_quaternion_of_a_matrix_is_that_of_scipy(q):
     assert min(np.abs(found - expected).max(), np.abs(found + expected).max()) < ROUNDING
 
 
+@given(quaternions())
+@example(np.array([1.0, 0.0, 0.0, 0.0]))
+@example(np.array([0.0, -0.6, 0.8, -0.0]))
+@example(np.array([0.0, 0.0, -1.0, 1e-17]))
+def test_the_sign_of_w_is_plus_even_of_zero(q):
+    for sign in (1.0, -1.0):
+        w = quaternion_from_matrix(matrix_from_quaternion(sign * q))[3]
+        assert math.copysign(1.0, w) == 1.0
+
+
+@pytest.mark.parametrize("zero", [0.0, -0.0])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_half_turns_about_the_axes(axis, zero):
+    matrix = np.full((3, 3), zero)
+    np.fill_diagonal(matrix, -1.0)
+    matrix[axis, axis] = 1.0
+    q = quaternion_from_matrix(matrix)
+    assert np.abs(q).tolist() == [float(n == axis) for n in range(4)]
+    assert math.copysign(1.0, q[3]) == 1.0
+
+
 def test_quaternion_is_normalised():
     q = np.array([1.0, 2.0, 3.0, 4.0])
     assert np.allclose(matrix_from_quaternion(q), matrix_from_quaternion(q / 7.0), atol=ROUNDING)
@@ -105,6 +130,33 @@ def test_angles_never_reach_360(angle_deg):
     ra_deg, _, roll_deg = radec_roll_from_matrix(matrix_from_radec_roll(angle_deg, 0.0, angle_deg))
     assert 0.0 <= ra_deg < 360.0
     assert 0.0 <= roll_deg < 360.0
+
+
+@pytest.mark.parametrize("pole", [1.0, -1.0], ids=["north", "south"])
+@pytest.mark.parametrize("turn_deg", [0.0, 16.0, 90.0, 180.0, 300.0])
+@pytest.mark.parametrize("zeros", [(0.0, 0.0), (0.0, -0.0)])
+def test_at_the_pole_itself_the_right_ascension_is_0(pole, turn_deg, zeros):
+    c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    matrix = np.array([[c, s, 0.0], [-s * pole, c * pole, 0.0], [*zeros, pole]])
+    ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(matrix)
+    assert (ra_deg, dec_deg) == (0.0, 90.0 * pole)
+    assert np.abs(matrix_from_radec_roll(ra_deg, dec_deg, roll_deg) - matrix).max() < ROUNDING
+
+
+def test_at_the_pole_itself_a_minus_zero_changes_nothing():
+    # A quaternion with these zeros makes a boresight of [-0, 0, 1].
+    matrix = matrix_from_quaternion(np.array([0.0, -0.0, -0.6, 0.8]))
+    angles = radec_roll_from_matrix(matrix)
+    assert angles[0] == 0.0
+    assert np.abs(matrix_from_radec_roll(*angles) - matrix).max() < ROUNDING
+
+
+@pytest.mark.parametrize("ra_deg", [0.0, 123.0, 300.0])
+@pytest.mark.parametrize("dec_deg", [-90.0, 90.0])
+def test_next_to_the_pole_each_angle_comes_back(ra_deg, dec_deg):
+    # The cosine of 90 deg in radians is 6e-17, not 0: enough to carry the right ascension.
+    back = radec_roll_from_matrix(matrix_from_radec_roll(ra_deg, dec_deg, 17.0))
+    assert back == pytest.approx((ra_deg, dec_deg, 17.0), abs=1e-12)
 
 
 @given(angles)
@@ -175,6 +227,113 @@ def test_wahba_always_gives_a_proper_rotation(kind, random_directions):
         found = solve_wahba_svd(body, icrs)
         assert np.linalg.det(found) == pytest.approx(1.0)
         assert np.abs(found @ found.T - np.eye(3)).max() < ROUNDING
+
+
+def turned(icrs: np.ndarray, matrix: np.ndarray, noise: float, seed: int) -> np.ndarray:
+    """Return directions as a camera at that attitude measures them."""
+    body = icrs @ matrix.T
+    body = body + np.random.default_rng(seed).normal(scale=noise, size=icrs.shape)
+    return body / np.linalg.norm(body, axis=1)[:, None]
+
+
+def about(axis: np.ndarray, angle_deg: float) -> np.ndarray:
+    return Rotation.from_rotvec(np.radians(angle_deg) * axis).inv().as_matrix()
+
+
+HALF_TURNS = [about(axis / np.linalg.norm(axis), 180.0) for axis in [*np.eye(3), np.ones(3)]]
+
+
+def field(count: int, seed: int, radius_rad: float = 0.1) -> np.ndarray:
+    """Return directions within a field of view somewhere on the sky."""
+    generator = np.random.default_rng(seed)
+    offset = generator.uniform(-1.0, 1.0, (count, 2)) * radius_rad
+    near = np.column_stack([offset, np.ones(count)]) @ random_attitudes(1, generator)[0]
+    return near / np.linalg.norm(near, axis=1)[:, None]
+
+
+def scipy_attitude(body: np.ndarray, icrs: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
+    return Rotation.align_vectors(body, icrs, weights=weights)[0].as_matrix()
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("noise", [0.0, 30 * ARCSEC, 0.01])
+@pytest.mark.parametrize("count", [4, 15])
+def test_quest_agrees_with_svd_and_scipy_in_a_field_of_view(count, noise, weighted):
+    for seed, matrix in enumerate(random_attitudes(40, np.random.default_rng(11))):
+        icrs = field(count, seed)
+        body = turned(icrs, matrix, noise, seed)
+        weights = np.random.default_rng(seed).uniform(0.1, 5.0, count) if weighted else None
+        found = matrix_from_quaternion(solve_wahba_quest(body, icrs, weights))
+        assert np.abs(found - solve_wahba_svd(body, icrs, weights)).max() < 1e-9
+        assert np.abs(found - scipy_attitude(body, icrs, weights)).max() < 1e-9
+
+
+@pytest.mark.parametrize("matrix", HALF_TURNS, ids=["x", "y", "z", "oblique"])
+@pytest.mark.parametrize("noise", [0.0, 30 * ARCSEC])
+def test_quest_has_no_singular_attitude(matrix, noise, random_directions):
+    for seed in range(10):
+        for icrs in (random_directions(6, seed), field(6, seed)):
+            body = turned(icrs, matrix, noise, seed)
+            q = solve_wahba_quest(body, icrs)
+            assert q[3] >= 0.0
+            assert np.linalg.norm(q) == pytest.approx(1.0, abs=ROUNDING)
+            assert np.abs(matrix_from_quaternion(q) - solve_wahba_svd(body, icrs)).max() < 1e-9
+
+
+@pytest.mark.parametrize("apart_deg", [5.0, 60.0, 90.0, 175.0])
+@pytest.mark.parametrize("noise", [0.0, 30 * ARCSEC])
+def test_quest_needs_two_directions(apart_deg, noise):
+    for seed, matrix in enumerate(random_attitudes(20, np.random.default_rng(12))):
+        icrs = np.eye(3)[:2].copy()
+        icrs[1] = [np.cos(np.radians(apart_deg)), np.sin(np.radians(apart_deg)), 0.0]
+        body = turned(icrs, matrix, noise, seed)
+        found = matrix_from_quaternion(solve_wahba_quest(body, icrs))
+        assert np.abs(found - solve_wahba_svd(body, icrs)).max() < 1e-9
+
+
+@pytest.mark.parametrize("radius_deg", [0.3, 1.0])
+def test_quest_agrees_with_svd_for_stars_close_together(radius_deg):
+    for seed, matrix in enumerate(random_attitudes(100, np.random.default_rng(13))):
+        icrs = field(4, seed, np.radians(radius_deg))
+        body = turned(icrs, matrix, 10 * ARCSEC, seed)
+        found = matrix_from_quaternion(solve_wahba_quest(body, icrs))
+        assert np.abs(found - solve_wahba_svd(body, icrs)).max() < 1e-9
+
+
+def test_quest_leaves_a_star_of_weight_zero_out():
+    icrs = field(5, 14)
+    matrix = matrix_from_radec_roll(10.0, 20.0, 30.0)
+    body = icrs @ matrix.T
+    body[4] = -body[4]
+    q = solve_wahba_quest(body, icrs, np.array([1.0, 1.0, 1.0, 1.0, 0.0]))
+    assert np.abs(matrix_from_quaternion(q) - matrix).max() < 1e-9
+
+
+@pytest.mark.parametrize("count", [2, 3, 8])
+def test_many_problems_at_once_are_solved_like_one(count):
+    matrices = random_attitudes(60, np.random.default_rng(15))
+    icrs = np.stack([field(count, seed) for seed in range(60)])
+    body = np.stack([turned(*case, 1e-3, 16) for case in zip(icrs, matrices, strict=True)])
+    # What has no proper rotation as its best orthogonal matrix: mirrored fields.
+    body[::3, :, 0] *= -1.0
+    found = solve_wahba_svd(body, icrs)
+    assert found.shape == (60, 3, 3)
+    assert np.abs(np.linalg.det(found) - 1.0).max() < ROUNDING
+    for one, seen, star in zip(found, body, icrs, strict=True):
+        assert np.abs(one - solve_wahba_svd(seen, star)).max() < 1e-12
+
+
+def test_no_problems_at_once():
+    assert solve_wahba_svd(np.empty((0, 3, 3)), np.empty((0, 3, 3))).shape == (0, 3, 3)
+
+
+def test_determinant_is_that_of_numpy():
+    for matrix in np.random.default_rng(17).normal(size=(50, 3, 3)):
+        assert determinant(matrix) == pytest.approx(np.linalg.det(matrix), rel=1e-9, abs=1e-12)
+    assert determinant(np.arange(9.0).reshape(3, 3)) == 0.0
+    # One row after the other, so that a wrong sign or a swapped pair would show.
+    assert determinant(np.array([[0.0, 2.0, 0.0], [0.0, 0.0, 3.0], [5.0, 0.0, 0.0]])) == 30.0
+    assert determinant(np.array([[2.0, 0.0, 0.0], [0.0, 0.0, 3.0], [0.0, 5.0, 0.0]])) == -30.0
 
 
 def test_random_attitudes_are_rotations_spread_evenly():

@@ -19,6 +19,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import h5py
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
@@ -27,6 +29,7 @@ from starcat.artifact.verify import check_artifact
 from starcat.catalog.delimited import parse_delimited
 from starcat.catalog.source import data_source, read_source
 from starcat.errors import SourceError, StarcatError
+from starcat.images.image_file import write_image
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "errors.md"
 
@@ -527,7 +530,7 @@ def _(place: Place) -> Call:
     return place.identify("x_px,y_px\n1,2\n3,abc\n")
 
 
-@case("frame with a number that is not finite", 2)
+@case("frame with a number that is not finite", 0)
 def _(place: Place) -> Call:
     return place.identify("x_px,y_px\n1,2\n3,nan\n")
 
@@ -540,6 +543,56 @@ def _(place: Place) -> Call:
 @case("frame that is no text", 2)
 def _(place: Place) -> Call:
     return place.identify(b"\x89PNG\r\n\x1a\n")
+
+
+def json_frames(place: Place, text: str) -> Call:
+    return ["identify", place.artifact, place.write("frames.json", text)]
+
+
+@case("frames that are no JSON", 2)
+def _(place: Place) -> Call:
+    return json_frames(place, "[1, 2")
+
+
+@case("frame of JSON without centroids", 2)
+def _(place: Place) -> Call:
+    return json_frames(place, '[{"centroids_px": []}, {"centroids": []}]')
+
+
+@case("frame of JSON with half a pair", 2)
+def _(place: Place) -> Call:
+    return json_frames(place, '{"centroids_px": [[1]]}')
+
+
+@case("frame of JSON with too few magnitudes", 2)
+def _(place: Place) -> Call:
+    return json_frames(place, '{"centroids_px": [[1, 2]], "mag": []}')
+
+
+@case("image that is none", 2)
+def _(place: Place) -> Call:
+    return ["identify", place.artifact, place.write("frame.png", b"no picture")]
+
+
+@case("image of another size than the camera", 2)
+def _(place: Place) -> Call:
+    path = place.folder / "frame.fits"
+    write_image(path, np.zeros((48, 64), dtype=np.uint16))
+    return ["identify", place.artifact, path]
+
+
+@case("method unknown", 2)
+def _(place: Place) -> Call:
+    return [*place.identify("x_px,y_px\n1,2\n"), "--method", "triangles"]
+
+
+@case("method whose product is missing", 5)
+def _(place: Place) -> Call:
+    artifact = place.copy()
+    with h5py.File(artifact / "database.h5", "r+") as file:
+        del file["grid"]
+    frame = place.write("frame.csv", "x_px,y_px\n1,2\n")
+    return ["identify", artifact, frame, "--method", "grid"]
 
 
 @case("frame with a field without end", 2)

@@ -1,20 +1,118 @@
-"""Camera: the corner convention, the field of view, and what is behind or beside the frame."""
+"""Camera: the corner convention, the field of view, the lens, and what is beside the frame."""
 
 from __future__ import annotations
 
+import copy
+import dataclasses
+import math
+import pickle
+from itertools import combinations
+from pathlib import Path
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
+from scipy.optimize import root
 
 from starcat.camera import Camera
+from starcat.camera_file import camera_toml, read_camera
+from starcat.distortion import HORIZON, NO_DISTORTION, Distortion
+from starcat.errors import ConfigError
+from starcat.resources import resource_folder
+from starcat.spec import preset, preset_names
 from starcat.sphere import separation
 
 WIDE = Camera(1024, 768, 2000.0)
+BARREL = Distortion(-0.3)
+LENS = Camera(
+    1024,
+    768,
+    fov_x_deg=40.0,
+    principal_point_px=(500.0, 400.0),
+    distortion=Distortion(-0.3, 0.12, -0.03, 2e-3, -1e-3),
+)
 
 sides = st.integers(1, 5000)
 focal_lengths = st.floats(10.0, 1e5)
 shares = st.floats(-0.5, 1.5)
+tangential = st.floats(-5e-3, 5e-3)
+distortions = st.builds(
+    Distortion,
+    st.floats(-0.5, 0.5),
+    st.floats(-0.3, 0.3),
+    st.floats(-0.1, 0.1),
+    tangential,
+    tangential,
+)
+unit_shares = st.floats(0.0, 1.0)
+
+
+@st.composite
+def cameras(draw):
+    """Cameras of all kinds, whose detector stays a tenth short of the fold."""
+    width_px, height_px = draw(sides), draw(sides)
+    try:
+        camera = Camera(
+            width_px,
+            height_px,
+            **{"fov_x_deg" if width_px > height_px else "fov_y_deg": draw(st.floats(0.5, 90.0))},
+            principal_point_px=(width_px * draw(shares), height_px * draw(shares)),
+            distortion=draw(distortions | st.just(NO_DISTORTION)),
+        )
+    except ValueError:
+        assume(False)
+    assume(math.tan(camera.radius_rad) < 0.9 * camera.distortion.fold_radius)
+    return camera
+
+
+# Oracles: one point at a time, as the formula is printed in OpenCV's documentation -------------
+
+
+def by_formula(x, y, lens):
+    r2 = x**2 + y**2
+    radial = 1 + lens.k1 * r2 + lens.k2 * r2**2 + lens.k3 * r2**3
+    return (
+        x * radial + 2 * lens.p1 * x * y + lens.p2 * (r2 + 2 * x**2),
+        y * radial + lens.p1 * (r2 + 2 * y**2) + 2 * lens.p2 * x * y,
+    )
+
+
+def pixel_by_formula(camera, body):
+    x, y = by_formula(body[0] / body[2], body[1] / body[2], camera.distortion)
+    cx, cy = camera.principal_point_px
+    return x * camera.focal_length_px + cx, y * camera.focal_length_px + cy
+
+
+def direction_by_search(camera, pixel):
+    """Invert the formula with scipy's solver, outwards from the axis to stay inside the fold."""
+    image = (np.array(pixel) - camera.principal_point_px) / camera.focal_length_px
+    # Away from 0, because the solver's steps are a share of the number itself.
+    found = np.array([3.0, 3.0])
+    for share in np.linspace(0.0, 1.0, 17):
+        found = root(
+            lambda p, goal: by_formula(*p - 3.0, camera.distortion) - goal,
+            found,
+            share * image,
+            tol=1e-15,
+        ).x
+    found = found - 3.0
+    assert np.abs(by_formula(*found, camera.distortion) - image).max() < 1e-13
+    body = np.array([*found, 1.0])
+    return body / np.linalg.norm(body)
+
+
+def points_of(width_px, height_px):
+    x, y = np.meshgrid(np.linspace(0.0, width_px, 9), np.linspace(0.0, height_px, 9))
+    return np.column_stack([x.ravel(), y.ravel()])
+
+
+def images_of(points, lens):
+    """Return the images of points with rows x, y."""
+    return lens.distorted(np.array([complex(*point) for point in points]))
+
+
+# The pinhole ----------------------------------------------------------------------------------
 
 
 @given(sides, sides, focal_lengths, shares, shares)
@@ -39,6 +137,14 @@ def test_the_axis_is_the_middle_of_the_frame():
     assert WIDE.directions_from_pixels(np.array([[512.0, 384.0]])).tolist() == [[0.0, 0.0, 1.0]]
 
 
+def test_the_axis_is_at_the_principal_point():
+    axis = np.array([[0.0, 0.0, 1.0]])
+    for camera in (LENS, Camera(1024, 768, 2000.0, principal_point_px=(-50, 400))):
+        point = [list(camera.principal_point_px)]
+        assert camera.pixels_from_directions(axis).tolist() == point
+        assert camera.directions_from_pixels(np.array(point)).tolist() == axis.tolist()
+
+
 def test_the_only_pixel_of_a_one_pixel_camera_has_its_centre_at_a_half():
     camera = Camera(1, 1, 10.0)
     assert camera.pixels_from_directions(np.array([[0.0, 0.0, 1.0]])).tolist() == [[0.5, 0.5]]
@@ -50,40 +156,19 @@ def test_x_grows_to_the_right_and_y_downwards():
     assert down.tolist() == [512.0, 584.0]
 
 
-def test_directions_are_of_unit_length():
-    pixels = np.random.default_rng(2).uniform(-500.0, 1500.0, (200, 2))
-    length = np.linalg.norm(WIDE.directions_from_pixels(pixels), axis=1)
+@pytest.mark.parametrize("camera", [WIDE, LENS])
+def test_directions_are_of_unit_length(camera):
+    pixels = np.random.default_rng(2).uniform(0.0, 768.0, (200, 2))
+    length = np.linalg.norm(camera.directions_from_pixels(pixels), axis=1)
     assert np.abs(length - 1.0).max() < 1e-15
 
 
-def test_the_fields_of_view_are_the_angles_between_the_edges():
-    edges = np.array([[0.0, 384.0], [1024.0, 384.0], [512.0, 0.0], [512.0, 768.0]])
-    left, right, top, bottom = WIDE.directions_from_pixels(edges)
-    assert WIDE.fov_x_deg == pytest.approx(np.degrees(separation(left, right)), rel=1e-14)
-    assert WIDE.fov_y_deg == pytest.approx(np.degrees(separation(top, bottom)), rel=1e-14)
-
-
-def test_the_diagonal_is_the_angle_between_the_corners():
-    one, other = WIDE.directions_from_pixels(np.array([[0.0, 0.0], [1024.0, 768.0]]))
-    assert WIDE.diagonal_rad == pytest.approx(float(separation(one, other)), rel=1e-14)
-
-
-@given(sides, sides, st.floats(0.1, 170.0))
-def test_a_camera_of_a_field_has_that_field(width_px, height_px, fov_x_deg):
-    camera = Camera.from_fov(width_px, height_px, fov_x_deg)
-    assert camera.fov_x_deg == pytest.approx(fov_x_deg, rel=1e-13)
-    assert (camera.fov_y_deg > camera.fov_x_deg) == (height_px > width_px)
-
-
-def test_a_field_of_90_degrees_has_a_focal_length_of_half_the_width():
-    assert Camera.from_fov(1000, 500, 90.0).focal_length_px == pytest.approx(500.0, rel=1e-15)
-
-
-def test_what_is_behind_or_beside_the_camera_has_no_pixel():
+@pytest.mark.parametrize("camera", [WIDE, LENS])
+def test_what_is_behind_or_beside_the_camera_has_no_pixel(camera):
     body = np.array([[0.0, 0.0, -1.0], [0.1, 0.1, -0.9], [1.0, 0.0, 0.0], [np.nan] * 3])
-    pixels = WIDE.pixels_from_directions(body)
+    pixels = camera.pixels_from_directions(body)
     assert np.isnan(pixels).all()
-    assert not WIDE.contains(pixels).any()
+    assert not camera.contains(pixels).any()
 
 
 @pytest.mark.parametrize(
@@ -102,20 +187,662 @@ def test_what_is_behind_or_beside_the_camera_has_no_pixel():
         ((-np.inf, 5.0), False),
     ],
 )
-def test_the_frame_is_closed_at_left_and_top_and_open_at_right_and_bottom(pixel, inside):
-    assert WIDE.contains(np.array([pixel])).tolist() == [inside]
+@pytest.mark.parametrize("camera", [WIDE, LENS])
+def test_the_frame_is_closed_at_left_and_top_and_open_at_right_and_bottom(camera, pixel, inside):
+    assert camera.contains(np.array([pixel])).tolist() == [inside]
 
 
-def test_no_pixels():
+@pytest.mark.parametrize("camera", [WIDE, LENS])
+def test_no_pixels(camera):
     none = np.empty((0, 2))
-    assert WIDE.directions_from_pixels(none).shape == (0, 3)
-    assert WIDE.pixels_from_directions(np.empty((0, 3))).shape == (0, 2)
-    assert WIDE.contains(none).shape == (0,)
+    assert camera.directions_from_pixels(none).shape == (0, 3)
+    assert camera.pixels_from_directions(np.empty((0, 3))).shape == (0, 2)
+    assert camera.contains(none).shape == (0,)
+
+
+# The field of view ----------------------------------------------------------------------------
+
+
+def test_the_fields_of_view_are_the_angles_between_the_edges():
+    edges = np.array([[0.0, 384.0], [1024.0, 384.0], [512.0, 0.0], [512.0, 768.0]])
+    left, right, top, bottom = WIDE.directions_from_pixels(edges)
+    assert WIDE.fov_x_deg == pytest.approx(np.degrees(separation(left, right)), rel=1e-14)
+    assert WIDE.fov_y_deg == pytest.approx(np.degrees(separation(top, bottom)), rel=1e-14)
+
+
+def test_the_diagonal_is_the_angle_between_the_corners():
+    one, other = WIDE.directions_from_pixels(np.array([[0.0, 0.0], [1024.0, 768.0]]))
+    assert WIDE.diagonal_rad == pytest.approx(float(separation(one, other)), rel=1e-14)
+    assert WIDE.radius_rad == pytest.approx(math.atan(640.0 / 2000.0), rel=1e-15)
+
+
+@given(sides, sides, st.floats(0.1, 170.0))
+def test_a_camera_of_a_field_has_that_field(width_px, height_px, fov_deg):
+    camera = Camera(width_px, height_px, fov_x_deg=fov_deg)
+    assert camera.fov_x_deg == pytest.approx(fov_deg, rel=1e-13)
+    assert (camera.fov_y_deg > camera.fov_x_deg) == (height_px > width_px)
+    camera = Camera(width_px, height_px, fov_y_deg=fov_deg)
+    assert camera.fov_y_deg == pytest.approx(fov_deg, rel=1e-13)
+
+
+def test_a_field_of_90_degrees_has_a_focal_length_of_half_the_side():
+    assert Camera(1000, 500, fov_x_deg=90.0).focal_length_px == pytest.approx(500.0, rel=1e-15)
+    assert Camera(1000, 500, fov_y_deg=90.0).focal_length_px == pytest.approx(250.0, rel=1e-15)
+
+
+@pytest.mark.parametrize("ratio", [0.99901, 1.0, 1.00099])
+def test_both_fields_may_be_given_if_they_agree(ratio):
+    wide = Camera(1600, 1200, fov_x_deg=16.0)
+    fov_y_deg = math.degrees(2.0 * math.atan(600.0 / (ratio * wide.focal_length_px)))
+    assert Camera(1600, 1200, fov_x_deg=16.0, fov_y_deg=fov_y_deg) == wide
+
+
+@pytest.mark.parametrize("ratio", [0.99899, 1.00101])
+def test_two_fields_that_disagree_are_refused(ratio):
+    focal_length_px = ratio * 800.0 / math.tan(math.radians(8.0))
+    fov_y_deg = math.degrees(2.0 * math.atan(600.0 / focal_length_px))
+    with pytest.raises(ValueError, match=r"expected 12\.0342, which square pixels give"):
+        Camera(1600, 1200, fov_x_deg=16.0, fov_y_deg=fov_y_deg)
+
+
+@given(sides, sides, focal_lengths)
+def test_the_angles_of_a_pinhole_are_the_closed_forms(width_px, height_px, focal_length_px):
+    camera = Camera(width_px, height_px, focal_length_px)
+    half_x, half_y = 0.5 * width_px / focal_length_px, 0.5 * height_px / focal_length_px
+    # To the last bit, because the products of a build depend on them.
+    assert camera.fov_x_deg == 2.0 * np.degrees(np.arctan(half_x))
+    assert camera.fov_y_deg == 2.0 * np.degrees(np.arctan(half_y))
+    half_px = 0.5 * np.hypot(width_px, height_px)
+    assert camera.diagonal_rad == 2.0 * np.arctan(half_px / focal_length_px)
+    assert camera.radius_rad == 0.5 * camera.diagonal_rad
+
+
+@given(cameras())
+def test_angles_of_any_camera_are_those_of_its_edges_and_corners(camera):
+    w, h = camera.width_px, camera.height_px
+    middles = [(0.0, h / 2), (w, h / 2), (w / 2, 0.0), (w / 2, h)]
+    left, right, top, bottom = (direction_by_search(camera, middle) for middle in middles)
+    corners = [direction_by_search(camera, (x, y)) for x in (0.0, w) for y in (0.0, h)]
+    widest = max(separation(one, other) for one, other in combinations(corners, 2))
+    from_axis = separation(np.array(corners), np.array([0.0, 0.0, 1.0]))
+    close = {"rel": 1e-11, "abs": 1e-13}
+    assert camera.fov_x_deg == pytest.approx(math.degrees(separation(left, right)), **close)
+    assert camera.fov_y_deg == pytest.approx(math.degrees(separation(top, bottom)), **close)
+    assert camera.diagonal_rad == pytest.approx(float(widest), **close)
+    assert camera.radius_rad == pytest.approx(from_axis.max(), **close)
+
+
+@pytest.mark.parametrize("point", [(0, 0), (100, 0), (0, 100), (100, 100)])
+def test_a_camera_that_looks_out_of_its_corner(point):
+    camera = Camera(100, 100, 100.0, principal_point_px=point)
+    # The corners are at (0, 0, 1), (1, 0, 1), (0, 1, 1) and (1, 1, 1) but for signs; the two
+    # in the middle are 60 degrees apart, the first and the last 55.
+    assert camera.diagonal_rad == pytest.approx(math.radians(60.0), rel=1e-15)
+    assert camera.radius_rad == pytest.approx(math.atan(math.sqrt(2.0)), rel=1e-15)
+    assert camera.fov_x_deg == pytest.approx(math.degrees(math.acos(1.25 / math.sqrt(1.25 * 2.25))))
+
+
+def test_a_camera_that_looks_out_of_its_edge():
+    camera = Camera(100, 60, 100.0, principal_point_px=(0.0, 30.0))
+    assert camera.fov_x_deg == pytest.approx(45.0, rel=1e-15)
+
+
+def test_the_stated_field_is_that_of_the_pinhole():
+    barrel = Camera(1000, 1000, fov_x_deg=40.0, distortion=Distortion(-0.1))
+    pincushion = Camera(1000, 1000, fov_x_deg=40.0, distortion=Distortion(0.1))
+    assert barrel.focal_length_px == pincushion.focal_length_px
+    assert pincushion.fov_x_deg < 40.0 < barrel.fov_x_deg
+    assert pincushion.diagonal_rad < 2.0 * Camera(1000, 1000, fov_x_deg=40.0).radius_rad
+
+
+# The lens -------------------------------------------------------------------------------------
+
+
+def test_the_formula_by_hand():
+    lens = Distortion(k1=0.1, k2=0.01, k3=0.001, p1=0.01, p2=0.02)
+    # At (1, 2) r^2 is 5 and the radial factor 1 + 0.5 + 0.25 + 0.125.
+    x = 1.875 + 2 * 0.01 * 2 + 0.02 * (5 + 2)
+    y = 3.75 + 0.01 * (5 + 8) + 2 * 0.02 * 2
+    image = images_of([(1.0, 2.0)], lens)[0]
+    assert image.real == pytest.approx(x, rel=1e-15)
+    assert image.imag == pytest.approx(y, rel=1e-15)
+
+
+@given(cameras(), unit_shares, unit_shares)
+def test_projection_is_the_formula(camera, x_share, y_share):
+    pixel = (x_share * camera.width_px, y_share * camera.height_px)
+    body = direction_by_search(camera, pixel)
+    found = camera.pixels_from_directions(3.0 * body[None])[0]
+    # Some ten roundings of a number as large as the offset of the principal point.
+    assert np.abs(found - pixel_by_formula(camera, body)).max() < 1e-10
+    assert np.abs(found - pixel).max() < 1e-9
+
+
+@given(cameras(), unit_shares, unit_shares)
+def test_directions_are_those_that_a_search_finds(camera, x_share, y_share):
+    pixel = np.array([x_share * camera.width_px, y_share * camera.height_px])
+    found = camera.directions_from_pixels(pixel[None])[0]
+    assert separation(found, direction_by_search(camera, pixel)) < 1e-12
+
+
+@given(cameras())
+def test_pixels_of_any_camera_come_back(camera):
+    pixels = points_of(camera.width_px, camera.height_px)
+    back = camera.pixels_from_directions(camera.directions_from_pixels(pixels))
+    assert np.abs(back - pixels).max() < 1e-9
+
+
+@given(distortions, st.integers(0, 2**32 - 1))
+def test_directions_inside_the_fold_come_back(lens, seed):
+    generator = np.random.default_rng(seed)
+    size = min(lens.fold_radius, 3.0) * np.sqrt(generator.uniform(0.0, 0.99, 50))
+    z = size * np.exp(2j * np.pi * generator.uniform(size=50))
+    back = lens.undistorted(lens.distorted(z))
+    body, again = (np.column_stack([p.real, p.imag, np.ones(50)]) for p in (z, back))
+    assert separation(body, again).max() < 1e-12
+
+
+@given(st.floats(-0.5, 0.5), st.floats(-0.3, 0.3), st.floats(-0.1, 0.1), st.floats(-180.0, 180.0))
+def test_radial_distortion_commutes_with_rolls(k1, k2, k3, roll_deg):
+    camera = Camera(1000, 800, fov_x_deg=30.0, distortion=Distortion(k1, k2, k3))
+    pixels = points_of(1000, 800)
+    body = camera.directions_from_pixels(pixels)
+    c, s = math.cos(math.radians(roll_deg)), math.sin(math.radians(roll_deg))
+    turned = camera.pixels_from_directions(body @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]]))
+    expected = (pixels - [500.0, 400.0]) @ np.array([[c, s], [-s, c]]) + [500.0, 400.0]
+    assert np.abs(turned - expected).max() < 1e-9
+
+
+@given(st.floats(1e-3, 0.5), st.floats(-180.0, 180.0), st.floats(0.01, 0.6))
+def test_barrel_is_inwards_and_pincushion_outwards(strength, angle_deg, size):
+    point = (size * math.cos(math.radians(angle_deg)), size * math.sin(math.radians(angle_deg)))
+    barrel = images_of([point], Distortion(-strength))[0]
+    pincushion = images_of([point], Distortion(strength))[0]
+    assert abs(barrel) < size < abs(pincushion)
+    # Along the same line through the principal point.
+    assert abs((barrel * complex(*point).conjugate()).imag) < 1e-15
+    assert abs((pincushion * complex(*point).conjugate()).imag) < 1e-15
+
+
+def test_no_distortion_is_the_pinhole(random_directions):
+    body = random_directions(200, 3)
+    tiny = Camera(1024, 768, 2000.0, distortion=Distortion(k1=-1e-30))
+    some = Camera(1024, 768, 2000.0, distortion=Distortion())
+    assert Distortion().is_none
+    assert some == WIDE
+    np.testing.assert_array_equal(
+        some.pixels_from_directions(body), WIDE.pixels_from_directions(body)
+    )
+    for name in ("k1", "k2", "k3", "p1", "p2"):
+        assert not Distortion(**{name: 1e-30}).is_none
+    np.testing.assert_allclose(
+        tiny.pixels_from_directions(body), WIDE.pixels_from_directions(body), rtol=1e-14
+    )
+
+
+# The fold -------------------------------------------------------------------------------------
+
+
+def test_a_pinhole_has_no_fold():
+    assert Camera(100, 100, 1e-9).fov_x_deg == pytest.approx(180.0, abs=1e-8)
+
+
+def test_what_is_beyond_the_fold_is_not_in_the_frame():
+    camera = Camera(90, 90, 100.0, distortion=BARREL)
+    fold = 1.0 / math.sqrt(0.9)  # where 1 - 0.9 r^2 is 0
+    # The image of r = sqrt(1/0.3) would be the principal point itself.
+    radii = np.array([0.5, fold * (1 - 1e-9), fold * (1 + 1e-9), math.sqrt(1 / 0.3), 1.9, 1e6])
+    body = np.column_stack([radii, np.zeros(6), np.ones(6)])
+    pixels = camera.pixels_from_directions(body)
+    assert np.isfinite(pixels).all(axis=1).tolist() == [True, True, False, False, False, False]
+    assert not np.isfinite(pixels[2:]).any()
+    assert pixels[1, 0] == pytest.approx(45.0 + 100.0 * fold * 2.0 / 3.0, rel=1e-12)
+
+
+def test_pixels_that_no_direction_reaches():
+    camera = Camera(90, 90, 100.0, distortion=BARREL)
+    fold_px = 100.0 * 2.0 / 3.0 / math.sqrt(0.9)
+    x = 45.0 + fold_px * np.array([1 - 1e-9, 1 + 1e-9, 2.0, 1e6, np.nan, np.inf])
+    body = camera.directions_from_pixels(np.column_stack([x, np.full(6, 45.0)]))
+    assert np.isfinite(body[0]).all()
+    assert np.isnan(body[1:]).all()
+
+
+def test_pixels_that_no_direction_reaches_do_not_spoil_the_others():
+    on_detector = np.array([[1.0, 2.0], [900.0, 700.0]])
+    # A lens whose tangential part keeps the limit from being a circle.
+    far = np.array([[5e3, 0.0], [np.nan, 1.0], [-1e7, 2e6]])
+    found = LENS.directions_from_pixels(np.concatenate([far, on_detector]))
+    assert np.isnan(found[:3]).all()
+    expected = LENS.directions_from_pixels(on_detector)
+    assert separation(found[3:], expected).max() < 1e-15
 
 
 @pytest.mark.parametrize(
-    "arguments", [(0, 10, 100.0), (10, -1, 100.0), (10, 10, 0.0), (10, 10, float("nan"))]
+    ("lens", "fold"),
+    [
+        (Distortion(k1=-1 / 3), 1.0),
+        (Distortion(k2=-1 / 5), 1.0),
+        (Distortion(k3=-1 / 7), 1.0),
+        (Distortion(k1=-4 / 3, k2=3 / 5), 1.0 / math.sqrt(3.0)),  # 1 - 4 s + 3 s^2
+        (Distortion(k1=-2 / 3, k2=1 / 5), 1.0),  # (1 - s)^2 only touches 0
+        (Distortion(k1=-2 / 0.9, k2=1 / 0.45), math.sqrt(0.3)),  # (1 - s / 0.3)^2
+        (Distortion(k1=-1.98 / 3, k2=0.99 / 5), HORIZON),  # (1 - s)^2 comes as near as 0.01
+        (Distortion(k1=1 / 3, k2=-2 / 5), 1.0),  # 1 + s - 2 s^2
+        (Distortion(k1=0.3, p2=0.25), (1.5 - math.sqrt(1.05)) / 0.6),  # 1 + 0.3 r^2 - 1.5 r
+        (Distortion(p1=1 / 60), 10.0),
+        (Distortion(p2=-1 / 60), 10.0),
+        (Distortion(p1=0.6 / 60, p2=0.8 / 60), 10.0),
+        (Distortion(k1=0.3, k2=0.1, k3=0.1), HORIZON),
+        (Distortion(k1=-1e-30), HORIZON),
+        (NO_DISTORTION, HORIZON),
+    ],
 )
-def test_an_impossible_camera_is_refused(arguments):
-    with pytest.raises(ValueError, match="all three must be positive"):
-        Camera(*arguments)
+def test_where_the_image_folds(lens, fold):
+    assert lens.fold_radius == pytest.approx(fold, rel=1e-7)
+
+
+@given(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0), st.floats(-2.0, 2.0))
+def test_the_radial_fold_is_the_first_place_where_the_image_turns_back(k1, k2, k3):
+    lens = Distortion(k1, k2, k3)
+    r = np.linspace(0.0, 4.0, 40_001)
+    image = r * (1.0 + k1 * r**2 + k2 * r**4 + k3 * r**6)
+    backward = np.flatnonzero(np.diff(image) <= 0.0)
+    if len(backward):
+        assert abs(lens.fold_radius - r[backward[0]]) < 2e-4
+    else:
+        # Where the slope touches 0 the steps may miss it.
+        assert lens.fold_radius > 4.0 - 2e-4 or np.diff(image).min() < 1e-7
+
+
+@given(distortions, st.floats(0.0, 3.0), st.integers(0, 2**32 - 1))
+def test_no_two_directions_inside_the_fold_share_an_image(lens, stronger, seed):
+    lens = dataclasses.replace(lens, p1=lens.p1 * 30.0 * stronger, p2=lens.p2 * 30.0 * stronger)
+    generator = np.random.default_rng(seed)
+    size = min(lens.fold_radius, 5.0) * np.sqrt(generator.uniform(0.0, 1.0, 200))
+    z = size * np.exp(2j * np.pi * generator.uniform(size=200))
+    # As the gradient of a convex function: images differ along what their directions do.
+    image = np.array([complex(*by_formula(p.real, p.imag, lens)) for p in z])
+    along = ((image[:, None] - image) * (z[:, None] - z).conj()).real
+    assert (along[~np.eye(200, dtype=bool)] > 0.0).all()
+
+
+@given(tangential, tangential)
+def test_the_tangential_fold_is_where_the_image_turns_back_first(p1, p2):
+    strength = math.hypot(p1, p2)
+    assume(strength > 1e-6)
+    lens = Distortion(p1=p1, p2=p2)
+    towards = np.array([-p2, -p1]) / strength
+    at_shares = [by_formula(*(towards * lens.fold_radius * k), lens) for k in (0.98, 1.0, 1.02)]
+    inner, fold, outer = np.array(at_shares) @ towards
+    assert inner < fold > outer
+
+
+@given(distortions, st.floats(-180.0, 180.0))
+def test_every_image_within_the_image_radius_has_a_direction(lens, angle_deg):
+    angle = math.radians(angle_deg)
+    image = 0.9999 * min(lens.image_radius, 10.0) * np.array([np.exp(1j * angle)])
+    found = lens.undistorted(image)
+    assert abs(found[0]) < lens.fold_radius
+    assert abs(lens.distorted(found)[0] - image[0]) < 1e-13 * max(1.0, abs(image[0]))
+
+
+def test_both_ways_end_at_the_same_fold():
+    # Away from where it folds, the image of this lens goes on beyond the fold.
+    lens = Distortion(p1=1 / 60)
+    y = 10.0 * np.array([1 - 1e-10, 1 + 1e-10])
+    image = [complex(*by_formula(0.0, number, lens)) for number in y]
+    assert np.isnan(lens.distorted(1j * y)).tolist() == [False, True]
+    assert np.isnan(lens.undistorted(np.array(image))).tolist() == [False, True]
+
+
+def test_a_detector_beyond_the_fold_is_refused():
+    # The fold at 1.0541 focal lengths has its image at two thirds of that.
+    expected = (
+        "distortion folds the image back at 70.2728 px from the principal point, but the "
+        "detector reaches out to 707.107 px; expected a fold beyond that"
+    )
+    with pytest.raises(ValueError, match=f"^{expected}$"):
+        Camera(1000, 1000, 100.0, distortion=BARREL)
+    at = {"principal_point_px": (-20.0, 0.5), "distortion": BARREL}
+    focal = math.hypot(30.0 + 20.0, 0.5) / (2.0 / 3.0 / math.sqrt(0.9))
+    Camera(30, 1, focal * (1 + 1e-9), **at)
+    with pytest.raises(ValueError, match=r"folds the image back at 50\.00"):
+        Camera(30, 1, focal * (1 - 1e-9), **at)
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        Distortion(k1=9e13),
+        Distortion(k3=9e13, k1=-1e-9),
+        Distortion(k1=14984415421791.152, k3=-8563154440.0),
+        Distortion(k1=-0.6, k2=1e9),
+    ],
+)
+def test_a_lens_that_bends_all_it_can_has_an_inverse(lens):
+    camera = Camera(1000, 1000, 110.0, distortion=lens)
+    pixels = points_of(1000, 1000)
+    back = camera.pixels_from_directions(camera.directions_from_pixels(pixels))
+    assert np.abs(back - pixels).max() < 1e-9
+
+
+def test_the_horizon_has_no_pixel_behind_a_lens():
+    camera = Camera(100, 100, 100.0, distortion=Distortion(k3=1.0))
+    body = np.array([[1.0, 0.0, 1e-7], [1.0, 0.0, 1e-9], [1.0, 1.0, 1e-300]])
+    assert np.isfinite(camera.pixels_from_directions(body)).all(axis=1).tolist() == [1, 0, 0]
+
+
+# The object -----------------------------------------------------------------------------------
+
+
+def test_cameras_are_values():
+    again = Camera(1024, 768, 2000, principal_point_px=np.array([512, 384]))
+    assert again == WIDE
+    assert hash(again) == hash(WIDE)
+    assert len({WIDE, again, LENS}) == 2
+    assert Camera(1024, 768, 2000.0, distortion=BARREL) != WIDE
+    assert Camera(1024, 768, 2000.0, principal_point_px=(512.0, 384.5)) != WIDE
+    assert (type(again.focal_length_px), type(again.principal_point_px[0])) == (float, float)
+    assert type(Camera(np.int32(8), np.int64(9), 2.0).width_px) is int
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        again.width_px = 5
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        LENS.distortion.k1 = 0.0
+
+
+def test_distortions_are_values():
+    assert Distortion() == NO_DISTORTION
+    assert hash(Distortion(1, p2=2)) == hash(Distortion(1.0, 0.0, 0.0, 0.0, 2.0))
+    assert type(Distortion(k1=1).k1) is float
+
+
+@pytest.mark.parametrize("camera", [WIDE, LENS])
+def test_copies_are_equal(camera):
+    assert eval(repr(camera)) == camera
+    changed = dataclasses.replace(camera, width_px=900)
+    assert changed.principal_point_px == camera.principal_point_px
+    assert changed.distortion == camera.distortion
+    pixels = points_of(1024, 768)
+    body = camera.directions_from_pixels(pixels)
+    assert camera.radius_rad > 0.0
+    for twin in (pickle.loads(pickle.dumps(camera)), copy.deepcopy(camera), copy.copy(camera)):
+        assert twin == camera
+        assert hash(twin) == hash(camera)
+        assert twin.radius_rad == camera.radius_rad
+        np.testing.assert_array_equal(twin.directions_from_pixels(pixels), body)
+    # What was computed from the coefficients stays behind.
+    assert len(pickle.dumps(camera)) < 1000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"width_px": 0}, "width_px is 0; expected a whole number from 1 to 1000000"),
+        ({"height_px": -1}, "height_px is -1; expected a whole number from 1 to 1000000"),
+        ({"width_px": 10.0}, "width_px is 10.0; expected a whole number from 1 to 1000000"),
+        ({"width_px": True}, "width_px is True; expected a whole number from 1 to 1000000"),
+        ({"width_px": 1_000_001}, "width_px is 1000001; expected a whole number from 1 to 1000000"),
+        ({"height_px": "9"}, "height_px is '9'; expected a whole number from 1 to 1000000"),
+        ({"focal_length_px": 0.0}, "focal_length_px is 0.0; expected a finite number above 0"),
+        ({"focal_length_px": -5}, "focal_length_px is -5; expected a finite number above 0"),
+        ({"focal_length_px": np.nan}, "focal_length_px is nan; expected a finite number above 0"),
+        ({"focal_length_px": np.inf}, "focal_length_px is inf; expected a finite number above 0"),
+        ({"focal_length_px": True}, "focal_length_px is True; expected a finite number above 0"),
+        ({"focal_length_px": "9"}, "focal_length_px is '9'; expected a finite number above 0"),
+        ({"focal_length_px": None}, "found no scale; expected one of focal_length_px, fov_x_deg"),
+        ({"fov_x_deg": 9.0}, "found focal_length_px and fov_x_deg; expected one of focal_length"),
+        (
+            {"fov_x_deg": 9.0, "fov_y_deg": 9.0},
+            "found focal_length_px and fov_x_deg and fov_y_deg; expected one of focal_length_px",
+        ),
+        (
+            {"focal_length_px": None, "fov_x_deg": 0.0},
+            "fov_x_deg is 0.0; expected a finite number above 0 and below 180",
+        ),
+        (
+            {"focal_length_px": None, "fov_y_deg": 180.0},
+            "fov_y_deg is 180.0; expected a finite number above 0 and below 180",
+        ),
+        (
+            {"focal_length_px": None, "fov_x_deg": 40.0, "fov_y_deg": np.nan},
+            "fov_y_deg is nan; expected a finite number above 0 and below 180",
+        ),
+        (
+            {"focal_length_px": None, "fov_x_deg": 90.0, "fov_y_deg": 60},
+            "fov_y_deg is 60; expected 90, which square pixels give with fov_x_deg 90.0, or "
+            "neither",
+        ),
+        ({"principal_point_px": (1.0,)}, "principal_point_px is (1.0,); expected two finite num"),
+        ({"principal_point_px": (1, 2, 3)}, "principal_point_px is (1, 2, 3); expected two fini"),
+        ({"principal_point_px": 5}, "principal_point_px is 5; expected two finite numbers, x and"),
+        ({"principal_point_px": "12"}, "principal_point_px is '12'; expected two finite numbers"),
+        ({"principal_point_px": (0, np.inf)}, "principal_point_px is (0, inf); expected two fin"),
+        ({"distortion": -0.1}, "distortion is -0.1; expected a Distortion"),
+    ],
+)
+def test_an_impossible_camera_is_refused(arguments, message):
+    usual = {"width_px": 10, "height_px": 10, "focal_length_px": 100.0}
+    with pytest.raises(ValueError, match="expected") as refused:
+        Camera(**usual | arguments)
+    assert str(refused.value).startswith(message)
+
+
+@pytest.mark.parametrize("name", ["k1", "k2", "k3", "p1", "p2"])
+@pytest.mark.parametrize("value", [np.nan, -np.inf, 1e14, "1", None, False, 10**400])
+def test_an_impossible_distortion_is_refused(name, value):
+    with pytest.raises(ValueError, match=f"^{name} is .*; expected a finite number above -1e.14"):
+        Distortion(**{name: value})
+    Distortion(**{name: np.nextafter(1e14, 0.0)})
+
+
+# Files ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def read(tmp_path):
+    """Read a camera from TOML text."""
+
+    def read(text: str) -> Camera:
+        path = tmp_path / "cam.toml"
+        path.write_text(text, encoding="utf-8")
+        return read_camera(path)
+
+    return read
+
+
+@given(camera=cameras())
+def test_a_camera_that_is_written_and_read_is_the_same(camera, tmp_path_factory):
+    path = tmp_path_factory.mktemp("camera") / "camera.toml"
+    path.write_text(camera_toml(camera), encoding="utf-8")
+    assert read_camera(path) == camera
+    path.write_text(f"[camera]\n{camera_toml(camera).replace('[dist', '[camera.dist')}")
+    assert read_camera(path) == camera
+
+
+def test_a_camera_file_as_it_is_written():
+    camera = Camera(
+        16, 9, 2e22, principal_point_px=(0.1, 1e-7), distortion=Distortion(-0.1, p2=2e-17)
+    )
+    expected = """\
+width_px = 16
+height_px = 9
+focal_length_px = 2e+22
+principal_point_px = [0.1, 1e-07]
+
+[distortion]
+k1 = -0.1
+k2 = 0.0
+k3 = 0.0
+p1 = 0.0
+p2 = 2e-17
+"""
+    assert camera_toml(camera) == expected
+
+
+SIZE = "width_px = 1000\nheight_px = 500\n"
+
+
+@pytest.mark.parametrize(
+    ("scale", "focal_length_px"),
+    [
+        ("focal_length_px = 500", 500.0),
+        ("fov_x_deg = 90", 500.0),
+        ("fov_y_deg = 90.0", 250.0),
+        ("fov_y_deg = 53.1301\nfov_x_deg = 90", 500.0),
+        ("focal_length_mm = 40\npixel_um = 16.0", 2500.0),
+    ],
+)
+def test_the_ways_to_say_the_scale(read, scale, focal_length_px):
+    camera = read(SIZE + scale)
+    assert camera.focal_length_px == pytest.approx(focal_length_px, rel=1e-15)
+    assert camera == Camera(1000, 500, camera.focal_length_px)
+
+
+def test_whole_numbers_will_do_for_any_number(read):
+    text = f"{SIZE}fov_x_deg = 9\nprincipal_point_px = [1, 2]\ndistortion = {{ k1 = 1 }}"
+    assert read(text) == Camera(
+        1000, 500, fov_x_deg=9.0, principal_point_px=(1.0, 2.0), distortion=Distortion(1.0)
+    )
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_a_build_spec_is_a_camera_file(name):
+    path = resource_folder("presets") / f"{name}.toml"
+    assert read_camera(path) == preset(name).camera.camera()
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "value", "message"),
+    [
+        ("", "width_px", None, "width_px: missing; every camera needs it"),
+        ("width_px = 9", "height_px", None, "height_px: missing; every camera needs it"),
+        ("camera = {}", "camera.width_px", None, "camera.width_px: missing; every camera needs"),
+        ("camera = 5", "camera", 5, "camera: found 5; expected a table"),
+        (
+            SIZE,
+            None,
+            None,
+            "found no scale; expected one of focal_length_px, fov_x_deg, fov_y_deg, "
+            "fov_x_deg with fov_y_deg, focal_length_mm with pixel_um",
+        ),
+        (SIZE + "pixel_um = 5", None, None, "found pixel_um; expected one of focal_length_px, "),
+        (
+            SIZE + "fov_x_deg = 9\nfocal_length_mm = 5\npixel_um = 5",
+            None,
+            None,
+            "found fov_x_deg and focal_length_mm and pixel_um; expected one of",
+        ),
+        (
+            SIZE + "focal_length_px = 9\nfov_y_deg = 5",
+            None,
+            None,
+            "found focal_length_px and fov_y_deg; expected one of",
+        ),
+        (
+            SIZE + "fov_deg = 9",
+            "fov_deg",
+            9,
+            "fov_deg: unknown key; did you mean 'fov_y_deg'? known keys here: width_px, "
+            "height_px, focal_length_px, fov_x_deg, fov_y_deg, focal_length_mm, pixel_um, "
+            "principal_point_px, distortion",
+        ),
+        (SIZE + "zzz = 9", "zzz", 9, "zzz: unknown key; known keys here: width_px, height_px, f"),
+        (SIZE + '"\\u0007" = 9', "'\\x07'", 9, "'\\x07': unknown key; known keys here: width_px"),
+        (
+            SIZE + "fov_x_deg = 9\n[distortion]\nk4 = 1.0",
+            "distortion.k4",
+            1.0,
+            "distortion.k4: unknown key; did you mean 'k3'? known keys here: k1, k2, k3, p1, p2",
+        ),
+        (
+            "[camera]\nfov = 1\n" + SIZE,
+            "camera.fov",
+            1,
+            "camera.fov: unknown key; did you mean 'fov_y_deg'? known keys here: width_px",
+        ),
+        (
+            f"[camera]\n{SIZE}fov_x_deg = 9\n[distortion]\nk1 = 1.0",
+            "distortion",
+            {"k1": 1.0},
+            "distortion: found outside [camera]; expected in it",
+        ),
+        (
+            "width_px = 0\nheight_px = 5\nfov_x_deg = 9",
+            "width_px",
+            0,
+            "width_px is 0; expected a whole number from 1 to 1000000",
+        ),
+        (
+            "[camera]\nwidth_px = 9\nheight_px = 5.0\nfov_x_deg = 9",
+            "camera.height_px",
+            5.0,
+            "camera.height_px is 5.0; expected a whole number from 1 to 1000000",
+        ),
+        (
+            SIZE + "fov_x_deg = '9'",
+            "fov_x_deg",
+            "9",
+            "fov_x_deg is '9'; expected a finite number above 0 and below 180",
+        ),
+        (
+            SIZE + "fov_x_deg = 90\nfov_y_deg = 9",
+            "fov_y_deg",
+            9,
+            "fov_y_deg is 9; expected 53.1301, which square pixels give with fov_x_deg 90",
+        ),
+        (
+            SIZE + "focal_length_mm = inf\npixel_um = 5",
+            "focal_length_mm",
+            math.inf,
+            "focal_length_mm is inf; expected a finite number above 0",
+        ),
+        (
+            SIZE + "focal_length_mm = 50\npixel_um = 0",
+            "pixel_um",
+            0,
+            "pixel_um is 0; expected a finite number above 0",
+        ),
+        (
+            SIZE + "fov_x_deg = 9\nprincipal_point_px = 3",
+            "principal_point_px",
+            3,
+            "principal_point_px is 3; expected two finite numbers, x and y",
+        ),
+        (
+            SIZE + "fov_x_deg = 9\ndistortion = -0.1",
+            "distortion",
+            -0.1,
+            "distortion: found -0.1; expected a table",
+        ),
+        (
+            f"[camera]\n{SIZE}fov_x_deg = 9\ndistortion.p1 = true",
+            "camera.distortion.p1",
+            True,
+            "camera.distortion.p1 is True; expected a finite number above",
+        ),
+        (
+            f"[camera]\n{SIZE}fov_x_deg = 120\ndistortion.k1 = -0.3",
+            "camera.distortion",
+            {"k1": -0.3},
+            "camera.distortion folds the image back at 202.86 px from the principal point",
+        ),
+    ],
+)
+def test_a_wrong_camera_file_is_refused(read, tmp_path, text, key, value, message):
+    with pytest.raises(ConfigError) as refused:
+        read(text)
+    assert str(refused.value).startswith(f"{tmp_path / 'cam.toml'}: {message}")
+    assert (refused.value.key, refused.value.value) == (key, value)
+
+
+def test_an_unreadable_camera_file_is_refused(tmp_path: Path):
+    path = tmp_path / "cam.toml"
+    with pytest.raises(ConfigError, match=r"cam\.toml: no such camera file"):
+        read_camera(path)
+    with pytest.raises(ConfigError, match="not a readable TOML file: Is a directory"):
+        read_camera(tmp_path)
+    for content in (b"width_px = ", b"\xff\xfe"):
+        path.write_bytes(content)
+        with pytest.raises(ConfigError, match=r"cam\.toml: not a readable TOML file: "):
+            read_camera(path)

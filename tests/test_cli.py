@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import typer
@@ -18,6 +19,7 @@ import starcat as package
 from starcat.artifact.content import content_sha256
 from starcat.catalog.source import source_names
 from starcat.cli import app
+from starcat.matcher.methods import METHODS
 from starcat.schema import product_schema
 from starcat.spec import preset_names
 
@@ -254,7 +256,7 @@ def test_inspect_as_json_is_the_manifest(starcat: Run, small_artifact: Path) -> 
 def test_simulate_depends_on_the_seed(
     starcat: Run, frame: Path, small_artifact: Path, tmp_path: Path
 ) -> None:
-    assert frame.read_text().startswith("x_px,y_px\n")
+    assert frame.read_text().startswith("x_px,y_px,mag\n")
     texts = []
     for seed in ("7", "8"):
         path = tmp_path / f"{seed}.csv"
@@ -274,13 +276,73 @@ def test_a_simulated_frame_is_identified(starcat: Run, frame: Path, small_artifa
 def test_identify_as_json(starcat: Run, frame: Path, small_artifact: Path) -> None:
     answer = json.loads(starcat(["identify", small_artifact, frame, "--json"]).out)
     assert list(answer) == [
-        "status", "n_matched", "boresight_ra_deg", "boresight_dec_deg", "roll_deg",
+        "frame", "status", "n_matched", "boresight_ra_deg", "boresight_dec_deg", "roll_deg",
         "q_body_from_icrs", "residual_arcsec", "false_match_probability", "stars",
     ]  # fmt: skip
     assert answer["status"] == "identified"
     assert len(answer["stars"]) == len(frame.read_text().splitlines()) - 1
     assert answer["n_matched"] == sum(star["star"] is not None for star in answer["stars"])
     assert sum(part**2 for part in answer["q_body_from_icrs"]) == pytest.approx(1.0)
+
+
+def test_an_image_is_searched_identified_and_drawn(
+    starcat: Run, small_artifact: Path, tmp_path: Path
+) -> None:
+    image, picture = tmp_path / "frame.fits", tmp_path / "frame.png"
+    assert starcat(["simulate", small_artifact, "-o", image, "--seed", "7"]).code == 0
+    run = starcat(["identify", small_artifact, image, "--json", "--picture", picture])
+    answer = json.loads(run.out)
+    assert answer["status"] == "identified"
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    upside_down = starcat(["identify", small_artifact, image, "--flip"])
+    assert "no_match" in upside_down.out
+    assert "--no-flip" in upside_down.err
+
+
+def test_many_frames_of_one_file(
+    starcat: Run, frame: Path, small_artifact: Path, tmp_path: Path
+) -> None:
+    rows = [line.split(",") for line in frame.read_text().splitlines()[1:]]
+    pixels = [[float(x), float(y)] for x, y, _ in rows]
+    frames = [
+        {"name": "whole", "centroids_px": pixels, "mag": [float(mag) for *_, mag in rows]},
+        {"centroids_px": [*pixels[:-1], [1e300, 2.0], pixels[0]]},
+        {"centroids_px": pixels[:3]},
+    ]
+    path = tmp_path / "frames.json"
+    path.write_text(json.dumps({"frames": frames}))
+    run = starcat(["identify", small_artifact, path])
+    assert fits(run.out)
+    assert re.search(r"^whole +identified +", run.out, re.MULTILINE)
+    answers = json.loads(starcat(["identify", small_artifact, path, "--json"]).out)
+    assert [answer["frame"] for answer in answers] == ["whole", "frames 2", "frames 3"]
+    assert [a["status"] for a in answers] == ["identified", "identified", "too_few_stars"]
+    assert [star.get("dropped") for star in answers[1]["stars"][-2:]] == [
+        "out_of_frame", "duplicate",
+    ]  # fmt: skip
+    one = np.array([answers[0]["q_body_from_icrs"], answers[1]["q_body_from_icrs"]])
+    assert np.abs(one[0] - one[1]).max() < 1e-3
+
+
+def test_the_camera_of_a_file_is_used(
+    starcat: Run, frame: Path, small_artifact: Path, tmp_path: Path
+) -> None:
+    camera = tmp_path / "camera.toml"
+    camera.write_text("width_px = 512\nheight_px = 512\nfov_x_deg = 40.0\n")
+    arguments = ["identify", small_artifact, frame, "--json", "--camera", camera]
+    assert json.loads(starcat(arguments).out)["status"] == "identified"
+    camera.write_text("width_px = 512\nheight_px = 512\nfov_x_deg = 20.0\n")
+    assert json.loads(starcat(arguments).out)["status"] == "no_match"
+
+
+@pytest.mark.parametrize("method", list(METHODS))
+def test_every_method_is_there(
+    starcat: Run, frame: Path, small_artifact: Path, method: str
+) -> None:
+    run = starcat(["identify", small_artifact, frame, "--json", "--method", method])
+    assert run.code == 0
+    assert json.loads(run.out)["status"] in {"identified", "no_match"}
+    assert re.search(rf"^{method} +\w", starcat(["methods"]).out, re.MULTILINE)
 
 
 def test_a_frame_of_no_stars_is_not_identified(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -137,3 +139,45 @@ def test_counts_never_fall_and_end_with_all():
     assert index.counts[0] == 0
     assert index.counts[-1] == 500
     assert (np.diff(index.counts) >= 0).all()
+
+
+@pytest.mark.parametrize(
+    ("interval", "expected"),
+    [
+        ((-np.inf, np.inf), range(6)),
+        ((-np.inf, 1.0), range(1)),
+        ((5.0, np.inf), range(5, 6)),
+        ((np.inf, np.inf), []),
+        ((-np.inf, -np.inf), []),
+        ((np.inf, -np.inf), []),
+        ((-np.inf, 0.9), []),
+        ((5.1, np.inf), []),
+        ((-1e300, 1e300), range(6)),
+        ((np.nan, np.nan), []),
+        ((np.nan, 3.0), []),
+        ((0.0, np.nan), []),
+        ((3.0, 2.0), []),
+    ],
+)
+def test_range_by_hand(interval, expected):
+    index = build_kvector(np.array([1.0, 1.5, 2.0, 2.0, 3.0, 5.0]))
+    for low, high in (interval, tuple(np.float64(interval))):
+        found = rows(index.range(low, high))
+        assert set(expected) <= set(found)
+        # A step of the line is 0.8; the values are at most two to a step.
+        assert len(found) <= len(expected) + (4 if len(expected) else 0)
+
+
+@given(values_and_ends(), st.booleans())
+def test_narrow_values_are_found_by_wide_ends(case, swap):
+    # The triangles' areas are kept as float32; their line and the ends are float64.
+    values, ends = case
+    assume(np.abs(values).max(initial=0.0) < 1e38)
+    narrow = np.sort(values.astype(np.float32))
+    wide = build_kvector(narrow.astype(np.float64))
+    index = replace(wide, values=narrow)
+    low, high = sorted(ends) if swap and not np.isnan(ends).any() else ends
+    assume(not max(abs(low), abs(high)) > 3e38)
+    expected = brute_force(narrow.astype(np.float64), low, high)
+    assert set(expected) <= set(rows(index.range(low, high)))
+    assert rows(index.exact(low, high)) == expected

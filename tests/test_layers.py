@@ -21,9 +21,12 @@ ROOMS = [
     "artifact",
     "matcher",
     "evaluation",
+    "images",
     "report",
     "pipeline",
     "surface",
+    "commands",
+    "entry",
 ]
 """A module imports from its own room and from those before it."""
 
@@ -37,7 +40,9 @@ SINGLE_MODULES = {
         "sphere",
         "kvector",
         "attitude",
+        "distortion",
         "camera",
+        "camera_file",
         "proximity",
         "spec",
         "votable",
@@ -45,10 +50,23 @@ SINGLE_MODULES = {
         "votable",
     ],
     "pipeline": ["recipes", "guide_stars", "build_log", "build_report", "pipeline", "rebuild"],
-    "surface": ["console", "coverage_tables", "reports", "artifact_reports", "cli", "__main__"],
+    "surface": [
+        "console",
+        "coverage_tables",
+        "reports",
+        "artifact_reports",
+        "identification",
+        "match_reports",
+        "evaluate",
+        "evaluate_reports",
+    ],
+    "entry": ["cli", "__main__"],
 }
 
-LIGHT = {"starcat." + name for name in ("errors", "sphere", "kvector", "attitude", "camera")}
+LIGHT = {
+    "starcat." + name
+    for name in ("errors", "sphere", "kvector", "attitude", "distortion", "camera")
+}
 """The basic modules that a small machine carries along with the matcher."""
 
 
@@ -172,10 +190,34 @@ def test_every_module_imports_in_a_fresh_interpreter(room):
 HEAVY = {"pyarrow", "pandas", "duckdb", "astropy", "scipy", "pydantic", "matplotlib", "erfa"}
 
 
+MATCHER = [name for name in MODULES if room_of(name) == "matcher"]
+
+
+def test_every_method_is_a_module_of_the_matcher():
+    from starcat.matcher.methods import METHODS
+
+    assert {method.propose.__module__ for method in METHODS.values()} <= set(MATCHER)
+
+
 def test_the_matcher_loads_nothing_heavy():
-    loaded = loaded_by("import starcat.matcher.matcher, starcat.matcher.centroids")
-    assert "numpy" in loaded
+    imports = "; ".join(f"import {name}" for name in MATCHER)
+    loaded = loaded_by(imports)
+    assert {"numpy", "h5py"} <= loaded
     assert not loaded & (HEAVY | {"typer", "click", "rich", "requests", "pooch"})
+
+
+def test_the_matcher_runs_where_only_numpy_and_h5py_are_installed():
+    # Everything else that is not of Python itself is made impossible to import.
+    loaded_by(f"""
+import importlib, sys
+class Nothing:
+    def find_spec(self, name, path=None, target=None):
+        top = name.partition(".")[0]
+        if top not in sys.stdlib_module_names and top not in ("numpy", "h5py", "starcat"):
+            raise ImportError(name)
+sys.meta_path.insert(0, Nothing())
+for name in {MATCHER}:
+    importlib.import_module(name)""")
 
 
 def test_the_cli_loads_nothing_heavy_before_it_knows_the_command():

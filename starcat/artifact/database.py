@@ -179,7 +179,10 @@ def open_for_writing(path: Path) -> Iterator[h5py.File]:
     OSError
         If the file cannot be written, with the system's number for the reason.
     """
-    file = h5py.File(path, "w", libver=("earliest", "v110"))
+    # Aligned, so that a matcher can map any dataset as an array.
+    file = h5py.File(
+        path, "w", libver=("earliest", "v110"), alignment_threshold=1, alignment_interval=8
+    )
     try:
         yield file
         file.flush()

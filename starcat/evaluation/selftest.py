@@ -10,8 +10,9 @@ import numpy as np
 
 from starcat.attitude import matrix_from_quaternion
 from starcat.evaluation.simulate import Frame, Noise, simulate_frames
-from starcat.matcher.matcher import MIN_STARS, Matcher
+from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
+from starcat.matcher.verification import MIN_STARS
 from starcat.progress import Progress, no_progress
 
 HARD = {"drop_probability": 0.1, "false_stars": 3}

@@ -1,4 +1,4 @@
-"""Simulated frames: what a camera at a known attitude would measure of a list of stars."""
+"""Simulated frames: what a camera at a known attitude would measure of a sky."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from starcat.attitude import random_attitudes
 from starcat.camera import Camera
+from starcat.evaluation.sky import Sky
 
 Array = NDArray[np.float64]
 
@@ -25,16 +26,22 @@ class Frame:
     centroids_px : ndarray of float64, shape (N, 2)
         Measured centroids, in random order.
     star_index : ndarray of int64, shape (N,)
-        Row of each centroid's star; -1 for a false one.
+        Row of each centroid's guide star; -1 for another star and for a false one.
+    mag : ndarray of float64, shape (N,)
+        Measured magnitudes.
+    is_false : ndarray of bool, shape (N,)
+        Which centroids are no stars at all.
     """
 
     matrix: Array
     centroids_px: Array
     star_index: NDArray[np.int64]
+    mag: Array
+    is_false: NDArray[np.bool_]
 
     @property
     def n_stars(self) -> int:
-        """Centroids that are stars."""
+        """Centroids that are guide stars."""
         return int((self.star_index >= 0).sum())
 
 
@@ -49,18 +56,32 @@ class Noise:
     drop_probability : float
         Chance of a star to be missing.
     false_stars : int
-        Spots at random places.
+        Spots at random places, with the magnitudes of stars drawn from the sky.
+    false_share : float
+        Further such spots, so many that they are this share of all centroids; below 1.
+    noise_mag : float
+        Standard deviation of a magnitude, before the limit decides what is seen.
+    limit_mag : float
+        Fainter ones are not seen.
     """
 
     noise_px: float = 0.0
     drop_probability: float = 0.0
     false_stars: int = 0
+    false_share: float = 0.0
+    noise_mag: float = 0.0
+    limit_mag: float = float("inf")
 
 
 def simulate_frames(
-    directions: Array, camera: Camera, count: int, noise: Noise, seed: int
+    directions: Array,
+    camera: Camera,
+    count: int,
+    noise: Noise,
+    seed: int,
+    mag: Array | None = None,
 ) -> Iterator[Frame]:
-    """Simulate frames at attitudes uniform over all rotations.
+    """Simulate frames of guide stars at attitudes uniform over all rotations.
 
     Parameters
     ----------
@@ -74,25 +95,73 @@ def simulate_frames(
         What they suffer.
     seed : int
         Of all that is random; the same seed gives the same frames.
+    mag : ndarray of float64, shape (N,), optional
+        Their magnitudes; 0 each by default.
 
     Yields
     ------
     Frame
-        Centroids that noise moves off the detector are lost, as they would be.
+        As `simulate_frame` makes them.
     """
     generator = np.random.default_rng(seed)
-    half_angle = 0.55 * camera.diagonal_rad
+    stars = np.arange(len(directions), dtype=np.int32)
+    sky = Sky(directions, np.zeros(len(directions)) if mag is None else mag, stars)
     for matrix in random_attitudes(count, generator):
-        near = np.flatnonzero(directions @ matrix[2] >= np.cos(half_angle))
-        centroids = camera.pixels_from_directions(directions[near] @ matrix.T)
-        inside = camera.contains(centroids)
-        centroids, star = centroids[inside], near[inside]
-        seen = generator.random(len(star)) >= noise.drop_probability
-        centroids, star = centroids[seen], star[seen]
-        centroids = centroids + generator.normal(scale=noise.noise_px, size=centroids.shape)
-        false = generator.random((noise.false_stars, 2)) * [camera.width_px, camera.height_px]
-        centroids = np.concatenate([centroids, false])
-        star = np.concatenate([star, np.full(noise.false_stars, -1)])
-        order = generator.permutation(len(star))
-        order = order[camera.contains(centroids[order])]
-        yield Frame(matrix, centroids[order], star[order])
+        yield simulate_frame(sky, camera, matrix, noise, generator)
+
+
+def simulate_frame(
+    sky: Sky, camera: Camera, matrix: Array, noise: Noise, generator: np.random.Generator
+) -> Frame:
+    """Simulate one frame.
+
+    Parameters
+    ----------
+    sky : Sky
+        All that shines.
+    camera : Camera
+        The camera as it is, which may differ from what a matcher is told.
+    matrix : ndarray of float64, shape (3, 3)
+        Attitude, ``body = matrix @ icrs``.
+    noise : Noise
+        What the frame suffers.
+    generator : numpy.random.Generator
+        Source of randomness.
+
+    Returns
+    -------
+    Frame
+        Centroids that noise moves off the detector are lost, as they would be.
+    """
+    near = np.flatnonzero(sky.directions @ matrix[2] >= np.cos(1.05 * camera.radius_rad))
+    centroids = camera.pixels_from_directions(sky.directions[near] @ matrix.T)
+    inside = camera.contains(centroids)
+    centroids, star = centroids[inside], near[inside]
+    seen = generator.random(len(star)) >= noise.drop_probability
+    mag = sky.mag[star]
+    if noise.noise_mag > 0.0:
+        mag = mag + generator.normal(scale=noise.noise_mag, size=len(mag))
+    seen &= mag <= noise.limit_mag
+    centroids, star, mag = centroids[seen], star[seen], mag[seen]
+    centroids = centroids + generator.normal(scale=noise.noise_px, size=centroids.shape)
+    count = noise.false_stars + round(len(star) * noise.false_share / (1.0 - noise.false_share))
+    false = generator.random((count, 2)) * [camera.width_px, camera.height_px]
+    order = generator.permutation(len(star) + count)
+    centroids = np.concatenate([centroids, false])
+    order = order[camera.contains(centroids[order])]
+    borrowed = sky.mag[_visible(sky, noise.limit_mag, count, generator)]
+    return Frame(
+        matrix,
+        centroids[order],
+        np.concatenate([sky.star_index[star], np.full(count, -1)]).astype(np.int64)[order],
+        np.concatenate([mag, borrowed])[order],
+        (np.arange(len(star) + count) >= len(star))[order],
+    )
+
+
+def _visible(
+    sky: Sky, limit_mag: float, count: int, generator: np.random.Generator
+) -> NDArray[np.int64]:
+    """Draw stars up to a magnitude."""
+    bright = np.flatnonzero(sky.mag <= limit_mag)
+    return bright[generator.integers(0, max(1, len(bright)), count)] if len(bright) else bright

@@ -1,10 +1,18 @@
-"""The products of an artifact as the matcher holds them: arrays, read from its HDF5 file."""
+"""The products of an artifact as the matcher holds them: arrays mapped from its HDF5 file.
+
+Only what a method needs is opened. Contiguous datasets are not read but mapped, so opening
+takes milliseconds whatever the size of the database.
+"""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+import mmap
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, TypeVar
 
 import h5py
 import numpy as np
@@ -12,27 +20,34 @@ from numpy.typing import NDArray
 
 from starcat.camera import Camera
 from starcat.errors import ProductError, SchemaVersionError
-from starcat.kvector import KVector
+
+Made = TypeVar("Made")
 
 READABLE_LAYOUT = 1
 """Major version of the HDF5 layout that this matcher reads."""
 
+READABLE_SCHEMAS = 1
+"""Major version of the products' schemas that this matcher reads."""
+
 
 @dataclass(frozen=True)
-class PairIndex:
-    """Star pairs by separation.
+class ProductArrays:
+    """One product: its columns and indices, and the numbers beside them.
 
     Attributes
     ----------
-    i, j : ndarray of int32, shape (M,)
-        Rows of the stars.
-    kvector : KVector
-        Over the separations, radians.
+    arrays : mapping of str to ndarray
+        By name of the dataset, as the product's schema says.
+    numbers : mapping of str to float
+        By name of the attribute.
     """
 
-    i: NDArray[np.int32]
-    j: NDArray[np.int32]
-    kvector: KVector
+    arrays: Mapping[str, NDArray[Any]]
+    numbers: Mapping[str, float] = field(default_factory=dict)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        """Return an array by its name."""
+        return self.arrays[name]
 
 
 @dataclass(frozen=True)
@@ -55,8 +70,8 @@ class Database:
         Magnitudes.
     designation : ndarray of bytes, shape (N,)
         Names.
-    pairs : PairIndex
-        Of the product ``pairs``.
+    products : mapping of str to ProductArrays
+        Those that were opened.
     """
 
     name: str
@@ -66,11 +81,61 @@ class Database:
     directions: NDArray[np.float64]
     mag: NDArray[np.float64]
     designation: NDArray[np.bytes_]
-    pairs: PairIndex
+    products: Mapping[str, ProductArrays] = field(default_factory=dict)
+    _derived: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def derived(self, make: Callable[..., Made], *arguments: float) -> Made:
+        """Return what a method makes of the database before it can use it, made once.
+
+        Parameters
+        ----------
+        make : callable
+            A function of the database and the arguments.
+        *arguments : float
+            For ``make``; for other ones it is called again.
+
+        Returns
+        -------
+        object
+            The same one every time.
+        """
+        key = make, arguments
+        if key not in self._derived:
+            self._derived[key] = make(self, *arguments)
+        found: Made = self._derived[key]
+        return found
 
 
-def open_database(artifact: Path) -> Database:
+def open_database(artifact: Path, products: Iterable[str] = ()) -> Database:
     """Open the database of an artifact.
+
+    Parameters
+    ----------
+    artifact : Path
+        The artifact's folder, or its ``database.h5``.
+    products : iterable of str
+        Names of the products to open beside the stars.
+
+    Returns
+    -------
+    Database
+        Its arrays are read-only views of the file, which has to stay in place.
+
+    Raises
+    ------
+    ProductError
+        If there is no database, or it lacks a product.
+    SchemaVersionError
+        If its layout or a product's schema is of another major version.
+    """
+    path = _database_file(artifact)
+    with _readable(path) as file, path.open("rb") as raw:
+        mapped = mmap.mmap(raw.fileno(), 0, access=mmap.ACCESS_READ)
+        return _read(file, mapped, path, tuple(products))
+
+
+def products_in(artifact: Path) -> tuple[str, ...]:
+    """Return the names of the products that an artifact's database holds.
 
     Parameters
     ----------
@@ -79,52 +144,84 @@ def open_database(artifact: Path) -> Database:
 
     Returns
     -------
-    Database
-        With its arrays in memory.
+    tuple of str
+        In alphabetical order.
 
     Raises
     ------
     ProductError
-        If there is no database, or it lacks a product.
-    SchemaVersionError
-        If its layout is of another major version.
+        If there is no readable database.
     """
+    with _readable(_database_file(artifact)) as file:
+        return tuple(sorted(file))
+
+
+def _database_file(artifact: Path) -> Path:
     path = artifact / "database.h5" if artifact.is_dir() else artifact
     if not path.is_file():
         raise ProductError(f"{path}: no such database; give the folder of an artifact", path=path)
+    return path
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[h5py.File]:
     try:
         with h5py.File(path, "r") as file:
-            return _read(file, path)
+            yield file
     except (OSError, KeyError, ValueError, RuntimeError) as error:
         raise ProductError(
             f"{path}: not a readable starcat database ({error}); build it again", path=path
         ) from error
 
 
-def _read(file: h5py.File, path: Path) -> Database:
-    layout = str(file.attrs["layout_version"])
-    if int(layout.split(".")[0]) != READABLE_LAYOUT:
-        raise SchemaVersionError(
-            f"{path}: layout version {layout}; this matcher reads {READABLE_LAYOUT}.x",
-            product="database",
-            found=layout,
-            expected=f"{READABLE_LAYOUT}.x",
-        )
-    stars, pairs = file["stars"], file["pairs"]
+def _read(file: h5py.File, mapped: mmap.mmap, path: Path, products: tuple[str, ...]) -> Database:
+    _check_version(str(file.attrs["layout_version"]), READABLE_LAYOUT, "database", path)
+    stars = _product(file, mapped, "stars", path)
     camera = json.loads(file.attrs["camera"])
-    kvector = KVector(
-        pairs["separation_rad"][:],
-        pairs["kvector_counts"][:],
-        float(pairs.attrs["kvector_intercept"]),
-        float(pairs.attrs["kvector_slope"]),
-    )
     return Database(
         name=f"{file.attrs['name']}-{file.attrs['version']}",
         camera=Camera(camera["width_px"], camera["height_px"], camera["focal_length_px"]),
         epoch_jyear=float(file.attrs["epoch_jyear"]),
-        star_id=stars["star_id"][:],
-        directions=np.stack([stars[axis][:] for axis in ("x", "y", "z")], axis=-1),
-        mag=stars["mag"][:],
-        designation=stars["designation"][:],
-        pairs=PairIndex(pairs["i"][:], pairs["j"][:], kvector),
+        star_id=stars["star_id"],
+        directions=np.stack([stars[axis] for axis in ("x", "y", "z")], axis=-1),
+        mag=stars["mag"],
+        designation=stars["designation"],
+        products={name: _product(file, mapped, name, path) for name in products},
     )
+
+
+def _product(file: h5py.File, mapped: mmap.mmap, name: str, path: Path) -> ProductArrays:
+    if name not in file:
+        raise ProductError(
+            f"{path}: has no product {name!r}; set 'products.{name}.enabled = true' in its spec "
+            f"and build it again, or choose a method that works with {', '.join(sorted(file))}",
+            product=name,
+            path=path,
+        )
+    group = file[name]
+    _check_version(str(group.attrs["schema"]).rpartition("-")[2], READABLE_SCHEMAS, name, path)
+    numbers = {
+        key: float(value)
+        for key, value in group.attrs.items()
+        if isinstance(value, (int, float, np.number))
+    }
+    return ProductArrays({key: _map(group[key], mapped) for key in group}, numbers)
+
+
+def _map(dataset: h5py.Dataset, mapped: mmap.mmap) -> NDArray[Any]:
+    """Return a dataset as a view of the mapped file; what is not contiguous is read."""
+    offset = dataset.id.get_offset()
+    if offset is None or dataset.chunks is not None:
+        return np.asarray(dataset[()])
+    count = int(np.prod(dataset.shape))
+    return np.frombuffer(mapped, dataset.dtype, count, offset).reshape(dataset.shape)
+
+
+def _check_version(found: str, readable: int, product: str, path: Path) -> None:
+    if found.split(".")[0] != str(readable):
+        raise SchemaVersionError(
+            f"{path}: {product} is of version {found}; this matcher reads {readable}.x",
+            product=product,
+            found=found,
+            expected=f"{readable}.x",
+        )

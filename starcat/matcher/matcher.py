@@ -1,79 +1,115 @@
 """The matcher: centroids in, identified stars and attitude out.
 
-A method proposes triangles of stars; every proposal goes through the same verification, and
-only an agreement that chance does not explain is an answer.
+A method proposes which centroids are which stars; every proposal goes through the same
+verification, and only an agreement that chance does not explain is an answer.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from starcat.attitude import solve_wahba_svd
 from starcat.camera import Camera
-from starcat.matcher.database import Database, open_database
-from starcat.matcher.pairs import candidate_triangles, observed_triangles
+from starcat.matcher.database import Database, open_database, products_in
+from starcat.matcher.methods import METHODS, best_method, method_named
+from starcat.matcher.observation import Observation, observe
 from starcat.matcher.result import MatchResult, identified, unidentified
-from starcat.matcher.verification import agree, chance_of_agreement
+from starcat.matcher.selection import DEFAULT, Selection
+from starcat.matcher.verification import MIN_STARS, Agreement, verify
 
-Array = NDArray[np.float64]
+CERTAIN = 1e-9
+"""Largest false-match probability of an answer, unless another one is asked for.
 
-MIN_STARS = 4
-"""Three stars make an attitude; at least one more has to agree with it."""
+Where more is allowed, a hundredth of it ends the search; else the best answer is taken.
+"""
 
 
 @dataclass(frozen=True)
 class Matcher:
-    """A database and the limits of an identification.
+    """A database, a method and the limits of an identification.
 
     Attributes
     ----------
     database : Database
-        The stars and their pairs.
+        The stars and the products that the method needs.
+    method : str
+        A key of `METHODS`.
     tolerance_px : float
         Largest error of a centroid, as a radius.
     max_false_match_probability : float
         Answers that chance would give more often than this are withheld.
-    max_triangles : int
-        Observed triangles tried before giving up.
+    selection : Selection
+        Which triangles of centroids are tried, for the methods that choose some.
+    max_batches : int
+        Batches of candidates tried before giving up.
     """
 
     database: Database
+    method: str = "triangle"
     tolerance_px: float = 2.0
-    max_false_match_probability: float = 1e-6
-    max_triangles: int = 200
+    max_false_match_probability: float = CERTAIN
+    selection: Selection = DEFAULT
+    max_batches: int = 200
 
     @classmethod
-    def open(cls, artifact: Path, tolerance_px: float = 2.0) -> Matcher:
+    def open(
+        cls,
+        artifact: Path,
+        method: str | None = "triangle",
+        *,
+        tolerance_px: float = 2.0,
+        max_false_match_probability: float = CERTAIN,
+        selection: Selection = DEFAULT,
+    ) -> Matcher:
         """Open the database of an artifact.
 
         Parameters
         ----------
         artifact : Path
             The artifact's folder.
-        tolerance_px : float, default 2
-            Largest error of a centroid, as a radius.
+        method : str, default "triangle"
+            A key of `METHODS`; None for the best one that the artifact's products allow.
+        tolerance_px, max_false_match_probability, selection
+            As the attributes.
 
         Returns
         -------
         Matcher
             Ready to identify.
-        """
-        return cls(open_database(artifact), tolerance_px)
 
-    def identify(self, centroids_px: ArrayLike, camera: Camera | None = None) -> MatchResult:
+        Raises
+        ------
+        ConfigError
+            If there is no such method.
+        ProductError, SchemaVersionError
+            If the artifact cannot be read, or lacks a product that the method needs.
+        """
+        path = Path(artifact)
+        method = best_method(products_in(path)) if method is None else method
+        database = open_database(path, method_named(method).products)
+        return cls(database, method, tolerance_px, max_false_match_probability, selection)
+
+    def identify(
+        self,
+        centroids_px: ArrayLike,
+        camera: Camera | None = None,
+        *,
+        magnitudes: ArrayLike | None = None,
+    ) -> MatchResult:
         """Identify the stars of a frame.
 
         Parameters
         ----------
         centroids_px : array_like of float64, shape (N, 2)
-            Pixels; the order carries no meaning. Centroids that are not finite or lie
-            outside the frame get no star.
+            Pixels; the order carries no meaning. Centroids that are not finite, lie outside
+            the frame or repeat another get no star and are reported.
         camera : Camera, optional
             The database's own by default.
+        magnitudes : array_like of float64, shape (N,), optional
+            Of any zero point; they decide what is tried first, never what is accepted.
 
         Returns
         -------
@@ -83,46 +119,31 @@ class Matcher:
         Raises
         ------
         ValueError
-            If the centroids are not pairs of numbers.
+            If the centroids are not pairs of numbers, or the magnitudes are not one each.
         """
         camera = camera or self.database.camera
-        given = np.asarray(centroids_px, dtype=np.float64)
-        if given.size == 0:
-            given = given.reshape(0, 2)
-        if given.ndim != 2 or given.shape[1] != 2:
-            raise ValueError(f"centroids_px has shape {given.shape}; expected (N, 2)")
-        # Sorted by distance from the centre, so that the answer does not depend on the order.
-        offset = given - [0.5 * camera.width_px, 0.5 * camera.height_px]
-        usable = np.flatnonzero(camera.contains(given))
-        order = usable[np.lexsort((*offset[usable].T, np.hypot(*offset[usable].T)))]
-        if len(order) < MIN_STARS:
-            return unidentified("too_few_stars", len(given))
-        found = self._search(given[order], camera)
+        observation = observe(centroids_px, camera, self.tolerance_px, magnitudes)
+        if len(observation) < MIN_STARS:
+            return unidentified("too_few_stars", observation)
+        found = self._search(observation)
         if found is None:
-            return unidentified("no_match", len(given))
-        matrix, index, residual_rad, chance = found
-        star_index = np.full(len(given), -1, dtype=np.int32)
-        star_index[order] = index
-        residual_arcsec = float(np.degrees(residual_rad) * 3600.0)
-        return identified(matrix, star_index, self.database.star_id, residual_arcsec, chance)
+            return unidentified("no_match", observation)
+        return identified(found, observation, self.database.star_id)
 
-    def _search(
-        self, centroids_px: Array, camera: Camera
-    ) -> tuple[Array, NDArray[np.int32], float, float] | None:
-        """Try triangles until an attitude explains the frame beyond chance."""
-        body = camera.directions_from_pixels(centroids_px)
-        tolerance_rad = self.tolerance_px / camera.focal_length_px
-        radius_px = 1.5 * self.tolerance_px
-        fraction = np.pi * radius_px**2 / (camera.width_px * camera.height_px)
-        tried = 0
-        for triangle in observed_triangles(body, self.max_triangles):
-            for stars in candidate_triangles(body, triangle, self.database, tolerance_rad):
-                tried += 1
-                matrix = solve_wahba_svd(body[list(triangle)], self.database.directions[stars])
-                found = agree(matrix, body, centroids_px, camera, self.database, radius_px)
-                chance = tried * chance_of_agreement(
-                    len(body), found.n_matched, 3, found.stars_in_frame, fraction
-                )
-                if chance <= self.max_false_match_probability:
-                    return found.matrix, found.star_index, found.residual_rad, chance
-        return None
+    def _search(self, observation: Observation) -> Agreement | None:
+        """Return the first agreement that is certain, or the best of those that are accepted."""
+        limit = self.max_false_match_probability
+        certain = limit if limit <= CERTAIN else max(CERTAIN, 0.01 * limit)
+        best: Agreement | None = None
+        proposals = METHODS[self.method].propose(observation, self.database, self.selection)
+        for candidates in islice(proposals, self.max_batches):
+            found = verify(candidates, observation, self.database, certain)
+            if best is None or (
+                found is not None and found.false_match_probability < best.false_match_probability
+            ):
+                best = found
+            if best is not None and best.false_match_probability <= certain:
+                break
+        if best is None or best.false_match_probability > self.max_false_match_probability:
+            return None
+        return best

@@ -1,7 +1,8 @@
-"""Identification by star pairs: three observed separations, looked up in the K-vector.
+"""Identification by star pairs: the improved triangle method (Zhang 2006).
 
-For an observed triangle the pairs that fit two of its sides are joined at their common star;
-the third side and the handedness leave few triangles of stars, each of which is a candidate.
+For an observed triangle the pairs that fit two of its sides, found by the K-vector over the
+separations, are joined at their common star; the third side and the handedness leave few
+triangles of stars, each of which is a candidate. Needs the product ``pairs``.
 """
 
 from __future__ import annotations
@@ -11,83 +12,124 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.matcher.database import Database, PairIndex
+from starcat.kvector import KVector
+from starcat.matcher.candidates import Candidates
+from starcat.matcher.database import Database
+from starcat.matcher.observation import Observation
+from starcat.matcher.selection import Selection, select_triangles
 from starcat.sphere import separation
 
-Array = NDArray[np.float64]
-Triangle = tuple[int, int, int]
+Rows = NDArray[np.intp]
+
+PRODUCTS = ("pairs",)
 
 
-def candidate_triangles(
-    body: Array, triangle: Triangle, database: Database, tolerance_rad: float
-) -> NDArray[np.int64]:
+def candidates(
+    observation: Observation, database: Database, selection: Selection
+) -> Iterator[Candidates]:
+    """Propose the triangles of stars that observed triangles may be.
+
+    Parameters
+    ----------
+    observation : Observation
+        The frame.
+    database : Database
+        With the product ``pairs``.
+    selection : Selection
+        Which observed triangles, and in what order.
+
+    Yields
+    ------
+    Candidates
+        Three stars each, one batch an observed triangle.
+
+    References
+    ----------
+    Zhang, Jiang et al. 2006, the improved triangle algorithm, a baseline of S2 and S4.
+    """
+    for triangle in select_triangles(observation, selection):
+        stars = triangles_of_stars(triangle, observation, database)
+        if len(stars):
+            yield Candidates(np.broadcast_to(triangle, stars.shape), stars)
+
+
+def triangles_of_stars(triangle: Rows, observation: Observation, database: Database) -> Rows:
     """Return the triangles of stars that an observed triangle may be.
 
     Parameters
     ----------
-    body : ndarray of float64, shape (N, 3)
-        Directions of the centroids in the camera frame.
-    triangle : tuple of int
-        Three rows of ``body``.
+    triangle : ndarray of int, shape (3,)
+        Rows of the observation.
+    observation : Observation
+        The frame.
     database : Database
-        The stars and their pairs.
-    tolerance_rad : float
-        Largest difference of a separation, radians.
+        With the product ``pairs``.
 
     Returns
     -------
-    ndarray of int64, shape (C, 3)
+    ndarray of int, shape (C, 3)
         Rows of the stars, in the order of ``triangle``; the same handedness.
     """
-    a, b, c = (body[k] for k in triangle)
-    ab, ac, bc = (float(separation(u, v)) for u, v in ((a, b), (a, c), (b, c)))
-    first_b, star_b = _directed(database.pairs, ab, tolerance_rad)
-    first_c, star_c = _directed(database.pairs, ac, tolerance_rad)
+    a, b, c = triangle
+    apart, tolerance_rad = observation.separation_rad, side_tolerance_rad(observation)
+    first_b, star_b = directed_pairs(database, apart[a, b], tolerance_rad)
+    first_c, star_c = directed_pairs(database, apart[a, c], tolerance_rad)
     order = np.argsort(first_c, kind="stable")
-    low = np.searchsorted(first_c[order], first_b, side="left")
-    high = np.searchsorted(first_c[order], first_b, side="right")
-    count = high - low
+    first_c, star_c = first_c[order], star_c[order]
+    low = np.searchsorted(first_c, first_b, side="left")
+    count = np.searchsorted(first_c, first_b, side="right") - low
     left = np.repeat(np.arange(len(first_b)), count)
-    step = np.arange(len(left)) - np.repeat(np.cumsum(count) - count, count)
-    right = order[np.repeat(low, count) + step]
-    stars = np.stack([first_b[left], star_b[left], star_c[right]], axis=-1)
-    u, v, w = (database.directions[stars[:, k]] for k in range(3))
-    fits = np.abs(separation(v, w) - bc) <= tolerance_rad
-    handed = np.einsum("ij,ij->i", np.cross(u, v), w) * float(np.cross(a, b) @ c) > 0.0
-    return np.asarray(stars[fits & handed], dtype=np.int64)
+    right = np.arange(len(left)) + np.repeat(low - np.cumsum(count) + count, count)
+    v, w = database.directions[star_b[left]], database.directions[star_c[right]]
+    fits = np.abs(separation(v, w) - apart[b, c]) <= tolerance_rad
+    left, v, w = left[fits], v[fits], w[fits]
+    u = database.directions[first_b[left]]
+    handedness = np.einsum("ij,ij->i", np.cross(u, v), w)
+    handed = handedness * np.linalg.det(observation.body[triangle]) > 0.0
+    left, right = left[handed], right[fits][handed]
+    return np.stack([first_b[left], star_b[left], star_c[right]], axis=-1).astype(np.intp)
 
 
-def _directed(
-    pairs: PairIndex, separation_rad: float, tolerance_rad: float
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return the pairs of about a separation, each in both directions."""
-    rows = pairs.kvector.exact(separation_rad - tolerance_rad, separation_rad + tolerance_rad)
-    i, j = pairs.i[rows], pairs.j[rows]
-    return np.concatenate([i, j]), np.concatenate([j, i])
-
-
-def observed_triangles(body: Array, most: int) -> Iterator[Triangle]:
-    """Return triangles of centroids, those that are least alike first.
+def side_tolerance_rad(observation: Observation) -> float:
+    """Return the largest error of a separation.
 
     Parameters
     ----------
-    body : ndarray of float64, shape (N, 3)
-        Directions of the centroids, N >= 3.
-    most : int
-        How many triangles at the most.
+    observation : Observation
+        The frame.
 
-    Yields
-    ------
-    tuple of int
-        Rows of ``body``. Neighbouring triangles in the list share few centroids, so a false
-        star spoils few of them.
+    Returns
+    -------
+    float
+        Radians: both ends err, but rarely both by the most and apart.
     """
-    count = len(body)
-    made = 0
-    for wide in range(1, count - 1):
-        for narrow in range(1, count - wide):
-            for first in range(count - wide - narrow):
-                yield first, first + narrow, first + narrow + wide
-                made += 1
-                if made >= most:
-                    return
+    return 1.5 * observation.tolerance_rad
+
+
+def directed_pairs(
+    database: Database, separation_rad: float, tolerance_rad: float
+) -> tuple[Rows, Rows]:
+    """Return the pairs of about a separation, each in both directions.
+
+    Parameters
+    ----------
+    database : Database
+        With the product ``pairs``.
+    separation_rad, tolerance_rad : float
+        Radians.
+
+    Returns
+    -------
+    first, second : ndarray of int, shape (P,)
+        Rows of the stars.
+    """
+    product = database.products["pairs"]
+    index = KVector(
+        product["separation_rad"],
+        product["kvector_counts"],
+        product.numbers["kvector_intercept"],
+        product.numbers["kvector_slope"],
+    )
+    rows = index.exact(separation_rad - tolerance_rad, separation_rad + tolerance_rad)
+    i, j = product["i"][rows], product["j"][rows]
+    return np.concatenate([i, j]), np.concatenate([j, i])

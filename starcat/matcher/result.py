@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.attitude import quaternion_from_matrix, radec_roll_from_matrix
+from starcat.matcher.observation import Observation
+from starcat.matcher.verification import Agreement
 
 Status = Literal["identified", "no_match", "too_few_stars"]
 
@@ -34,7 +36,10 @@ class MatchResult:
     residual_arcsec : float
         Root mean square angle between matched centroids and their stars.
     false_match_probability : float
-        Expected number of chance agreements as good as this one; 1 unless identified.
+        Bound on the probability that chance agrees as well; 1 unless identified.
+    dropped : tuple of (int, str)
+        Row and reason of every centroid that was not used: ``not_finite``, ``out_of_frame``
+        or ``duplicate``.
     """
 
     status: Status
@@ -47,24 +52,25 @@ class MatchResult:
     n_matched: int
     residual_arcsec: float
     false_match_probability: float
+    dropped: tuple[tuple[int, str], ...] = ()
 
 
-def unidentified(status: Status, count: int) -> MatchResult:
+def unidentified(status: Status, observation: Observation) -> MatchResult:
     """Return the answer to a frame that was not identified.
 
     Parameters
     ----------
     status : {"no_match", "too_few_stars"}
         Why.
-    count : int
-        Number of centroids.
+    observation : Observation
+        The frame.
 
     Returns
     -------
     MatchResult
         Without stars.
     """
-    none = np.full(count, -1)
+    none = np.full(len(observation) + len(observation.dropped), -1)
     nan = float("nan")
     return MatchResult(
         status,
@@ -77,46 +83,46 @@ def unidentified(status: Status, count: int) -> MatchResult:
         0,
         nan,
         1.0,
+        observation.dropped,
     )
 
 
 def identified(
-    matrix: NDArray[np.float64],
-    star_index: NDArray[np.int32],
-    star_id: NDArray[np.int64],
-    residual_arcsec: float,
-    false_match_probability: float,
+    found: Agreement, observation: Observation, star_id: NDArray[np.int64]
 ) -> MatchResult:
     """Return the answer to an identified frame.
 
     Parameters
     ----------
-    matrix : ndarray of float64, shape (3, 3)
-        Attitude, ``body = matrix @ icrs``.
-    star_index : ndarray of int32, shape (N,)
-        Row of each centroid's star, -1 where none.
+    found : Agreement
+        Attitude and stars.
+    observation : Observation
+        The frame.
     star_id : ndarray of int64, shape (S,)
         Permanent numbers of the database's stars.
-    residual_arcsec, false_match_probability : float
-        As in `MatchResult`.
 
     Returns
     -------
     MatchResult
         With quaternion and angles of one and the same attitude.
     """
-    has_star = star_index >= 0
-    ids = np.where(has_star, star_id[np.where(has_star, star_index, 0)], -1)
-    ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(matrix)
+    count = len(observation) + len(observation.dropped)
+    index = np.full(count, -1, dtype=np.int32)
+    index[observation.rows] = found.star_index
+    ids = np.full(count, -1, dtype=np.int64)
+    has_star = index >= 0
+    ids[has_star] = star_id[index[has_star]]
+    ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(found.matrix)
     return MatchResult(
         "identified",
-        ids.astype(np.int64),
-        star_index,
-        quaternion_from_matrix(matrix),
+        ids,
+        index,
+        quaternion_from_matrix(found.matrix),
         ra_deg,
         dec_deg,
         roll_deg,
-        int(has_star.sum()),
-        residual_arcsec,
-        false_match_probability,
+        found.n_matched,
+        float(np.degrees(found.residual_rad) * 3600.0),
+        found.false_match_probability,
+        observation.dropped,
     )

@@ -1,0 +1,154 @@
+"""The commands about artifacts: building, checking, comparing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from starcat.commands.shared import Input, Json, chosen_spec, inputs_by_source
+from starcat.errors import ProductError
+
+app = typer.Typer()
+
+
+@app.command()
+def presets(json: Json = False) -> None:
+    """List the build specs that ship with starcat.
+
+    Example: starcat presets
+    """
+    from starcat.reports import print_presets
+
+    print_presets(as_json=json)
+
+
+@app.command()
+def build(
+    spec: Annotated[Path | None, typer.Argument(help="A build spec (TOML).")] = None,
+    preset: Annotated[str | None, typer.Option(help="A spec that ships with starcat.")] = None,
+    inputs: Input = None,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder to put <name>-<version>/ into.")
+    ] = Path("dist"),
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Replace a different artifact of that name.")
+    ] = False,
+    workers: Annotated[
+        int, typer.Option(min=1, max=64, help="Threads; the artifact is the same for any number.")
+    ] = 2,
+    json: Json = False,
+) -> None:
+    """Build a guide-star database, check it, and prove that it identifies its own fields.
+
+    Example: starcat build --preset sao-12deg --input sao=sao.dat.gz -o dist
+    """
+    from starcat.console import progress_bars
+    from starcat.pipeline import build as run_build
+    from starcat.reports import print_built
+
+    chosen, given = chosen_spec(spec, preset), inputs_by_source(inputs)
+    with progress_bars() as progress:
+        built = run_build(
+            chosen, given, output, replace=replace, workers=workers, progress=progress
+        )
+    print_built(built, as_json=json)
+
+
+@app.command()
+def inspect(
+    artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
+    json: Json = False,
+) -> None:
+    """Say what an artifact holds and what it was made from.
+
+    Example: starcat inspect dist/gaia-12deg-1.0.0
+    """
+    from starcat.artifact.reader import open_artifact
+    from starcat.reports import print_artifact
+
+    print_artifact(open_artifact(artifact), as_json=json)
+
+
+@app.command()
+def coverage(
+    artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder for CSV, JSON, PNG and SVG.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Say how many stars, pairs and triangles the fields of an artifact hold.
+
+    Example: starcat coverage dist/gaia-12deg-1.0.0 -o coverage
+    """
+    from starcat.artifact.reader import open_artifact
+    from starcat.coverage_tables import print_coverage
+
+    print_coverage(open_artifact(artifact), output, as_json=json)
+
+
+@app.command()
+def verify(
+    artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
+    json: Json = False,
+) -> None:
+    """Check an artifact: digests, schemas, rows, orders, indices, references, counts.
+
+    Exits with 5 if anything is wrong.
+
+    Example: starcat verify dist/gaia-12deg-1.0.0
+    """
+    from starcat.artifact.verify import verify_artifact
+    from starcat.artifact_reports import print_verification
+
+    found = verify_artifact(artifact)
+    print_verification(found, as_json=json)
+    if found.findings:
+        raise typer.Exit(ProductError.exit_code)
+
+
+@app.command()
+def diff(
+    a: Annotated[Path, typer.Argument(metavar="A", help="The earlier artifact's folder.")],
+    b: Annotated[Path, typer.Argument(metavar="B", help="The later one's.")],
+    json: Json = False,
+) -> None:
+    """Say what differs between two artifacts: spec, sources, stars and why, products.
+
+    Example: starcat diff dist/gaia-12deg-1.0.0 dist/gaia-12deg-1.1.0
+    """
+    from starcat.artifact.diff import diff_artifacts
+    from starcat.artifact.reader import open_artifact
+    from starcat.artifact_reports import print_difference
+
+    found = diff_artifacts(open_artifact(a), open_artifact(b))
+    print_difference(found, (a.resolve().name, b.resolve().name), as_json=json)
+
+
+@app.command()
+def rebuild(
+    artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
+    inputs: Input = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder to keep the new artifact in.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Build an artifact again from its manifest and compare every byte.
+
+    Exits with 5 if a file differs.
+
+    Example: starcat rebuild dist/sao-12deg-1.0.0 --input sao=sao.dat.gz
+    """
+    from starcat.artifact_reports import print_rebuilt
+    from starcat.console import progress_bars
+    from starcat.rebuild import rebuild as build_again
+
+    given = inputs_by_source(inputs)
+    with progress_bars() as progress:
+        rebuilt = build_again(artifact, given, output, progress)
+    print_rebuilt(rebuilt, as_json=json)
+    if not rebuilt.is_identical:
+        raise typer.Exit(ProductError.exit_code)

@@ -1,0 +1,99 @@
+"""The commands about catalogs: what there is, fetching, reading."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from starcat.commands.shared import Json
+
+app = typer.Typer()
+
+
+@app.command()
+def sources(json: Json = False) -> None:
+    """List the catalogs that starcat knows, and where each would be read from.
+
+    Example: starcat sources
+    """
+    from starcat.reports import print_sources
+
+    print_sources(as_json=json)
+
+
+@app.command()
+def fetch(
+    source: Annotated[str, typer.Argument(help="A source, as 'starcat sources' lists them.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder; default: the download cache.")
+    ] = None,
+    part: Annotated[
+        list[str] | None, typer.Option("--part", help="Only this part. Repeatable.")
+    ] = None,
+    retries: Annotated[int, typer.Option(min=0, help="Tries again per address.")] = 3,
+    json: Json = False,
+) -> None:
+    """Download a catalog, check it, and remember its digest.
+
+    Example: starcat fetch tycho2
+    """
+    from starcat.catalog.fetch import cache_folder, fetch_source
+    from starcat.catalog.source import data_source
+    from starcat.console import progress_bars
+    from starcat.reports import print_fetched
+
+    with progress_bars() as progress:
+        report = fetch_source(
+            data_source(source),
+            output or cache_folder(),
+            parts=tuple(part or ()),
+            retries=retries,
+            progress=progress,
+        )
+    print_fetched(report, as_json=json)
+
+
+@app.command()
+def ingest(
+    source: Annotated[str, typer.Argument(help="A star catalog, such as sao.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Parquet file to write.")],
+    inputs: Annotated[
+        list[Path] | None,
+        typer.Option("--input", help="File or folder of the catalog. Repeatable."),
+    ] = None,
+    epoch: Annotated[
+        float | None,
+        typer.Option(
+            min=1800, max=2200, help="Julian year to move positions to; default: its own."
+        ),
+    ] = None,
+    band: Annotated[str | None, typer.Option(help="Band of the magnitudes.")] = None,
+    read_limit_mag: Annotated[
+        float | None,
+        typer.Option(min=-30, max=40, help="Leave out fainter records while reading."),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Read an archive file into a star table (Parquet), with a reason for every row left out.
+
+    Example: starcat ingest sao --input sao.dat.gz -o sao.parquet --epoch 2026.0
+    """
+    from starcat.catalog.export import write_star_tables
+    from starcat.catalog.ingest import ingest as read_catalog
+    from starcat.catalog.locate import locate
+    from starcat.console import progress_bars
+    from starcat.reports import print_ingested
+
+    with progress_bars() as progress:
+        read = read_catalog(
+            source,
+            locate(source, {source: inputs or []}),
+            band=band,
+            epoch_jyear=epoch,
+            read_limit_mag=read_limit_mag,
+            progress=progress,
+        )
+        write_star_tables(read, output)
+    print_ingested(read, output, as_json=json)

@@ -1,0 +1,120 @@
+"""The commands about frames: simulating, identifying, testing a database."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from starcat.commands.shared import Json, MethodName, NoisePx
+
+app = typer.Typer()
+
+
+@app.command()
+def methods(json: Json = False) -> None:
+    """List the ways to identify stars, and the products that each needs.
+
+    Example: starcat methods
+    """
+    from starcat.match_reports import print_methods
+
+    print_methods(as_json=json)
+
+
+@app.command()
+def simulate(
+    artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="CSV, FITS, PNG or TIFF.")],
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same frame.")] = 0,
+    noise_px: NoisePx = 0.5,
+    false_stars: Annotated[int, typer.Option(min=0, help="Spots that are no stars.")] = 0,
+) -> None:
+    """Write one simulated frame, centroids or image, to try 'starcat identify' with.
+
+    Example: starcat simulate dist/gaia-12deg-1.0.0 -o frame.csv --seed 7
+    """
+    from starcat.evaluation.simulate import Noise, simulate_frames
+    from starcat.identification import write_simulated
+    from starcat.matcher.database import open_database
+
+    database = open_database(artifact)
+    noise = Noise(noise_px, false_stars=false_stars)
+    frames = simulate_frames(database.directions, database.camera, 1, noise, seed, mag=database.mag)
+    write_simulated(output, next(frames), database.camera, seed)
+
+
+@app.command()
+def identify(
+    artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
+    file: Annotated[
+        Path,
+        typer.Argument(help="Centroids (CSV: x_px,y_px[,mag]; JSON) or image (FITS, PNG, TIFF)."),
+    ],
+    method: MethodName = None,
+    camera: Annotated[
+        Path | None, typer.Option(help="Camera file (TOML); default: the database's camera.")
+    ] = None,
+    tolerance_px: Annotated[
+        float, typer.Option(min=0.01, max=200, help="Largest error of a centroid.")
+    ] = 2.0,
+    max_false_match_probability: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Less certain answers are withheld.")
+    ] = 1e-9,
+    flip: Annotated[
+        bool | None, typer.Option("--flip/--no-flip", help="First row of the image at the bottom.")
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="PNG or SVG of the first frame, its stars named.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Identify the stars of frames and find the camera's attitude.
+
+    Example: starcat identify dist/gaia-12deg-1.0.0 frame.csv --picture frame.png
+    """
+    from starcat.camera_file import read_camera
+    from starcat.console import say
+    from starcat.identification import draw, identify_frames, measure
+    from starcat.match_reports import print_matches
+    from starcat.matcher.matcher import Matcher
+
+    matcher = Matcher.open(
+        artifact,
+        method,
+        tolerance_px=tolerance_px,
+        max_false_match_probability=max_false_match_probability,
+    )
+    eye = read_camera(camera) if camera else matcher.database.camera
+    measured = measure(file, flip=flip)
+    results = identify_frames(matcher, measured, eye)
+    print_matches(measured.frames, results, matcher.database, as_json=json)
+    if measured.image is not None and results[0].status != "identified":
+        say("An image that was read upside down is never identified: try --flip or --no-flip.")
+    if picture:
+        draw(picture, measured, results[0], matcher.database, eye)
+
+
+@app.command()
+def selftest(
+    artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
+    frames: Annotated[int, typer.Option(min=1, help="Fields of each kind.")] = 500,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same fields.")] = 1,
+    noise_px: NoisePx = 0.5,
+    method: MethodName = None,
+    json: Json = False,
+) -> None:
+    """Identify simulated fields with a database and print the rates.
+
+    Example: starcat selftest dist/gaia-12deg-1.0.0 --frames 1000
+    """
+    from starcat.console import progress_bars
+    from starcat.evaluation.selftest import self_test
+    from starcat.matcher.matcher import Matcher
+    from starcat.reports import print_rates
+
+    matcher = Matcher.open(artifact, method, tolerance_px=max(0.5, 4.0 * noise_px))
+    with progress_bars() as progress:
+        rates = self_test(matcher, frames, noise_px, seed, progress)
+    print_rates(rates, as_json=json)

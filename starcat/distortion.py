@@ -1,0 +1,214 @@
+"""Distortion: where a lens puts a direction that a pinhole would put elsewhere, and back.
+
+Points are x + i y in focal lengths from the optical axis, which is what a direction's x/z and
+y/z are without distortion. Pixels are the camera's.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from numbers import Real
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Points = NDArray[np.complex128]
+
+HORIZON = 1e8
+"""The x/z of directions that no image is computed for, 2 milliarcsec short of 90 degrees."""
+
+LARGEST = 1e14
+"""Of coefficients: a k3 that moves the edge of a field of 0.25 deg by a hundredth of it."""
+
+NEWTON_STEPS = 50
+"""At most; one to three do, but for points that are next to the fold or have no inverse."""
+
+
+def checked_number(name: str, value: object, low: float = -np.inf, high: float = np.inf) -> float:
+    """Return a value that has to be a finite number.
+
+    Parameters
+    ----------
+    name : str
+        Of the value, for the message.
+    value : object
+        To check; a bool is not a number.
+    low, high : float, optional
+        Ends of the open interval that it has to lie in.
+
+    Returns
+    -------
+    float
+        The value.
+
+    Raises
+    ------
+    ValueError
+        If it is anything else; says what was found and what was expected.
+    """
+    if isinstance(value, Real) and not isinstance(value, bool):
+        with suppress(OverflowError):  # of a whole number beyond the floats
+            number = float(value)
+            if low < number < high:
+                return number
+    above = f" above {low:g}" if low > -np.inf else ""
+    below = f" and below {high:g}" if high < np.inf else ""
+    raise ValueError(f"{name} is {value!r}; expected a finite number{above}{below}")
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """Radial and tangential distortion of a lens (Brown-Conrady), as in OpenCV.
+
+    Attributes
+    ----------
+    k1, k2, k3 : float
+        Radial coefficients; ``k1 < 0`` is barrel distortion, ``k1 > 0`` pincushion.
+    p1, p2 : float
+        Tangential coefficients, of a lens whose elements are not centred.
+
+    Raises
+    ------
+    ValueError
+        If a coefficient is not a number between -1e14 and 1e14.
+
+    Notes
+    -----
+    With x, y the direction's x/z and y/z and ``s = x^2 + y^2``, the image in focal lengths
+    from the principal point is at::
+
+        x (1 + k1 s + k2 s^2 + k3 s^3) + 2 p1 x y + p2 (s + 2 x^2)
+        y (1 + k1 s + k2 s^2 + k3 s^3) + p1 (s + 2 y^2) + 2 p2 x y
+
+    References
+    ----------
+    Conrady 1919, "Decentred lens-systems"; Brown 1966, "Decentering distortion of lenses".
+    """
+
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+
+    def __post_init__(self) -> None:
+        given = vars(self).items()
+        vars(self).update({name: checked_number(name, k, -LARGEST, LARGEST) for name, k in given})
+
+    def __getstate__(self) -> dict[str, float]:
+        return asdict(self)
+
+    @cached_property
+    def is_none(self) -> bool:
+        """Whether the lens does not distort at all."""
+        return not (self.k1 or self.k2 or self.k3 or self.p1 or self.p2)
+
+    @cached_property
+    def fold_radius(self) -> float:
+        """Distance from the axis, as x/z, below which no two directions share an image.
+
+        Notes
+        -----
+        The model is the gradient of a function. As far as its Hessian is positive, on a disc,
+        the function is strictly convex and no two points share a gradient. The Hessian's
+        eigenvalues are the radial polynomial P and d(r P)/dr, less 6 r hypot(p1, p2) at the
+        worst. Without p1 and p2, the image turns back exactly where d(r P)/dr is 0.
+        """
+        t = 6.0 * float(np.hypot(self.p1, self.p2))
+        # Roots of 1/r, so that the leading coefficient is not 0.
+        slope = np.roots([1.0, -t, 3.0 * self.k1, 0.0, 5.0 * self.k2, 0.0, 7.0 * self.k3])
+        radial = np.roots([1.0, -t, self.k1, 0.0, self.k2, 0.0, self.k3])
+        root = np.concatenate([slope, radial])
+        # Rounding makes a double root, where the slope only touches 0, a complex pair.
+        largest = root.real[np.abs(root.imag) <= 1e-7 * np.abs(root)].max(initial=0.0)
+        return float(1.0 / max(largest, 1.0 / HORIZON))
+
+    @cached_property
+    def image_radius(self) -> float:
+        """Distance from the principal point, focal lengths, within which images have inverses."""
+        r = np.array(self.fold_radius)
+        return float(r * self._polynomial(r * r) - 3.0 * np.hypot(self.p1, self.p2) * r * r)
+
+    @cached_property
+    def _scales(self) -> tuple[Array, Array]:
+        """Distances of images, rising, and what takes them to the directions; radial part."""
+        even = np.tan(np.linspace(0.0, min(np.arctan(self.fold_radius), 1.57), 4097))
+        # A strong lens has bent the image before the first of the even steps is over.
+        r = np.union1d(even, np.geomspace(1e-12, 1.0, 1025) * even[-1])
+        polynomial = self._polynomial(r * r)
+        return r * polynomial, 1.0 / polynomial
+
+    def _polynomial(self, s: Array) -> Array:
+        return 1.0 + s * (self.k1 + s * (self.k2 + s * self.k3))
+
+    def distorted(self, z: Points) -> Points:
+        """Return where the lens puts directions.
+
+        Parameters
+        ----------
+        z : ndarray of complex128, shape (N,)
+            Directions, x/z + i y/z.
+
+        Returns
+        -------
+        ndarray of complex128, shape (N,)
+            Images x + i y, focal lengths; NaN from the fold outwards.
+        """
+        size = np.abs(z)
+        size = np.where(size < self.fold_radius, size, np.nan)
+        s = size * size
+        factor = self._polynomial(s)
+        if not (self.p1 or self.p2):
+            return np.asarray(z * factor)
+        factor += 2.0 * (self.p2 * z.real + self.p1 * z.imag)
+        return np.asarray(z * factor + s * complex(self.p2, self.p1))
+
+    def undistorted(self, image: Points) -> Points:
+        """Return which directions the lens puts at images: the inverse of `distorted`.
+
+        Parameters
+        ----------
+        image : ndarray of complex128, shape (N,)
+            Images x + i y, focal lengths.
+
+        Returns
+        -------
+        ndarray of complex128, shape (N,)
+            Directions, x/z + i y/z; NaN where there is none inside the fold.
+
+        Notes
+        -----
+        Newton's method in the plane, started from a table of the radial part. At a distance
+        d short of the fold, images that differ by a rounding are 1e-16/d apart in direction.
+        """
+        tangential = complex(self.p2, self.p1)
+        with np.errstate(all="ignore"):  # what has no inverse may go anywhere
+            z = image * np.interp(np.abs(image), *self._scales)
+            for _ in range(NEWTON_STEPS):
+                s = z.real * z.real + z.imag * z.imag
+                factor = self._polynomial(s)
+                slope = self.k1 + s * (2.0 * self.k2 + 3.0 * self.k3 * s)
+                across = 2.0 * self.p2 * z.real + 2.0 * self.p1 * z.imag
+                miss = z * (factor + across) + s * tangential - image
+                # Derivatives by z, which is real, and by its conjugate.
+                by_z = factor + s * slope + 2.0 * across
+                by_conjugate = z * (slope * z + 2.0 * tangential)
+                step = by_z * miss - by_conjugate * miss.conj()
+                step /= by_z * by_z - (by_conjugate * by_conjugate.conj()).real
+                z = z - step
+                size = np.abs(z)
+                outside = size >= self.fold_radius
+                # The error that is left is about the square of the step.
+                unsolved = outside | (np.abs(step) > 1e-8 * size)
+                if not unsolved.any():
+                    break
+                # The edge of a disc is nearer to all that lies in it than what lies outside.
+                z = np.where(outside, z * (self.fold_radius / size), z)
+        return np.where(unsolved, np.nan, z)
+
+
+NO_DISTORTION = Distortion()
+"""Of a lens that is as good as a pinhole."""

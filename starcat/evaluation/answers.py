@@ -1,0 +1,115 @@
+"""Ways to answer a frame: the matcher as it is, or a paper's method without verification."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.camera import Camera
+from starcat.matcher import hausdorff_angular, hausdorff_l1, hausdorff_l2
+from starcat.matcher.database import Database
+from starcat.matcher.matcher import Matcher
+from starcat.matcher.observation import Observation, observe
+from starcat.matcher.reference import references
+from starcat.matcher.result import MatchResult, unidentified
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
+Name = Callable[[Observation, Database], Rows]
+Answer = Callable[[Matcher, Array, Camera, "Array | None"], MatchResult]
+
+CAP_PX = 3.0
+"""What a difference counts at the most, in the capped form of S5's distance."""
+
+
+def with_matcher(
+    matcher: Matcher, centroids_px: Array, camera: Camera, mag: Array | None
+) -> MatchResult:
+    """Answer as starcat does: ranked candidates and the shared verification.
+
+    Parameters
+    ----------
+    matcher : Matcher
+        With a database open.
+    centroids_px : ndarray of float64, shape (N, 2)
+        Pixels.
+    camera : Camera
+        What the matcher is told.
+    mag : ndarray of float64, shape (N,), or None
+        Magnitudes.
+
+    Returns
+    -------
+    MatchResult
+        The answer.
+    """
+    return matcher.identify(centroids_px, camera, magnitudes=mag)
+
+
+def bare(name: Name) -> Answer:
+    """Return the answer of a method that only names stars.
+
+    Parameters
+    ----------
+    name : callable
+        Returns a row of the database for each centroid of an observation, -1 for none.
+
+    Returns
+    -------
+    Answer
+        Its results have stars, but no attitude and no false-match probability below 1.
+    """
+
+    def answer(
+        matcher: Matcher, centroids_px: Array, camera: Camera, mag: Array | None
+    ) -> MatchResult:
+        observation = observe(centroids_px, camera, matcher.tolerance_px, mag)
+        none = unidentified("no_match", observation)
+        if len(observation) < 2:
+            return none
+        index = none.star_index.copy()
+        index[observation.rows] = name(observation, matcher.database)
+        return replace(none, star_index=index, n_matched=int((index >= 0).sum()))
+
+    return answer
+
+
+def _angular(observation: Observation, database: Database) -> Rows:
+    return hausdorff_angular.identify_bare(observation, database)
+
+
+def _angular_capped(observation: Observation, database: Database) -> Rows:
+    cap_rad = CAP_PX / observation.camera.focal_length_px
+    return hausdorff_angular.identify_bare(observation, database, cap_rad)
+
+
+def _l2(observation: Observation, database: Database) -> Rows:
+    # The circle inside the frame, whatever the scale may be.
+    reach = 0.5 * min(observation.camera.width_px, observation.camera.height_px)
+    radius_rad = float(np.arctan(reach / observation.camera.focal_length_px))
+    stars, _ = hausdorff_l2.rank_stars(observation, database, count=1, radius_rad=radius_rad)
+    return _reference_alone(observation, stars)
+
+
+def _l1(observation: Observation, database: Database) -> Rows:
+    stars, _ = hausdorff_l1.rank_stars(observation, database, count=1)
+    return _reference_alone(observation, stars)
+
+
+def _reference_alone(observation: Observation, stars: Rows) -> Rows:
+    named = np.full(len(observation), -1, dtype=np.intp)
+    named[references(observation)[0]] = stars[0]
+    return named
+
+
+ANSWERS: dict[str, Answer] = {
+    "matcher": with_matcher,
+    "S5 mean of minima": bare(_angular),
+    "S5 capped": bare(_angular_capped),
+    "S1 L2": bare(_l2),
+    "S1 L1": bare(_l1),
+}
+"""Ways to answer, by the name that a trial gives."""

@@ -1,0 +1,274 @@
+"""Running all trials of a paper, and what came of them.
+
+Trials run side by side, one process each; a trial that is finished is never run again, so a
+campaign that was stopped goes on where it was.
+"""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from starcat.errors import StarcatError
+from starcat.evaluation.axes import axis_label
+from starcat.evaluation.paper import Paper, Row, Statistic
+from starcat.evaluation.rates import Share, TrialRates, failures_of, rates_of
+from starcat.evaluation.trial import Trial, frame_count, run_trial
+from starcat.progress import Progress, no_progress
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A row of a paper and what was measured.
+
+    Attributes
+    ----------
+    row : Row
+        The paper's.
+    rates : TrialRates
+        Of its trial.
+    failures : dict of str to int
+        Frames without success by the row's rule, by cause.
+    """
+
+    row: Row
+    rates: TrialRates
+    failures: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def is_goal_reached(self) -> bool | None:
+        """Whether rate and mean time are what starcat wants; None where it wants nothing."""
+        row, rates = self.row, self.rates
+        if row.goal_percent is None and row.goal_ms is None:
+            return None
+        share = rates.by_rule if row.goal_over == "all" else rates.by_rule_enough
+        is_often = row.goal_percent is None or share.percent >= row.goal_percent
+        return is_often and (row.goal_ms is None or rates.mean_ms <= row.goal_ms)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the row as plain values.
+
+        Returns
+        -------
+        dict
+            For JSON: the row, its trial in full, the rates with their intervals.
+        """
+        rates = {
+            name: value.as_dict() if isinstance(value, Share) else round(value, 4)
+            for name, value in vars(self.rates).items()
+        }
+        return {
+            **_plain(asdict(self.row)),
+            **rates,
+            "frames": self.rates.by_rule.count,
+            "failures": self.failures,
+            "is_goal_reached": self.is_goal_reached,
+        }
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """All that was measured of a paper.
+
+    Attributes
+    ----------
+    paper : Paper
+        What it prints.
+    is_quick : bool
+        Whether fewer frames were tried than the paper's.
+    rows : tuple of Measured
+        In the paper's order.
+    statistics : tuple of Statistic
+        Numbers that need no trial.
+    """
+
+    paper: Paper
+    is_quick: bool
+    rows: tuple[Measured, ...]
+    statistics: tuple[Statistic, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the outcome as plain values.
+
+        Returns
+        -------
+        dict
+            For JSON; a curve's rows have ``axis``, what their ``x`` is.
+        """
+        labels = {group: _axis(rows) for group, rows in self._groups.items()}
+        return {
+            "name": self.paper.name,
+            "title": self.paper.title,
+            "citation": self.paper.citation,
+            "deviations": list(self.paper.deviations),
+            "is_quick": self.is_quick,
+            "rows": [one.as_dict() | {"axis": labels[one.row.group]} for one in self.rows],
+            "statistics": [
+                asdict(one) | {"is_goal_reached": is_goal_reached(one)} for one in self.statistics
+            ],
+        }
+
+    @property
+    def _groups(self) -> dict[str, list[Row]]:
+        groups: dict[str, list[Row]] = {}
+        for one in self.rows:
+            groups.setdefault(one.row.group, []).append(one.row)
+        return groups
+
+
+def is_goal_reached(statistic: Statistic) -> bool | None:
+    """Return whether a number is what starcat wants.
+
+    Parameters
+    ----------
+    statistic : Statistic
+        With or without a goal.
+
+    Returns
+    -------
+    bool or None
+        None where starcat wants nothing.
+    """
+    measured, goal = statistic.measured, statistic.goal
+    if goal is None:
+        return None
+    if statistic.is_lower_better is None:
+        return abs(measured - goal) <= 0.01 * abs(goal)
+    return measured <= goal if statistic.is_lower_better else measured >= goal
+
+
+def run_paper(
+    paper: Paper,
+    artifacts: Mapping[str, Path],
+    folder: Path,
+    *,
+    quick: bool = False,
+    workers: int = 2,
+    progress: Progress = no_progress,
+) -> Outcome:
+    """Run all trials of a paper, but those whose records are there.
+
+    Parameters
+    ----------
+    paper : Paper
+        What to run.
+    artifacts : mapping of str to Path
+        Artifact by preset.
+    folder : Path
+        The records go to ``<paper>/`` or ``<paper>-quick/`` in it.
+    quick : bool, default False
+        Whether the paper's quick rows are wanted.
+    workers : int, default 2
+        Trials at a time; the records are the same for any number, but for their times.
+    progress : Progress
+        Called with (name of the paper, frames done, frames of all trials).
+
+    Returns
+    -------
+    Outcome
+        Rates by row, and statistics.
+
+    Raises
+    ------
+    ValueError
+        If two different trials have the same name.
+    StarcatError
+        If the system ends a process.
+    """
+    rows = paper.rows(quick)
+    tasks = _tasks(rows, artifacts)
+    place = folder / (f"{paper.name}-quick" if quick else paper.name)
+    total = sum(frame_count(trial) for trial, _ in tasks)
+    done = 0
+    progress(paper.name, done, total)
+    with _running(tasks, place, workers) as finished:
+        for trial in finished:
+            done += frame_count(trial)
+            progress(paper.name, done, total)
+    measured = tuple(_measured(row, place / f"{row.trial.name}.parquet") for row in rows)
+    return Outcome(paper, quick, measured, tuple(paper.statistics(dict(artifacts), quick)))
+
+
+def _tasks(rows: list[Row], artifacts: Mapping[str, Path]) -> list[tuple[Trial, Path]]:
+    """Return each trial once: rows may share one. The longest go first."""
+    tasks: dict[str, tuple[Trial, Path]] = {}
+    for row in rows:
+        task = row.trial, artifacts[row.preset]
+        if tasks.setdefault(row.trial.name, task) != task:
+            raise ValueError(f"two different trials are named {row.trial.name!r}")
+    return sorted(tasks.values(), key=lambda task: -frame_count(task[0]))
+
+
+def _measured(row: Row, records: Path) -> Measured:
+    rates = rates_of(records, row.rule, row.trial.attitude_limit_px)
+    return Measured(row, rates, failures_of(records, row.rule, row.trial.attitude_limit_px))
+
+
+@contextmanager
+def _running(
+    tasks: list[tuple[Trial, Path]], folder: Path, workers: int
+) -> Iterator[Iterator[Trial]]:
+    """Give the trials as they end; leaving early drops those that have not ended."""
+    if workers == 1:
+        yield (_run(trial, artifact, folder) for trial, artifact in tasks)
+        return
+    # Processes that are copies of this one would hold locks of its libraries' threads.
+    context, others = multiprocessing.get_context("spawn"), multiprocessing.active_children()
+    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with_parent)
+    try:
+        futures = [pool.submit(_run, trial, artifact, folder) for trial, artifact in tasks]
+        yield (future.result() for future in as_completed(futures))
+    except BrokenProcessPool as error:
+        raise StarcatError(
+            "the system ended a process, perhaps for want of memory; what is finished is kept: "
+            "run again, with --workers 1"
+        ) from error
+    except BaseException:
+        for process in multiprocessing.active_children():
+            if process not in others:
+                process.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _run(trial: Trial, artifact: Path, folder: Path) -> Trial:
+    run_trial(trial, artifact, folder, workers=1)
+    return trial
+
+
+def _end_with_parent() -> None:
+    """Let a process end quietly with Ctrl-C, and when the one that began it is no more."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        if parent is not None:
+            parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _axis(rows: list[Row]) -> str:
+    points = [(row.trial, row.x) for row in rows if row.x is not None]
+    return axis_label([trial for trial, _ in points], [x for _, x in points])
+
+
+def _plain(value: Any) -> Any:
+    """Return a value without the numbers that JSON has no word for."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

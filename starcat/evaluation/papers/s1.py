@@ -1,0 +1,155 @@
+"""S1: L2-norm Hausdorff distance between planar reference sets (Wang et al. 2020)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from starcat.camera import Camera
+from starcat.evaluation.paper import Paper, Row, Statistic, product_mib, tolerance_for
+from starcat.evaluation.simulate import Noise
+from starcat.evaluation.trial import Attitudes, Trial
+
+PRESET = "sao-6deg"
+
+LIMIT_MAG = 6.95
+
+NOISE = Noise(noise_px=0.5, limit_mag=LIMIT_MAG)
+
+ROLLS_DEG = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 5.0, 45.0, 90.0, 180.0)
+
+SCALES = (1.0, 1.05, 2.0, 3.0, 4.0)
+
+WAYS = {"L2": ("hausdorff_l2", "S1 L2"), "L1": ("hausdorff_l1", "S1 L1")}
+"""Label to method and bare answer."""
+
+
+def camera_of_scale(scale: float) -> tuple[Camera, Camera]:
+    """Return a camera whose image is larger than the matcher is told.
+
+    Parameters
+    ----------
+    scale : float
+        Of the image, about its centre.
+
+    Returns
+    -------
+    as_it_is, as_told : Camera
+        With the same detector, which shows the same field at every scale.
+    """
+    size = round(1024 * scale)
+    told = Camera(1024, 1024, fov_x_deg=6.0).focal_length_px
+    return Camera(size, size, told * size / 1024), Camera(size, size, told)
+
+
+def rows(quick: bool) -> list[Row]:
+    """Return the rows of S1.
+
+    Parameters
+    ----------
+    quick : bool
+        One image of 10.
+
+    Returns
+    -------
+    list of Row
+        Both norms over roll and scale, and starcat's identification over the whole library.
+    """
+    count = 20 if quick else 200
+    made = []
+    for roll_deg in ROLLS_DEG:
+        for label, (method, answer) in WAYS.items():
+            stars = Attitudes("stars", count, roll_deg=roll_deg)
+            trial = _trial(f"roll-{roll_deg:g}-{label}", method, answer, stars, NOISE)
+            made.append(
+                Row("Roll", f"{label}, {roll_deg:g} deg", PRESET, trial, "reference", x=roll_deg)
+            )
+    for scale in SCALES:
+        for label, (method, answer) in WAYS.items():
+            camera, assumed = camera_of_scale(scale)
+            stars = Attitudes("stars", count, roll_deg=0.0)
+            trial = _trial(
+                f"scale-{scale:g}-{label}", method, answer, stars, NOISE, camera, assumed
+            )
+            made.append(Row("Scale", f"{label}, {scale:g}", PRESET, trial, "reference", x=scale))
+    return made + _whole_library(5 * count)
+
+
+def _whole_library(count: int) -> list[Row]:
+    group = "Whole library, any roll"
+    made = []
+    for value in (0.0, 0.5, 1.0):
+        noise = Noise(noise_px=value, limit_mag=LIMIT_MAG)
+        for label, kind, answer in (
+            ("L2 bare, centred on a star", "stars", "S1 L2"),
+            ("L2 with starcat, centred on a star", "stars", "matcher"),
+            ("L2 with starcat, anywhere", "random", "matcher"),
+        ):
+            slug = f"library-{value:g}-{label}".lower().replace(" ", "-").replace(",", "")
+            trial = _trial(slug, "hausdorff_l2", answer, Attitudes(kind, count), noise)
+            made.append(Row(group, f"{label}, {value:g} px", PRESET, trial, "reference", x=value))
+    return made
+
+
+def _trial(
+    name: str,
+    method: str,
+    answer: str,
+    attitudes: Attitudes,
+    noise: Noise,
+    camera: Camera | None = None,
+    assumed: Camera | None = None,
+) -> Trial:
+    return Trial(
+        f"s1-{name.lower()}",
+        method,
+        attitudes,
+        noise,
+        camera=camera,
+        assumed=assumed,
+        tolerance_px=tolerance_for(noise.noise_px),
+        max_false_match_probability=1e-3,
+        answer=answer,
+        seed=2020,
+    )
+
+
+def statistics(artifacts: dict[str, Path], quick: bool) -> list[Statistic]:
+    """Return the size of the reference sets.
+
+    Parameters
+    ----------
+    artifacts : dict of str to Path
+        Folders by preset.
+    quick : bool
+        Makes no difference.
+
+    Returns
+    -------
+    list of Statistic
+        Mebibytes in the HDF5 file.
+    """
+    return [
+        Statistic("Storage", "hausdorff_l2", product_mib(artifacts[PRESET], "hausdorff_l2"), "MiB")
+    ]
+
+
+PAPER = Paper(
+    name="S1",
+    title="L2-norm Hausdorff distance",
+    citation="Wang et al. 2020, Infrared and Laser Engineering",
+    presets=(PRESET,),
+    rows=rows,
+    statistics=statistics,
+    deviations=(
+        "The library is the preset's: SAO to V 6.95 without doubles and large variables, fewer "
+        "than the paper's 14,581.",
+        "Every frame is compared with the whole library; the paper's comparisons use a region of "
+        "30 x 30 degrees.",
+        "Frames of the rows over roll and scale are centred on a guide star, as the paper's are; "
+        "the reference star is the one nearest to the centre.",
+        "L1 compares planar coordinates with north up and the nominal scale, L2 distances over "
+        "the smallest one; both without verification in those rows.",
+        "A scaled frame shows the same field on a larger detector; the matcher is told the nominal "
+        "focal length.",
+    ),
+)

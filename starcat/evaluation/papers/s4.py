@@ -1,0 +1,138 @@
+"""S4: double-feature triangles in the short-wave infrared (Liao and Zhang 2024)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from starcat.evaluation.paper import Paper, Row, Statistic, product_mib, tolerance_for
+from starcat.evaluation.simulate import Noise
+from starcat.evaluation.trial import Attitudes, Trial
+
+PRESET = "2mass-8x6"
+
+LIMIT_MAG = 4.4
+
+METHODS = {"triangle": "double-feature triangle", "pairs": "improved triangle"}
+
+MIXED = Noise(noise_px=1.0, noise_mag=0.5, false_share=0.2, limit_mag=LIMIT_MAG)
+
+
+def rows(quick: bool) -> list[Row]:
+    """Return the rows of S4.
+
+    Parameters
+    ----------
+    quick : bool
+        One image of 20.
+
+    Returns
+    -------
+    list of Row
+        Its three curves and the mixed test.
+    """
+    count = 50 if quick else 1000
+    return [
+        *_curve("Position noise", "px", (0.2, 0.5, 1.0, 1.5, 2.0), (96.5, 83.5), 99.0, count),
+        *_curve("False stars", "%", (10.0, 20.0, 30.0, 40.0, 50.0), (87.6, 78.3), 95.0, count),
+        *_curve("Magnitude noise", "mag", (0.2, 0.4, 0.6, 0.8, 1.0), (98.0, None), 98.0, count),
+        *_mixed(10 * count),
+    ]
+
+
+def _trial(name: str, method: str, count: int, noise: Noise) -> Trial:
+    return Trial(
+        f"s4-{name}-{method}",
+        method,
+        Attitudes("random", count),
+        noise,
+        tolerance_px=tolerance_for(noise.noise_px),
+        max_false_match_probability=1.0,
+        seed=2024,
+    )
+
+
+def _curve(
+    group: str,
+    unit: str,
+    values: tuple[float, ...],
+    published: tuple[float | None, float | None],
+    goal: float,
+    count: int,
+) -> list[Row]:
+    made = []
+    for value in values:
+        is_last = value == values[-1]
+        for (method, label), percent in zip(METHODS.items(), published, strict=True):
+            slug = f"{group.lower().replace(' ', '-')}-{value:g}"
+            made.append(
+                Row(group, f"{label}, {value:g} {unit}", PRESET,
+                    _trial(slug, method, count, _noise(group, value)), "attitude",
+                    percent if is_last else None, None,
+                    goal if is_last and method == "triangle" else None, goal_over="4+", x=value)
+            )  # fmt: skip
+    return made
+
+
+def _noise(group: str, value: float) -> Noise:
+    if group == "Position noise":
+        return Noise(noise_px=value, limit_mag=LIMIT_MAG)
+    if group == "False stars":
+        return Noise(false_share=value / 100.0, limit_mag=LIMIT_MAG)
+    return Noise(noise_mag=value, limit_mag=LIMIT_MAG)
+
+
+def _mixed(count: int) -> list[Row]:
+    note = "1 px, 20 % false stars, 0.5 mag"
+    group = "Mixed noise"
+    return [
+        Row(group, METHODS["triangle"], PRESET, _trial("mixed", "triangle", count, MIXED),
+            "attitude", 95.5, 14.27, 98.0, 1.5, "4+", note=note),
+        Row(group, METHODS["pairs"], PRESET, _trial("mixed", "pairs", count, MIXED),
+            "attitude", 82.4, 68.45, note=note),
+    ]  # fmt: skip
+
+
+def statistics(artifacts: dict[str, Path], quick: bool) -> list[Statistic]:
+    """Return the sizes of the two feature bases.
+
+    Parameters
+    ----------
+    artifacts : dict of str to Path
+        Folders by preset.
+    quick : bool
+        Makes no difference.
+
+    Returns
+    -------
+    list of Statistic
+        Mebibytes in the HDF5 file, K-vectors included.
+    """
+    folder = artifacts[PRESET]
+    group = "Storage"
+    return [
+        Statistic(group, "triangles", product_mib(folder, "triangles"), "MiB", 8.2, 2.4, True),
+        Statistic(group, "pairs", product_mib(folder, "pairs"), "MiB", 2.4, None, None,
+                  "all pairs up to the field's diagonal"),
+    ]  # fmt: skip
+
+
+PAPER = Paper(
+    name="S4",
+    title="Short-wave-infrared double-feature triangles",
+    citation="Liao and Zhang 2024, Electronics Optics & Control",
+    presets=(PRESET,),
+    rows=rows,
+    statistics=statistics,
+    deviations=(
+        "The 7,274 stars are the brightest of an excerpt of 2MASS in (J+H)/2, which stands for "
+        "the paper's unstated magnitude.",
+        "The detector and the lens make 8.08 x 6.46 degrees; the tiling has the paper's 8 x 6.",
+        "Images show every star of the excerpt up to the limit, guide star or not, and with "
+        "magnitude noise also stars below it.",
+        "False stars: so many that they are the stated share of all spots; their magnitudes are "
+        "those of stars drawn at random.",
+        "Noises are Gaussian with the stated value as standard deviation (per axis for positions).",
+        "The paper's rule: the attitude is right. The matcher answers from a false-match "
+        "probability of 0.01 down, as four stars of four do not reach starcat's own 1e-9.",
+    ),
+)

@@ -1,0 +1,211 @@
+"""Rates, intervals and times of trials, and why frames failed, by SQL over their records."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import duckdb
+
+from starcat.matcher.matcher import CERTAIN
+
+_ACCEPTED = f"status = 'identified' AND false_match_probability <= {CERTAIN!r}"
+_HOLDS = "coalesce(attitude_error_px <= $reach_px, false)"
+
+RULES = {
+    "starcat": f"{_ACCEPTED} AND {_HOLDS} AND n_wrong = 0",
+    "attitude": _HOLDS,
+    "reference": "is_reference_right",
+    "two_stars": "n_right >= 2 AND n_wrong = 0",
+}
+"""Success as a condition on a record: starcat's own, and those of S4, of S1 and S2, of S5."""
+
+MEANINGS = {
+    "starcat": "accepted at a false-match probability of 1e-9, the attitude right, no star wrong",
+    "attitude": "the attitude is right",
+    "reference": "the guide star nearest to the centre of the frame has its own name",
+    "two_stars": "at least two stars right, none wrong",
+}
+"""The same in words."""
+
+CAUSES = {
+    "under 4 guide stars": "n_guide_stars < 4",
+    "4 or 5 guide stars": "n_guide_stars < 6",
+    "no answer": "status <> 'identified'",
+    "wrong answer": "true",
+}
+"""Why a frame failed, as a condition on its record: the first that holds."""
+
+_RATES = """
+WITH record AS (
+    SELECT *, n_guide_stars >= 4 AS enough, ({rule}) AS success, ({own}) AS success_own,
+           ({accepted}) AND NOT ({holds} AND n_wrong = 0) AS wrong
+    FROM read_parquet($records)
+)
+SELECT count(*), count(*) FILTER (enough),
+       count(*) FILTER (success), count(*) FILTER (success AND enough),
+       count(*) FILTER (success_own), count(*) FILTER (success_own AND enough),
+       count(*) FILTER (wrong), avg(time_ms), median(time_ms), quantile_cont(time_ms, 0.95)
+FROM record
+"""
+
+_FAILURES = """
+SELECT CASE {cases} END AS cause, count(*)
+FROM read_parquet($records)
+WHERE NOT ({rule})
+GROUP BY cause
+"""
+
+Z95 = 1.959963984540054
+"""Standard deviations of a two-sided interval of 95 %."""
+
+
+@dataclass(frozen=True)
+class Share:
+    """So many of so many.
+
+    Attributes
+    ----------
+    hits, count : int
+        Successes and frames.
+    """
+
+    hits: int
+    count: int
+
+    @property
+    def percent(self) -> float:
+        """The share in percent; NaN of none."""
+        return 100.0 * self.hits / self.count if self.count else float("nan")
+
+    @property
+    def interval_percent(self) -> tuple[float, float]:
+        """Wilson's interval of 95 %, in percent; all of 0 to 100 for no frames.
+
+        References
+        ----------
+        Wilson 1927, Journal of the American Statistical Association 22, 209.
+        """
+        if not self.count:
+            return 0.0, 100.0
+        p, n, z2 = self.hits / self.count, self.count, Z95 * Z95
+        middle = (p + 0.5 * z2 / n) / (1.0 + z2 / n)
+        half = Z95 / (1.0 + z2 / n) * (p * (1.0 - p) / n + 0.25 * z2 / (n * n)) ** 0.5
+        return 100.0 * max(0.0, middle - half), 100.0 * min(1.0, middle + half)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the share as plain values.
+
+        Returns
+        -------
+        dict
+            For JSON; ``percent`` is None of none.
+        """
+        low, high = self.interval_percent
+        return {
+            "hits": self.hits,
+            "count": self.count,
+            "percent": round(self.percent, 4) if self.count else None,
+            "low_percent": round(low, 4),
+            "high_percent": round(high, 4),
+        }
+
+
+@dataclass(frozen=True)
+class TrialRates:
+    """How a trial went.
+
+    Attributes
+    ----------
+    ceiling : Share
+        Frames with at least four guide stars.
+    by_rule, by_rule_enough : Share
+        Successes by the paper's rule, of all frames and of those with four guide stars.
+    starcat, starcat_enough : Share
+        The same by starcat's own rule: accepted at 1e-9, attitude right, no star wrong.
+    wrong : int
+        Frames that starcat itself would have accepted, wrongly.
+    mean_ms, median_ms, p95_ms : float
+        Time of an identification.
+    """
+
+    ceiling: Share
+    by_rule: Share
+    by_rule_enough: Share
+    starcat: Share
+    starcat_enough: Share
+    wrong: int
+    mean_ms: float
+    median_ms: float
+    p95_ms: float
+
+
+def rates_of(records: Path, rule: str, reach_px: float) -> TrialRates:
+    """Return the rates of a trial.
+
+    Parameters
+    ----------
+    records : Path
+        Its Parquet file.
+    rule : str
+        A key of `RULES`.
+    reach_px : float
+        An attitude is right if it moves no corner of the frame by more, pixels.
+
+    Returns
+    -------
+    TrialRates
+        Of all frames.
+    """
+    query = _RATES.format(rule=RULES[rule], own=RULES["starcat"], accepted=_ACCEPTED, holds=_HOLDS)
+    (row,) = _rows(query, records, reach_px)
+    count, enough, hits, hits_enough, own, own_enough, wrong, mean, median, p95 = row
+    return TrialRates(
+        Share(enough, count),
+        Share(hits, count),
+        Share(hits_enough, enough),
+        Share(own, count),
+        Share(own_enough, enough),
+        wrong,
+        mean or 0.0,
+        median or 0.0,
+        p95 or 0.0,
+    )
+
+
+def failures_of(records: Path, rule: str, reach_px: float) -> dict[str, int]:
+    """Count the frames of a trial that failed, by cause.
+
+    Parameters
+    ----------
+    records : Path
+        Its Parquet file.
+    rule : str
+        A key of `RULES`.
+    reach_px : float
+        As for `rates_of`.
+
+    Returns
+    -------
+    dict of str to int
+        Every cause of `CAUSES`, in that order; together all frames without success.
+    """
+    cases = " ".join(f"WHEN {condition} THEN '{cause}'" for cause, condition in CAUSES.items())
+    query = _FAILURES.format(cases=cases, rule=RULES[rule])
+    return dict.fromkeys(CAUSES, 0) | dict(_rows(query, records, reach_px))
+
+
+def _rows(query: str, records: Path, reach_px: float) -> list[Any]:
+    values = {"records": str(records), "reach_px": float(reach_px)}
+    # A value that the query does not name would be an error.
+    named = {name: value for name, value in values.items() if f"${name}" in query}
+    with _database().cursor() as cursor:
+        return list(cursor.execute(query, named).fetchall())
+
+
+@cache
+def _database() -> duckdb.DuckDBPyConnection:
+    """Return an empty database: opening one takes longer than a query does."""
+    return duckdb.connect()

@@ -1,0 +1,204 @@
+"""An evaluation of any artifact with any camera: one quantity varied at a time.
+
+It is laid out as a paper's rows are, so the same trials, tables and plots serve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from starcat.artifact.reader import open_artifact
+from starcat.camera import Camera
+from starcat.errors import ConfigError
+from starcat.evaluation.axes import AXES
+from starcat.evaluation.paper import Paper, Row, Statistic, tolerance_for
+from starcat.evaluation.simulate import Noise
+from starcat.evaluation.trial import Attitudes, Trial
+from starcat.matcher.database import open_database, products_in
+from starcat.matcher.methods import METHODS, best_method, method_named
+
+FRAMES, FEW_FRAMES = 500, 100
+"""Of a trial, unless a sweep says otherwise; of a quick one."""
+
+NOISE_PX = 0.5
+"""Of centroids, while another quantity is varied; a sweep may say otherwise."""
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What is to be tried.
+
+    Attributes
+    ----------
+    artifact : Path
+        The artifact's folder.
+    camera : Camera
+        What the matcher takes the camera to be; the true one differs where ``k1`` and
+        ``scale`` say so.
+    methods : tuple of str
+        Ways to identify.
+    limit_mag : float
+        Fainter stars are not seen.
+    values : mapping of str to tuple of float
+        By key of `AXES`. A single value holds for all trials; of several, each is tried while
+        the others keep theirs.
+    frames : int
+        Of each trial.
+    tolerance_px : float, optional
+        Of the matcher; by default what the position noise asks for (`tolerance_for`).
+    seed : int
+        Of all that is random.
+    is_quick : bool
+        Whether few frames were asked for.
+    """
+
+    artifact: Path
+    camera: Camera
+    methods: tuple[str, ...]
+    limit_mag: float
+    values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    frames: int = FRAMES
+    tolerance_px: float | None = None
+    seed: int = 1
+    is_quick: bool = False
+
+
+def plan_sweep(
+    artifact: Path,
+    values: Mapping[str, Sequence[float]],
+    *,
+    method: str | None = None,
+    camera: Camera | None = None,
+    frames: int | None = None,
+    tolerance_px: float | None = None,
+    seed: int = 1,
+    quick: bool = False,
+) -> Sweep:
+    """Fill in what a user did not say.
+
+    Parameters
+    ----------
+    artifact : Path
+        The artifact's folder.
+    values : mapping of str to sequence of float
+        As `Sweep` has them; where there are none, every quantity takes its usual values.
+    method : str, optional
+        A key of `METHODS`; ``all`` for every one that the artifact's products allow; by
+        default the best of them.
+    camera : Camera, optional
+        The artifact's own by default.
+    frames, tolerance_px, seed
+        As `Sweep` has them.
+    quick : bool, default False
+        Whether few frames will do where ``frames`` does not say how many.
+
+    Returns
+    -------
+    Sweep
+        Complete.
+
+    Raises
+    ------
+    ConfigError
+        If a quantity or the method is unknown, or a quantity has no value.
+    ProductError
+        If the folder is not an artifact, or lacks a product that the method needs.
+    """
+    for name, given in values.items():
+        if name not in AXES or not given:
+            raise ConfigError(
+                f"noise {name!r} has {len(given)} values; expected one or more of one of "
+                + ", ".join(AXES),
+                key=name,
+            )
+    manifest = open_artifact(artifact).manifest
+    usual = {name: axis.usual for name, axis in AXES.items() if axis.usual}
+    wanted = {name: tuple(sorted(set(given))) for name, given in values.items()}
+    return Sweep(
+        artifact,
+        camera or open_database(artifact).camera,
+        _methods(artifact, method),
+        manifest["spec"]["selection"]["faint_limit_mag"],
+        wanted or usual,
+        frames or (FEW_FRAMES if quick else FRAMES),
+        tolerance_px,
+        seed,
+        quick,
+    )
+
+
+def _methods(artifact: Path, method: str | None) -> tuple[str, ...]:
+    products = set(products_in(artifact))
+    if method is None:
+        return (best_method(products),)
+    if method == "all":
+        return tuple(n for n, known in METHODS.items() if products.issuperset(known.products))
+    open_database(artifact, method_named(method).products)
+    return (method,)
+
+
+def sweep_paper(sweep: Sweep) -> Paper:
+    """Return a sweep as something that `run_paper` runs.
+
+    Parameters
+    ----------
+    sweep : Sweep
+        What is to be tried.
+
+    Returns
+    -------
+    Paper
+        Named after the artifact, which is its only preset; nothing is published or expected.
+
+    Raises
+    ------
+    ConfigError
+        If a value is out of range.
+    """
+    name = sweep.artifact.resolve().name
+    rows = _rows(sweep, name)
+
+    def no_statistics(artifacts: Mapping[str, Path], is_quick: bool) -> list[Statistic]:
+        return []
+
+    size = f"{sweep.camera.width_px} x {sweep.camera.height_px} px"
+    field_of_view = f"{sweep.camera.fov_x_deg:.3g} x {sweep.camera.fov_y_deg:.3g} deg"
+    title = f"{field_of_view}, {size}, stars to {sweep.limit_mag:g} mag"
+    return Paper(name, title, "", (name,), lambda is_quick: rows, no_statistics)
+
+
+def _rows(sweep: Sweep, preset: str) -> list[Row]:
+    """Return a group a quantity that varies, or one group of a single point."""
+    single = {name: v[0] for name, v in sweep.values.items() if len(v) == 1}
+    varied = {name: v for name, v in sweep.values.items() if name not in single}
+    rows = []
+    for method in sweep.methods:
+        base = _trial(sweep, method, single)
+        if not varied:
+            held = ", ".join(f"{AXES[name].label} {value:g}" for name, value in single.items())
+            rows.append(Row(held or "clean", method, preset, base, "starcat"))
+    for name, values in varied.items():
+        for method in sweep.methods:
+            for value in values:
+                trial = _trial(sweep, method, single | {name: value}, f"{name}_{value:g}_")
+                label = AXES[name].label
+                rows.append(Row(label, f"{value:g}", preset, trial, "starcat", x=value))
+    return rows
+
+
+def _trial(sweep: Sweep, method: str, values: Mapping[str, float], name: str = "") -> Trial:
+    trial = Trial(
+        f"{name}{method}",
+        method,
+        Attitudes("random", sweep.frames),
+        Noise(NOISE_PX, limit_mag=sweep.limit_mag),
+        camera=sweep.camera,
+        assumed=sweep.camera,
+        seed=sweep.seed,
+    )
+    for axis, value in values.items():
+        trial = AXES[axis].with_value(trial, value)
+    tolerance_px = sweep.tolerance_px or tolerance_for(trial.noise.noise_px)
+    return replace(trial, tolerance_px=tolerance_px)

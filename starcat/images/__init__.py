@@ -1,0 +1,1 @@
+"""The image path: star images rendered, read from files, measured and drawn."""

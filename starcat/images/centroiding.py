@@ -1,0 +1,249 @@
+"""Spots of light in an image: found above the background and measured with sub-pixel accuracy.
+
+Input is one grey image, output are centroids and brightness, brightest first. Background,
+detection, windowed centroids and apertures are those of sep, Source Extractor as a library,
+which the extra ``images`` brings. Trails and blooming are not handled.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from starcat.errors import ConfigError
+from starcat.images.background import (
+    PIXEL_VARIANCE,
+    Sky,
+    load_sep,
+    pixels_around,
+    repair_hot_pixels,
+    subtract_background,
+)
+
+Array = NDArray[np.float64]
+
+_SIGMA_RANGE_PX = (0.3, 5.0)
+_SIGMA_SPOTS = 50
+_CLEAR_NOISE = 100.0
+"""Flux in units of one pixel's noise: 100 is a signal over noise of 28 where sigma is 1 px."""
+_WIDEST_RADIUS_PX = 15.0
+_NARROWEST_WINDOW_PX = 1.0  # a narrower window follows the pixel grid (docs/decisions.md)
+_APERTURE_SIGMA, _EDGE_SIGMA = 2.0, 3.0
+_PLATEAU_NOISE, _PLATEAU_DEPTH, _PLATEAU_PIXELS = 6.0, 0.005, 3
+"""A plateau: pixels that differ by no more than read noise, and by half a per cent."""
+
+
+@dataclass(frozen=True)
+class Spots:
+    """What was found in one image, brightest first.
+
+    Attributes
+    ----------
+    centroids_px : ndarray of float64, shape (N, 2)
+        Pixels (x right, y down, origin at the outer corner of the top-left pixel).
+    flux : ndarray of float64, shape (N,)
+        Light above the background, in the units of the image.
+    mag : ndarray of float64, shape (N,)
+        Instrumental magnitude, -2.5 log10 flux: its zero point is unknown.
+    snr : ndarray of float64, shape (N,)
+        Flux over its standard deviation, in an aperture of two sigma.
+    saturated : ndarray of bool, shape (N,)
+        The brightest pixel is at the detector's limit: measured too faint.
+    blended : ndarray of bool, shape (N,)
+        Touches another spot: each pulls at the other's centroid.
+    at_edge : ndarray of bool, shape (N,)
+        Cut by the edge of the image: the centroid is pulled inwards.
+    psf_sigma_px : float
+        Standard deviation of a star's spot before the pixels sample it.
+    """
+
+    centroids_px: Array
+    flux: Array
+    mag: Array
+    snr: Array
+    saturated: NDArray[np.bool_]
+    blended: NDArray[np.bool_]
+    at_edge: NDArray[np.bool_]
+    psf_sigma_px: float
+
+    def __len__(self) -> int:
+        """Return the number of spots."""
+        return len(self.flux)
+
+
+def find_spots(
+    image: ArrayLike,
+    *,
+    threshold_sigma: float = 5.0,
+    psf_sigma_px: float | None = None,
+    saturation: float | None = None,
+    gain_e_per_adu: float | None = None,
+) -> Spots:
+    """Find the spots of an image and measure them.
+
+    Parameters
+    ----------
+    image : array_like, shape (height, width)
+        Grey values, row 0 at the top. Values that are not finite are left out.
+    threshold_sigma : float, default 5
+        Least signal over noise of a spot, after smoothing with a star's own shape. A frame of
+        a million pixels has about one false spot at 5.
+    psf_sigma_px : float, optional
+        Standard deviation of a star's spot, pixels; without it, measured on the brightest.
+    saturation : float, optional
+        Grey value from which a pixel is saturated; without it, a spot is saturated if three of
+        its pixels form a plateau at the largest value of the image.
+    gain_e_per_adu : float, optional
+        Electrons of one grey step, for the photon noise in ``snr``; without it only the noise
+        of the background counts.
+
+    Returns
+    -------
+    Spots
+        By flux, equal ones by x, then by y. Empty if nothing stands out.
+
+    Raises
+    ------
+    ConfigError
+        If sep is not installed; if the image is not 2-D, too small, without a finite value, or
+        has too much in it to be a sky; if a parameter is not positive.
+
+    References
+    ----------
+    Bertin and Arnouts 1996, A&AS 117, 393. Barbary 2016, JOSS 1 (6), 58.
+    """
+    _check_positive(
+        threshold_sigma=threshold_sigma,
+        psf_sigma_px=psf_sigma_px,
+        saturation=saturation,
+        gain_e_per_adu=gain_e_per_adu,
+    )
+    sky = subtract_background(image)
+    sigma = psf_sigma_px
+    if sigma is None:
+        sky = repair_hot_pixels(sky, _SIGMA_RANGE_PX[0])
+        sigma = _measured_sigma(sky, _detect(sky, 1.0, threshold_sigma))
+    sky = repair_hot_pixels(sky, sigma)
+    found = _detect(sky, float(sigma), threshold_sigma)
+    return _measured(sky, found, float(sigma), saturation, gain_e_per_adu)
+
+
+def _check_positive(**values: float | None) -> None:
+    for name, value in values.items():
+        if value is not None and not 0.0 < value < np.inf:
+            raise ConfigError(
+                f"{name} is {value}; expected a positive number", key=name, value=value
+            )
+
+
+def _detect(sky: Sky, sigma: float, threshold: float) -> NDArray[Any]:
+    """Return sep's table of what stands out after smoothing with a star's shape.
+
+    Filter "conv" with the threshold in units of the smoothed noise, and no cleaning: sep's
+    matched filter followed by its cleaning loses real stars (docs/decisions.md).
+    """
+    reach = np.arange(-int(np.ceil(2.5 * sigma)), int(np.ceil(2.5 * sigma)) + 1)
+    profile = np.exp(-0.5 * (reach / sigma) ** 2)
+    kernel = np.outer(profile, profile) / profile.sum() ** 2
+    smoothed = threshold * float(np.sqrt((kernel**2).sum()))
+    try:
+        found = load_sep().extract(
+            sky.above, smoothed, err=sky.noise, mask=sky.mask, minarea=1, clean=False,
+            filter_kernel=kernel, filter_type="conv",
+        )  # fmt: skip
+    except Exception as error:  # sep raises nothing more special when a buffer is full
+        raise ConfigError(
+            f"the image has too much in it to be a sky ({error}); raise the threshold "
+            f"({threshold:g} sigma) or check that it is a star image"
+        ) from error
+    return np.asarray(found)
+
+
+def _measured_sigma(sky: Sky, found: NDArray[Any]) -> float:
+    """Return sigma of the spots that stand out well, from the radius with half of their light.
+
+    Of these the middle by brightness: the brightest may be saturated, which makes them wide.
+    """
+    order = np.argsort(-found["flux"], kind="stable")
+    clear = int((found["flux"] > _CLEAR_NOISE * sky.noise[found["ypeak"], found["xpeak"]]).sum())
+    first = max(clear - _SIGMA_SPOTS, 0) // 2
+    chosen = found[order[first : first + min(max(clear, 3), _SIGMA_SPOTS)]]
+    if not len(chosen):
+        return 1.0
+    widest = np.full(len(chosen), _WIDEST_RADIUS_PX)
+    radius, _ = load_sep().flux_radius(
+        sky.above, chosen["x"], chosen["y"], widest, 0.5, mask=sky.mask, subpix=5
+    )
+    variance = np.median(radius) ** 2 / (2.0 * np.log(2.0)) - PIXEL_VARIANCE
+    return float(np.clip(np.sqrt(max(variance, 0.0)), *_SIGMA_RANGE_PX))
+
+
+def _measured(
+    sky: Sky, found: NDArray[Any], sigma: float, saturation: float | None, gain: float | None
+) -> Spots:
+    """Measure place and light of what was found, and put it into order."""
+    seen = float(np.sqrt(sigma**2 + PIXEL_VARIANCE))
+    centroids = _windowed(sky, found, max(seen, _NARROWEST_WINDOW_PX))
+    x, y = (centroids - 0.5).T
+    part, error, _ = load_sep().sum_circle(
+        sky.above, x, y, _APERTURE_SIGMA * seen, err=sky.noise, mask=sky.mask, gain=gain, subpix=0
+    )
+    flux = part / (1.0 - np.exp(-0.5 * _APERTURE_SIGMA**2))
+    to_edge = np.minimum(centroids, sky.raw.shape[::-1] - centroids).min(axis=1)
+    order = brightest_first(flux, centroids)[: np.count_nonzero(flux > 0.0)]
+    return Spots(
+        centroids[order],
+        flux[order],
+        -2.5 * np.log10(flux[order]),
+        part[order] / error[order],
+        _is_saturated(sky, found, saturation)[order],
+        _is_blended(found)[order],
+        to_edge[order] < _EDGE_SIGMA * seen,
+        sigma,
+    )
+
+
+def brightest_first(flux: Array, centroids_px: Array) -> NDArray[np.int64]:
+    """Return the order of spots.
+
+    Parameters
+    ----------
+    flux : ndarray of float64, shape (N,)
+        Light of each spot.
+    centroids_px : ndarray of float64, shape (N, 2)
+        Their places.
+
+    Returns
+    -------
+    ndarray of int64, shape (N,)
+        Rows by flux, the brightest first; equal ones by x, then by y.
+    """
+    return np.lexsort((centroids_px[:, 1], centroids_px[:, 0], -flux))
+
+
+def _is_saturated(sky: Sky, found: NDArray[Any], saturation: float | None) -> NDArray[np.bool_]:
+    """Return which spots reach the limit, given or seen as a plateau at the image's maximum."""
+    around = pixels_around(sky.raw, found["xpeak"], found["ypeak"])
+    if saturation is not None:
+        return np.asarray((around >= saturation).any(axis=(1, 2)))
+    read_noise = _PLATEAU_NOISE * float(np.median(sky.noise))
+    depth = min(read_noise, _PLATEAU_DEPTH * float(sky.above.max()))
+    at_limit = around >= float(sky.raw[~sky.mask].max()) - depth
+    return np.asarray(at_limit.sum(axis=(1, 2)) >= _PLATEAU_PIXELS)
+
+
+def _windowed(sky: Sky, found: NDArray[Any], window: float) -> Array:
+    """Return windowed centroids; barycentres where a window drifts to the spot beside it."""
+    start = np.stack([found["x"], found["y"]], axis=1)
+    x, y, _ = load_sep().winpos(sky.above, *start.T, window, mask=sky.mask, subpix=0)
+    centroids = np.stack([x, y], axis=1)
+    drifts = _is_blended(found) & (np.hypot(*(centroids - start).T) > 0.5 * window)
+    # sep counts from the centre of the first pixel.
+    return np.asarray(np.where(drifts[:, None], start, centroids) + 0.5, dtype=np.float64)
+
+
+def _is_blended(found: NDArray[Any]) -> NDArray[np.bool_]:
+    return np.asarray((found["flag"] & load_sep().OBJ_MERGED) > 0)

@@ -1,0 +1,202 @@
+"""Image files: FITS, PNG and TIFF to and from one array of grey values, row 0 at the top.
+
+What kind a file is, its first bytes say, not its name. Colour becomes luminance. Stacks and
+cubes are refused, and so is what could only be read with fewer digits than the file has.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import logging
+import warnings
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.errors import ConfigError, OutputError, reason
+
+Grey = NDArray[np.float32] | NDArray[np.float64]
+
+_log = logging.getLogger(__name__)
+
+_KINDS = {
+    b"SIMPLE  =": "FITS",
+    b"\x89PNG\r\n\x1a\n": "PNG",
+    b"II*\0": "TIFF",
+    b"MM\0*": "TIFF",
+    b"II+\0": "TIFF",
+    b"MM\0+": "TIFF",
+}
+_SUFFIXES = {
+    ".fits": "FITS", ".fit": "FITS", ".fts": "FITS", ".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF",
+}  # fmt: skip
+_LUMINANCE = np.array([0.299, 0.587, 0.114])
+"""Of red, green, blue: ITU-R BT.601."""
+
+
+def read_image(path: Path, *, flip: bool | None = None, hdu: int | None = None) -> Grey:
+    """Read the grey values of an image.
+
+    Parameters
+    ----------
+    path : Path
+        FITS (also gzipped or tile-compressed), PNG or TIFF.
+    flip : bool, optional
+        Whether the first row of the file is the bottom of the picture. If not given, it is so
+        where a FITS file says ``ROWORDER = 'BOTTOM-UP'``, and nowhere else.
+    hdu : int, optional
+        Part of a FITS file, counted from 0; the first that holds a plane if not given. Which
+        one it was is logged.
+
+    Returns
+    -------
+    ndarray of float32 or float64, shape (height, width)
+        Row 0 is the top row. float64 only where float32 would lose digits of the file.
+
+    Raises
+    ------
+    ConfigError
+        If the file is missing, damaged, of another kind, not one plane, or colour of 16 bits.
+
+    Notes
+    -----
+    The FITS standard does not say which row is the top one. Programs that write arrays put the
+    top row first, which is what is assumed here; viewers show the first row at the bottom. A
+    frame that is read upside down is a mirror image, and no mirror image is ever identified.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({reason(error)})") from error
+    if data.startswith(b"\x1f\x8b"):
+        try:
+            data = gzip.decompress(data)
+        except (OSError, EOFError, zlib.error) as error:
+            raise ConfigError(f"{path}: damaged gzip file ({error})") from error
+    kind = next((kind for start, kind in _KINDS.items() if data.startswith(start)), None)
+    if kind is None:
+        raise ConfigError(f"{path}: neither FITS nor PNG nor TIFF; convert it to one of these")
+    try:
+        values, upside_down = _read_fits(data, path, hdu) if kind == "FITS" else _read_picture(data)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    except Exception as error:  # damaged bytes make either library raise whatever it happens to
+        raise ConfigError(f"{path}: cannot be read as {kind} ({error})") from error
+    if upside_down if flip is None else flip:
+        values = values[::-1]
+    if values.dtype.itemsize <= (4 if values.dtype.kind == "f" else 2):
+        return np.ascontiguousarray(values, dtype=np.float32)
+    return np.ascontiguousarray(values, dtype=np.float64)
+
+
+def _read_fits(data: bytes, path: Path, hdu: int | None) -> tuple[NDArray[Any], bool]:
+    """Return the plane of a FITS file, and whether it says that its first row is the bottom."""
+    from astropy.io import fits
+    from astropy.utils.exceptions import AstropyWarning
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AstropyWarning)  # about headers, as cameras write them
+        with fits.open(io.BytesIO(data), memmap=False) as parts:
+            shapes = [part.shape if part.is_image else () for part in parts]
+            planes = [number for number, shape in enumerate(shapes) if _is_plane(shape)]
+            found = "; ".join(
+                f"HDU {number} {'x'.join(map(str, shape)) or 'no image'}"
+                for number, shape in enumerate(shapes)
+            )
+            if not planes or (hdu is not None and hdu not in planes):
+                raise ConfigError(f"{found}; expected an image of two dimensions")
+            chosen = planes[0] if hdu is None else hdu
+            _log.info("%s: HDU %d of %d (%s)", path, chosen, len(parts), found)
+            values = np.asarray(parts[chosen].data)
+            order = str(parts[chosen].header.get("ROWORDER", "")).strip().upper()
+    return values.reshape(values.shape[-2:]), order == "BOTTOM-UP"
+
+
+def _is_plane(shape: tuple[int, ...]) -> bool:
+    """Return whether an array is a plane, however many axes of length 1 it has before."""
+    return len(shape) >= 2 and min(shape) > 0 and all(length == 1 for length in shape[:-2])
+
+
+def _read_picture(data: bytes) -> tuple[NDArray[Any], bool]:
+    """Return the grey values of a PNG or TIFF file, whose first row is the top."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about tags beside the image, and about its size
+        return _grey_of_picture(data), False
+
+
+def _grey_of_picture(data: bytes) -> NDArray[Any]:
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        picture = Image.open(io.BytesIO(data), formats=("PNG", "TIFF"))
+    except UnidentifiedImageError as error:
+        raise ConfigError("damaged, or a variety that Pillow does not know") from error
+    with picture:
+        if getattr(picture, "n_frames", 1) > 1:
+            raise ConfigError(f"holds {getattr(picture, 'n_frames', 1)} images; expected one")
+        bits, is_negative = _bits(data, picture)
+        is_grey = picture.mode in ("L", "I", "F") or picture.mode.startswith("I;16")
+        if bits > 8 and not is_grey:
+            raise ConfigError(
+                f"colour of {bits} bits, of which 8 would be left; convert it to grey or FITS"
+            )
+        if is_grey:
+            values = np.asarray(picture)
+            return 65_535 - values if is_negative else values
+        return np.asarray(np.asarray(picture.convert("RGB")) @ _LUMINANCE)
+
+
+def _bits(data: bytes, picture: Any) -> tuple[int, bool]:
+    """Return the bits of a value in the file, and whether 16 of them count from white down."""
+    if picture.format == "PNG":
+        return data[24], False
+    bits = max(picture.tag_v2.get(258, (1,)))  # BitsPerSample
+    # Pillow turns 8-bit values around where white is zero, but not 16-bit ones.
+    return bits, picture.tag_v2.get(262) == 0 and picture.mode.startswith("I;16")
+
+
+def write_image(path: Path, image: NDArray[Any]) -> None:
+    """Write an image, the same bytes for the same values.
+
+    Parameters
+    ----------
+    path : Path
+        ``.fits``, ``.png`` or ``.tif``, replaced if it exists.
+    image : ndarray, shape (height, width)
+        Row 0 is the top row. PNG and TIFF take uint8 and uint16, FITS all numbers.
+
+    Raises
+    ------
+    ConfigError
+        If the suffix names another kind.
+    ValueError
+        If the array is not 2-D or its type does not go into the file.
+    OutputError
+        If the file cannot be written.
+    """
+    kind = _SUFFIXES.get(path.suffix.lower())
+    if kind is None:
+        raise ConfigError(f"{path}: unknown kind of image; expected {', '.join(_SUFFIXES)}")
+    if image.ndim != 2 or not image.size:
+        raise ValueError(f"image of shape {image.shape}; expected two dimensions")
+    buffer = io.BytesIO()
+    if kind == "FITS":
+        from astropy.io import fits
+
+        part = fits.PrimaryHDU(image)
+        part.header["ROWORDER"] = ("TOP-DOWN", "the first row is the top one")
+        part.writeto(buffer)
+    else:
+        from PIL import Image
+
+        if image.dtype not in (np.uint8, np.uint16):
+            raise ValueError(f"image of {image.dtype}; {kind} takes uint8 and uint16")
+        Image.fromarray(np.ascontiguousarray(image)).save(buffer, format=kind)
+    try:
+        path.write_bytes(buffer.getvalue())
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({reason(error)})", path=path) from error

@@ -1,0 +1,192 @@
+"""Star images: what a detector records of stars at known places, with all of its noise.
+
+Input are centroids and magnitudes, output is one frame of 16 bits. The point spread function is
+a Gaussian, integrated over each pixel. Not drawn are smear, blooming, cosmic rays and optics
+whose spot changes over the field.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf
+
+Array = NDArray[np.float64]
+
+_REACH_SIGMA = 6.0
+"""A star is drawn this far to each side: 4e-9 of its light falls outside."""
+_HOT_RANGE = (0.02, 0.5)
+"""Electrons of a hot pixel, as parts of the full well."""
+_MOST_ELECTRONS = 1e15
+"""Above it a count has no digits left; numpy draws none above 9e18."""
+
+
+@dataclass(frozen=True)
+class Optics:
+    """A lens and a detector, for one exposure.
+
+    Attributes
+    ----------
+    psf_sigma_px : float
+        Standard deviation of the Gaussian spot, pixels.
+    zero_point_e : float
+        Electrons of a star of magnitude 0. The default is 19,100 electrons per second and mm2
+        [1]_ through an aperture of 20 mm in 0.1 s.
+    background_e : float
+        Electrons of sky and dark current in a pixel.
+    read_noise_e : float
+        Standard deviation of the read-out, electrons.
+    gain_e_per_adu : float
+        Electrons of one step of the file.
+    bias_adu : float
+        Steps added to every pixel, so that noise does not fall below zero.
+    full_well_e : float
+        Electrons that a pixel can hold; what is above is lost.
+    hot_pixels : int
+        Pixels with a high dark current, at places that the seed gives.
+
+    References
+    ----------
+    .. [1] Liebe 2002, "Accuracy performance of star trackers - a tutorial", IEEE Transactions
+       on Aerospace and Electronic Systems 38 (2), 587-599.
+    """
+
+    psf_sigma_px: float = 1.0
+    zero_point_e: float = 600_000.0
+    background_e: float = 20.0
+    read_noise_e: float = 8.0
+    gain_e_per_adu: float = 1.0
+    bias_adu: float = 100.0
+    full_well_e: float = 50_000.0
+    hot_pixels: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("psf_sigma_px", "gain_e_per_adu", "full_well_e"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise ValueError(f"{name} is {getattr(self, name)}; expected a positive number")
+        for name in ("zero_point_e", "background_e", "read_noise_e", "bias_adu", "hot_pixels"):
+            if not 0.0 <= getattr(self, name) < np.inf:
+                raise ValueError(f"{name} is {getattr(self, name)}; expected 0 or more")
+
+
+def star_electrons(
+    centroids_px: Array, mag: Array, camera_size: tuple[int, int], optics: Optics
+) -> Array:
+    """Return the mean number of electrons that stars release, without background or noise.
+
+    Parameters
+    ----------
+    centroids_px : ndarray of float64, shape (N, 2)
+        Pixels (x right, y down, origin at the outer corner of the top-left pixel). A star
+        outside of the frame still shines into it; one at NaN is not drawn.
+    mag : ndarray of float64, shape (N,)
+        Magnitudes in the passband of the zero point.
+    camera_size : tuple of int
+        Width and height, pixels.
+    optics : Optics
+        Its spot and its zero point; the well has no bottom here.
+
+    Returns
+    -------
+    ndarray of float64, shape (height, width)
+        Electrons.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ, a magnitude is not a number, or the frame has no pixels.
+    """
+    width, height = camera_size
+    centroids_px, mag = np.asarray(centroids_px), np.asarray(mag)
+    _check(centroids_px, mag, camera_size)
+    image = np.zeros((height, width))
+    drawn = np.isfinite(centroids_px).all(axis=1)
+    electrons = optics.zero_point_e * 10.0 ** (-0.4 * mag[drawn])
+    columns, left = _profiles(centroids_px[drawn, 0], optics.psf_sigma_px)
+    rows, top = _profiles(centroids_px[drawn, 1], optics.psf_sigma_px)
+    size = columns.shape[1]
+    near = (left < width) & (left + size > 0) & (top < height) & (top + size > 0)
+    for star in np.flatnonzero(near):
+        x, y = int(left[star]), int(top[star])
+        across = columns[star, max(-x, 0) : width - x]
+        down = rows[star, max(-y, 0) : height - y]
+        patch = image[max(y, 0) : y + size, max(x, 0) : x + size]
+        patch += electrons[star] * down[:, None] * across
+    return image
+
+
+def _check(centroids_px: Array, mag: Array, camera_size: tuple[int, int]) -> None:
+    if centroids_px.ndim != 2 or centroids_px.shape[1] != 2 or mag.shape != centroids_px.shape[:1]:
+        raise ValueError(
+            f"centroids_px of shape {centroids_px.shape} and mag of shape {mag.shape}; "
+            "expected (N, 2) and (N,)"
+        )
+    if not np.isfinite(mag).all():
+        raise ValueError("mag has values that are not finite; every star needs a magnitude")
+    if min(camera_size) < 1:
+        raise ValueError(f"camera_size is {camera_size}; expected at least 1 x 1 px")
+
+
+def _profiles(centre: Array, sigma: float) -> tuple[Array, NDArray[np.int64]]:
+    """Return each star's light in the pixels along one axis, and the first of these pixels."""
+    first = np.floor(np.clip(centre, -1e9, 1e9) - _REACH_SIGMA * sigma).astype(np.int64)
+    edges = first[:, None] + np.arange(int(np.ceil(2.0 * _REACH_SIGMA * sigma)) + 2)
+    below = 0.5 * erf((edges - centre[:, None]) / (np.sqrt(2.0) * sigma))
+    return np.diff(below, axis=1), first
+
+
+def render_image(
+    centroids_px: Array,
+    mag: Array,
+    camera_size: tuple[int, int],
+    optics: Optics,
+    seed: int,
+) -> NDArray[np.uint16]:
+    """Return the image of stars as a detector would record it.
+
+    Parameters
+    ----------
+    centroids_px : ndarray of float64, shape (N, 2)
+        Pixels, as in `star_electrons`.
+    mag : ndarray of float64, shape (N,)
+        Magnitudes in the passband of the zero point.
+    camera_size : tuple of int
+        Width and height, pixels.
+    optics : Optics
+        Spot, zero point, noise and limits.
+    seed : int
+        Of all that is random; the same seed gives the same image.
+
+    Returns
+    -------
+    ndarray of uint16, shape (height, width)
+        ADU, row 0 at the top; values that 16 bits cannot hold are cut.
+
+    Raises
+    ------
+    ValueError
+        As `star_electrons` does.
+
+    Notes
+    -----
+    Electrons of stars, background and hot pixels are Poisson variates; the full well cuts
+    them; the read-out adds Gaussian noise and rounds to whole ADU.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> image = render_image(np.array([[10.5, 20.5]]), np.array([3.0]), (64, 48), Optics(), 1)
+    >>> image.shape, np.unravel_index(image.argmax(), image.shape) == (20, 10)
+    ((48, 64), True)
+    """
+    generator = np.random.default_rng(seed)
+    mean = star_electrons(centroids_px, mag, camera_size, optics) + optics.background_e
+    hot = generator.choice(mean.size, min(optics.hot_pixels, mean.size), replace=False)
+    mean.flat[hot] += optics.full_well_e * generator.uniform(*_HOT_RANGE, size=len(hot))
+    electrons = generator.poisson(np.minimum(mean, _MOST_ELECTRONS)).astype(np.float64)
+    np.minimum(electrons, optics.full_well_e, out=electrons)
+    electrons += generator.normal(scale=optics.read_noise_e, size=mean.shape)
+    adu = np.rint(electrons / optics.gain_e_per_adu + optics.bias_adu)
+    return np.clip(adu, 0, 65_535).astype(np.uint16)

@@ -1,0 +1,140 @@
+"""One frame as the methods see it: usable centroids, their directions, an order of their own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from starcat.camera import Camera
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Observation:
+    """The usable centroids of a frame.
+
+    Attributes
+    ----------
+    rows : ndarray of int64, shape (N,)
+        Where each centroid stood in the frame as given.
+    centroids_px : ndarray of float64, shape (N, 2)
+        Pixels. Brightest first where magnitudes are known, else nearest to the centre first,
+        so that nothing depends on the order in which they were given.
+    body : ndarray of float64, shape (N, 3)
+        Directions in the camera frame.
+    mag : ndarray of float64, shape (N,), or None
+        Magnitudes, NaN for a centroid without one; None where none is known.
+    camera : Camera
+        The camera.
+    tolerance_px : float
+        Largest error of a centroid, as a radius.
+    dropped : tuple of (int, str)
+        Row and reason of every centroid that is not used: ``not_finite``, ``out_of_frame`` or
+        ``duplicate``.
+    """
+
+    rows: NDArray[np.int64]
+    centroids_px: Array
+    body: Array
+    mag: Array | None
+    camera: Camera
+    tolerance_px: float
+    dropped: tuple[tuple[int, str], ...] = ()
+
+    def __len__(self) -> int:
+        """Return the number of usable centroids."""
+        return len(self.rows)
+
+    @property
+    def tolerance_rad(self) -> float:
+        """Largest error of a direction, radians."""
+        return self.tolerance_px / self.camera.focal_length_px
+
+    @cached_property
+    def separation_rad(self) -> Array:
+        """Separations between all centroids, radians, shape (N, N)."""
+        x, y, z = self.body.T
+        dx, dy, dz = x[:, None] - x, y[:, None] - y, z[:, None] - z
+        # By the chord, which is exact for the angles within a frame.
+        return np.asarray(2.0 * np.arcsin(0.5 * np.sqrt(dx * dx + dy * dy + dz * dz)))
+
+
+def observe(
+    centroids_px: ArrayLike,
+    camera: Camera,
+    tolerance_px: float,
+    magnitudes: ArrayLike | None = None,
+) -> Observation:
+    """Prepare a frame for identification.
+
+    Parameters
+    ----------
+    centroids_px : array_like of float64, shape (N, 2)
+        Pixels; the order carries no meaning.
+    camera : Camera
+        The camera that took the frame.
+    tolerance_px : float
+        Largest error of a centroid, as a radius.
+    magnitudes : array_like of float64, shape (N,), optional
+        Of any zero point, larger is fainter; NaN where unknown.
+
+    Returns
+    -------
+    Observation
+        Of the centroids that can be used. Of several at the very same place one is kept, the
+        brightest where magnitudes are known.
+
+    Raises
+    ------
+    ValueError
+        If the centroids are not pairs of numbers, or the magnitudes are not one a centroid.
+    """
+    given = np.asarray(centroids_px, dtype=np.float64)
+    given = given.reshape(0, 2) if given.size == 0 else given
+    if given.ndim != 2 or given.shape[1] != 2:
+        raise ValueError(f"centroids_px has shape {given.shape}; expected (N, 2)")
+    mag = None if magnitudes is None else np.asarray(magnitudes, dtype=np.float64)
+    if mag is not None and mag.shape != (len(given),):
+        raise ValueError(f"magnitudes have shape {mag.shape}; expected ({len(given)},)")
+    usable = camera.contains(given)
+    rows, dropped = np.flatnonzero(usable), _unusable(given, usable)
+    rows = rows[_own_order(given[rows], None if mag is None else mag[rows], camera)]
+    rows, repeats = _without_repeats(rows, given)
+    kept = given[rows]
+    known = None if mag is None or not np.isfinite(mag[rows]).any() else mag[rows]
+    body = camera.directions_from_pixels(kept)
+    return Observation(rows, kept, body, known, camera, tolerance_px, (*dropped, *repeats))
+
+
+def _unusable(given: Array, usable: NDArray[np.bool_]) -> list[tuple[int, str]]:
+    if usable.all():
+        return []
+    finite = np.asarray(np.isfinite(given).all(axis=1))
+    return [
+        (int(row), "out_of_frame" if finite[row] else "not_finite")
+        for row in np.flatnonzero(~usable)
+    ]
+
+
+def _own_order(centroids_px: Array, mag: Array | None, camera: Camera) -> NDArray[np.int64]:
+    """Return the brightest first (unknown ones last), or the nearest to the centre."""
+    x = centroids_px[:, 0] - 0.5 * camera.width_px
+    y = centroids_px[:, 1] - 0.5 * camera.height_px
+    distance = x * x + y * y
+    return np.lexsort((y, x, distance) if mag is None else (y, x, distance, mag))
+
+
+def _without_repeats(
+    rows: NDArray[np.int64], given: Array
+) -> tuple[NDArray[np.int64], list[tuple[int, str]]]:
+    place = given[rows, 0] + 1j * given[rows, 1]
+    order = np.argsort(place, kind="stable")
+    same = np.diff(place[order]) == 0.0
+    if not same.any():
+        return rows, []
+    repeats = order[1:][same]
+    return np.delete(rows, repeats), [(int(row), "duplicate") for row in rows[np.sort(repeats)]]

@@ -1,0 +1,199 @@
+"""Which triangles of centroids are looked up, and in what order.
+
+Three methods share this stage. With magnitudes the brightest go first, as in S3; without
+them the most compact. S4's order, the largest inscribed circle first, can be had. Triangles
+with a short side or a narrow angle are left out: two centroids of a double star and three
+centroids in a line say little.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.matcher.observation import Observation
+
+Array = NDArray[np.float64]
+Triple = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class Selection:
+    """How triangles are chosen.
+
+    Attributes
+    ----------
+    order : {"auto", "brightness", "inradius", "compact"}
+        ``brightness`` is S3's, ``inradius`` S4's, the largest first; ``compact`` has the
+        triangles with the shortest long side first, which the most fields hold whole. ``auto``
+        is ``brightness`` where magnitudes are known, else ``compact``.
+    min_side_px : float
+        Shorter sides are a double star's (d_min of S3).
+    min_angle_deg : float
+        Narrower angles are a line's (theta_min of S3).
+    most_centroids : int
+        Only the first of the observation's order take part.
+    few_centroids : int
+        Frames with no more than these also try, at the end, the triangles that are left out.
+
+    References
+    ----------
+    Li et al. 2015 (S3), whose thresholds are unstated: the defaults reproduce its counts.
+    Liao and Zhang 2024 (S4), eq. 7.
+    """
+
+    order: Literal["auto", "brightness", "inradius", "compact"] = "auto"
+    min_side_px: float = 10.0
+    min_angle_deg: float = 15.0
+    most_centroids: int = 32
+    few_centroids: int = 12
+
+
+DEFAULT = Selection()
+
+LEAST_ANGLE_DEG = 4.0
+"""Narrower triangles are never tried."""
+
+
+def select_triangles(observation: Observation, selection: Selection = DEFAULT) -> NDArray[np.intp]:
+    """Return the triangles of a frame in the order in which they are to be looked up.
+
+    Parameters
+    ----------
+    observation : Observation
+        The frame.
+    selection : Selection
+        Thresholds and order.
+
+    Returns
+    -------
+    ndarray of int, shape (T, 3)
+        Rows of the observation, ascending within a triangle.
+    """
+    count = min(len(observation), selection.most_centroids)
+    stars = _triples(count)
+    a, b, c = _sides(observation.separation_rad, stars)
+    side = selection.min_side_px / observation.camera.focal_length_px
+    good = is_well_shaped(a, b, c, side, np.radians(selection.min_angle_deg))
+    known = observation.mag is not None
+    if selection.order == "brightness" or (selection.order == "auto" and known):
+        order = np.arange(len(stars))
+    elif selection.order == "inradius":
+        order = np.argsort(-_squared_inradius(a, b, c), kind="stable")
+    else:
+        order = np.argsort(np.maximum(np.maximum(a, b), c), kind="stable")
+    good = good[order]
+    if count > selection.few_centroids:
+        return np.asarray(stars[order[good]])
+    poor = is_well_shaped(a, b, c, observation.tolerance_rad, np.radians(LEAST_ANGLE_DEG))[order]
+    return np.asarray(stars[np.concatenate([order[good], order[poor & ~good]])])
+
+
+def optimised_triangle(
+    separation_px: Array, min_side_px: float, min_angle_rad: float
+) -> Triple | None:
+    """Return S3's triangle: the brightest stars that are neither a double nor in a line.
+
+    Parameters
+    ----------
+    separation_px : ndarray of float64, shape (N, N)
+        Distances between the centroids, brightest first.
+    min_side_px, min_angle_rad : float
+        S3's d_min and theta_min; both have to be exceeded.
+
+    Returns
+    -------
+    tuple of int, or None
+        Rows, ascending; None if no triangle passes.
+
+    Notes
+    -----
+    Start from stars N, N + 1, N + 2. Where a side is too short, its fainter star is dropped,
+    where an angle is too narrow, the faintest of the three; the next star takes its place.
+    When the stars run out, N moves on by one.
+
+    References
+    ----------
+    Li et al. 2015 (S3), the flow chart's 13 steps.
+    """
+    count = len(separation_px)
+    for start in range(count - 2):
+        chosen, following = [start, start + 1, start + 2], start + 3
+        while True:
+            dropped = _to_drop(separation_px, chosen, min_side_px, min_angle_rad)
+            if dropped is None:
+                i, j, k = chosen
+                return i, j, k
+            if following >= count:
+                break
+            chosen = [*(star for star in chosen if star != dropped), following]
+            following += 1
+    return None
+
+
+def is_well_shaped(
+    a: Array, b: Array, c: Array, min_side: float, min_angle_rad: float
+) -> NDArray[np.bool_]:
+    """Return which triangles have no short side and no narrow angle.
+
+    Parameters
+    ----------
+    a, b, c : ndarray of float64, shape (T,)
+        Sides, in the unit of ``min_side``.
+    min_side : float
+        Every side has to be longer.
+    min_angle_rad : float
+        Every angle has to be wider, radians; below pi / 3.
+
+    Returns
+    -------
+    ndarray of bool, shape (T,)
+        S3's two constraints. The narrowest angle is opposite the shortest side.
+
+    Examples
+    --------
+    >>> is_well_shaped(*np.array([[3.0, 1.0], [4.0, 4.0], [5.0, 4.9]]), 2.0, 0.5)
+    array([ True, False])
+    """
+    shortest = np.minimum(np.minimum(a, b), c)
+    longest = np.maximum(np.maximum(a, b), c)
+    middle = a + b + c - shortest - longest
+    # The law of cosines for the angle opposite the shortest side.
+    cosine = middle * middle + longest * longest - shortest * shortest
+    wide = cosine < 2.0 * np.cos(min_angle_rad) * middle * longest
+    return np.asarray((shortest > min_side) & wide)
+
+
+def _to_drop(
+    separation_px: Array, chosen: list[int], min_side_px: float, min_angle_rad: float
+) -> int | None:
+    for i, j in combinations(chosen, 2):
+        if separation_px[i, j] <= min_side_px:
+            return j
+    i, j, k = chosen
+    a, b, c = separation_px[[j, i, i], [k, k, j]].reshape(3, 1)
+    return None if is_well_shaped(a, b, c, min_side_px, min_angle_rad)[0] else k
+
+
+def _sides(separation_rad: Array, stars: NDArray[np.intp]) -> tuple[Array, Array, Array]:
+    """Return the sides opposite the first, second and third star of triangles."""
+    i, j, k = stars.T
+    return separation_rad[j, k], separation_rad[i, k], separation_rad[i, j]
+
+
+def _squared_inradius(a: Array, b: Array, c: Array) -> Array:
+    """Return the squared inradius (S4, eq. 7) of plane triangles."""
+    half = 0.5 * (a + b + c)
+    return (half - a) * (half - b) * (half - c) / half
+
+
+@lru_cache(maxsize=64)
+def _triples(count: int) -> NDArray[np.intp]:
+    """Return all triples, those whose last member comes early first."""
+    found = sorted(combinations(range(count), 3), key=lambda triple: triple[::-1])
+    return np.array(found, dtype=np.intp).reshape(-1, 3)

@@ -1,0 +1,115 @@
+"""Which directions have a star near them: the stars of a sky in small cells.
+
+Candidates are many and most are wrong; this tells quickly how many centroids each would
+explain. Made when it is first needed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+MIN_SIDE = 0.02
+"""Smallest side of a cell, in units of the sphere's radius: 1.1 degrees."""
+
+
+@dataclass(frozen=True)
+class StarCells:
+    """Stars by the cells of a cubic grid that they lie in or near.
+
+    Attributes
+    ----------
+    directions : ndarray of float64, shape (N, 3)
+        Unit vectors of the stars.
+    side : float
+        Of a cell.
+    margin : float
+        A star is listed in every cell that it is this near to.
+    keys : ndarray of int64, shape (C,)
+        Cells with stars, ascending.
+    offsets : ndarray of int64, shape (C + 1,)
+        The stars of cell c are ``rows[offsets[c]:offsets[c + 1]]``.
+    rows : ndarray of int64
+        Rows of the stars.
+    """
+
+    directions: Array
+    side: float
+    margin: float
+    keys: NDArray[np.int64]
+    offsets: NDArray[np.int64]
+    rows: NDArray[np.int64]
+
+    def has_star(self, directions: Array, reach_rad: float) -> NDArray[np.bool_]:
+        """Return which directions have a star within reach.
+
+        Parameters
+        ----------
+        directions : ndarray of float64, shape (P, 3)
+            Unit vectors.
+        reach_rad : float
+            Largest separation, radians, at most the margin.
+
+        Returns
+        -------
+        ndarray of bool, shape (P,)
+            Separations by the chord, which at this size is the angle.
+
+        Raises
+        ------
+        ValueError
+            If the reach is beyond the margin.
+        """
+        if reach_rad > self.margin:
+            raise ValueError(f"reach_rad is {reach_rad}; these cells allow {self.margin}")
+        key = _keys(directions, self.side)
+        cell = np.minimum(np.searchsorted(self.keys, key), len(self.keys) - 1)
+        there = np.flatnonzero(self.keys[cell] == key)
+        start = self.offsets[cell[there]]
+        count = self.offsets[cell[there] + 1] - start
+        query = np.repeat(there, count)
+        first = np.repeat(start - np.cumsum(count) + count, count)
+        star = self.rows[np.arange(len(query)) + first]
+        offset = directions[query] - self.directions[star]
+        near = np.einsum("ij,ij->i", offset, offset) <= reach_rad * reach_rad
+        found = np.zeros(len(directions), dtype=bool)
+        found[query[near]] = True
+        return found
+
+
+def star_cells(directions: Array, reach_rad: float) -> StarCells:
+    """Sort stars into cells.
+
+    Parameters
+    ----------
+    directions : ndarray of float64, shape (N, 3)
+        Unit vectors, at least one.
+    reach_rad : float
+        Largest reach that will be asked for, radians.
+
+    Returns
+    -------
+    StarCells
+        With cells that are several times as wide.
+    """
+    side = max(MIN_SIDE, 4.0 * reach_rad)
+    margin = 0.25 * side
+    corners = np.array(list(product((-margin, margin), repeat=3)))
+    count = len(directions)
+    pairs = [_keys(directions + corner, side) * count + np.arange(count) for corner in corners]
+    cell, rows = np.divmod(np.unique(np.concatenate(pairs)), count)
+    keys, first = np.unique(cell, return_index=True)
+    offsets = np.append(first, len(cell)).astype(np.int64)
+    return StarCells(directions, side, margin, keys, offsets, rows)
+
+
+def _keys(directions: Array, side: float) -> NDArray[np.int64]:
+    """Return the cells of points, in the cube that holds the sphere and its margin."""
+    across = int(2.0 / side) + 3
+    x, y, z = np.floor((directions + 1.0) / side).astype(np.int64).T + 1
+    return np.asarray((x * across + y) * across + z)

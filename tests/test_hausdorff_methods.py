@@ -1,0 +1,838 @@
+"""Hausdorff methods: scores against plain loops, invariance, and what the matcher makes of them."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from dataclasses import replace
+from math import inf, isnan, tan
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from starcat.attitude import matrix_from_quaternion, matrix_from_radec_roll
+from starcat.camera import Camera
+from starcat.evaluation.simulate import Noise, simulate_frames
+from starcat.matcher import hausdorff_angular, hausdorff_l1, hausdorff_l2, reference_sets
+from starcat.matcher.consensus import (
+    _all_agreeing,
+    consistent,
+    consistent_candidates,
+    neighbour_candidates,
+    support,
+)
+from starcat.matcher.database import Database, ProductArrays
+from starcat.matcher.matcher import Matcher
+from starcat.matcher.observation import Observation, observe
+from starcat.matcher.pairs import side_tolerance_rad
+from starcat.matcher.reference import references
+from starcat.matcher.reference_sets import (
+    lowest,
+    means_of_minima,
+    smallest_differences,
+    within_reach,
+)
+from starcat.matcher.selection import Selection
+from starcat.products.hausdorff_angular import angular_reference_sets
+from starcat.products.hausdorff_l2 import planar_reference_sets
+from starcat.sphere import radec_from_directions, separation
+
+CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
+FOCAL_PX = CAMERA.focal_length_px
+METHODS = ("hausdorff_angular", "hausdorff_l2", "hausdorff_l1")
+TURNING = ("hausdorff_angular", "hausdorff_l2")
+"""The methods that do not mind a roll."""
+
+
+def make_database(u: np.ndarray, radius_deg: tuple[float, float] = (13.3, 10.0)) -> Database:
+    """A database with both products, rows in 16 bits as in a file."""
+    products = {}
+    for name, make, values, radius in (
+        ("hausdorff_angular", angular_reference_sets, "separation_rad", radius_deg[0]),
+        ("hausdorff_l2", planar_reference_sets, "ratio", radius_deg[1]),
+    ):
+        sets = make(u, np.radians(radius))
+        columns = {
+            "star": sets.star.astype(np.uint16),
+            "neighbour": sets.neighbour.astype(np.uint16),
+            values: getattr(sets, values),
+        }
+        products[name] = ProductArrays({**columns, **sets.index.datasets}, sets.index.attributes)
+    count = len(u)
+    mag = np.random.default_rng(count).uniform(2.0, 6.0, count)
+    named = np.full(count, b"star")
+    return Database("sky", CAMERA, 2026.0, np.arange(count), u, mag, named, products)
+
+
+@pytest.fixture(scope="module")
+def sky(random_directions) -> Database:
+    return make_database(random_directions(1500, 1))
+
+
+@pytest.fixture(scope="module")
+def small_sky(random_directions) -> Database:
+    """Few enough stars for loops, three of them without any neighbour or with one only."""
+    u = random_directions(150, 2)
+    pole = np.array([0.0, 0.0, 1.0])
+    lonely = u[u @ pole < np.cos(np.radians(40.0))]
+    return make_database(np.concatenate([pole[None, :], lonely]), (30.0, 25.0))
+
+
+def frames(sky: Database, count: int, noise: Noise | None = None, seed: int = 3):
+    return list(simulate_frames(sky.directions, CAMERA, count, noise or Noise(), seed))
+
+
+def observed(centroids_px, magnitudes=None, tolerance_px: float = 2.0) -> Observation:
+    return observe(centroids_px, CAMERA, tolerance_px, magnitudes)
+
+
+def frame_of(
+    sky: Database, matrix: np.ndarray, scale: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Centroids and stars at an attitude, stretched about the middle of the frame."""
+    star = np.flatnonzero(sky.directions @ matrix[2] > 0.9)
+    px = 512.0 + scale * (CAMERA.pixels_from_directions(sky.directions[star] @ matrix.T) - 512.0)
+    inside = CAMERA.contains(px)
+    return px[inside], star[inside]
+
+
+def frame_centred_on(sky: Database, star: int, roll_deg: float, scale: float = 1.0):
+    ra, dec = radec_from_directions(sky.directions[star])
+    return frame_of(sky, matrix_from_radec_roll(float(ra), float(dec), roll_deg), scale)
+
+
+def members(sky: Database, product: str, values: str, star: int) -> list[float]:
+    arrays = sky.products[product].arrays
+    first, last = arrays["star_offsets"][star : star + 2]
+    return [float(value) for value in arrays[values][first:last]]
+
+
+# Sets of numbers
+
+
+SETS = [[], [1.0, 2.0, 2.0, 5.0], [], [3.0], [0.5, 2.5], []]
+ARRANGED = reference_sets.reference_sets(
+    np.array([value for members in SETS for value in members]),
+    np.cumsum([0] + [len(members) for members in SETS]),
+)
+NUMBERS = st.lists(st.floats(-1.0, 6.0) | st.sampled_from([1.0, 1.5, 2.0, 3.5]), max_size=8)
+
+
+@given(NUMBERS)
+def test_smallest_differences_are_those_of_loops(numbers):
+    found = smallest_differences(ARRANGED, np.array(numbers))
+    expected = [[min((abs(n - v) for v in s), default=inf) for s in SETS] for n in numbers]
+    assert found == pytest.approx(np.array(expected).reshape(-1, len(SETS)))
+
+
+@given(NUMBERS, st.floats(0.01, 3.0))
+def test_gains_within_reach_are_those_of_loops(numbers, step):
+    reach = step * (1.0 + np.arange(len(numbers)))
+    number, star, gain = within_reach(ARRANGED, np.array(numbers), reach)
+    found = np.zeros((len(numbers), len(SETS)))
+    np.add.at(found, (number, star), gain)
+    for row, wanted in enumerate(numbers):
+        for column, values in enumerate(SETS):
+            difference = min((abs(wanted - value) for value in values), default=inf)
+            assert found[row, column] == pytest.approx(max(0.0, reach[row] - difference), abs=1e-12)
+
+
+def test_means_of_minima_skip_stars_without_members():
+    values = np.array([value for members in SETS for value in members])
+    found = means_of_minima((np.abs(values - n) for n in (2.0, 4.0)), ARRANGED.offsets)
+    assert found.tolist() == [inf, 0.5, inf, 1.0, 1.0, inf]
+    assert means_of_minima([], ARRANGED.offsets).tolist() == [inf] * 6
+    assert means_of_minima([np.empty(0)], np.array([0, 0])).tolist() == [inf]
+
+
+def test_the_lowest_scores_come_first_and_equal_ones_by_row():
+    scores = np.array([[3.0, 1.0, 2.0, 1.0], [inf, np.nan, 5.0, inf]])
+    stars, best = lowest(scores, 3)
+    assert stars.tolist() == [[1, 3, 2], [2, -1, -1]]
+    assert best.tolist() == [[1.0, 1.0, 2.0], [5.0, inf, inf]]
+    stars, best = lowest(scores, 6)
+    assert stars[0].tolist() == [1, 3, 2, 0, -1, -1]
+    assert best[1].tolist() == [5.0, inf, inf, inf, inf, inf]
+    assert lowest(np.empty((2, 0)), 1)[0].tolist() == [[-1], [-1]]
+    many = np.random.default_rng(6).permutation(np.arange(400) // 4).astype(float)[None, :]
+    expected = sorted(range(400), key=lambda star: (many[0, star], star))
+    assert lowest(many, 200)[0][0].tolist() == expected[:200]
+
+
+def things_made(database: Database) -> list[str]:
+    return [database.name]
+
+
+def test_what_is_derived_is_made_once_and_let_go_with_its_database(random_directions):
+    database = make_database(random_directions(20, 5))
+    one = database.derived(things_made)
+    assert database.derived(things_made) is one
+    other = replace(database, name="other")
+    assert other.derived(things_made) == ["other"]
+    gone = weakref.ref(database)
+    del database
+    gc.collect()
+    assert gone() is None
+
+
+# Angular reference sets
+
+
+def angular_scores(sky: Database, seen: Observation, cap_rad: float | None) -> np.ndarray:
+    """The paper's score in plain loops, shape (N, S)."""
+    radius = sky.products["hausdorff_angular"].numbers["radius_rad"]
+    scores = np.full((len(seen), len(sky.directions)), inf)
+    for a in range(len(seen)):
+        apart = [float(separation(seen.body[a], seen.body[b])) for b in range(len(seen)) if b != a]
+        apart = [one for one in apart if one <= radius]
+        for star in range(len(sky.directions)):
+            values = members(sky, "hausdorff_angular", "separation_rad", star)
+            minima = [min((abs(one - v) for v in values), default=inf) for one in apart]
+            if cap_rad is not None:
+                minima = [min(one, cap_rad) for one in minima]
+            if minima:
+                scores[a, star] = sum(minima) / len(minima)
+    return scores
+
+
+@pytest.mark.parametrize("cap_px", [None, 3.0, 60.0])
+def test_angular_scores_are_those_of_loops(small_sky, cap_px):
+    generator = np.random.default_rng(7)
+    cap_rad = None if cap_px is None else cap_px / FOCAL_PX
+    for count in (2, 6, 9):
+        seen = observed(generator.uniform(0.0, 1024.0, (count, 2)))
+        every = len(small_sky.directions)
+        stars, scores = hausdorff_angular.rank_stars(seen, small_sky, cap_rad=cap_rad, count=every)
+        expected = angular_scores(small_sky, seen, cap_rad)
+        ordered = np.take_along_axis(expected, np.where(stars < 0, 0, stars), axis=1)
+        ordered[stars < 0] = inf
+        assert scores == pytest.approx(ordered, abs=1e-12)
+        assert scores == pytest.approx(np.sort(expected, axis=1), abs=1e-12)
+
+
+def test_many_pairs_are_scored_in_parts(small_sky, monkeypatch):
+    seen = observed(np.random.default_rng(8).uniform(0.0, 1024.0, (9, 2)))
+    for cap_rad in (None, 0.02):
+        whole = hausdorff_angular.rank_stars(seen, small_sky, cap_rad=cap_rad, count=5)
+        with monkeypatch.context() as patch:
+            patch.setattr(hausdorff_angular, "_AT_ONCE", 2 * len(small_sky.directions))
+            parts = hausdorff_angular.rank_stars(seen, small_sky, cap_rad=cap_rad, count=5)
+        assert parts[0].tolist() == whole[0].tolist()
+        assert parts[1] == pytest.approx(whole[1], abs=1e-15)
+
+
+def test_separations_beyond_the_radius_are_not_used(random_directions):
+    near = make_database(random_directions(300, 4), (5.0, 5.0))
+    seen = observed([[100.0, 100.0], [150.0, 100.0], [900.0, 900.0]])
+    stars, scores = hausdorff_angular.rank_stars(seen, near, cap_rad=0.01, count=2)
+    alone = int(np.argmax(seen.centroids_px[:, 0]))
+    assert stars[alone].tolist() == [-1, -1]
+    assert np.isinf(scores[alone]).all()
+    pair = observed([[100.0, 100.0], [150.0, 100.0]])
+    only = hausdorff_angular.rank_stars(pair, near, cap_rad=0.01, count=2)[1]
+    assert np.delete(scores, alone, axis=0).tolist() == only.tolist()
+
+
+def test_only_the_first_centroids_take_part_on_request(sky):
+    frame = frames(sky, 1)[0]
+    seen = observed(frame.centroids_px)
+    first = observed(seen.centroids_px[:6])
+    whole = hausdorff_angular.rank_stars(first, sky, cap_rad=0.001, count=4)
+    part = hausdorff_angular.rank_stars(seen, sky, cap_rad=0.001, count=4, first=6)
+    assert part[0].tolist() == whole[0].tolist()
+    assert part[1] == pytest.approx(whole[1], abs=1e-15)
+
+
+def test_the_bare_angular_method_names_the_stars_of_noiseless_frames(sky):
+    right = total = 0
+    for frame in frames(sky, 20):
+        seen = observed(frame.centroids_px)
+        named = hausdorff_angular.identify_bare(seen, sky)
+        true = frame.star_index[seen.rows]
+        right += int((named == true).sum())
+        total += len(true)
+    assert right >= 0.97 * total
+
+
+def test_names_outside_the_field_and_names_given_twice_are_outliers(sky, monkeypatch):
+    u = sky.directions
+    near = np.argsort(-(u @ u[0]))[:3]
+    far = np.argsort(u @ u[0])[:2]
+    names = np.array([near[0], far[0], near[1], far[1], near[2], near[2], -1])[:, None]
+    scores = np.where(names < 0, inf, 0.001)
+    monkeypatch.setattr(hausdorff_angular, "rank_stars", lambda *_, **__: (names, scores))
+    seen = observed(np.random.default_rng(1).uniform(0.0, 1024.0, (7, 2)))
+    named = hausdorff_angular.identify_bare(seen, sky)
+    assert named.tolist() == [near[0], -1, near[1], -1, -1, -1, -1]
+    # Two names on either side of the sky, the last star's among them, and one without: a tie.
+    here, there = np.argsort(u @ u[-1])[:2], np.argsort(-(u @ u[-1]))[1:3]
+    names = np.array([*here, *there, -1])[:, None]
+    scores = np.where(names < 0, inf, 0.001)
+    named = hausdorff_angular.identify_bare(observed(seen.centroids_px[:5]), sky)
+    assert named.tolist() == [*here, -1, -1, -1]
+
+
+def test_the_angular_method_begins_with_consensus_and_goes_on_without(sky, monkeypatch):
+    frame = frames(sky, 1)[0]
+    seen = observed(frame.centroids_px)
+    first = next(hausdorff_angular.candidates(seen, sky, Selection()))
+    assert first.stars.shape[1] > 6
+    monkeypatch.setattr(hausdorff_angular, "consistent_candidates", lambda *_: iter(()))
+    first = next(hausdorff_angular.candidates(seen, sky, Selection()))
+    assert first.stars.shape == (1, 3)
+    assert Matcher(sky, "hausdorff_angular").identify(frame.centroids_px).status == "identified"
+
+
+def test_crowded_frames_are_thinned_out(sky):
+    px = np.random.default_rng(17).uniform(0.0, 1024.0, (70, 2))
+    assert list(hausdorff_angular.candidates(observed(px), sky, Selection()))
+
+
+# Planar reference sets
+
+
+def l2_scores(sky: Database, seen: Observation, reference: int, w1=1.0, w2=0.0, m=2.0):
+    """Eqs. 13 to 15 in plain loops, for each star."""
+    product = sky.products["hausdorff_l2"]
+    radius = product.numbers["radius_rad"]
+    apart = {
+        k: float(separation(seen.body[reference], seen.body[k]))
+        for k in range(len(seen))
+        if k != reference
+    }
+    around = {k: tan(one) for k, one in apart.items() if one <= radius}
+    scores = []
+    for star in range(len(sky.directions)):
+        first, last = product["star_offsets"][star : star + 2]
+        total = 0.0
+        for k, distance in around.items():
+            ratio = distance / min(around.values())
+            best = inf
+            for row in range(first, last):
+                term = w1 * abs(product["ratio"][row] - ratio) ** m
+                if seen.mag is not None:
+                    fainter = seen.mag[k] - seen.mag[reference]
+                    expected = sky.mag[int(product["neighbour"][row])] - sky.mag[star]
+                    term += 0.0 if isnan(fainter) else w2 * abs(expected - fainter) ** m
+                best = min(best, term)
+            total += best
+        scores.append(total / len(around) if around else inf)
+    return np.array(scores)
+
+
+def same_ranking(found: tuple[np.ndarray, np.ndarray], expected: np.ndarray) -> bool:
+    """Whether a whole ranking has the expected scores, in order."""
+    stars, scores = found
+    there = stars >= 0
+    assert there.sum() == np.isfinite(expected).sum()
+    assert scores[there] == pytest.approx(expected[stars[there]], rel=1e-9, abs=1e-12)
+    return bool(np.all(np.diff(scores[there]) >= 0.0))
+
+
+@pytest.mark.parametrize("weights", [{}, {"m": 1.0}, {"w1": 2.0, "w2": 0.7}, {"w2": 0.3, "m": 1.0}])
+@pytest.mark.parametrize("known", [True, False])
+def test_l2_scores_are_those_of_loops(small_sky, weights, known):
+    generator = np.random.default_rng(9)
+    for count in (2, 5, 8):
+        mag = generator.uniform(1.0, 6.0, count)
+        mag[1:2] = np.nan
+        seen = observed(generator.uniform(0.0, 1024.0, (count, 2)), mag if known else None)
+        for reference in range(count):
+            found = hausdorff_l2.rank_stars(seen, small_sky, reference, count=200, **weights)
+            assert same_ranking(found, l2_scores(small_sky, seen, reference, **weights))
+
+
+def test_the_reference_star_is_the_nearest_to_the_centre(small_sky):
+    seen = observed([[100.0, 900.0], [700.0, 700.0], [530.0, 500.0]], [1.0, 2.0, 3.0])
+    central = int(np.flatnonzero(seen.centroids_px[:, 0] == 530.0)[0])
+    for rank_stars in (hausdorff_l2.rank_stars, hausdorff_l1.rank_stars):
+        default = rank_stars(seen, small_sky, count=9)
+        asked = rank_stars(seen, small_sky, central, count=9)
+        assert default[0].tolist() == asked[0].tolist()
+        assert default[1].tolist() == asked[1].tolist()
+
+
+def test_the_smallest_distance_is_one_that_is_not_zero(small_sky):
+    seen = observed(np.random.default_rng(18).uniform(200.0, 824.0, (6, 2)))
+    body = seen.body.copy()
+    body[5] = body[0]
+    twin = replace(seen, body=body)
+    alone = observed(seen.centroids_px[:5])
+    found = hausdorff_l2.rank_stars(twin, small_sky, 0, count=200)
+    expected = hausdorff_l2.rank_stars(alone, small_sky, 0, count=200)
+    assert found[0].tolist() == expected[0].tolist()
+    assert found[1].tolist() == expected[1].tolist()
+    same = (hausdorff_l2.likely_stars(one, small_sky, 0, 3, 9).tolist() for one in (twin, alone))
+    assert len({tuple(stars) for stars in same}) == 1
+
+
+@given(st.integers(0, 1499), st.floats(0.0, 360.0))
+def test_l2_does_not_mind_a_roll(sky, star, roll_deg):
+    upright, star_of = frame_centred_on(sky, star, 0.0)
+    # A turn takes no star in the inscribed circle off the frame.
+    kept = np.hypot(*(upright - 512.0).T) < 500.0
+    turn = np.radians(roll_deg)
+    matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    turned = 512.0 + (upright[kept] - 512.0) @ matrix.T
+    if kept.sum() < 3:
+        return
+    one = hausdorff_l2.rank_stars(observed(upright[kept]), sky, count=9)
+    other = hausdorff_l2.rank_stars(observed(turned), sky, count=9)
+    assert other[1] == pytest.approx(one[1], abs=1e-9)
+    assert one[1][0] < 1e-12
+    assert star in star_of[kept]
+
+
+@given(st.integers(0, 1499), st.floats(0.3, 1.0))
+def test_l2_does_not_mind_the_scale_of_a_centred_frame(sky, star, scale):
+    nominal, _ = frame_centred_on(sky, star, 0.0)
+    inside = np.hypot(*(nominal - 512.0).T) / FOCAL_PX < np.tan(np.radians(9.9))
+    if inside.sum() < 3:
+        return
+    shrunk = 512.0 + scale * (nominal[inside] - 512.0)
+    one = hausdorff_l2.rank_stars(observed(nominal[inside]), sky, count=9)
+    other = hausdorff_l2.rank_stars(observed(shrunk), sky, count=9)
+    assert other[1] == pytest.approx(one[1], abs=1e-8)
+
+
+def test_l2_names_the_star_at_the_centre_of_noiseless_frames(sky):
+    right = 0
+    for star in range(40):
+        for roll_deg, scale in ((0.0, 1.0), (77.0, 1.0), (180.0, 1.4)):
+            px, _ = frame_centred_on(sky, star, roll_deg, scale)
+            right += int(hausdorff_l2.rank_stars(observed(px), sky, count=1)[0][0]) == star
+    assert right >= 0.95 * 120
+
+
+def test_another_radius_serves_frames_of_another_scale(sky):
+    shrunk = float(np.arctan(0.7 * np.tan(sky.products["hausdorff_l2"].numbers["radius_rad"])))
+    right = {None: 0, shrunk: 0}
+    for star in range(40):
+        seen = observed(frame_centred_on(sky, star, 180.0, 0.7)[0])
+        for radius_rad in right:
+            found = hausdorff_l2.rank_stars(seen, sky, count=1, radius_rad=radius_rad)
+            right[radius_rad] += int(found[0][0]) == star
+    assert right[shrunk] >= 38
+    assert right[None] < 20
+
+
+@pytest.mark.parametrize("spoilt", ["missing", "false"])
+def test_another_divisor_finds_what_the_smallest_distance_misses(sky, spoilt):
+    bare = likely = first_round = tried = 0
+    for star in range(60):
+        px, _ = frame_centred_on(sky, star, 30.0)
+        away = np.hypot(*(px - 512.0).T)
+        nearest = np.argsort(away)[1]
+        if len(px) < 8 or away[nearest] > 300.0:
+            continue
+        if spoilt == "missing":
+            px = np.delete(px, nearest, axis=0)
+        else:
+            px = np.concatenate([px, [[512.0 + 0.7 * away[nearest], 512.0]]])
+        seen = observed(px)
+        centre = int(references(seen)[0])
+        bare += int(hausdorff_l2.rank_stars(seen, sky, centre, count=1)[0][0]) == star
+        first_round += star in hausdorff_l2.likely_stars(seen, sky, centre, 1, 10)
+        likely += star in hausdorff_l2.likely_stars(seen, sky, centre, 2, 10)
+        tried += 1
+    assert tried > 30
+    assert bare < 0.5 * tried
+    assert first_round < 0.7 * tried
+    assert likely > 0.9 * tried
+
+
+def test_a_difference_of_ratios_counts_in_units_of_its_error(small_sky):
+    """`likely_stars` in plain loops."""
+    generator = np.random.default_rng(10)
+    product = small_sky.products["hausdorff_l2"]
+    for count, tolerance_px in ((4, 20.0), (4, 20.0), (200, 20.0), (200, 2.0)):
+        seen = observed(generator.uniform(200.0, 824.0, (6, 2)), None, tolerance_px)
+        apart = np.sort(seen.separation_rad[0])[1:]
+        distance = np.tan(apart[apart <= product.numbers["radius_rad"]])
+        for divisors in (1, 2, 3):
+            expected = set()
+            for j in range(min(divisors, len(distance) - 1)):
+                for k in range(divisors):
+                    scores = [
+                        loop_agreement(members(small_sky, "hausdorff_l2", "ratio", star), k)(
+                            distance, j, side_tolerance_rad(seen)
+                        )
+                        for star in range(len(small_sky.directions))
+                    ]
+                    order = sorted(range(len(scores)), key=lambda s: (-round(scores[s], 12), s))
+                    expected |= {star for star in order[:count] if scores[star] > 0.0}
+            found = hausdorff_l2.likely_stars(seen, small_sky, 0, divisors, count)
+            assert set(found.tolist()) == expected
+
+
+def loop_agreement(values: list[float], k: int):
+    """Agreement of a star whose distances are divided by the k-th smallest."""
+
+    def agreement(distance: np.ndarray, j: int, error: float) -> float:
+        if len(values) <= k:
+            return 0.0
+        total = 0.0
+        for i, one in enumerate(distance):
+            if i == j:
+                continue
+            ratio = one / distance[j]
+            reach = error / distance[j] * np.sqrt(1.0 + ratio * ratio)
+            nearest = min(abs(ratio - value / values[k]) for value in values)
+            total += 1.0 - min(1.0, nearest / reach) ** 2
+        return total
+
+    return agreement
+
+
+# The baseline
+
+
+def test_l1_scores_are_those_of_loops(small_sky):
+    generator = np.random.default_rng(11)
+    product = small_sky.products["hausdorff_l2"]
+    u = small_sky.directions
+    for count in (2, 5, 8):
+        seen = observed(generator.uniform(0.0, 1024.0, (count, 2)))
+        # The camera looks along the x axis with north up, so its own sky is at hand.
+        upright = matrix_from_radec_roll(0.0, 0.0, 0.0)
+        for reference in range(count):
+            up = np.array([0.0, -1.0, 0.0])
+            points = [
+                tangent_point(seen.body[k], seen.body[reference], up)
+                for k in range(count)
+                if k != reference
+                and separation(seen.body[k], seen.body[reference]) <= product.numbers["radius_rad"]
+            ]
+            expected = []
+            for star in range(len(u)):
+                first, last = product["star_offsets"][star : star + 2]
+                stars = [
+                    tangent_point(upright @ u[int(n)], upright @ u[star], upright @ [0.0, 0.0, 1.0])
+                    for n in product["neighbour"][first:last]
+                ]
+                minima = [
+                    min((abs(x - p) + abs(y - q) for p, q in stars), default=inf) for x, y in points
+                ]
+                expected.append(sum(minima) / len(minima) if minima else inf)
+            # A star at the pole has its own north, which the loops do not know.
+            found = hausdorff_l1.rank_stars(seen, small_sky, reference, count=200)
+            kept = found[0] != 0
+            expected[0] = inf
+            assert same_ranking((found[0][kept], found[1][kept]), np.array(expected))
+
+
+def tangent_point(v: np.ndarray, u: np.ndarray, up: np.ndarray) -> tuple[float, float]:
+    north = up - (up @ u) * u
+    north = north / np.linalg.norm(north)
+    plane = v / (v @ u) - u
+    return float(plane @ np.cross(north, u)), float(plane @ north)
+
+
+def test_l1_needs_an_upright_camera_of_the_nominal_scale(sky):
+    def right(**how) -> float:
+        frames = (frame_centred_on(sky, star, **how)[0] for star in range(40))
+        seen = [observed(px) for px in frames]
+        return np.mean([hausdorff_l1.identify_bare(one, sky) == k for k, one in enumerate(seen)])
+
+    assert right(roll_deg=0.0) == 1.0
+    assert right(roll_deg=0.5) == 1.0
+    assert right(roll_deg=3.0) < 0.1
+    assert right(roll_deg=0.0, scale=1.05) < 0.1
+
+
+def test_l1_has_no_right_star_upside_down_where_l2_has(sky):
+    l1 = l2 = 0
+    for star in range(30):
+        seen = observed(frame_centred_on(sky, star, 180.0)[0])
+        l1 += int(hausdorff_l1.rank_stars(seen, sky, count=1)[0][0]) == star
+        l2 += int(hausdorff_l2.rank_stars(seen, sky, count=1)[0][0]) == star
+    assert l1 <= 2
+    assert l2 >= 28
+
+
+# Consensus
+
+
+def names_of(sky: Database, frame, generator, ranks: int = 4) -> tuple[Observation, np.ndarray]:
+    """A frame, and for each centroid some stars, the right one at a random rank."""
+    seen = observed(frame.centroids_px)
+    ranked = generator.integers(0, len(sky.directions), (len(seen), ranks))
+    place = generator.integers(0, ranks, len(seen))
+    ranked[np.arange(len(seen)), place] = frame.star_index[seen.rows]
+    return seen, ranked
+
+
+def loop_fits(sky: Database, seen: Observation, one, other) -> bool:
+    (a, s), (b, t) = one, other
+    if a == b or s == t:
+        return False
+    apart = separation(sky.directions[s], sky.directions[t])
+    wanted = separation(seen.body[a], seen.body[b])
+    return bool(abs(apart - wanted) <= side_tolerance_rad(seen))
+
+
+def test_names_agree_as_loops_say(sky):
+    generator = np.random.default_rng(12)
+    for frame in frames(sky, 5, Noise(0.5), seed=12):
+        seen, ranked = names_of(sky, frame, generator)
+        # Names that repeat, within a centroid and between two.
+        ranked[0, :2] = ranked[1, 0]
+        names = [(a, int(s)) for a in range(len(seen)) for s in ranked[a]]
+        centroid, star = np.array(names).T
+        fits = consistent(centroid, star, seen, sky)
+        expected = [[loop_fits(sky, seen, one, other) for other in names] for one in names]
+        assert fits.tolist() == expected
+        partners = [
+            len({b for (b, _), agree in zip(names, row, strict=True) if agree}) for row in expected
+        ]
+        assert support(fits, centroid, len(seen)).tolist() == partners
+
+
+def test_all_agreeing_pairs_are_proposed_once_the_best_supported_first(sky):
+    generator = np.random.default_rng(13)
+    for frame in frames(sky, 5, Noise(0.5), seed=13):
+        seen, ranked = names_of(sky, frame, generator)
+        ranked[generator.random(ranked.shape) < 0.2] = -1
+        names = [(a, int(s)) for a in range(len(seen)) for s in ranked[a] if s >= 0]
+        partners = {
+            one: {other for other in names if loop_fits(sky, seen, one, other)} for one in names
+        }
+        count = {one: len({a for a, _ in others}) for one, others in partners.items()}
+        first, *batches = consistent_candidates(ranked, seen, sky)
+        proposed = [
+            tuple(zip(centroids.tolist(), stars.tolist(), strict=True))
+            for batch in batches
+            for centroids, stars in zip(batch.centroids, batch.stars, strict=True)
+        ]
+        expected = {frozenset((one, other)) for one in names for other in partners[one]}
+        assert {frozenset(pair) for pair in proposed} == expected
+        assert len(proposed) == len(expected)
+        joint = [count[one] + count[other] for one, other in proposed]
+        assert joint == sorted(joint, reverse=True)
+        apart = [seen.separation_rad[one[0], other[0]] for one, other in proposed]
+        level = [row for row, value in enumerate(joint) if value == joint[0]]
+        assert [apart[row] for row in level] == sorted((apart[r] for r in level), reverse=True)
+        group = list(zip(first.centroids[0].tolist(), first.stars[0].tolist(), strict=True))
+        assert set(proposed[0]) == set(group[:2])
+        assert all(loop_fits(sky, seen, a, b) for a in group for b in group if a != b)
+
+
+def test_the_first_proposal_is_the_whole_frame_where_every_star_is_named(sky):
+    for frame in frames(sky, 10, Noise(0.3), seed=14):
+        seen, ranked = names_of(sky, frame, np.random.default_rng(14))
+        first = next(consistent_candidates(ranked, seen, sky))
+        true = frame.star_index[seen.rows]
+        assert (first.stars[0] == true[first.centroids[0]]).all()
+        assert len(np.unique(first.centroids[0])) >= len(seen) - 1
+
+
+def test_one_star_is_not_two_centroids(sky):
+    seen = observed([[500.0, 500.0], [501.0, 500.0], [100.0, 100.0]])
+    assert not consistent(np.array([0, 1]), np.array([7, 7]), seen, sky).any()
+
+
+def test_a_group_agrees_with_each_other_and_prefers_the_best_supported():
+    fits = ~np.eye(5, dtype=bool)
+    fits[2, 3] = fits[3, 2] = False
+    group = _all_agreeing(np.array([0, 1]), fits, np.array([4, 4, 3, 5, 4]))
+    assert group.tolist() == [0, 1, 3, 4]
+
+
+def test_of_too_many_names_the_lower_ranks_are_left_out(sky):
+    frame = max(frames(sky, 20), key=lambda frame: frame.n_stars)
+    seen, ranked = names_of(sky, frame, np.random.default_rng(19), ranks=1)
+    false = np.random.default_rng(19).integers(0, len(sky.directions), (len(seen), 150))
+    above = next(consistent_candidates(np.concatenate([ranked, false], axis=1), seen, sky))
+    below = next(consistent_candidates(np.concatenate([false, ranked], axis=1), seen, sky))
+    assert above.stars.shape[1] == len(seen)
+    assert below.stars.shape[1] < 6
+
+
+def test_there_may_be_nothing_to_agree_on(sky):
+    seen = observed([[100.0, 100.0], [500.0, 300.0], [900.0, 700.0]])
+    none = np.full((3, 4), -1)
+    assert not list(consistent_candidates(none, seen, sky))
+    one = none.copy()
+    one[1, 2] = 7
+    assert not list(consistent_candidates(one, seen, sky))
+    assert not list(consistent_candidates(np.full((3, 2), 7), seen, sky))
+    assert not list(consistent_candidates(np.empty((0, 4), dtype=int), seen, sky))
+    product = sky.products["hausdorff_l2"]
+    for stars in (np.empty(0, dtype=np.intp), np.array([3])):
+        assert len(neighbour_candidates(0, stars, product, seen, sky)) == 0
+
+
+def test_the_number_of_proposals_has_a_limit(sky):
+    frame = max(frames(sky, 20), key=lambda frame: frame.n_stars)
+    seen, ranked = names_of(sky, frame, np.random.default_rng(15))
+    batches = list(consistent_candidates(ranked, seen, sky, most=30))
+    assert [len(batch) for batch in batches] == [1, 4, 16, 10]
+    repeated = np.tile(ranked, (1, 100))
+    assert repeated.size > 2048
+    assert len(next(consistent_candidates(repeated, seen, sky)).stars[0]) >= len(seen) - 1
+
+
+@pytest.mark.parametrize(("double", "tolerance_px"), [(False, 2.0), (True, 2.0), (False, 12.0)])
+def test_neighbours_that_agree_are_those_of_loops(sky, double, tolerance_px):
+    if double:
+        # Companions 2 px away, nearer than the tolerance.
+        u = sky.directions[:400] + 2.0 / FOCAL_PX * np.roll(sky.directions[:400], 1, axis=0)
+        companions = u / np.linalg.norm(u, axis=1)[:, None]
+        sky = make_database(np.concatenate([sky.directions[:400], companions]))
+    product = sky.products["hausdorff_l2"]
+    generator = np.random.default_rng(16)
+    for frame in frames(sky, 4, Noise(0.5, 0.1, 2), seed=16):
+        seen = observed(frame.centroids_px, None, tolerance_px)
+        true = frame.star_index[seen.rows]
+        reference = next(int(row) for row in references(seen) if true[row] >= 0)
+        others = generator.choice(len(sky.directions), 30, replace=False)
+        stars = np.unique(np.append(others, true[reference]))
+        found = neighbour_candidates(reference, stars, product, seen, sky)
+        expected = {}
+        for star in stars:
+            first, last = product["star_offsets"][star : star + 2]
+            names = [
+                (k, int(n))
+                for n in product["neighbour"][first:last]
+                for k in range(len(seen))
+                if loop_fits(sky, seen, (reference, int(star)), (k, int(n)))
+            ]
+            count = {
+                one: len({other[0] for other in names if loop_fits(sky, seen, one, other)})
+                for one in names
+            }
+            joint = {
+                frozenset((one, other)): count[one] + count[other]
+                for one in names
+                for other in names
+                if loop_fits(sky, seen, one, other)
+            }
+            if joint:
+                expected[int(star)] = joint
+        assert sorted(found.stars[:, 0].tolist()) == sorted(expected)
+        chosen = []
+        for centroids, named in zip(found.centroids.tolist(), found.stars.tolist(), strict=True):
+            pair = frozenset(zip(centroids[1:], named[1:], strict=True))
+            chosen.append(expected[named[0]][pair])
+            assert chosen[-1] == max(expected[named[0]].values())
+        assert chosen == sorted(chosen, reverse=True)
+        if not double:
+            assert (found.stars[0] == true[found.centroids[0]]).all()
+        assert (found.centroids[:, 0] == reference).all()
+
+
+# The matcher
+
+
+@pytest.fixture(scope="module", params=METHODS)
+def matcher(request, sky) -> Matcher:
+    return Matcher(sky, request.param)
+
+
+def own_frames(matcher: Matcher, count: int, noise: Noise, seed: int = 20):
+    """Frames that the method is made for: for the baseline, upright ones."""
+    if matcher.method in TURNING:
+        return [
+            (frame.centroids_px, frame.star_index)
+            for frame in frames(matcher.database, count, noise, seed)
+        ]
+    generator = np.random.default_rng(seed)
+    found = []
+    for star in generator.choice(len(matcher.database.directions), count):
+        px, star_of = frame_centred_on(matcher.database, int(star), 0.0)
+        kept = generator.random(len(px)) >= noise.drop_probability
+        px = px[kept] + generator.normal(scale=noise.noise_px, size=(kept.sum(), 2))
+        false = generator.uniform(0.0, 1024.0, (noise.false_stars, 2))
+        inside = np.append(CAMERA.contains(px), np.full(noise.false_stars, True))
+        names = np.append(star_of[kept], np.full(noise.false_stars, -1))
+        found.append((np.concatenate([px, false])[inside], names[inside]))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("noise", "least"), [(Noise(), 1.0), (Noise(0.5), 0.98), (Noise(0.5, 0.1, 3), 0.93)]
+)
+@pytest.mark.parametrize("known", [True, False])
+def test_frames_of_the_own_sky_are_identified(matcher, noise, least, known):
+    done = 0
+    generator = np.random.default_rng(21)
+    trials = own_frames(matcher, 60, noise)
+    for px, star in trials:
+        mag = matcher.database.mag[star] + generator.normal(scale=0.3, size=len(star))
+        found = matcher.identify(px, magnitudes=mag if known else None)
+        if found.status == "identified":
+            named = found.star_index >= 0
+            # A false spot beside the place of a star may pass for it.
+            assert (found.star_index[named] == star[named]).mean() > 0.7
+            done += 1
+    assert done >= least * len(trials)
+
+
+def test_the_order_of_the_centroids_does_not_matter(matcher):
+    generator = np.random.default_rng(22)
+    for px, star in own_frames(matcher, 10, Noise(0.5, 0.1, 3)):
+        order = generator.permutation(len(px))
+        mag = matcher.database.mag[star].round()
+        for one_mag, other_mag in ((None, None), (mag, mag[order])):
+            one = matcher.identify(px, magnitudes=one_mag)
+            other = matcher.identify(px[order], magnitudes=other_mag)
+            assert other.star_index.tolist() == one.star_index[order].tolist()
+            assert np.array_equal(other.q_body_from_icrs, one.q_body_from_icrs, equal_nan=True)
+
+
+def test_without_magnitudes_nothing_depends_on_brightness(matcher):
+    fainter = replace(matcher.database, mag=matcher.database.mag[::-1].copy())
+    for px, _ in own_frames(matcher, 5, Noise(0.5, 0.1, 3)):
+        seen = observed(px)
+        proposed = []
+        for database in (matcher.database, fainter):
+            module = {"hausdorff_angular": hausdorff_angular, "hausdorff_l2": hausdorff_l2}
+            method = module.get(matcher.method, hausdorff_l1)
+            batches = list(method.candidates(seen, database, Selection()))[:20]
+            proposed.append([(b.centroids.tolist(), b.stars.tolist()) for b in batches])
+        assert proposed[0]
+        assert proposed[0] == proposed[1]
+
+
+def test_a_mirrored_frame_is_not_identified(matcher):
+    for px, _ in own_frames(matcher, 8, Noise(0.3)):
+        mirrored = np.stack([1023.99 - px[:, 0], px[:, 1]], axis=-1)
+        assert matcher.identify(mirrored).status == "no_match"
+
+
+def test_random_points_are_not_identified(matcher):
+    generator = np.random.default_rng(23)
+    for count in (4, 8, 15, 24, 30):
+        for _ in range(2):
+            px = generator.uniform(0.0, 1024.0, (count, 2))
+            assert matcher.identify(px).status == "no_match"
+
+
+def test_few_centroids_and_empty_sets_are_no_match(matcher, random_directions):
+    # Stars 60 deg apart have no neighbours, and two stars make sets of one.
+    octahedron = np.concatenate([np.eye(3), -np.eye(3)])
+    pair = np.array([[1.0, 0.0, 0.0], [np.cos(0.05), np.sin(0.05), 0.0]])
+    generator = np.random.default_rng(24)
+    for u in (octahedron, pair, random_directions(1, 1), np.empty((0, 3))):
+        lonely = Matcher(make_database(u), matcher.method)
+        for count in (0, 1, 2, 3, 4, 9):
+            found = lonely.identify(generator.uniform(0.0, 1024.0, (count, 2)))
+            assert found.status == ("too_few_stars" if count < 4 else "no_match")
+    for count in (0, 1, 2, 3):
+        px = generator.uniform(0.0, 1024.0, (count, 2))
+        module = {"hausdorff_angular": hausdorff_angular, "hausdorff_l2": hausdorff_l2}
+        method = module.get(matcher.method, hausdorff_l1)
+        for batch in method.candidates(observed(px), matcher.database, Selection()):
+            assert batch.stars.shape == batch.centroids.shape
+
+
+def test_centroids_at_nearly_the_same_place_do_no_harm(matcher):
+    px, star = max(own_frames(matcher, 10, Noise(0.3)), key=lambda frame: len(frame[0]))
+    twin = px + np.spacing(px)
+    found = matcher.identify(np.concatenate([px, twin[:3]]))
+    assert found.status == "identified"
+    assert (found.star_index[3 : len(px)] == star[3:]).mean() > 0.9
+    matrix = matrix_from_quaternion(found.q_body_from_icrs)
+    assert np.linalg.det(matrix) == pytest.approx(1.0)

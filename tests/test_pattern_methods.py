@@ -1,0 +1,606 @@
+"""Dynamic angles, grid and radial patterns: right stars first, whatever the roll and the order."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from importlib import import_module
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from starcat.attitude import matrix_from_quaternion, matrix_from_radec_roll
+from starcat.camera import Camera
+from starcat.evaluation.simulate import Frame, Noise, simulate_frames
+from starcat.matcher import dynamic_angle, grid, radial
+from starcat.matcher.database import Database, ProductArrays
+from starcat.matcher.dynamic_angle import Tolerance
+from starcat.matcher.matcher import Matcher
+from starcat.matcher.methods import METHODS
+from starcat.matcher.observation import Observation, observe
+from starcat.matcher.reference import RANKS, by_reference, references, rows_between, surroundings
+from starcat.matcher.selection import DEFAULT
+from starcat.products.grid import cell_of, grid_patterns
+from starcat.products.index import Index, Ragged
+from starcat.products.neighbours import bin_of, find_neighbours
+from starcat.products.radial import radial_patterns, ring_of, smallest_shift
+from starcat.sphere import radec_from_directions, separation
+
+NAMES = ["dynamic_angle", "grid", "radial"]
+
+CAMERA = Camera(1024, 1024, fov_x_deg=16.0)
+
+RADIUS_RAD = np.radians(7.9)
+"""A little less than half the field, so that a star in the middle has its neighbours in it."""
+
+SECTORS = 16
+
+GRID = {"buffer_rad": np.radians(0.3), "cells_per_side": 40}
+
+
+def product_arrays(product) -> ProductArrays:
+    """Return a product as the HDF5 file holds it, rows of stars in few bits."""
+    arrays = {}
+    for column in fields(product):
+        value = getattr(product, column.name)
+        if isinstance(value, Ragged):
+            arrays |= {
+                f"{column.name}_offsets": value.offsets,
+                f"{column.name}_values": value.values,
+            }
+        elif isinstance(value, Index):
+            numbers = {name: float(number) for name, number in value.attributes.items()}
+            arrays |= value.datasets
+        elif column.name in {"star", "neighbour", "alignment_star"}:
+            arrays[column.name] = value.astype(np.uint16)
+        else:
+            arrays[column.name] = value
+    return ProductArrays(arrays, numbers)
+
+
+def database(u: np.ndarray, radius_rad: float = RADIUS_RAD) -> Database:
+    bins = {"angle_bin_rad": np.radians(2.0), "separation_bin_rad": np.radians(0.1)}
+    products = {
+        "neighbours": find_neighbours(u, radius_rad, **bins),
+        "grid": grid_patterns(u, radius_rad, **GRID),
+        "radial": radial_patterns(u, radius_rad, rings=60, sectors=SECTORS),
+    }
+    return Database(
+        name="sky-1.0.0",
+        camera=CAMERA,
+        epoch_jyear=2026.0,
+        star_id=np.arange(len(u)) + 1000,
+        directions=u,
+        mag=np.zeros(len(u)),
+        designation=np.full(len(u), b"star"),
+        products={name: product_arrays(product) for name, product in products.items()},
+    )
+
+
+@pytest.fixture(scope="module")
+def sky(random_directions) -> Database:
+    return database(random_directions(2500, 1))
+
+
+def module(name: str):
+    return import_module(f"starcat.matcher.{name}")
+
+
+def frames(sky: Database, count: int, noise: Noise | None = None, seed: int = 3) -> list[Frame]:
+    return list(simulate_frames(sky.directions, CAMERA, count, noise or Noise(), seed))
+
+
+def is_right(found, frame: Frame) -> bool:
+    # 0.01 rad is far more than noise can do and far less than a wrong attitude.
+    return bool(np.abs(matrix_from_quaternion(found.q_body_from_icrs) - frame.matrix).max() < 0.01)
+
+
+def centred_on(
+    sky: Database, star: int, roll_deg: float, tolerance_px: float = 2.0
+) -> tuple[Observation, int, np.ndarray]:
+    """Return a noiseless frame around a star, the star's centroid and all centroids' stars."""
+    ra, dec = radec_from_directions(sky.directions[star])
+    matrix = matrix_from_radec_roll(float(ra), float(dec), roll_deg)
+    ahead = np.flatnonzero(sky.directions @ matrix[2] > np.cos(CAMERA.radius_rad))
+    centroids = CAMERA.pixels_from_directions(sky.directions[ahead] @ matrix.T)
+    ahead, centroids = ahead[CAMERA.contains(centroids)], centroids[CAMERA.contains(centroids)]
+    observation = observe(centroids, CAMERA, tolerance_px)
+    truth = ahead[observation.rows]
+    return observation, int(np.flatnonzero(truth == star)[0]), truth
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_they_are_methods_with_their_products(name):
+    assert METHODS[name].propose is module(name).candidates
+    assert METHODS[name].products == module(name).PRODUCTS
+    assert METHODS[name].description
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_clean_frame_is_identified_star_by_star(sky, name):
+    matcher = Matcher(sky, name)
+    for frame in frames(sky, 40):
+        found = matcher.identify(frame.centroids_px)
+        assert found.status == "identified"
+        assert found.star_index.tolist() == frame.star_index.tolist()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_noise_missing_and_false_stars_give_no_wrong_answer(sky, name):
+    matcher = Matcher(sky, name)
+    right = 0
+    for frame in frames(sky, 40, Noise(noise_px=0.5, drop_probability=0.1, false_stars=3)):
+        found = matcher.identify(frame.centroids_px)
+        if found.status == "identified":
+            assert is_right(found, frame)
+            right += 1
+    assert right >= 39
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_ranks_and_scores_do_not_change_as_the_camera_turns(sky, name):
+    for star in (5, 80, 1700):
+        upright, reference, _ = centred_on(sky, star, 0.0)
+        stars, scores = module(name).rank_stars(upright, sky, reference)
+        assert stars[0] == star
+        for roll_deg in (33.0, 90.0, 200.5):
+            turned, reference, _ = centred_on(sky, star, roll_deg)
+            other, same = module(name).rank_stars(turned, sky, reference)
+            assert other.tolist() == stars.tolist()
+            assert same.tolist() == pytest.approx(scores.tolist(), abs=1e-12)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_star_seen_whole_has_the_best_score_there_is(sky, name):
+    product = sky.products[module(name).PRODUCTS[0]]
+    for star in range(0, 2500, 125):
+        # Only what is there is touched: with any tolerance more cells and rings would be.
+        observation, reference, _ = centred_on(sky, star, 77.0, 1e-9 if name != NAMES[0] else 2.0)
+        stars, scores = module(name).rank_stars(observation, sky, reference)
+        cells = np.diff(product.arrays.get("cells_offsets", []))
+        # Not always alone: a close double's two stars have the same neighbours in the same cells.
+        assert scores[stars == star].tolist() == [scores[0]]
+        assert scores[0] == pytest.approx(cells[star] if name == "grid" else 1.0, abs=1e-12)
+        assert (np.diff(scores) <= 0.0).all()
+        assert len(set(stars.tolist())) == len(stars)
+
+
+@pytest.mark.parametrize(
+    ("name", "offsets"), [("dynamic_angle", "star_offsets"), ("grid", "cells_offsets")]
+)
+def test_of_equal_stars_those_with_less_around_come_first(sky, name, offsets):
+    size = np.diff(sky.products[module(name).PRODUCTS[0]][offsets])
+    observation, reference, _ = centred_on(sky, 80, 0.0)
+    stars, scores = module(name).rank_stars(observation, sky, reference)
+    equal = np.diff(scores) == 0.0
+    assert equal.sum() > 10
+    assert (np.diff(size[stars])[equal] >= 0).all()
+    assert (np.diff(size[stars])[equal] > 0).any()
+
+
+def test_of_equal_rings_the_sectors_decide():
+    # Two stars with neighbours at the same separations, in other position angles.
+    apart = np.radians([2.0, 4.0, 6.0])
+    stars = []
+    for middle, angles_deg in ((0.0, [0.0, 90.0, 200.0]), (1.5, [0.0, 150.0, 160.0])):
+        angle = np.radians(angles_deg)
+        x, y = np.sin(apart) * np.cos(angle), np.sin(apart) * np.sin(angle)
+        around = np.stack([np.cos(apart), x, y], axis=-1)
+        turn = np.array([[np.cos(middle), -np.sin(middle)], [np.sin(middle), np.cos(middle)]])
+        group = np.concatenate([[[1.0, 0.0, 0.0]], around])
+        group[:, :2] = group[:, :2] @ turn.T
+        stars.append(group)
+    both = database(np.concatenate(stars))
+    for star, other in ((0, 4), (4, 0)):
+        observation, reference, _ = centred_on(both, star, 40.0)
+        ranked, scores = radial.rank_stars(observation, both, reference)
+        assert ranked[:2].tolist() == [star, other]
+        assert scores[0] - scores[1] > 0.25 * radial.SECTORS
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_neither_the_order_nor_magnitudes_change_the_answer(sky, name):
+    generator = np.random.default_rng(4)
+    matcher = Matcher(sky, name)
+    for frame in frames(sky, 15, Noise(0.5, 0.1, 3)):
+        order = generator.permutation(len(frame.centroids_px))
+        one = matcher.identify(frame.centroids_px)
+        other = matcher.identify(frame.centroids_px[order])
+        assert other.star_ids.tolist() == one.star_ids[order].tolist()
+        assert np.array_equal(other.q_body_from_icrs, one.q_body_from_icrs, equal_nan=True)
+        magnitudes = generator.random(len(order))
+        found = matcher.identify(frame.centroids_px, magnitudes=magnitudes)
+        assert found.star_ids.tolist() == one.star_ids.tolist()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_mirrored_frames_are_never_identified(sky, name):
+    matcher = Matcher(sky, name)
+    for frame in frames(sky, 8):
+        mirrored_px = frame.centroids_px * [-1, 1] + [1024, 0]
+        assert matcher.identify(mirrored_px).status == "no_match"
+
+
+@pytest.mark.parametrize("name", ["dynamic_angle", "grid"])
+def test_a_mirrored_star_agrees_in_less(sky, name):
+    for star in (5, 80, 1700):
+        observation, reference, _ = centred_on(sky, star, 20.0)
+        _, scores = module(name).rank_stars(observation, sky, reference)
+        mirrored = observe(observation.centroids_px * [-1, 1] + [1024, 0], CAMERA, 2.0)
+        stars, others = module(name).rank_stars(mirrored, sky, int(references(mirrored)[0]))
+        seen = others[stars == star]
+        assert seen.max(initial=0) < 0.7 * scores[0]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_random_points_are_never_identified(sky, name):
+    generator = np.random.default_rng(5)
+    matcher = Matcher(sky, name)
+    for _ in range(15):
+        points = generator.random((generator.integers(8, 31), 2)) * 1024.0
+        assert matcher.identify(points).status == "no_match"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_false_star_in_the_middle_does_not_matter(sky, name):
+    matcher = Matcher(sky, name)
+    for frame in frames(sky, 15, Noise(0.3)):
+        found = matcher.identify(np.concatenate([[[512.2, 511.9]], frame.centroids_px]))
+        assert found.status == "identified"
+        assert found.star_index[1:].tolist() == frame.star_index.tolist()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_star_in_the_middle_may_be_missing(sky, name):
+    matcher = Matcher(sky, name)
+    for star in range(0, 150, 10):
+        observation, reference, truth = centred_on(sky, star, 10.0)
+        found = matcher.identify(np.delete(observation.centroids_px, reference, axis=0))
+        assert found.star_index.tolist() == np.delete(truth, reference).tolist()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_rank_bears_a_false_and_a_missing_star(sky, name):
+    generator = np.random.default_rng(6)
+    right = 0
+    for star in range(0, 2500, 100):
+        observation, reference, _ = centred_on(sky, star, 10.0)
+        apart = observation.separation_rad[reference]
+        gone = generator.choice(np.flatnonzero(apart > np.radians(4.0)))
+        kept_px = np.delete(observation.centroids_px, gone, axis=0)
+        seen = observe(np.concatenate([kept_px, [[812.0, 700.0]]]), CAMERA, 2.0)
+        stars, _ = module(name).rank_stars(seen, sky, int(references(seen)[0]))
+        right += stars[0] == star
+    assert right >= 23
+
+
+def proposed(name: str, observation: Observation, sky: Database) -> set[tuple[int, int]]:
+    """Return centroid and star of all that is proposed for reference stars."""
+    batches = module(name).candidates(observation, sky, DEFAULT)
+    pairs = [(b.centroids[:, 0].tolist(), b.stars[:, 0].tolist()) for b in batches]
+    return {pair for c, s in pairs for pair in zip(c, s, strict=True)}
+
+
+def test_a_false_alignment_star_is_passed_over(sky, monkeypatch):
+    star = 80
+    observation, reference, _ = centred_on(sky, star, 10.0)
+    nearest = np.sort(observation.separation_rad[reference])[1]
+    false_px = [512.0 + 0.6 * nearest * CAMERA.focal_length_px, 512.0]
+    seen = observe(np.concatenate([observation.centroids_px, [false_px]]), CAMERA, 2.0)
+    middle = int(references(seen)[0])
+    assert 0.6 * nearest > GRID["buffer_rad"]
+    assert (middle, star) in proposed("grid", seen, sky)
+    monkeypatch.setattr(grid, "ALIGNMENTS", 1)
+    assert (middle, star) not in proposed("grid", seen, sky)
+
+
+def test_the_alignment_star_is_on_the_axis_and_not_near_it(sky):
+    cell_px = 2.0 * np.tan(RADIUS_RAD) / GRID["cells_per_side"] * CAMERA.focal_length_px
+    two = observe([[512.0, 512.0], [512.0 + 4.5 * cell_px, 512.0]], CAMERA, 2.0)
+    product = sky.products["grid"]
+    cell = int(cell_of(4.5 * cell_px / CAMERA.focal_length_px, 0.0, RADIUS_RAD, 40))
+    expected = product["cell_rows"][slice(*product["cell_offsets"][cell : cell + 2])]
+    _, scores = grid.rank_stars(two, sky, int(references(two)[0]), most=2500)
+    assert scores.sum() == len(expected) > 10
+
+
+@pytest.mark.parametrize("corner", [(-1, -1), (-1, 1), (1, -1), (1, 1)])
+def test_no_cell_is_missed_within_the_tolerance(sky, corner):
+    product, tested = sky.products["grid"], 0
+    for star in range(0, 2500, 25):
+        observation, reference, _ = centred_on(sky, star, 1.7 * star)
+        apart = observation.separation_rad[reference]
+        near = np.sort(apart[apart > GRID["buffer_rad"]])
+        edge = np.abs(apart - RADIUS_RAD).min() * CAMERA.focal_length_px < 4.0
+        if edge or (near[1] - near[0]) * CAMERA.focal_length_px < 4.0:
+            continue
+        # The star is in the middle: the image is the plane that touches the sphere at it.
+        offset = observation.centroids_px - 512.0
+        along = offset / np.maximum(np.hypot(*offset.T), 1e-9)[:, None]
+        across = along[:, ::-1] * [-1, 1]
+        shift = 1.9 * (corner[0] * along + corner[1] * across)
+        shift[apart <= near[0]] = 0.0
+        moved = observe(observation.centroids_px + shift, CAMERA, 2.0)
+        stars, scores = grid.rank_stars(moved, sky, int(references(moved)[0]))
+        assert scores[stars == star] == np.diff(product["cells_offsets"])[star]
+        tested += 1
+    assert tested > 50
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_is_proposed_is_as_far_apart_as_the_centroids(sky, name):
+    frame = frames(sky, 1, Noise(0.5, 0.1, 3))[0]
+    observation = observe(frame.centroids_px, CAMERA, 2.0)
+    for batch in module(name).candidates(observation, sky, DEFAULT):
+        u, v = (sky.directions[batch.stars[:, k]] for k in (0, -1))
+        seen = observation.separation_rad[batch.centroids[:, 0], batch.centroids[:, -1]]
+        assert np.abs(separation(u, v) - seen).max() <= 1.5 * observation.tolerance_rad
+
+
+def test_the_second_star_of_a_dynamic_angle_is_the_farthest_that_agrees(sky):
+    observation, reference, truth = centred_on(sky, 80, 0.0)
+    first = next(dynamic_angle.candidates(observation, sky, DEFAULT))
+    around = surroundings(observation, reference, RADIUS_RAD)
+    assert first.centroids.tolist() == [[reference, around.centroids[-1]]]
+    assert first.stars.tolist() == [[80, truth[around.centroids[-1]]]]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 4, 5])
+def test_few_stars_are_no_match_and_no_crash(random_directions, name, count):
+    generator = np.random.default_rng(7)
+    # Near the axis, where they are each other's neighbours.
+    u = random_directions(5, 8)[:count] * 0.05 + [0.0, 0.0, 1.0]
+    few = database(u / np.linalg.norm(u, axis=1)[:, None])
+    matcher = Matcher(few, name)
+    for centroids in (0, 1, 4, 9):
+        found = matcher.identify(generator.random((centroids, 2)) * 1024.0)
+        assert found.status in ("no_match", "too_few_stars")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_centroids_too_far_apart_for_a_pattern_are_no_match(sky, name):
+    corners = np.array([[3.0, 3.0], [1020.0, 4.0], [5.0, 1021.0], [1019.0, 1018.0]])
+    assert Matcher(sky, name).identify(corners).status == "no_match"
+    alone = observe(corners, CAMERA, 2.0)
+    stars, scores = module(name).rank_stars(alone, sky, 0)
+    assert (len(stars), len(scores)) == (0, 0)
+
+
+@pytest.fixture(scope="module")
+def crowded_sky(random_directions) -> Database:
+    return database(random_directions(65_536, 9), np.radians(1.5))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_last_star_of_a_full_16_bit_column_is_found(crowded_sky, name):
+    observation, reference, truth = centred_on(crowded_sky, 65_535, 0.0, 0.2)
+    stars, _ = module(name).rank_stars(observation, crowded_sky, reference)
+    assert stars[0] == 65_535
+    first = next(module(name).candidates(observation, crowded_sky, DEFAULT))
+    assert first.stars[0].tolist() == truth[first.centroids[0]].tolist()
+
+
+def merge_walk(observed, star, eps_angle_rad: float, eps_distance_rad: float) -> int:
+    """Return N_match of S2 as the paper has it, both lists starting with the matched pair."""
+    i = j = matches = 0
+    while i < len(observed) and j < len(star):
+        angle = observed[i][0] - star[j][0]
+        if abs(angle) <= eps_angle_rad and abs(observed[i][1] - star[j][1]) <= eps_distance_rad:
+            matches, i, j = matches + 1, i + 1, j + 1
+        elif angle < 0.0:
+            i += 1
+        else:
+            j += 1
+    return matches
+
+
+def rolled(angles: np.ndarray, separations: np.ndarray) -> list[list[tuple[float, float]]]:
+    """Return cumulative angles and separations, begun with each neighbour in turn."""
+    every = []
+    for first in range(len(angles)):
+        turn = np.mod(np.roll(angles, -first) - angles[first], 2.0 * np.pi)
+        every.append(list(zip(turn.tolist(), np.roll(separations, -first).tolist(), strict=True)))
+    return every
+
+
+def test_the_score_is_that_of_the_merge_walk(random_directions):
+    few = database(random_directions(1500, 10))
+    tolerance = Tolerance(np.radians(0.3), np.radians(2.5))
+    eps_angle_rad, eps_distance_rad = tolerance.angle_rad, tolerance.separation_rad
+    product = few.products["neighbours"]
+    observation, reference, _ = centred_on(few, 17, 50.0)
+    around = surroundings(observation, reference, RADIUS_RAD)
+    order = np.argsort(around.position_angle_rad)
+    seen = rolled(around.position_angle_rad[order], around.separation_rad[order])
+
+    def starts(one, other) -> bool:
+        step = one[1][0] - (other[1][0] if len(other) > 1 else 2.0 * np.pi)
+        return abs(step) <= eps_angle_rad and abs(one[0][1] - other[0][1]) <= eps_distance_rad
+
+    expected: dict[int, float] = {}
+    for star in range(1500):
+        rows = slice(*product["star_offsets"][star : star + 2])
+        own = rolled(product["position_angle_rad"][rows], product["separation_rad"][rows])
+        for one in seen:
+            for other in own:
+                if starts(one, other):
+                    n = merge_walk(one, other, eps_angle_rad, eps_distance_rad)
+                    expected[star] = max(expected.get(star, 0.0), n / len(around))
+    stars, scores = dynamic_angle.rank_stars(observation, few, reference, tolerance=tolerance)
+    assert len(expected) > 100
+    assert len(set(expected.values())) > 2
+    assert sorted(stars.tolist()) == sorted(expected)
+    more = scores - [expected[star] for star in stars.tolist()]
+    # A walk passes what lies a little before the start, a whole turn on, and what agrees
+    # crosswise, so it may count fewer.
+    assert more.min() > -1e-12
+    assert (more > 1e-12).mean() < 0.01
+
+
+def polar(apart_deg: float, angle_deg: float) -> list[float]:
+    """Return a direction from a star on the x axis, by separation and position angle."""
+    apart, angle = np.radians([apart_deg, angle_deg])
+    return [np.cos(apart), np.sin(apart) * np.sin(angle), np.sin(apart) * np.cos(angle)]
+
+
+def test_the_angle_to_a_near_neighbour_may_be_off_by_more():
+    star, last, near, missing = (polar(*at) for at in ((0, 0), (7, 240), (0.5, 0), (7, 120)))
+    few = database(np.array([star, last, near, missing]))
+    matrix = matrix_from_radec_roll(0.0, 0.0, 15.0)
+    # The near one is 1.9 px off across, 3.4 deg as seen from the star; then comes a false one.
+    turned = polar(0.5, np.degrees(1.9 / (np.radians(0.5) * CAMERA.focal_length_px)))
+    body = np.array([star, last, turned, polar(7, 60)]) @ matrix.T
+    observation = observe(CAMERA.pixels_from_directions(body), CAMERA, 2.0)
+    stars, scores = dynamic_angle.rank_stars(observation, few, int(references(observation)[0]))
+    assert stars[0] == 0
+    assert scores[0] == pytest.approx(2.0 / 3.0)
+
+
+def test_false_stars_between_all_neighbours_are_passed_over(monkeypatch):
+    star = polar(0, 0)
+    around = [polar(3.0 + k, 72.0 * k) for k in range(5)]
+    false = [polar(2.0 + k, 72.0 * k + 30.0) for k in range(5)]
+    few = database(np.array([star, *around]))
+    matrix = matrix_from_radec_roll(0.0, 0.0, 15.0)
+    body = np.array([star, *around, *false]) @ matrix.T
+    observation = observe(CAMERA.pixels_from_directions(body), CAMERA, 2.0)
+    middle = int(references(observation)[0])
+    stars, _ = dynamic_angle.rank_stars(observation, few, middle)
+    assert 0 not in stars
+    assert (middle, 0) in proposed("dynamic_angle", observation, few)
+    monkeypatch.setattr(dynamic_angle, "PASSED_OVER", (3,))
+    assert (middle, 0) not in proposed("dynamic_angle", observation, few)
+
+
+def test_the_angle_between_neighbours_is_as_uncertain_as_they_are_near():
+    tolerance = Tolerance(0.001)
+    both = tolerance.between(np.array([0.1, 0.03, 0.0]), np.array([0.1, 0.04, 0.1]))
+    assert both[0] == pytest.approx(0.01 * np.sqrt(2.0))
+    assert both[1] == pytest.approx(0.001 * np.hypot(1.0 / 0.03, 1.0 / 0.04))
+    assert np.pi <= both[2] < 3.2
+    assert Tolerance(0.001, 0.5).between(both, both).tolist() == [0.5] * 3
+
+
+def test_a_ring_that_is_only_touched_counts_half(sky, monkeypatch):
+    monkeypatch.setattr(radial, "SECTORS", 0.0)
+    product = sky.products["radial"]
+    # One centroid 1 px inside the end of ring 20.
+    away_px = np.tan(RADIUS_RAD * 21 / 60) * CAMERA.focal_length_px - 1.0
+    two = observe([[512.0, 512.0], [512.0, 512.0 + away_px]], CAMERA, 2.0)
+    stars, scores = radial.rank_stars(two, sky, int(references(two)[0]), most=2500)
+    has = np.zeros((60, 2500))
+    for ring in range(60):
+        has[ring, product["ring_rows"][slice(*product["ring_offsets"][ring : ring + 2])]] = 1.0
+    expected = 2.0 * (has[20] + 0.5 * has[21]) / (1.5 + has.sum(axis=0))
+    assert sorted(stars.tolist()) == list(range(2500))
+    assert scores.tolist() == pytest.approx(expected[stars].tolist())
+    assert (np.diff(scores) <= 0.0).all()
+
+
+@given(
+    st.lists(st.tuples(st.floats(0.0, 7.0), st.floats(0.0, 0.3)), max_size=20),
+    st.floats(1e-3, 8.0),
+    st.floats(1e-4, 0.3),
+    st.integers(1, 400),
+    st.integers(1, 400),
+)
+def test_bins_are_those_of_the_product(pairs, angle_bin, separation_bin, angles, separations):
+    angle_rad, separation_rad = np.array(pairs).reshape(-1, 2).T
+    arguments = angle_rad, separation_rad, angle_bin, separation_bin, angles, separations
+    assert dynamic_angle.bin_of(*arguments).tolist() == bin_of(*arguments).tolist()
+
+
+@given(
+    st.lists(st.tuples(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0)), max_size=20),
+    st.floats(0.01, 1.2),
+    st.integers(1, 200),
+)
+def test_cells_are_those_of_the_product(points, radius_rad, side):
+    edges = np.tan(radius_rad) * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
+    x, y = np.concatenate([np.array(points).reshape(-1, 2), np.stack([edges, edges[::-1]], -1)]).T
+    expected = cell_of(x, y, radius_rad, side).tolist()
+    assert grid.cell_of(x, y, radius_rad, side).tolist() == expected
+
+
+@given(st.lists(st.floats(0.0, 1.0), max_size=20), st.floats(0.01, 1.2), st.integers(1, 200))
+def test_rings_are_those_of_the_product(parts, radius_rad, rings):
+    separation_rad = radius_rad * np.array([*parts, 0.0, 0.5, 1.0])
+    expected = ring_of(separation_rad, radius_rad, rings).tolist()
+    assert radial.ring_of(separation_rad, radius_rad, rings).tolist() == expected
+
+
+@given(st.integers(1, 31), st.data())
+def test_the_smallest_shift_is_that_of_the_product(sectors, data):
+    pattern = data.draw(st.integers(0, 2**sectors - 1))
+    shifts = radial.shifts(pattern, sectors)
+    assert shifts.min() == smallest_shift(np.array([pattern]), sectors)[0]
+    assert {bin(shift).count("1") for shift in shifts.tolist()} == {pattern.bit_count()}
+
+
+def test_sectors_are_those_of_the_product(sky):
+    for star in range(0, 2500, 50):
+        observation, reference, _ = centred_on(sky, star, 3.0 * star)
+        around = surroundings(observation, reference, RADIUS_RAD)
+        pattern = radial.sector_pattern(around.position_angle_rad, SECTORS)
+        seen = radial.shifts(pattern, SECTORS).min()
+        assert seen == sky.products["radial"]["sector_pattern"][star]
+
+
+def test_surroundings_are_the_neighbours_counter_clockwise(sky):
+    product = sky.products["neighbours"]
+    for star in (0, 700, 2499):
+        observation, reference, truth = centred_on(sky, star, 123.0)
+        around = surroundings(observation, reference, RADIUS_RAD)
+        rows = slice(product["star_offsets"][star], product["star_offsets"][star + 1])
+        by_angle = np.argsort(np.mod(around.position_angle_rad, 2.0 * np.pi))
+        seen = truth[around.centroids][by_angle].tolist()
+        first = seen.index(product["neighbour"][rows][0])
+        assert seen[first:] + seen[:first] == product["neighbour"][rows].tolist()
+        step = np.diff(np.mod(around.position_angle_rad, 2.0 * np.pi)[by_angle])
+        expected = np.roll(product["successive_angle_rad"][rows], first)[: len(step)]
+        assert step == pytest.approx(expected, abs=1e-9)
+        u, v = sky.directions[star], sky.directions[truth[around.centroids]]
+        assert around.separation_rad == pytest.approx(separation(u, v), abs=1e-12)
+        assert (np.diff(around.separation_rad) >= 0.0).all()
+
+
+def test_reference_stars_come_from_the_centre_outwards_also_with_magnitudes(sky):
+    points = np.random.default_rng(11).random((30, 2)) * 1024.0
+    for magnitudes in (None, np.arange(30.0)):
+        observation = observe(points, CAMERA, 2.0, magnitudes)
+        order = references(observation)
+        away = np.hypot(*(observation.centroids_px[order] - 512.0).T)
+        assert sorted(order.tolist()) == list(range(30))
+        assert (np.diff(away) >= 0.0).all()
+
+
+def test_all_reference_stars_are_asked_for_their_best_before_any_for_more(sky):
+    frame = frames(sky, 1)[0]
+    observation = observe(frame.centroids_px, CAMERA, 2.0)
+    order = references(observation).tolist()
+
+    def of(first):
+        def propose(reference):
+            stars = first + np.arange(30)
+            return radial.Candidates(
+                np.full((30, 2), reference), np.stack([stars, stars + 1], axis=-1)
+            )
+
+        return propose
+
+    batches = list(by_reference(observation, of(0), of(100)))
+    singles, more = batches[: 2 * len(order)], batches[2 * len(order) :]
+    assert [b.centroids[0, 0] for b in singles] == order + order
+    assert [b.stars[:, 0].tolist() for b in singles] == [[0]] * len(order) + [[100]] * len(order)
+    assert [len(b) for b in more] == [2 * len(order) * n for n in np.diff(RANKS)]
+    assert more[0].stars[: RANKS[1] - 1, 0].tolist() == list(range(1, RANKS[1]))
+
+
+@given(st.lists(st.tuples(st.integers(0, 50), st.integers(0, 5)), max_size=12))
+def test_rows_between_are_all_rows_of_all_runs(runs):
+    start, count = np.array(runs, dtype=np.int64).reshape(-1, 2).T
+    run, row = rows_between(start, start + count)
+    expected = [(k, s + n) for k, (s, c) in enumerate(runs) for n in range(c)]
+    assert list(zip(run.tolist(), row.tolist(), strict=True)) == expected
