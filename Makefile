@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help install check format test test-all demo bench docs golden release clean
+.PHONY: help install check format test test-all demo bench reproduction docs golden release clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -44,6 +44,10 @@ bench: $(READY) ## time and memory beside bare parsers and other star trackers, 
 	$(BIN)/python tests/benchmarks/ingest.py
 	$(BIN)/python tests/benchmarks/products.py
 	$(BIN)/python tests/benchmarks/matcher.py
+
+reproduction: $(READY) ## measure what the papers print (half an hour), rewrite docs/reproduction.md
+	$(BIN)/starcat evaluate --paper all --output dist/evaluation $(INPUTS)
+	$(BIN)/python tests/builders/reproduction.py
 
 docs: $(READY) ## rewrite the generated pages of docs/
 	$(BIN)/python tests/builders/docs.py

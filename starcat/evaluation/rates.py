@@ -41,7 +41,7 @@ CAUSES = {
 _RATES = """
 WITH record AS (
     SELECT *, n_guide_stars >= 4 AS enough, ({rule}) AS success, ({own}) AS success_own,
-           ({accepted}) AND NOT ({holds} AND n_wrong = 0) AS wrong
+           ({accepted}) AND NOT ({holds}) AS wrong
     FROM read_parquet($records)
 )
 SELECT count(*), count(*) FILTER (enough),
@@ -126,7 +126,7 @@ class TrialRates:
     starcat, starcat_enough : Share
         The same by starcat's own rule: accepted at 1e-9, attitude right, no star wrong.
     wrong : int
-        Frames that starcat itself would have accepted, wrongly.
+        Frames that starcat itself would have accepted with a wrong attitude.
     mean_ms, median_ms, p95_ms : float
         Time of an identification.
     """

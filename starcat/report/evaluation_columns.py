@@ -231,7 +231,7 @@ LEGEND = (
      "four can reach"),
     ("4+", "successes by the paper's rule over the frames with at least four guide stars"),
     ("own rule, own 4+", "the same two by starcat's own rule: {starcat}"),
-    ("wrong", "frames that starcat would have accepted with a wrong attitude or a wrong star"),
+    ("wrong", "frames that starcat would have accepted with a wrong attitude"),
     ("ms", "mean time of an identification"),
     ("goal, reached", "what starcat wants to reach, of all frames or of those with four guide "
      "stars"),

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from starcat.catalog.source import data_source, source_names
 from starcat.catalog.verdict import Reason
 from starcat.cli import app
+from starcat.report.evaluation import write_reproduction
 from starcat.resources import resource_folder
 from starcat.schema import read_schema
 
@@ -86,7 +87,8 @@ def main() -> None:
     DOCS.mkdir(exist_ok=True)
     for name, text in pages().items():
         (DOCS / name).write_text(text.rstrip() + "\n", encoding="utf-8")
-    sys.stderr.write(f"wrote {', '.join(pages())} in docs/\n")
+    write_reproduction(DOCS / "reproduction.json", DOCS)
+    sys.stderr.write(f"wrote {', '.join(pages())}, reproduction.md in docs/\n")
 
 
 if __name__ == "__main__":

@@ -74,7 +74,8 @@ def _point(
             seed=2005,
         )
         here = published is not None and value == published[0]
-        percent = published[1] if published and here and label == "mean of minima" else None
+        is_method = label in ("starcat", "mean of minima")
+        percent = published[1] if published and here and is_method else None
         goal = published[2] if published and here and label == "starcat" else None
         made.append(
             Row(group, f"{label}, {value:g} {unit}".rstrip(), PRESET, trial, "two_stars",

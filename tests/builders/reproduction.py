@@ -1,0 +1,13 @@
+"""Write docs/reproduction.md from a full evaluation of the papers (`make reproduction`)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from starcat.evaluate import write_reproduction
+
+ROOT = Path(__file__).resolve().parents[2]
+
+if __name__ == "__main__":
+    page = write_reproduction(ROOT / "dist" / "evaluation", ROOT / "docs")
+    print(f"wrote {page.relative_to(ROOT)}")
