@@ -14,7 +14,7 @@ from docs import pages
 from starcat import cli
 
 
-@pytest.mark.parametrize("name", ["cli.md", "products.md", "sources.md"])
+@pytest.mark.parametrize("name", ["cli.md", "products.md", "sources.md", "reproduction.md"])
 def test_generated_pages_are_what_make_docs_writes(name):
     assert (ROOT / "docs" / name).read_text() == pages()[name].rstrip() + "\n"
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from starcat.commands.shared import Input, Json, MethodName, inputs_by_source
+from starcat.commands.shared import Input, Json, inputs_by_source
 from starcat.errors import ConfigError
 
 app = typer.Typer()
@@ -23,13 +23,18 @@ def evaluate(
         list[str] | None,
         typer.Option(metavar="NAME=VALUE,...", help="What varies, as noise_px=0,1,2. Repeatable."),
     ] = None,
-    method: MethodName = None,
+    method: Annotated[
+        str | None, typer.Option(help="See 'starcat methods', or all; default: the best there is.")
+    ] = None,
     camera: Annotated[
         Path | None, typer.Option(help="Camera file (TOML); default: the database's camera.")
     ] = None,
-    frames: Annotated[int | None, typer.Option(min=1, help="Frames of each trial.")] = None,
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="Of each trial; default: 500, with --quick 100.")
+    ] = None,
     tolerance_px: Annotated[
-        float | None, typer.Option(min=0.01, max=200, help="Largest error of a centroid.")
+        float | None,
+        typer.Option(min=0.01, max=200, help="Default: three times the position noise, or 1."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same frames.")] = 1,
     quick: Annotated[bool, typer.Option("--quick", help="Fewer frames.")] = False,

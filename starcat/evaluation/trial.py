@@ -14,7 +14,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 import pyarrow as pa
@@ -24,13 +24,15 @@ from numpy.typing import NDArray
 from starcat.attitude import matrix_from_quaternion, matrix_from_radec_roll
 from starcat.camera import Camera
 from starcat.evaluation.answers import ANSWERS
-from starcat.evaluation.judge import FIELDS, Verdict, judge
+from starcat.evaluation.judge import Verdict, judge
 from starcat.evaluation.simulate import Noise, simulate_frame
 from starcat.evaluation.sky import Sky, sky_of_artifact
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.selection import Selection
 from starcat.matcher.verification import REACH
 from starcat.progress import Progress, no_progress
+
+_TYPES = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}
 
 AT_ONCE = 250
 """Frames of one task of a process."""
@@ -160,8 +162,10 @@ def run_trial(
         progress(trial.name, len(verdicts), count)
     # Without an attitude its errors are NaN, which a query would take for a number.
     columns = {
-        name: pa.array([getattr(verdict, name) for verdict in verdicts], from_pandas=True)
-        for name in FIELDS
+        name: pa.array(
+            [getattr(verdict, name) for verdict in verdicts], _TYPES[kind], from_pandas=True
+        )
+        for name, kind in get_type_hints(Verdict).items()
     }
     table = pa.table(columns).replace_schema_metadata({b"starcat_trial": facts})
     folder.mkdir(parents=True, exist_ok=True)

@@ -17,7 +17,7 @@ from starcat.report.evaluation_tables import (
     statistic_tables,
     summary_table,
 )
-from starcat.report.page import _STYLE, table
+from starcat.report.page import STYLE, table
 
 Content = Mapping[str, Any]
 
@@ -68,7 +68,7 @@ def evaluation_page(
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{_STYLE}{_MORE_STYLE}</style>\n</head>\n"
+        f"<title>{escape(title)}</title>\n<style>{STYLE}{_MORE_STYLE}</style>\n</head>\n"
         f"<body>\n{body}\n</body>\n</html>\n"
     )
 

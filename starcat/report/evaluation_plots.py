@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from starcat.report.evaluation_columns import Line, method_of
 from starcat.report.evaluation_tables import groups_of
-from starcat.report.plots import _headline, _own_style
+from starcat.report.plots import headline, own_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -103,10 +103,10 @@ def draw_rates(title: str, lines: Sequence[Line], series: Sequence[str]) -> Figu
     frames = sorted({line["frames"] for line in lines})
     several = f"{frames[0]:,}" + (f" to {frames[-1]:,}" if len(frames) > 1 else "")
     places = _places({line["x"] for line in lines})
-    with _own_style():
+    with own_style():
         figure = Figure(figsize=(7.2, 4.0))
         below = f"{several} frames a point; bars: 95 % interval (Wilson)"
-        _headline(figure, title[:1].upper() + title[1:], below)
+        headline(figure, title[:1].upper() + title[1:], below)
         axes = figure.add_axes((0.105, 0.13, 0.595, 0.69))
         axes.grid(axis="y", color="#e3e7ea")
         handles = _draw_curves(axes, lines, series, places)
@@ -206,7 +206,7 @@ def save_small_svg(figure: Figure, path: Path) -> None:
     import matplotlib
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-    with _own_style():
+    with own_style():
         matplotlib.rcParams["svg.fonttype"] = "none"
         nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
         FigureCanvasSVG(figure).print_figure(path, metadata=nothing)

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
-_STYLE = """
+STYLE = """
 :root { color-scheme: light dark; --line: #d5dbe0; --soft: #5b6770; --head: #f1f4f6; }
 @media (prefers-color-scheme: dark) {
   :root { --line: #3a444c; --soft: #a3b0ba; --head: #20272d; }
@@ -82,7 +82,7 @@ def report_page(content: Mapping[str, Any], plots: Mapping[str, bytes]) -> str:
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}: build report</title>\n<style>{_STYLE}</style>\n</head>\n"
+        f"<title>{escape(title)}: build report</title>\n<style>{STYLE}</style>\n</head>\n"
         f"<body>\n{body}\n</body>\n</html>\n"
     )
 

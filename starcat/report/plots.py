@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_STYLE: dict[Any, Any] = {
+STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",  # comes with matplotlib
     "font.size": 9.0,
     "axes.spines.top": False,
@@ -47,13 +47,13 @@ Array = NDArray[np.float64]
 
 
 @contextmanager
-def _own_style() -> Iterator[None]:
+def own_style() -> Iterator[None]:
     """Draw with matplotlib's defaults and the style above, then put everything back."""
     import matplotlib
 
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
-        matplotlib.rcParams.update(_STYLE)
+        matplotlib.rcParams.update(STYLE)
         yield
 
 
@@ -81,9 +81,9 @@ def draw_map(title: str, coverage: Coverage, summary: CoverageSummary) -> Figure
     raster = nearest_raster(coverage.boresights, coverage.stars, _RASTER_WIDTH)
     least = summary.stars.minimum
     most = max(int(np.quantile(coverage.stars, 0.995, method="inverted_cdf")), least + 1)
-    with _own_style():
+    with own_style():
         figure = Figure(figsize=(8.4, 5.2))
-        _headline(figure, f"{title}: guide stars in the field", _map_legend(summary))
+        headline(figure, f"{title}: guide stars in the field", _map_legend(summary))
         axes = figure.add_axes((0.05, 0.17, 0.92, 0.7))
         edge = Ellipse((0, 0), 2 * HALF_WIDTH, 2 * HALF_HEIGHT, fill=False, color="#333", lw=1)
         axes.add_patch(edge)
@@ -116,7 +116,7 @@ def _map_legend(summary: CoverageSummary) -> str:
     )
 
 
-def _headline(figure: Figure, title: str, below: str) -> None:
+def headline(figure: Figure, title: str, below: str) -> None:
     """Write title and legend at fixed places: nothing has to be measured."""
     height = figure.get_figheight()
     figure.text(0.03, 1.0 - 0.3 / height, title, fontsize=11)
@@ -168,7 +168,7 @@ def _chart(title: str, below: str) -> tuple[Figure, Axes]:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.2, 4.0))
-    _headline(figure, title, below)
+    headline(figure, title, below)
     axes = figure.add_axes((0.12, 0.13, 0.85, 0.69))
     axes.grid(axis="y", color="#e3e7ea")
     return figure, axes
@@ -197,7 +197,7 @@ def draw_histogram(title: str, summary: CoverageSummary) -> Figure:
         "1 %": summary.stars.one_percent,
         "median": summary.stars.median,
     }
-    with _own_style():
+    with own_style():
         figure, axes = _chart(f"{title}: guide stars per field", f"{summary.fields:,} fields")
         left = np.arange(len(fields)) * width - 0.5
         axes.bar(left, fields, width * 0.92, align="edge", color=_BLUE)
@@ -235,7 +235,7 @@ def draw_magnitudes(title: str, band: str, counts: Mapping[str, Any]) -> Figure:
     left, right = np.asarray(counts["from_mag"]), np.asarray(counts["to_mag"])
     kept = np.asarray(counts["guide_stars"])
     read = kept + np.asarray(counts["rejected"])
-    with _own_style():
+    with own_style():
         below = f"{kept.sum():,} guide stars of {read.sum():,} records with a magnitude"
         figure, axes = _chart(f"{title}: guide stars by magnitude", below)
         width = right - left
@@ -271,7 +271,7 @@ def save_plot(figure: Figure, folder: Path, name: str) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-    with _own_style():
+    with own_style():
         FigureCanvasAgg(figure).print_figure(
             folder / f"{name}.png", dpi=_DPI, metadata={"Software": None}
         )

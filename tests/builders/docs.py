@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from starcat.catalog.source import data_source, source_names
 from starcat.catalog.verdict import Reason
 from starcat.cli import app
-from starcat.report.evaluation import write_reproduction
+from starcat.report.evaluation import reproduction_page
 from starcat.resources import resource_folder
 from starcat.schema import read_schema
 
@@ -79,7 +79,12 @@ def sources_page() -> str:
 
 def pages() -> dict[str, str]:
     """Return all generated pages by file name."""
-    return {"cli.md": cli_page(), "products.md": products_page(), "sources.md": sources_page()}
+    return {
+        "cli.md": cli_page(),
+        "products.md": products_page(),
+        "sources.md": sources_page(),
+        "reproduction.md": reproduction_page(DOCS / "reproduction.json"),
+    }
 
 
 def main() -> None:
@@ -87,8 +92,7 @@ def main() -> None:
     DOCS.mkdir(exist_ok=True)
     for name, text in pages().items():
         (DOCS / name).write_text(text.rstrip() + "\n", encoding="utf-8")
-    write_reproduction(DOCS / "reproduction.json", DOCS)
-    sys.stderr.write(f"wrote {', '.join(pages())}, reproduction.md in docs/\n")
+    sys.stderr.write(f"wrote {', '.join(pages())} in docs/\n")
 
 
 if __name__ == "__main__":
