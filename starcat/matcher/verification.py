@@ -26,6 +26,12 @@ Array = NDArray[np.float64]
 MIN_STARS = 4
 """Three stars make an attitude; at least one more has to agree with it."""
 
+MIN_SHARE = 0.4
+"""An attitude has to explain this share of the centroids, or of the stars if they are fewer.
+
+Stars crowd in clusters, where a part of them agrees with an attitude that is off.
+"""
+
 REACH = 1.5
 """Stars and centroids agree within this many tolerances: an attitude from few stars errs too."""
 
@@ -182,14 +188,18 @@ def agree(matrix: Array, observation: Observation, database: Database) -> Agreem
     seen = body[matched]
     difference = seen - u[star[matched]] @ matrix.T
     square = float(np.vdot(difference, difference)) / len(matched)
-    if _is_scaled(predicted[star[matched]], observation.centroids_px[matched], observation):
+    stars = _within_reach_of_frame(predicted, observation)
+    explained = len(matched) >= MIN_SHARE * min(len(body), stars)
+    if not explained or _is_scaled(
+        predicted[star[matched]], observation.centroids_px[matched], observation
+    ):
         return Agreement(matrix, index, math.sqrt(square), 1.0)
     distance = residual_px[matched]
     chance = false_match_probability(
         float(distance @ distance),
         seen,
         len(body),
-        _within_reach_of_frame(predicted, observation),
+        stars,
         camera,
     )
     return Agreement(matrix, index, math.sqrt(square), chance)
