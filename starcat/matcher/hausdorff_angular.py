@@ -150,7 +150,7 @@ def _add(
         return
     number, star, gain = within_reach(sets, apart[a, b], np.full(len(a), cap_rad))
     for end in (a, b):
-        place = (end * len(sets))[number] + star
+        place = end[number] * len(sets) + star
         total -= np.bincount(place, gain, total.size).reshape(total.shape)
         total += cap_rad * np.bincount(end, minlength=len(total))[:, None]
 

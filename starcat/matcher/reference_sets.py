@@ -160,8 +160,8 @@ def within_reach(sets: ReferenceSets, numbers: Array, reach: Array) -> tuple[Row
     start = np.searchsorted(sets.value, numbers - reach, side="left")
     stop = np.searchsorted(sets.value, numbers + reach, side="right")
     number, row = rows_between(start, stop)
-    wanted = np.repeat(numbers, stop - start)
-    gain = np.repeat(reach, stop - start) - np.abs(wanted - sets.value[row])
+    wanted = numbers[number]
+    gain = reach[number] - np.abs(wanted - sets.value[row])
     gain *= (sets.low[row] <= wanted) & (wanted < sets.high[row])
     return number, sets.star[row], gain
 
