@@ -36,6 +36,7 @@ test-all: $(READY) ## the fast tests and the sky-scale ones
 demo: $(READY) ## build a database from the embedded sky, check it, identify simulated fields
 	$(BIN)/starcat build --preset gaia-12deg --output dist --replace
 	$(BIN)/starcat verify dist/gaia-12deg-1.0.0
+	$(BIN)/starcat sql dist/gaia-12deg-1.0.0 --named emptiest-fields --set count=3
 	$(BIN)/starcat simulate dist/gaia-12deg-1.0.0 --output dist/frame.csv --seed 7
 	$(BIN)/starcat identify dist/gaia-12deg-1.0.0 dist/frame.csv
 	$(BIN)/starcat selftest dist/gaia-12deg-1.0.0 --frames 500
@@ -44,13 +45,15 @@ bench: $(READY) ## time and memory beside bare parsers and other star trackers, 
 	$(BIN)/python tests/benchmarks/ingest.py
 	$(BIN)/python tests/benchmarks/products.py
 	$(BIN)/python tests/benchmarks/matcher.py
+	$(BIN)/python tests/benchmarks/sql.py
 
 reproduction: $(READY) ## measure what the papers print (half an hour), rewrite docs/reproduction.md
 	$(BIN)/starcat evaluate --paper all --output dist/evaluation $(INPUTS)
 	$(BIN)/python tests/builders/reproduction.py
 
-docs: $(READY) ## rewrite the generated pages of docs/
+docs: $(READY) ## rewrite the generated pages of docs/, build the site in dist/docs
 	$(BIN)/python tests/builders/docs.py
+	$(BIN)/sphinx-build -W --keep-going -q -b html docs dist/docs
 
 golden: $(READY) ## rewrite the golden digests; look at the difference before committing it
 	$(BIN)/python tests/builders/golden.py

@@ -14,7 +14,15 @@ from typing import Annotated, Any
 import typer
 
 from starcat import __version__
-from starcat.commands import artifacts, catalogs, evaluating, matching
+from starcat.commands import (
+    artifacts,
+    catalogs,
+    evaluating,
+    exchanging,
+    matching,
+    querying,
+    releasing,
+)
 from starcat.errors import StarcatError, reason
 
 app = typer.Typer(
@@ -25,7 +33,10 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-for part in (catalogs, artifacts, matching, evaluating):  # the order of --help
+PARTS = (catalogs, artifacts, querying, exchanging, releasing, matching, evaluating)
+"""In the order of --help."""
+
+for part in PARTS:
     app.add_typer(part.app)
 
 

@@ -26,9 +26,9 @@ def out() -> Console:
     rich.console.Console
         On stdout, at most 100 columns wide, plain where it is not a terminal.
     """
-    console = Console(highlight=False, soft_wrap=False)
-    width = min(console.width, MAX_WIDTH) if sys.stdout.isatty() else MAX_WIDTH
-    return Console(highlight=False, width=width)
+    width = min(Console().width, MAX_WIDTH) if sys.stdout.isatty() else MAX_WIDTH
+    # Brackets are units and indices here, no markup.
+    return Console(highlight=False, markup=False, width=width)
 
 
 def print_json(content: Any) -> None:

@@ -188,3 +188,15 @@ class ProductError(StarcatError):
         super().__init__(message)
         self.product = product
         self.path = path
+
+
+class QueryError(StarcatError):
+    """A query that is no SQL, asks for what is not there, or for what is not allowed."""
+
+    exit_code = 2
+
+
+class QueryLimitError(QueryError):
+    """A query that was stopped: it took too long, or more memory than it may."""
+
+    exit_code = 1

@@ -37,6 +37,7 @@ from starcat.catalog.locate import locate
 from starcat.catalog.selection import Selected
 from starcat.catalog.stars import directions_of, sort_rows
 from starcat.catalog.variability import AmplitudeTable, join_amplitudes, read_amplitudes
+from starcat.crossmatch import match_catalogs
 from starcat.errors import BuildError, ConfigError
 from starcat.evaluation.selftest import Rates, self_test
 from starcat.guide_stars import select_stars
@@ -140,13 +141,15 @@ def build(
         selected, fields = select_stars(stars, spec)
         clock.lap("select")
         products = make_products(spec, catalog, selected, fields, progress)
+        matched = match_catalogs(selected, spec, inputs, workers, progress)
+        products += matched.products
         clock.lap("products")
         facts = write_products(partial, products, database_facts(spec))
         clock.lap("write")
         rates = run_self_test(partial, spec, progress)
         clock.lap("self-test")
         progress("report", 0, None)
-        sources = source_facts(catalog, selected, amplitudes, joined)
+        sources = [*source_facts(catalog, selected, amplitudes, joined), *matched.sources]
         filters = tuple(filter_coverage(step, spec) for step in selected.steps)
         results = Results(spec, sources, products, facts, fields, filters, rates)
         report = report_build(partial, results)
@@ -158,7 +161,8 @@ def build(
         outcome = publish(partial, final, replace=replace)
         clock.lap("verify")
     write_build_log(final, outcome, clock.times_s)
-    warnings = (*catalog.notes, *filter(None, [holes_warning(report.gap)]))
+    notes = (*catalog.notes, *matched.notes)
+    warnings = (*dict.fromkeys(notes), *filter(None, [holes_warning(report.gap)]))
     return Built(
         final, outcome, manifest, filters, report, rates, catalog.problems, warnings, clock.times_s
     )
@@ -190,7 +194,7 @@ def read_sources(
     joins = spec.selection.variables.join
     check_inputs(spec, inputs)
     # All inputs are found before any is read: a missing one is known at once.
-    paths = {name: locate(name, inputs) for name in (spec.catalog.source, *joins)}
+    paths = {name: locate(name, inputs) for name in spec.sources}
     catalog = ingest(
         spec.catalog.source,
         paths[spec.catalog.source],

@@ -170,6 +170,8 @@ def _balance(facts: dict[str, Any]) -> list[tuple[str, str]]:
     rows = [("read", f"{facts['rows_read']:,}"), ("kept", f"{facts['kept']:,}")]
     for name, count in facts["rejected"].items():
         rows.append((f"rejected: {name} ({Reason[name].value})", f"{count:,}"))
+    if facts.get("role") == "crossmatch":
+        rows.append(("guide stars with a counterpart", f"{facts['joined']:,}"))
     return rows
 
 

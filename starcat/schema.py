@@ -10,20 +10,13 @@ import json
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-
-import pyarrow as pa
+from typing import TYPE_CHECKING
 
 from starcat.errors import SchemaError, SchemaVersionError
 from starcat.resources import resource_folder
 
-_SCALARS = {
-    "bool": pa.bool_(),
-    "int32": pa.int32(),
-    "int64": pa.int64(),
-    "float32": pa.float32(),
-    "float64": pa.float64(),
-    "string": pa.string(),
-}
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 
 @dataclass(frozen=True)
@@ -70,7 +63,9 @@ class SchemaColumn:
     @property
     def arrow_field(self) -> pa.Field:
         """The column as pyarrow knows it, with unit and meaning as metadata."""
-        kind = _SCALARS[self.item_dtype]
+        import pyarrow as pa  # not needed to know what a column means
+
+        kind = pa.type_for_alias(self.item_dtype)
         if self.is_list:
             kind = pa.list_(pa.field("item", kind, nullable=False))
         facts = {"unit": self.unit, "description": self.description, "ucd": self.ucd}
@@ -108,6 +103,8 @@ class ProductSchema:
     @property
     def arrow_schema(self) -> pa.Schema:
         """The columns as a pyarrow schema with units and meanings as field metadata."""
+        import pyarrow as pa
+
         metadata = {"starcat.schema": self.name}
         return pa.schema([column.arrow_field for column in self.columns], metadata)
 

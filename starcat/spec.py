@@ -11,7 +11,15 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 
 from starcat.camera import Camera
 from starcat.errors import ConfigError
@@ -217,6 +225,62 @@ class Radial(_Product):
     sectors: int = Field(16, ge=1, le=30)
 
 
+class Crossmatch(_Product):
+    """Counterparts of the guide stars in other catalogs."""
+
+    enabled: bool = False
+    catalogs: tuple[Literal["sao", "hipparcos", "tycho1", "tycho2", "2mass", "gaia"], ...] = Field(
+        (),
+        strict=False,  # a list in TOML
+        description="star catalogs to look for counterparts in",
+    )
+    radius_arcsec: float = Field(
+        10.0, gt=0.0, le=600.0, description="largest separation of a candidate"
+    )
+    position_error_arcsec: float | None = Field(
+        None,
+        gt=0.0,
+        le=60.0,
+        description="standard deviation of the difference of two positions of a star, each axis; "
+        "default: measured",
+    )
+    unknown_motion_mas_yr: float = Field(
+        20.0,
+        ge=0.0,
+        le=10_000.0,
+        description="standard deviation of the motion of a pair in which neither has one",
+    )
+    outlier_share: float = Field(
+        0.02, ge=0.0, lt=1.0, description="of the stars, off by more than errors explain"
+    )
+    expected_delta_mag: Mag | None = Field(
+        None, description="magnitude of the counterpart minus the star's; default: measured"
+    )
+    colour_spread_mag: float = Field(
+        1.0, gt=0.0, le=30.0, description="standard deviation of that difference"
+    )
+    completeness: float | None = Field(
+        None, gt=0.0, lt=1.0, description="share of stars with a counterpart; default: measured"
+    )
+    ambiguous_odds: float = Field(
+        10.0, ge=1.0, description="candidates that differ by no more are ambiguous"
+    )
+    min_probability: float = Field(
+        0.5, ge=0.0, le=1.0, description="candidates that together have less are doubtful"
+    )
+    read_limit_mag: Mag | None = Field(
+        None, description="fainter counterparts are rejected while reading"
+    )
+
+    @model_validator(mode="after")
+    def _catalogs_once_each(self) -> Crossmatch:
+        if self.enabled and not self.catalogs:
+            raise ValueError('no catalogs; name some, such as catalogs = ["hipparcos"]')
+        if len(set(self.catalogs)) != len(self.catalogs):
+            raise ValueError(f"a catalog is named twice: {', '.join(self.catalogs)}")
+        return self
+
+
 class Products(_Section):
     """Which products the artifact holds, and their parameters."""
 
@@ -227,6 +291,18 @@ class Products(_Section):
     hausdorff_l2: HausdorffL2 = HausdorffL2()
     grid: Grid = Grid()
     radial: Radial = Radial()
+    crossmatch: Crossmatch = Crossmatch()
+
+    @model_serializer(mode="wrap")
+    def _without_an_unused_section(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out a section that came after the first artifacts, so that they stay as they are.
+
+        Specs that do not speak of it read the same before and after.
+        """
+        content: dict[str, Any] = dump(self)
+        if self.crossmatch == Crossmatch():
+            del content["crossmatch"]
+        return content
 
 
 class SelfTest(_Section):
@@ -254,10 +330,21 @@ class BuildSpec(_Section):
     products: Products = Products()
     self_test: SelfTest = SelfTest()
 
+    @model_validator(mode="after")
+    def _counterparts_in_other_catalogs(self) -> BuildSpec:
+        if self.catalog.source in self.products.crossmatch.catalogs:
+            raise ValueError(
+                f"products.crossmatch.catalogs: {self.catalog.source} is the catalog of the stars "
+                "themselves; name others"
+            )
+        return self
+
     @property
     def sources(self) -> tuple[str, ...]:
-        """Names of all sources that the build reads, the stars' first."""
-        return (self.catalog.source, *self.selection.variables.join)
+        """Names of all sources that the build reads, the stars' first, each once."""
+        wanted = self.products.crossmatch
+        names = [self.catalog.source, *self.selection.variables.join]
+        return tuple(dict.fromkeys([*names, *(wanted.catalogs if wanted.enabled else ())]))
 
 
 def read_spec(path: Path) -> BuildSpec:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 import signal
 import sys
 import tomllib
@@ -127,3 +129,43 @@ def small_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[byt
     (folder / "sao.dat").write_bytes(b"".join(sao_lines))
     spec = spec_from_dict(tomllib.loads(SMALL_SPEC), "small.toml")
     return build(spec, {"sao": [folder / "sao.dat"]}, folder / "dist").folder
+
+
+@pytest.fixture(scope="session")
+def artifact_version(
+    tmp_path_factory: pytest.TempPathFactory, small_artifact: Path
+) -> Callable[[str], Path]:
+    """The small artifact as another version: a sound artifact without the time of a build.
+
+    The database, the manifest and the report differ from those of other versions, as they do
+    when it is built; the tables are the same files.
+    """
+    import h5py
+
+    from starcat.artifact.content import file_sha256, json_bytes
+    from starcat.artifact.manifest import manifest_digest
+
+    folder = tmp_path_factory.mktemp("versions")
+
+    def make(version: str) -> Path:
+        artifact = folder / f"small-{version}"
+        if artifact.exists():
+            return artifact
+        shutil.copytree(small_artifact, artifact)
+        manifest = json.loads((artifact / "manifest.json").read_bytes())
+        manifest["version"] = manifest["spec"]["version"] = version
+        with h5py.File(artifact / "database.h5", "r+") as file:
+            file.attrs["version"] = version
+            file.attrs["spec"] = json.dumps(manifest["spec"], sort_keys=True)
+        for path in (artifact / "report").iterdir():
+            path.write_bytes(path.read_bytes() + f"<!-- {version} -->".encode())
+        for name, facts in manifest["files"].items():
+            facts |= {
+                "bytes": (artifact / name).stat().st_size,
+                "sha256": file_sha256(artifact / name),
+            }
+        manifest["manifest_sha256"] = manifest_digest(manifest)
+        (artifact / "manifest.json").write_bytes(json_bytes(manifest))
+        return artifact
+
+    return make

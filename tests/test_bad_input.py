@@ -7,11 +7,13 @@ the page says that starcat says is looked for in what it says (``…`` stands fo
 from __future__ import annotations
 
 import gzip
+import hashlib
 import json
 import os
 import re
 import resource
 import shutil
+import struct
 import subprocess
 import sys
 from collections.abc import Callable
@@ -21,6 +23,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -29,7 +32,9 @@ from starcat.artifact.verify import check_artifact
 from starcat.catalog.delimited import parse_delimited
 from starcat.catalog.source import data_source, read_source
 from starcat.errors import SourceError, StarcatError
+from starcat.exchange.formats import format_of
 from starcat.images.image_file import write_image
+from starcat.releases.publishing import publish_artifact
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "errors.md"
 
@@ -211,6 +216,13 @@ def _(place: Place) -> Call:
     return place.ingest_file("gaia", place.write("gaia_merged.bin", place.lines))
 
 
+@case("binary file with proper motions for magnitudes", 3)
+def _(place: Place) -> Call:
+    header = b"GDR3" + struct.pack("<IQ", 1, 1)
+    star = struct.pack("<qddfff", 4472832130942575872, 269.448, 4.739, 8.19, -800.5, 10362.4)
+    return place.ingest_file("gaia", place.write("gaia_merged.bin", header + star))
+
+
 @case("binary file cut off", 0)
 def _(place: Place) -> Call:
     from starcat.catalog.gaia import embedded_sky
@@ -359,6 +371,61 @@ def _(place: Place) -> Call:
 @case("band unknown in a spec", 2)
 def _(place: Place) -> Call:
     return place.build('catalog.source = "sao"', 'catalog = { source = "sao", band = "K" }')
+
+
+def with_counterparts(place: Place, section: str) -> Call:
+    old = "boresights.count = 200"
+    return place.build(old, f"{old}\nproducts.crossmatch = {section}")
+
+
+@case("counterparts in no catalog", 2)
+def _(place: Place) -> Call:
+    return with_counterparts(place, "{ enabled = true }")
+
+
+@case("counterparts in the stars' own catalog", 2)
+def _(place: Place) -> Call:
+    return with_counterparts(place, '{ enabled = true, catalogs = ["sao"] }')
+
+
+@case("catalog of counterparts missing", 3)
+def _(place: Place) -> Call:
+    return with_counterparts(place, '{ enabled = true, catalogs = ["hipparcos"] }')
+
+
+def matched_with(place: Place, other: Path) -> Call:
+    """Find the stars of a good artifact in a file."""
+    return ["crossmatch", place.artifact / "stars.parquet", other, "-o", place.out / "x.parquet"]
+
+
+@case("star table missing", 3)
+def _(place: Place) -> Call:
+    return matched_with(place, place.folder / "none.parquet")
+
+
+@case("star table that is no Parquet file", 3)
+def _(place: Place) -> Call:
+    return matched_with(place, place.write("stars.parquet", b"HIP 1"))
+
+
+@case("star table without a column", 4)
+def _(place: Place) -> Call:
+    return matched_with(place, place.artifact / "pairs.parquet")
+
+
+@case("star table with a column of another type", 4)
+def _(place: Place) -> Call:
+    table = pq.read_table(place.artifact / "stars.parquet")
+    where = table.column_names.index("ra_deg")
+    text = table["ra_deg"].cast("string")
+    pq.write_table(table.set_column(where, "ra_deg", text), place.folder / "stars.parquet")
+    return matched_with(place, place.folder / "stars.parquet")
+
+
+@case("cross-identification in place of a folder", 1)
+def _(place: Place) -> Call:
+    (place.out / "x.parquet").mkdir(parents=True)
+    return matched_with(place, place.artifact / "stars.parquet")
 
 
 @case("option of the wrong type", 2)
@@ -603,6 +670,343 @@ def _(place: Place) -> Call:
 @case("frame without centroids", 0)
 def _(place: Place) -> Call:
     return place.identify("x_px,y_px\n")
+
+
+# Queries -----------------------------------------------------------------------------------
+
+
+@case("query about nothing", 2)
+def _(place: Place) -> Call:
+    return ["sql"]
+
+
+@case("query about what is not there", 2)
+def _(place: Place) -> Call:
+    return ["sql", "nosuch", "SELECT 1"]
+
+
+@case("query about a file of unknown kind", 2)
+def _(place: Place) -> Call:
+    return ["sql", place.write("notes.txt", "no stars"), "SELECT 1"]
+
+
+@case("query that is no SQL", 2)
+def _(place: Place) -> Call:
+    return ["sql", place.artifact, "SELEC 1"]
+
+
+@case("query that writes", 2)
+def _(place: Place) -> Call:
+    return ["sql", place.artifact, f"COPY stars TO '{place.out}/stars.csv'"]
+
+
+@case("query of another file", 2)
+def _(place: Place) -> Call:
+    return ["sql", place.artifact, "SELECT * FROM read_csv('/etc/passwd')"]
+
+
+@case("query of a column that is not there", 2)
+def _(place: Place) -> Call:
+    return ["sql", place.artifact, "SELECT magg FROM stars"]
+
+
+@case("query that takes too long", 1)
+def _(place: Place) -> Call:
+    endless = (
+        "SELECT count(*) FROM range(1000000) a, range(1000000) b WHERE sin(a.range * b.range) > 2"
+    )
+    return ["sql", place.artifact, endless, "--time-limit-s", 0.2]
+
+
+@case("named query unknown", 2)
+def _(place: Place) -> Call:
+    return ["sql", place.artifact, "--named", "densest-feilds"]
+
+
+@case("value of a named query of the wrong type", 2)
+def _(place: Place) -> Call:
+    return ["sql", place.artifact, "--named", "densest-fields", "--set", "count=many"]
+
+
+@case("answer in a format unknown", 2)
+def _(place: Place) -> Call:
+    return ["sql", place.artifact, "SELECT 1", "-o", place.folder / "answer.xls"]
+
+
+@case("Parquet file cut off under a query", 5)
+def _(place: Place) -> Call:
+    path = place.copy() / "pairs.parquet"
+    path.write_bytes(path.read_bytes()[:-100])
+    return ["sql", path.parent, "SELECT 1"]
+
+
+# Registries --------------------------------------------------------------------------------
+
+
+def registry_of(place: Place) -> Path:
+    """A registry with one release, to be damaged."""
+    publish_artifact(place.artifact, str(place.folder / "registry"))
+    for path in (place.folder / "registry").rglob("*"):
+        path.chmod(0o755)
+    return place.folder / "registry"
+
+
+def pull(place: Place, wanted: str = "small", *more: object, registry: bool = True) -> Call:
+    named = ["--registry", place.folder / "registry"] if registry else []
+    return ["pull", wanted, *named, "-o", place.out, "--lock", place.folder / "lock", *more]
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+def listed(registry: Path) -> Path:
+    """The manifest of the one release."""
+    index = json.loads((registry / "index.json").read_bytes())
+    digest = index["releases"][0]["manifest"]["sha256"]
+    return registry / "blobs" / "sha256" / digest[:2] / digest
+
+
+def blob(registry: Path, name: str) -> Path:
+    digest = json.loads(listed(registry).read_bytes())["files"][name]["sha256"]
+    return registry / "blobs" / "sha256" / digest[:2] / digest
+
+
+@case("publishing to an address", 2)
+def _(place: Place) -> Call:
+    return ["publish", place.artifact, "https://example.org/registry"]
+
+
+@case("registry at another kind of address", 2)
+def _(place: Place) -> Call:
+    return ["releases", "ftp://example.org/registry"]
+
+
+@case("published version with another content", 1)
+def _(place: Place) -> Call:
+    record = registry_of(place) / "versions/small/1.0.0.json"
+    edit(record, json.loads(record.read_bytes())["manifest"]["sha256"], "0" * 64)
+    return ["publish", place.artifact, place.folder / "registry"]
+
+
+@case("publishing into a folder with other things", 1)
+def _(place: Place) -> Call:
+    return ["publish", place.artifact, place.write("home/thesis.tex", "text").parent]
+
+
+@case("publishing a damaged artifact", 5)
+def _(place: Place) -> Call:
+    folder = place.copy()
+    flip(folder / "pairs.parquet")
+    return ["publish", folder, place.folder / "registry"]
+
+
+@case("no registry there", 3)
+def _(place: Place) -> Call:
+    return ["releases", place.folder / "registry"]
+
+
+@case("artifact that a registry does not have", 3)
+def _(place: Place) -> Call:
+    registry_of(place)
+    return pull(place, "smaller")
+
+
+@case("version that a registry does not have", 3)
+def _(place: Place) -> Call:
+    registry_of(place)
+    return pull(place, "small@1.2.3")
+
+
+@case("name and version of another form", 2)
+def _(place: Place) -> Call:
+    return pull(place, "small@1.0")
+
+
+@case("pull of nothing", 2)
+def _(place: Place) -> Call:
+    return ["pull", "-o", place.out]
+
+
+@case("pull without a registry", 2)
+def _(place: Place) -> Call:
+    return pull(place, registry=False)
+
+
+@case("lock file that pins nothing", 2)
+def _(place: Place) -> Call:
+    return pull(place, "small", "--locked")
+
+
+def pinned(place: Place, old: str = "", new: str = "") -> None:
+    """A registry, and a lock file that pins its release, with one text replaced."""
+    manifest = listed(registry_of(place))
+    entry = {
+        "name": "small",
+        "version": "1.0.0",
+        "registry": "registry",
+        "manifest": {"sha256": manifest.name, "bytes": manifest.stat().st_size},
+    }
+    lock = {"format": "starcat-lock", "lock_version": "1.0.0", "artifacts": [entry]}
+    edit(place.write("lock", json.dumps(lock)), old, new)
+
+
+@case("lock file that pins another version", 2)
+def _(place: Place) -> Call:
+    pinned(place)
+    return pull(place, "small@1.2.3", "--locked")
+
+
+@case("lock file damaged", 5)
+def _(place: Place) -> Call:
+    pinned(place, "starcat-lock", "starcat-luck")
+    return pull(place)
+
+
+@case("lock file of a newer starcat", 4)
+def _(place: Place) -> Call:
+    pinned(place, '"lock_version": "1', '"lock_version": "2')
+    return pull(place)
+
+
+@case("published version that is not the pinned one", 5)
+def _(place: Place) -> Call:
+    pinned(place, '"bytes": ', '"bytes": 1')
+    return pull(place)
+
+
+@case("another artifact at the name of a pull", 1)
+def _(place: Place) -> Call:
+    registry_of(place)
+    place.write("out/small-1.0.0/manifest.json", "{}")
+    return pull(place)
+
+
+@case("index of a registry damaged", 5)
+def _(place: Place) -> Call:
+    index = registry_of(place) / "index.json"
+    index.write_bytes(index.read_bytes()[:100])
+    return pull(place)
+
+
+@case("index with a name that leads elsewhere", 5)
+def _(place: Place) -> Call:
+    edit(registry_of(place) / "index.json", '"small"', '"../../small"')
+    return pull(place)
+
+
+@case("registry of a newer starcat", 4)
+def _(place: Place) -> Call:
+    edit(registry_of(place) / "index.json", '"registry_version": "1', '"registry_version": "2')
+    return pull(place)
+
+
+@case("file of a registry missing", 5)
+def _(place: Place) -> Call:
+    blob(registry_of(place), "pairs.parquet").unlink()
+    return pull(place)
+
+
+@case("file of a registry damaged", 5)
+def _(place: Place) -> Call:
+    flip(blob(registry_of(place), "pairs.parquet"))
+    return pull(place)
+
+
+@case("file of a registry that is a link", 5)
+def _(place: Place) -> Call:
+    path = blob(registry_of(place), "pairs.parquet")
+    path.rename(place.folder / "copy")
+    path.symlink_to(place.folder / "copy")
+    return pull(place)
+
+
+@case("manifest with a path that leads elsewhere", 5)
+def _(place: Place) -> Call:
+    manifest = listed(registry_of(place))
+    data = manifest.read_bytes().replace(b'"pairs.parquet": {', b'"../../pairs.parquet": {')
+    digest = hashlib.sha256(data).hexdigest()
+    place.write(f"registry/blobs/sha256/{digest[:2]}/{digest}", data)
+    index = place.folder / "registry/index.json"
+    edit(index, manifest.name, digest)
+    edit(index, f'"bytes": {manifest.stat().st_size}', f'"bytes": {len(data)}')
+    return pull(place)
+
+
+# Exports -----------------------------------------------------------------------------------
+
+
+@case("export of nothing", 2)
+def _(place: Place) -> Call:
+    return ["export", "--to", "fits", "-o", place.out]
+
+
+@case("export of what is not there", 3)
+def _(place: Place) -> Call:
+    return ["export", place.folder / "small-1.1.0", "-o", place.out]
+
+
+@case("export of a file that is not Parquet", 3)
+def _(place: Place) -> Call:
+    return ["export", place.write("stars.csv", "star_id\n1\n"), "--to", "fits", "-o", place.out]
+
+
+@case("format unknown", 2)
+def _(place: Place) -> Call:
+    return ["export", place.artifact, "--to", "xlsx", "-o", place.out]
+
+
+@case("format that the name of a file does not say", 2)
+def _(place: Place) -> Call:
+    return lambda: format_of(place.out / "stars.csv.gz")
+
+
+@case("product unknown", 2)
+def _(place: Place) -> Call:
+    return ["export", place.artifact, "--product", "star", "-o", place.out]
+
+
+@case("HATS of what are no stars", 2)
+def _(place: Place) -> Call:
+    return ["export", place.artifact, "--to", "hats", "--product", "pairs", "-o", place.out]
+
+
+@case("another file of that name", 1)
+def _(place: Place) -> Call:
+    place.write("out/stars.csv", "mine")
+    return ["export", place.artifact, "-o", place.out]
+
+
+@case("file in place of the folder", 1)
+def _(place: Place) -> Call:
+    return ["export", place.artifact, "-o", place.write("out", "mine")]
+
+
+@case("text that a format cannot hold", 4)
+def _(place: Place) -> Call:
+    path = place.folder / "stars.parquet"
+    pq.write_table(pa.table({"designation": ["α Centauri"]}), path)
+    return ["export", path, "--to", "fits", "-o", place.out]
+
+
+@case("type that no format can hold", 4)
+def _(place: Place) -> Call:
+    path = place.folder / "stars.parquet"
+    pq.write_table(pa.table({"code": [b"x"]}), path)
+    return ["export", path, "--to", "csv", "-o", place.out]
+
+
+@case("peer unknown", 2)
+def _(place: Place) -> Call:
+    return ["export", place.artifact, "--from-peer", "lost", "-o", place.out]
+
+
+@case("peer's database damaged", 3)
+def _(place: Place) -> Call:
+    path = place.write("default_database.npz", "no archive")
+    return ["export", path, "--from-peer", "cedar-solve", "-o", place.out]
 
 
 # The tests ---------------------------------------------------------------------------------

@@ -179,7 +179,14 @@ def test_the_embedded_sky_of_gaia() -> None:
     number, flags = (read.stars[name].to_numpy() for name in ("star_id", "quality_flags"))
     from_hipparcos = number < 0
     assert from_hipparcos.sum() == 70
-    np.testing.assert_array_equal((flags & Quality.NO_PROPER_MOTION) > 0, from_hipparcos)
+    # What the package calls proper motions are the magnitudes BP and RP.
+    assert (flags & Quality.NO_PROPER_MOTION).all()
+    colour, mag, bp = (floats_of(read.stars, c) for c in ("colour_mag", "mag", "second_mag"))
+    assert np.isnan(colour).sum() == 364
+    known = ~np.isnan(colour)
+    assert ((bp >= mag - 0.05) & (mag >= bp - colour - 0.05))[known].mean() > 0.97
+    barnard = np.flatnonzero(number == 4472832130942575872)[0]
+    assert (mag[barnard], bp[barnard], colour[barnard]) == (8.193974, 9.791788, 2.833697)
     hip = np.nan_to_num(floats_of(read.stars, "hip_number"))
     np.testing.assert_array_equal(hip, np.where(from_hipparcos, -number, 0))
     row = int(np.flatnonzero(number == -32349)[0])

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from sphinx.cmd.build import build_main as sphinx_build
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "builders"))
@@ -14,7 +15,7 @@ from docs import pages
 from starcat import cli
 
 
-@pytest.mark.parametrize("name", ["cli.md", "products.md", "sources.md", "reproduction.md"])
+@pytest.mark.parametrize("name", pages())
 def test_generated_pages_are_what_make_docs_writes(name):
     assert (ROOT / "docs" / name).read_text() == pages()[name].rstrip() + "\n"
 
@@ -26,7 +27,10 @@ def commands(page):
     return [line[2:] for line in lines if line.startswith("$ starcat ")]
 
 
-@pytest.mark.parametrize("name", ["README.md", "docs/tutorial.md"])
+WALKED = ["README.md", "docs/tutorial.md", "docs/howto-prove.md", "docs/howto-query.md"]
+
+
+@pytest.mark.parametrize("name", WALKED)
 def test_every_command_of_a_page_runs(name, catalogs, tmp_path, monkeypatch):
     found = commands(ROOT / name)
     assert found
@@ -48,3 +52,10 @@ def test_links_between_pages_lead_somewhere():
     for page in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]:
         for target in re.findall(r"\]\((?!https?://|#)([^)#]+)", page.read_text()):
             assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_the_site_builds_without_a_warning(tmp_path):
+    built = sphinx_build(["-W", "--keep-going", "-q", "-b", "html", str(ROOT / "docs"), str(tmp_path)])
+    assert built == 0
+    every = {page.stem for page in (ROOT / "docs").glob("*.md")}
+    assert every == {page.stem for page in tmp_path.glob("*.html")} - {"genindex", "search"}

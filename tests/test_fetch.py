@@ -465,7 +465,7 @@ def test_waits_double_between_attempts(
     archive: Archive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waits: list[float] = []
-    monkeypatch.setattr("starcat.catalog.fetch.time.sleep", waits.append)
+    monkeypatch.setattr("starcat.download.time.sleep", waits.append)
     url = archive.serve("/tiny.dat", BODY, statuses=[500] * 9)
     with pytest.raises(DownloadError):
         fetch(tiny_source(url), tmp_path, retries=8, backoff_s=1.0)

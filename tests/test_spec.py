@@ -68,7 +68,7 @@ def changed(path: str, value: object) -> dict[str, Any]:
     *sections, name = path.split(".")
     place = spec
     for section in sections:
-        place = place[section]
+        place = place.setdefault(section, {})  # a section out of use is not dumped
     place[name] = value
     return spec
 
@@ -181,8 +181,8 @@ def test_missing_keys(key: str) -> None:
 
 
 def test_every_key_has_its_unit_in_its_name() -> None:
-    units = ("_deg", "_px", "_mag", "_jyear", "_mm", "_um", "_rad", "_arcsec")
-    plain = {"min_identified"}
+    units = ("_deg", "_px", "_mag", "_jyear", "_mm", "_um", "_rad", "_arcsec", "_mas_yr")
+    plain = {"min_identified", "outlier_share", "completeness", "ambiguous_odds", "min_probability"}
     for path, entry in KEYS.items():
         if entry["type"] == "number" and path.rpartition(".")[2] not in plain:
             assert path.endswith(units), path

@@ -13,16 +13,20 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from starcat import __version__
-from starcat.artifact.content import json_bytes
-from starcat.catalog.ingest import FileFacts
 from starcat.errors import ProductError, SchemaVersionError
-from starcat.schema import ProductSchema
+
+if TYPE_CHECKING:  # reading a manifest needs none of these
+    from starcat.catalog.ingest import FileFacts
+    from starcat.schema import ProductSchema
 
 MANIFEST_NAME = "manifest.json"
 MANIFEST_VERSION = "1.0.0"
+COUNTERPARTS_VERSION = "1.1.0"
+"""Of a manifest that lists catalogs of counterparts: the others stay as they were before."""
+
 DATABASE_NAME = "database.h5"
 PARTS = ("name", "version", "frame", "epoch_jyear", "spec", "sources", "products", "files")
 LIBRARIES = ("numpy", "scipy", "pyerfa", "pyarrow", "h5py", "pydantic", "matplotlib", "pillow")
@@ -35,7 +39,7 @@ class SourceFacts:
     Attributes
     ----------
     source, role : str
-        Name of the data source; ``stars`` or ``variability``.
+        Name of the data source; ``stars``, ``variability`` or ``crossmatch``.
     files : sequence of FileFacts
         Its input files.
     rows_read, kept : int
@@ -43,7 +47,7 @@ class SourceFacts:
     rejected : dict of str to int
         The others, by reason.
     joined : int, optional
-        Stars whose amplitude came from this source.
+        Stars whose amplitude came from this source, or whose counterpart is in it.
     """
 
     source: str
@@ -119,6 +123,23 @@ class ProductFacts:
         return facts
 
 
+def manifest_version(sources: Sequence[SourceFacts]) -> str:
+    """Return the version of the manifest of a build.
+
+    Parameters
+    ----------
+    sources : sequence of SourceFacts
+        What went in.
+
+    Returns
+    -------
+    str
+        The lowest that knows all of their roles.
+    """
+    roles = {source.role for source in sources}
+    return COUNTERPARTS_VERSION if "crossmatch" in roles else MANIFEST_VERSION
+
+
 def software_versions() -> dict[str, str]:
     """Return the versions of what computes and writes the products.
 
@@ -144,6 +165,8 @@ def manifest_digest(manifest: Mapping[str, Any]) -> str:
     str
         SHA-256, hexadecimal, of the canonical JSON of all other keys.
     """
+    from starcat.artifact.content import json_bytes  # with pyarrow, which reading does without
+
     others = {key: value for key, value in manifest.items() if key != "manifest_sha256"}
     return hashlib.sha256(json_bytes(others)).hexdigest()
 

@@ -15,6 +15,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from starcat.artifact.content import content_sha256
+from starcat.artifact.counterparts import counterpart_problems
 from starcat.errors import SchemaError
 from starcat.schema import ProductSchema
 from starcat.sphere import directions_from_radec, separation
@@ -40,12 +41,15 @@ class HeldProduct:
         Its entry in the manifest.
     directions : ndarray of float64, shape (N, 3)
         Of the artifact's stars, ICRS; no rows where they are not known.
+    stars : pyarrow.Table, optional
+        The artifact's stars; None where they are not known.
     """
 
     table: pa.Table
     schema: ProductSchema
     facts: Mapping[str, Any]
     directions: NDArray[np.float64]
+    stars: pa.Table | None = None
 
 
 Check = Callable[[HeldProduct], Iterator[str]]
@@ -211,6 +215,23 @@ def separations_are_those_of_the_stars(held: HeldProduct) -> Iterator[str]:
         yield f"separation_rad of row {row} is not that of its stars"
 
 
+def counterparts_are_those_of_the_stars(held: HeldProduct) -> Iterator[str]:
+    """Yield where counterparts contradict each other or their stars.
+
+    Parameters
+    ----------
+    held : HeldProduct
+        The product; only crossmatch has counterparts.
+
+    Yields
+    ------
+    str
+        The problem.
+    """
+    if held.schema.product == "crossmatch" and held.stars is not None:
+        yield from counterpart_problems(held.table, held.stars)
+
+
 TABLE_CHECKS: tuple[Check, ...] = (
     content_is_the_manifests,
     rows_are_in_order,
@@ -218,5 +239,9 @@ TABLE_CHECKS: tuple[Check, ...] = (
 )
 """Of every product whose columns follow its schema."""
 
-REFERENCE_CHECKS: tuple[Check, ...] = (star_rows_exist, separations_are_those_of_the_stars)
+REFERENCE_CHECKS: tuple[Check, ...] = (
+    star_rows_exist,
+    separations_are_those_of_the_stars,
+    counterparts_are_those_of_the_stars,
+)
 """Where the stars are known; each needs what the one before it found sound."""

@@ -14,10 +14,11 @@ from typing import Any, TypeVar
 
 import h5py
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
 from starcat.artifact.content import file_sha256, json_bytes
+from starcat.artifact.counterparts import counterparts_of
 from starcat.artifact.database_checks import (
     group_problems,
     index_problems,
@@ -259,27 +260,28 @@ def _file_problems(path: Path, facts: dict[str, Any]) -> Iterator[str]:
 def _check_products(artifact: Artifact, damaged: set[str], log: _Log) -> dict[str, HeldProduct]:
     """Return the products whose columns follow their schemas, after checking what is in them."""
     sound: dict[str, HeldProduct] = {}
-    directions = np.empty((0, 3))
+    stars: pa.Table | None = None
     for product in sorted(artifact.products, key=lambda name: name != "stars"):
         file = artifact.manifest["products"][product]["parquet"]
         if file in damaged:
             continue
-        held = log.get(file, product, _hold, artifact, product, directions)
+        held = log.get(file, product, _hold, artifact, product, stars)
         if held is None or not log.run(file, product, columns_follow_the_schema, held):
             continue
         sound[product] = held
         for check in TABLE_CHECKS:
             log.run(file, product, check, held)
         if product == "stars":
-            directions = directions_of(held.table)
+            stars = held.table
         elif "stars" in sound:
             all(log.run(file, product, check, held) for check in REFERENCE_CHECKS)
     return sound
 
 
-def _hold(artifact: Artifact, product: str, directions: NDArray[np.float64]) -> HeldProduct:
+def _hold(artifact: Artifact, product: str, stars: pa.Table | None) -> HeldProduct:
     facts = artifact.manifest["products"][product]
-    return HeldProduct(artifact.table(product), artifact.schema(product), facts, directions)
+    directions = np.empty((0, 3)) if stars is None else directions_of(stars)
+    return HeldProduct(artifact.table(product), artifact.schema(product), facts, directions, stars)
 
 
 def _count_problems(manifest: dict[str, Any], held: dict[str, HeldProduct]) -> Iterator[str]:
@@ -308,6 +310,13 @@ def _count_problems(manifest: dict[str, Any], held: dict[str, HeldProduct]) -> I
                 yield (
                     f"{source['source']}: rejected {source['rejected']}, but the product rejected "
                     f"holds {counted}"
+                )
+        if source["role"] == "crossmatch" and "crossmatch" in held:
+            found = counterparts_of(held["crossmatch"].table, source["source"])
+            if found != source["joined"]:
+                yield (
+                    f"{source['source']}: {source['joined']} stars have a counterpart, but the "
+                    f"product crossmatch holds {found}"
                 )
     for product, facts in products.items():
         if facts["parquet"] not in manifest["files"]:

@@ -1,16 +1,20 @@
-"""Star tables as files: whole at their final name, or not there."""
+"""Tables as files: whole at their final name, or not there."""
 
 from __future__ import annotations
 
 import os
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import pyarrow as pa
-
-from starcat.catalog.ingest import Ingested
 from starcat.errors import OutputError, reason
 from starcat.parquet import write_parquet
+
+if TYPE_CHECKING:  # other rooms write files without reading a catalog
+    import pyarrow as pa
+
+    from starcat.catalog.ingest import Ingested
 
 
 def rejected_path(output: Path) -> Path:
@@ -44,19 +48,56 @@ def write_star_tables(read: Ingested, output: Path) -> None:
     OutputError
         If the file cannot be written.
     """
-    _write(read.stars, output)
+    write_table(read.stars, output)
     beside = rejected_path(output)
     if len(read.rejected):
-        _write(read.rejected, beside)
+        write_table(read.rejected, beside)
     else:
         beside.unlink(missing_ok=True)
 
 
-def _write(table: pa.Table, path: Path) -> None:
+def write_table(table: pa.Table, path: Path) -> None:
+    """Write a table as a Parquet file.
+
+    Parameters
+    ----------
+    table : pyarrow.Table
+        Units and meanings are in its field metadata.
+    path : Path
+        Replaced when the new file is whole.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
+    with whole_file(path) as partial:
+        write_parquet(table, partial)
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Give a file to write to, which gets its final name when all of it is there.
+
+    Parameters
+    ----------
+    path : Path
+        The final name; its folder is made, and a file of that name is replaced.
+
+    Yields
+    ------
+    Path
+        Hidden, in the same folder; removed if the writing fails.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_parquet(table, partial)
+        yield partial
         partial.replace(path)
     except OSError as error:
         raise OutputError(

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from starcat.catalog.gunzip import MAGIC, GzipReader, Readable
-from starcat.catalog.source import DataSource, RecordFile
+from starcat.catalog.source import DataSource, RecordFile, data_source, source_names
 from starcat.errors import ParseError, SourceError, SourceMissing
 
 BLOCK_BYTES = 1 << 22
@@ -184,15 +184,36 @@ def _existing(folder: Path, name: str) -> Path | None:
     return None
 
 
+def source_of_file(path: Path) -> str | None:
+    """Return the source whose archive name a file has.
+
+    Parameters
+    ----------
+    path : Path
+        The file, with or without ``.gz``.
+
+    Returns
+    -------
+    str or None
+        A name of ``data_sources``; None where no archive has a file of that name.
+    """
+    named = (name for name in source_names() if _named_layout(data_source(name), path))
+    return next(named, None)
+
+
 def _layout_of(source: DataSource, path: Path) -> RecordFile:
     """Return the layout whose archive name the file has; the first where none fits."""
+    return _named_layout(source, path) or source.files[0]
+
+
+def _named_layout(source: DataSource, path: Path) -> RecordFile | None:
     name = path.name.removesuffix(".gz")
     for layout in source.files:
         for pattern in layout.file_names:
             stem = re.escape(pattern).replace(re.escape("{part}"), r"\w+")
             if re.fullmatch(stem, name):
                 return layout
-    return source.files[0]
+    return None
 
 
 def _files_in_folder(source: DataSource, folder: Path) -> list[InputFile]:

@@ -34,6 +34,7 @@ from starcat.catalog.records import Problem, Records
 from starcat.catalog.source import DataSource, data_source
 from starcat.catalog.stars import (
     StarBlock,
+    floats_of,
     move_to_epoch,
     sort_rows,
     table_from_columns,
@@ -234,7 +235,35 @@ def ingest(
         rejected=rejected,
         files=facts,
         problems=tuple(f"{files[n].path.name} {problem}" for n, problem in problems[:20]),
-        notes=missing_files(source, files),
+        notes=(*missing_files(source, files), *unmoved_stars(source_name, stars, epoch_jyear)),
+    )
+
+
+def unmoved_stars(source_name: str, stars: pa.Table, epoch_jyear: float | None) -> tuple[str, ...]:
+    """Return a note where most stars of a catalog are not at the epoch that was asked for.
+
+    Parameters
+    ----------
+    source_name : str
+        The catalog.
+    stars : pyarrow.Table
+        Its star table.
+    epoch_jyear : float, optional
+        Julian year that was asked for.
+
+    Returns
+    -------
+    tuple of str
+        How many stars stay at which epochs, having no proper motion; empty for a few.
+    """
+    epochs = floats_of(stars, "epoch_jyear")
+    unmoved = epochs[epochs != epoch_jyear] if epoch_jyear is not None else epochs[:0]
+    if 2 * len(unmoved) <= len(epochs):
+        return ()
+    years = " to ".join(f"{year:g}" for year in sorted({unmoved.min(), unmoved.max()}))
+    return (
+        f"{source_name}: {len(unmoved):,} of {len(epochs):,} stars have no proper motion and stay "
+        f"at J{years}, not J{epoch_jyear:g}",
     )
 
 

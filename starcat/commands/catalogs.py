@@ -97,3 +97,29 @@ def ingest(
         )
         write_star_tables(read, output)
     print_ingested(read, output, as_json=json)
+
+
+@app.command()
+def crossmatch(
+    a: Annotated[Path, typer.Argument(metavar="A", help="Star table (Parquet) of the stars.")],
+    b: Annotated[
+        Path, typer.Argument(metavar="B", help="Star table to look for their counterparts in.")
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Parquet file to write.")],
+    radius: Annotated[
+        float, typer.Option(min=0.001, max=600, help="Largest separation, arcsec.")
+    ] = 10.0,
+    json: Json = False,
+) -> None:
+    """Find the counterparts of stars in another catalog by position, epoch and magnitude.
+
+    Every candidate is written with its odds; the verdicts say how sure the likeliest one is.
+
+    Example: starcat crossmatch sao.parquet hipparcos.parquet -o found.parquet
+    """
+    from starcat.crossmatch import match_files
+    from starcat.crossmatch_reports import print_crossmatch
+    from starcat.spec import Crossmatch
+
+    found = match_files(a, b, output, Crossmatch(radius_arcsec=radius))
+    print_crossmatch(found, (a.stem, b.stem), output, as_json=json)

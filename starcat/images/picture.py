@@ -197,7 +197,7 @@ def _draw_legend(figure: Figure, names: Sequence[str | None], left_out: int) -> 
     figure.legend(handles=handles, loc="lower left", bbox_to_anchor=place, ncols=2,
                   frameon=False, borderaxespad=0.0, handletextpad=0.3)  # fmt: skip
     if left_out:
-        note = f"{left_out} more names have no room"
+        note = f"{left_out} more names have no room" if left_out > 1 else "1 name has no room"
         right = 1.0 - _RIGHT_IN / figure.get_figwidth()
         figure.text(right, 0.16 / figure.get_figheight(), note, color="#777", ha="right", size=8)
 

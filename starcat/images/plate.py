@@ -19,10 +19,15 @@ Array = NDArray[np.float64]
 
 SKY, STAR, LOST = "#0b1220", "#5ad1e6", "#ffb454"
 """Colours of the sky, of what is identified and of what is not."""
+_BRIGHT, _FAINT, _LARGE_PT = "#f4fbfd", "#a9bcc7", 7.0
+"""Colours of names, and the radius of a mark above which the first one is taken."""
 _LABEL_PT = 8.0
 _LETTER_PT = 0.62 * _LABEL_PT
 _MOST_LABELS = 60
+_LABEL_GAP_PT = 4.0
 _COMPASS_PT = 76.0
+_GLOW = ((3.2, 0.06), (2.2, 0.10), (1.5, 0.18), (1.0, 1.0))
+"""Layers of a spot: their sizes and opacities."""
 
 
 @dataclass(frozen=True)
@@ -93,14 +98,17 @@ def draw_sky(plate: Plate, image: NDArray[Any] | None) -> None:
     plate : Plate
         What is being drawn.
     image : ndarray, shape (height, width), or None
-        Grey values; without it every spot becomes a dot.
+        Grey values; without it every spot becomes a dot with a glow.
     """
     from matplotlib.colors import LinearSegmentedColormap
 
     width, height = plate.size
     if image is None:
         x, y = plate.centroids.T
-        plate.axes.scatter(x, y, 4.0 + 50.0 * (0.2 * plate.radii - 1.0) ** 1.5, color="white", lw=0)
+        width_pt = np.sqrt(4.0 + 50.0 * (0.2 * plate.radii - 1.0) ** 1.5)
+        for size, opacity in _GLOW:
+            area = (size * width_pt) ** 2
+            plate.axes.scatter(x, y, area, color="white", alpha=opacity, lw=0)
         return
     colours = LinearSegmentedColormap.from_list("sky", [SKY, "#8b97ad", "#ffffff"])
     extent = (0.0, float(width), float(height), 0.0)
@@ -175,7 +183,8 @@ def draw_names(plate: Plate, taken: Array) -> int:
     """
     from matplotlib.patheffects import withStroke
 
-    sizes = np.array([[_LETTER_PT * len(name or ""), 1.25 * _LABEL_PT] for name in plate.names])
+    widths = [_LETTER_PT * len(name or "") + _LABEL_GAP_PT for name in plate.names]
+    sizes = np.array([[width, 1.25 * _LABEL_PT] for width in widths])
     order = np.argsort(-plate.radii, kind="stable")
     wanted = [int(spot) for spot in order if plate.names[spot]]
     places = place_labels(
@@ -184,8 +193,9 @@ def draw_names(plate: Plate, taken: Array) -> int:
     halo = [withStroke(linewidth=2.0, foreground=SKY)]
     for spot, corner in places.items():
         x, y = (np.array(corner) + 0.5 * sizes[spot]) / plate.scale
+        colour = _BRIGHT if plate.radii[spot] > _LARGE_PT else _FAINT
         plate.axes.text(
-            x, y, str(plate.names[spot]), color="#eaf6f9", size=_LABEL_PT, ha="center",
+            x, y, str(plate.names[spot]), color=colour, size=_LABEL_PT, ha="center",
             va="center", path_effects=halo, parse_math=False,
         )  # fmt: skip
     return len(wanted) - len(places)

@@ -97,7 +97,8 @@ def draw_map(title: str, coverage: Coverage, summary: CoverageSummary) -> Figure
         _graticule(axes)
         axes.plot(*_cut(*project(*galactic_equator())), color="white", lw=1.0, ls=(0, (4, 3)))
         x, y = project(summary.worst_ra_deg, summary.worst_dec_deg)
-        axes.plot(x, y, "o", ms=11, mfc="none", mec=_RED, mew=2.2)
+        for colour, width in (("white", 4.2), (_RED, 2.2)):
+            axes.plot(x, y, "o", ms=11, mfc="none", mec=colour, mew=width)
         axes.set(xlim=(-3.02, 2.88), ylim=(-1.46, 1.46), aspect="equal")
         axes.set_axis_off()
         place = figure.add_axes((0.27, 0.1, 0.48, 0.025))
@@ -148,13 +149,15 @@ def _graticule(axes: Axes) -> None:
     for ra in (0, 60, 120, 240, 300):
         x, y = project(np.full(91, ra), dec)
         axes.plot(x, y, **line)
-        axes.text(float(x[45]), 0.02, f"{ra}°", color="white", ha="center", va="bottom", size=8)
+        # On the side of the meridian that the galactic equator does not cross.
+        axes.text(float(x[45]) - 0.03, 0.03, f"{ra}°", color="white", ha="right", size=8)
     for value in range(-60, 90, 30):
         x, y = project([180.0, 180.0], [value, value])
-        end = abs(float(x[0]))
+        end, height = abs(float(x[0])), float(y[0])
         axes.plot([-end, end], y, **line)
-        label = f"{value:+d}°" if value else "0°"
-        axes.text(-end - 0.03, float(y[0]), label, ha="right", va="center", size=8)
+        # The edge of the map leans away from the label of its parallel.
+        label = f"{value:+d}°".replace("-", "\N{MINUS SIGN}") if value else "0°"
+        axes.text(-1.03 * end - 0.02, 1.03 * height, label, ha="right", va="center", size=8)
 
 
 def _cut(x: Array, y: Array) -> tuple[Array, Array]:

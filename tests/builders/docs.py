@@ -1,4 +1,4 @@
-"""Write the generated pages of docs/: commands, products and data sources. ``make docs``."""
+"""Write the generated pages of docs/: commands, SQL, products and data sources. ``make docs``."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from typer.testing import CliRunner
 from starcat.catalog.source import data_source, source_names
 from starcat.catalog.verdict import Reason
 from starcat.cli import app
+from starcat.query.gallery import gallery
+from starcat.query.macros import macros
 from starcat.report.evaluation import reproduction_page
 from starcat.resources import resource_folder
 from starcat.schema import read_schema
@@ -59,6 +61,29 @@ def products_page() -> str:
     return "\n".join(page) + "\n"
 
 
+def sql_page() -> str:
+    """Return the reference of macros and named queries, from their SQL files."""
+    page = [
+        NOTE + "# SQL: macros and named queries\n",
+        "`starcat sql --macros` and `starcat sql --list` print the same. How to use them:",
+        "[howto-query.md](howto-query.md).\n\n## Macros\n",
+    ]
+    for macro in sorted(macros(), key=lambda m: (m.is_table, m.name)):
+        place = "FROM " if macro.is_table else ""
+        page.append(f"### {macro.name}\n\n`{place}{macro.name}({macro.arguments})`\n")
+        page.append(f"{macro.help}\n\n```sql\n{macro.example}\n```\n")
+    page.append("## Named queries\n")
+    for query in gallery().values():
+        names = " ".join(chr(ord("A") + k) for k in range(query.targets))
+        first = query.values[0] if query.values else None
+        given = f" --set {first.name}={first.default}" if first else ""
+        page.append(f"### {query.name}\n\n{query.help}\n")
+        page += [f"- `{v.name}` = {v.default}: {v.help}" for v in query.values]
+        page.append(f"\n```text\nstarcat sql {names} --named {query.name}{given}\n```\n")
+        page.append(f"```sql\n{query.text}\n```\n")
+    return "\n".join(page)
+
+
 def sources_page() -> str:
     """Return the reference of all data sources, from their TOML files."""
     page = [NOTE + "# Data sources\n"]
@@ -81,6 +106,7 @@ def pages() -> dict[str, str]:
     """Return all generated pages by file name."""
     return {
         "cli.md": cli_page(),
+        "sql.md": sql_page(),
         "products.md": products_page(),
         "sources.md": sources_page(),
         "reproduction.md": reproduction_page(DOCS / "reproduction.json"),

@@ -1,0 +1,383 @@
+"""Downloading one file, and going on where an earlier attempt ended.
+
+Input is an address (http, https, ftp) and a path; output is the body in ``<name>.part``
+beside it, which the caller checks and renames. After an interruption a part is continued: of
+a file that may change, if the server says that it is the same version; of content that is
+fixed, such as a blob named by its digest, always. A server that ignores ranges sends the
+whole. This module checks sizes, no digests.
+"""
+
+from __future__ import annotations
+
+import ftplib
+import logging
+import os
+import re
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Literal
+from urllib.parse import urlsplit
+
+import pooch
+import requests
+from pydantic import BaseModel, ConfigDict
+from urllib3.exceptions import HTTPError
+
+from starcat import __version__
+from starcat.errors import DownloadError, OutputError
+from starcat.progress import Progress, no_progress
+
+Arrival = Literal["downloaded", "resumed"]
+"""Fetched in one go; continued from an earlier part."""
+
+_logger = logging.getLogger(__name__)
+_BLOCK_BYTES = 1 << 18
+_LONGEST_WAIT_S = 60.0
+
+
+class NotFound(DownloadError):  # noqa: N818 - the name reads as the fact
+    """A file that the server says it does not have."""
+
+
+@dataclass(frozen=True)
+class DownloadOptions:
+    """How to download.
+
+    Attributes
+    ----------
+    retries : int
+        Further attempts after the first has failed.
+    timeout_s : float
+        Seconds to wait for a connection, and for each block of data.
+    backoff_s : float
+        Seconds before the second attempt; doubled for each further one, up to 60.
+    progress : Progress
+        Called with file name, bytes there are, and bytes in all or None.
+    fixed_bytes : int, optional
+        Size of content that never changes at its address; a body of another size is refused.
+    most_bytes : int, optional
+        A longer body is refused.
+    """
+
+    retries: int = 3
+    timeout_s: float = 60.0
+    backoff_s: float = 1.0
+    progress: Progress = no_progress
+    fixed_bytes: int | None = None
+    most_bytes: int | None = None
+
+
+class _PartState(BaseModel):
+    """Which version of which remote file a ``.part`` is the beginning of."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    url: str
+    validator: str
+    total: int | None
+
+    @property
+    def is_fixed(self) -> bool:
+        """Whether there is but one version."""
+        return not self.validator
+
+
+class _Refused(Exception):  # noqa: N818 - not an error of its own: it ends the attempts
+    """The server's answer will be the same next time."""
+
+    def __init__(self, message: str, status: int | None = None) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+class _Broken(Exception):  # noqa: N818
+    """The answer may be better next time."""
+
+
+# The errors of requests are OSErrors.
+_WORTH_A_RETRY = (_Broken, OSError, HTTPError, EOFError, ftplib.Error)
+
+
+def download(url: str, path: Path, options: DownloadOptions) -> Arrival:
+    """Bring one address to ``<name>.part``, trying again after a short wait.
+
+    Parameters
+    ----------
+    url : str
+        An address of http, https or ftp.
+    path : Path
+        The name that the caller will give to the file.
+    options : DownloadOptions
+        How.
+
+    Returns
+    -------
+    {"downloaded", "resumed"}
+        Whether an earlier part was continued.
+
+    Raises
+    ------
+    NotFound
+        If the server has no such file.
+    DownloadError
+        If it did not come; what has arrived is kept for the next attempt.
+    OutputError
+        If the part cannot be written.
+    """
+    reason: Exception | None = None
+    attempts = 1 + max(0, options.retries)
+    for attempt in range(attempts):
+        if attempt:
+            time.sleep(min(options.backoff_s * 2.0 ** (attempt - 1), _LONGEST_WAIT_S))
+        try:
+            if urlsplit(url).scheme == "ftp":
+                _transfer_ftp(url, path, options)
+                return "downloaded"
+            return "resumed" if _transfer_http(url, path, options) else "downloaded"
+        except _Refused as error:
+            kind = NotFound if error.status in (404, 410) else DownloadError
+            raise kind(f"{error}") from error
+        except ftplib.error_perm as error:
+            raise DownloadError(f"{error}") from error
+        except _WORTH_A_RETRY as error:
+            _logger.info("%s, attempt %d: %s", url, attempt + 1, error)
+            reason = error
+    raise DownloadError(f"{reason} (attempts: {attempts})") from reason
+
+
+def _transfer_http(url: str, path: Path, options: DownloadOptions) -> bool:
+    """Get what is missing of a file; tell whether an earlier part was continued."""
+    state = _part_state(url, path, options)
+    there = part_of(path).stat().st_size if state else 0
+    if state and there == state.total:
+        return True
+    headers = {"Accept-Encoding": "identity", "User-Agent": f"starcat/{__version__}"}
+    if state:
+        headers |= {"Range": f"bytes={there}-"}
+        headers |= {} if state.is_fixed else {"If-Range": state.validator}
+    with requests.get(url, headers=headers, stream=True, timeout=options.timeout_s) as response:
+        if not state or response.status_code not in (206, 416):
+            _receive_whole(response, url, path, options)
+            return False
+        if _continues(response, state, there):
+            _receive(response, path, there, state.total, options)
+            return True
+    _logger.info("%s: the part does not fit what is there now; starting over", url)
+    forget_part(path)
+    return _transfer_http(url, path, options)
+
+
+def _continues(response: requests.Response, state: _PartState, there: int) -> bool:
+    """Tell whether a partial answer begins where the part ends, in the same version."""
+    found = re.fullmatch(
+        r"bytes (\d+)-(\d+)/(\d+|\*)", response.headers.get("Content-Range", "").strip()
+    )
+    if response.status_code != 206 or found is None or int(found[1]) != there:
+        return False
+    same_total = state.total is None or found[3] in ("*", str(state.total))
+    validators = [response.headers.get(key) for key in ("ETag", "Last-Modified")]
+    # A server that ignores If-Range gives itself away by another validator.
+    same_version = state.is_fixed or state.validator in validators or not any(validators)
+    return same_total and same_version
+
+
+def _receive_whole(
+    response: requests.Response, url: str, path: Path, options: DownloadOptions
+) -> None:
+    """Take an answer that begins at the first byte, noting what a later part must match."""
+    answer = f"the server answered {response.status_code} {response.reason}"
+    if response.status_code >= 500 or response.status_code in (408, 429):
+        raise _Broken(answer)
+    if response.status_code != 200:
+        raise _Refused(answer, response.status_code)
+    packed = response.headers.get("Content-Encoding", "identity") != "identity"
+    if packed and not path.name.endswith(".gz"):
+        raise _Refused("the server packs the body although it was asked not to")
+    length = response.headers.get("Content-Length", "")
+    total = int(length) if length.isdecimal() else options.fixed_bytes
+    if options.fixed_bytes not in (None, total):
+        raise _Refused(f"the server has {total} bytes; expected {options.fixed_bytes}")
+    forget_part(path)
+    validator = _validator(response)
+    if validator and options.fixed_bytes is None:
+        _write_state(path, _PartState(url=url, validator=validator, total=total))
+    _receive(response, path, 0, total, options)
+
+
+def _validator(response: requests.Response) -> str | None:
+    """Return what names the version of the remote file; a weak ETag does not."""
+    etag: str | None = response.headers.get("ETag")
+    if etag and not etag.startswith("W/"):
+        return etag
+    return response.headers.get("Last-Modified")
+
+
+def _receive(
+    response: requests.Response,
+    path: Path,
+    there: int,
+    total: int | None,
+    options: DownloadOptions,
+) -> None:
+    """Append a body to the part as it comes, and see that all of it came, and no more."""
+    done = there
+    limits = [bytes_ for bytes_ in (total, options.most_bytes) if bytes_ is not None]
+    with _appending(part_of(path), path.name, there, total, options.progress) as write:
+        try:
+            # As sent: a .gz is not unpacked, whatever its headers say.
+            while block := response.raw.read1(_BLOCK_BYTES, decode_content=False):
+                if limits and done + len(block) > min(limits):
+                    raise _Refused(f"the body is longer than {min(limits)} bytes")
+                done = write(block)
+        except (HTTPError, OSError) as error:
+            reason = f"received {done} of {total or 'unknown'} bytes ({type(error).__name__})"
+            raise _Broken(reason) from error
+    if total is not None and done != total:
+        raise _Broken(f"received {done} of {total} bytes")
+
+
+def _transfer_ftp(url: str, path: Path, options: DownloadOptions) -> None:
+    """Get a whole file by FTP; an earlier part is not continued."""
+    address = urlsplit(url)
+    downloader = pooch.FTPDownloader(
+        port=address.port or ftplib.FTP_PORT, timeout=options.timeout_s, chunk_size=_BLOCK_BYTES
+    )
+    # Beside the part of an http address, which is dropped only when there is a whole file.
+    part = beside(path, ".ftp.part")
+    with _output(part):
+        part.unlink(missing_ok=True)
+    with _appending(part, path.name, 0, None, options.progress) as write:
+        target = SimpleNamespace(write=write)
+        downloader(f"ftp://{address.hostname}{address.path}", target, None)
+    forget_part(path)
+    rename(part, part_of(path))
+
+
+@contextmanager
+def _appending(
+    part: Path, name: str, there: int, total: int | None, progress: Progress
+) -> Iterator[Callable[[bytes], int]]:
+    """Open the part; yield a function that appends a block and returns the bytes there are.
+
+    Unbuffered: what has come is there for the next attempt, whatever happens. A full disk is
+    no failed download, and ends it.
+    """
+    done = there
+
+    def write(block: bytes) -> int:
+        nonlocal done
+        with _output(part):
+            rest = memoryview(block)
+            while rest:
+                rest = rest[stream.write(rest) :]
+        done += len(block)
+        progress(name, done, total)
+        return done
+
+    with _output(part):
+        stream = part.open("ab", buffering=0)
+    progress(name, there, total)
+    with stream:
+        yield write
+        os.fsync(stream.fileno())
+
+
+@contextmanager
+def _output(path: Path) -> Iterator[None]:
+    """Turn a failure to write into the error that says so."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error}", path=path) from error
+
+
+def beside(path: Path, suffix: str) -> Path:
+    """Return the path of the same name with something behind it.
+
+    Parameters
+    ----------
+    path : Path
+        A file.
+    suffix : str
+        What to append to its name.
+
+    Returns
+    -------
+    Path
+        In the same folder.
+    """
+    return path.with_name(path.name + suffix)
+
+
+def part_of(path: Path) -> Path:
+    """Return where the body of a file is until it is whole and checked.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    Path
+        ``<name>.part``.
+    """
+    return beside(path, ".part")
+
+
+def _part_state(url: str, path: Path, options: DownloadOptions) -> _PartState | None:
+    """Say what the part is the beginning of; None where it cannot be continued."""
+    try:
+        size = part_of(path).stat().st_size
+        if options.fixed_bytes is not None:
+            state = _PartState(url=url, validator="", total=options.fixed_bytes)
+            return state if 0 < size <= options.fixed_bytes else None
+        state = _PartState.model_validate_json(beside(path, ".part.json").read_bytes())
+    except (OSError, ValueError):
+        return None
+    return state if state.url == url and size > 0 else None
+
+
+def _write_state(path: Path, state: _PartState) -> None:
+    file = beside(path, ".part.json")
+    with _output(file):
+        file.write_text(state.model_dump_json() + "\n", encoding="utf-8")
+
+
+def rename(path: Path, target: Path) -> None:
+    """Rename a file, replacing what has the name.
+
+    Parameters
+    ----------
+    path, target : Path
+        Its name now, and the one to give it.
+
+    Raises
+    ------
+    OutputError
+        If that is not possible.
+    """
+    with _output(target):
+        path.replace(target)
+
+
+def forget_part(path: Path) -> None:
+    """Drop the part of a file, then its state: a state without a part is harmless.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Raises
+    ------
+    OutputError
+        If that is not possible.
+    """
+    for file in (part_of(path), beside(path, ".part.json")):
+        with _output(file):
+            file.unlink(missing_ok=True)

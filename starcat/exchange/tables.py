@@ -1,0 +1,121 @@
+"""What can be exported: the products of an artifact, or a Parquet file, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import partial
+from pathlib import Path
+
+import pyarrow as pa
+
+from starcat.artifact.reader import open_artifact
+from starcat.errors import ConfigError, SourceError, SourceMissing
+from starcat.parquet import read_parquet
+
+
+@dataclass(frozen=True)
+class NamedTables:
+    """Tables that are read when asked for.
+
+    Attributes
+    ----------
+    name : str
+        Of all of them together, such as the artifact's name and version.
+    readers : mapping of str to callable
+        What returns each table, by product.
+    """
+
+    name: str
+    readers: Mapping[str, Callable[[], pa.Table]]
+
+    def chosen(self, products: Sequence[str] | None) -> list[str]:
+        """Return the names asked for, in the order of the tables.
+
+        Parameters
+        ----------
+        products : sequence of str, optional
+            Names; all by default.
+
+        Returns
+        -------
+        list of str
+            Each once.
+
+        Raises
+        ------
+        ConfigError
+            If one is not there.
+        """
+        for product in products or ():
+            if product not in self.readers:
+                near = get_close_matches(product, self.readers, 1)
+                hint = f"did you mean {near[0]!r}? " if near else ""
+                raise ConfigError(
+                    f"{self.name} has no product {product!r}; {hint}it has "
+                    f"{', '.join(self.readers)}",
+                    key="product",
+                    value=product,
+                )
+        return [name for name in self.readers if not products or name in products]
+
+
+def tables_of(path: Path) -> NamedTables:
+    """Return the tables of an artifact, or the one of a Parquet file.
+
+    Parameters
+    ----------
+    path : Path
+        The folder of an artifact, or a file such as 'starcat ingest' writes.
+
+    Returns
+    -------
+    NamedTables
+        Products by name; the table of a file has the name of the file.
+
+    Raises
+    ------
+    ProductError
+        If a folder is not an artifact.
+    SourceError
+        If a file is missing or not Parquet.
+    """
+    if path.is_dir():
+        artifact = open_artifact(path)
+        readers = {name: partial(artifact.table, name) for name in artifact.products}
+        return NamedTables(f"{artifact.manifest['name']}-{artifact.manifest['version']}", readers)
+    if not path.exists():
+        raise SourceMissing(
+            f"{path}: does not exist; give the folder of an artifact or a Parquet file", path=path
+        )
+    return NamedTables(path.stem, {path.stem: partial(_read_file, path)})
+
+
+def in_memory(name: str, tables: Mapping[str, pa.Table]) -> NamedTables:
+    """Return tables that have been read.
+
+    Parameters
+    ----------
+    name : str
+        Of all of them together.
+    tables : mapping of str to pyarrow.Table
+        By product.
+
+    Returns
+    -------
+    NamedTables
+        The same.
+    """
+    return NamedTables(name, {product: partial(tables.__getitem__, product) for product in tables})
+
+
+def _read_file(path: Path) -> pa.Table:
+    try:
+        return read_parquet(path)
+    except (OSError, pa.ArrowException) as error:
+        raise SourceError(
+            f"{path}: not a readable Parquet file ({error}); give the folder of an artifact or a "
+            "Parquet file, or say with --from-peer whose file it is",
+            path=path,
+        ) from error

@@ -1,0 +1,155 @@
+"""Tables as CSV and JSON text, batch by batch.
+
+CSV: nothing for null, ``""`` for an empty text (for both where there is one column only),
+``nan`` and ``inf`` for numbers that are none, lists and records as JSON in the cell. JSON: an
+array of objects, one a line; JSON has neither NaN nor infinity, so both are null there. Integers
+have all their digits in both.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv as pcsv
+
+from starcat.exchange.column_types import is_list, plain_batch, plain_schema, time_texts
+
+_STEP_ROWS = 1 << 14
+
+
+def csv_chunks(batches: pa.RecordBatchReader) -> Iterator[tuple[bytes, int]]:
+    """Yield a table as CSV.
+
+    Parameters
+    ----------
+    batches : pyarrow.RecordBatchReader
+        The table.
+
+    Yields
+    ------
+    tuple of (bytes, int)
+        UTF-8 text, the header first, and how many rows it holds.
+
+    Raises
+    ------
+    SchemaError
+        If a column has no place in a file.
+    """
+    schema = plain_schema(batches.schema)
+    yield _csv(schema.empty_table().to_batches(), schema, header=True), 0
+    for batch in _small_batches(batches, schema):
+        yield _csv([batch], schema, header=False), batch.num_rows
+
+
+def json_chunks(batches: pa.RecordBatchReader) -> Iterator[tuple[bytes, int]]:
+    """Yield a table as a JSON array of objects.
+
+    Parameters
+    ----------
+    batches : pyarrow.RecordBatchReader
+        The table.
+
+    Yields
+    ------
+    tuple of (bytes, int)
+        UTF-8 text and how many rows it holds.
+
+    Raises
+    ------
+    SchemaError
+        If a column has no place in a file.
+    """
+    schema = plain_schema(batches.schema)
+    before = "[\n"
+    for batch in _small_batches(batches, schema):
+        texts = json_texts(batch.to_struct_array())
+        yield (before + ",\n".join(texts.to_pylist())).encode(), batch.num_rows
+        before = ",\n"
+    yield ("[]\n" if before == "[\n" else "\n]\n").encode(), 0
+
+
+def json_texts(values: pa.Array) -> pa.Array:
+    """Return each value as JSON.
+
+    Parameters
+    ----------
+    values : pyarrow.Array
+        Of a plain type.
+
+    Returns
+    -------
+    pyarrow.StringArray
+        Without nulls: a missing value, NaN and the infinities are ``null``.
+    """
+    kind = values.type
+    if is_list(kind):
+        texts = _list_texts(values)
+    elif pa.types.is_struct(kind):
+        texts = _record_texts(values)
+    elif pa.types.is_floating(kind):
+        finite = pc.fill_null(pc.is_finite(values), False)
+        return pc.if_else(finite, values.cast(pa.string()), "null")
+    elif pa.types.is_temporal(kind):
+        texts = _quoted(time_texts(values))
+    elif pa.types.is_string(kind):
+        texts = _quoted(values)
+    else:
+        texts = values.cast(pa.string())
+    return pc.fill_null(texts, "null")
+
+
+def _small_batches(batches: pa.RecordBatchReader, schema: pa.Schema) -> Iterator[pa.RecordBatch]:
+    """Yield the rows in steps whose text fits into memory, however large the batches are."""
+    for batch in batches:
+        for start in range(0, batch.num_rows, _STEP_ROWS):
+            yield plain_batch(batch.slice(start, _STEP_ROWS), schema)
+
+
+def _csv(batches: list[pa.RecordBatch], schema: pa.Schema, *, header: bool) -> bytes:
+    """Return batches as CSV; lists, records and times are texts in it."""
+    table = pa.Table.from_batches(batches, schema)
+    columns = [_cells(column.combine_chunks()) for column in table.columns]
+    if len(columns) == 1 and columns[0].null_count:
+        # A null alone in its row would be an empty line, which readers skip.
+        columns = [pc.fill_null(columns[0].cast(pa.string()), "")]
+    target = io.BytesIO()
+    pcsv.write_csv(
+        pa.table(columns, names=schema.names), target, pcsv.WriteOptions(include_header=header)
+    )
+    return target.getvalue()
+
+
+def _cells(values: pa.Array) -> pa.Array:
+    if is_list(values.type) or pa.types.is_struct(values.type):
+        return pc.if_else(values.is_valid(), json_texts(values), None)
+    return time_texts(values) if pa.types.is_temporal(values.type) else values
+
+
+def _quoted(texts: pa.Array) -> pa.Array:
+    """Return texts as JSON strings; each different one is quoted once."""
+    codes = texts.dictionary_encode()
+    quoted = [json.dumps(text, ensure_ascii=False) for text in codes.dictionary.to_pylist()]
+    return pa.array(quoted, pa.string()).take(codes.indices)
+
+
+def _list_texts(values: pa.Array) -> pa.Array:
+    items = json_texts(values.flatten())
+    lengths = pc.fill_null(values.value_lengths(), 0).to_numpy(zero_copy_only=False)
+    offsets = np.concatenate(([0], np.cumsum(lengths))).astype(np.int32)
+    joined = pc.binary_join(pa.ListArray.from_arrays(offsets, items), ",")
+    texts = pc.binary_join_element_wise("[", joined, "]", "")
+    return pc.if_else(values.is_valid(), texts, None)
+
+
+def _record_texts(values: pa.Array) -> pa.Array:
+    parts: list[pa.Array | str] = []
+    for field, items in zip(values.type, values.flatten(), strict=True):
+        comma = ", " if parts else ""
+        parts += [f"{comma}{json.dumps(field.name, ensure_ascii=False)}: ", json_texts(items)]
+    texts = pc.binary_join_element_wise("{", *parts, "}", "")
+    return pc.if_else(values.is_valid(), texts, None)

@@ -1,0 +1,378 @@
+"""Counterparts: which entry of one catalog is which star of another, and how sure that is.
+
+Two sets of moving stars in; every pair of star and candidate counterpart within a radius out,
+with separation, magnitude difference, odds and a verdict in words. Separations are measured at
+one epoch of the pair: a star with proper motion is moved to its candidate's epoch, a candidate
+with proper motion to the epoch of a star without. Knows neither catalogs nor files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from starcat.products.match_odds import MatchModel, Odds, match_odds
+from starcat.products.match_probability import runs
+from starcat.sphere import chord_from_separation, separation
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+VERDICTS = ("unique", "best", "ambiguous", "taken", "doubtful", "other")
+"""In words what a candidate is to its star; `Matches.verdict` counts in this order."""
+
+UNIQUE, BEST, AMBIGUOUS, TAKEN, DOUBTFUL, OTHER = range(len(VERDICTS))
+
+CHUNK = 1 << 17
+"""Stars searched at once: bounds the memory, whatever the size of the catalogs."""
+
+
+@dataclass(frozen=True)
+class MovingStars:
+    """Stars of one catalog, each at its own epoch.
+
+    Attributes
+    ----------
+    directions : ndarray of float64, shape (N, 3)
+        ICRS unit vectors at ``epoch_jyear``.
+    velocities : ndarray of float64, shape (N, 3)
+        Proper motions as vectors along the sky, radians a year; 0 where unknown.
+    has_motion : ndarray of bool, shape (N,)
+        Whether the proper motion is known.
+    epoch_jyear : ndarray of float64, shape (N,)
+        Julian years.
+    mag : ndarray of float64, shape (N,)
+        Magnitudes; NaN where unknown.
+    error_rad : ndarray of float64, shape (N,), optional
+        Standard deviations of the positions, each axis, radians.
+    """
+
+    directions: Array
+    velocities: Array
+    has_motion: Flags
+    epoch_jyear: Array
+    mag: Array
+    error_rad: Array | None = None
+
+    def at(self, rows: Rows, epoch_jyear: Array | float) -> Array:
+        """Return directions at an epoch.
+
+        Parameters
+        ----------
+        rows : ndarray of int64, shape (M,)
+            Which stars.
+        epoch_jyear : ndarray of float64, shape (M,) or float
+            Julian years; stars without proper motion stay.
+
+        Returns
+        -------
+        ndarray of float64, shape (M, 3)
+            ICRS unit vectors.
+        """
+        years = np.broadcast_to(epoch_jyear, len(rows)) - self.epoch_jyear[rows]
+        moved: Array = self.directions[rows] + self.velocities[rows] * years[:, None]
+        moved /= np.sqrt(np.einsum("ij,ij->i", moved, moved))[:, None]
+        return moved
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Stars and candidate counterparts within a radius; arrays of shape (M,).
+
+    Attributes
+    ----------
+    star, counterpart : ndarray of int64
+        Rows of the two sets.
+    separation_rad : ndarray of float64
+        Radians, at ``epoch_jyear``.
+    epoch_jyear : ndarray of float64
+        Julian year at which the two were compared.
+    unmoved_years : ndarray of float64
+        Years between their positions where neither could be moved, else 0.
+    """
+
+    star: Rows
+    counterpart: Rows
+    separation_rad: Array
+    epoch_jyear: Array
+    unmoved_years: Array
+
+    def take(self, rows: Rows | Flags) -> Pairs:
+        """Return some of the pairs.
+
+        Parameters
+        ----------
+        rows : ndarray of int64 or bool, shape (K,)
+            Which ones.
+
+        Returns
+        -------
+        Pairs
+            In the order of the rows.
+        """
+        return Pairs(
+            self.star[rows],
+            self.counterpart[rows],
+            self.separation_rad[rows],
+            self.epoch_jyear[rows],
+            self.unmoved_years[rows],
+        )
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Every candidate of every star, by star and rank; arrays of shape (M,).
+
+    Attributes
+    ----------
+    star, counterpart : ndarray of int64
+        Rows of the two sets.
+    rank, star_rank : ndarray of int64
+        Of the candidate among those of its star, and of the star among those of its candidate;
+        1 is the likeliest.
+    n_candidates, n_stars : ndarray of int64
+        Candidates of the star, and stars that the candidate is one of, within the radius.
+    separation_rad : ndarray of float64
+        Radians, at ``epoch_jyear``.
+    delta_mag : ndarray of float64
+        Magnitude of the candidate minus that of the star; NaN where either is unknown.
+    epoch_jyear : ndarray of float64
+        Julian year at which the two were compared.
+    odds : Odds
+        How likely each pair is, and the model behind it.
+    verdict : ndarray of int64
+        Index into `VERDICTS`.
+    """
+
+    star: Rows
+    counterpart: Rows
+    rank: Rows
+    star_rank: Rows
+    n_candidates: Rows
+    n_stars: Rows
+    separation_rad: Array
+    delta_mag: Array
+    epoch_jyear: Array
+    odds: Odds
+    verdict: Rows
+
+    def count(self, verdict: str) -> int:
+        """Return how many stars have a best candidate with a verdict.
+
+        Parameters
+        ----------
+        verdict : str
+            One of `VERDICTS`.
+
+        Returns
+        -------
+        int
+            Stars.
+        """
+        return int(((self.rank == 1) & (self.verdict == VERDICTS.index(verdict))).sum())
+
+
+def crossmatch(
+    stars: MovingStars, counterparts: MovingStars, radius_rad: float, model: MatchModel
+) -> Matches:
+    """Find the counterparts of stars in another catalog.
+
+    Parameters
+    ----------
+    stars, counterparts : MovingStars
+        The two catalogs.
+    radius_rad : float
+        Largest separation of a candidate at the epoch of the comparison, itself included.
+    model : MatchModel
+        Errors of positions and magnitudes, and what the verdicts ask for.
+
+    Returns
+    -------
+    Matches
+        In order of (star, rank). Of two candidates with the same odds the nearer one, then the
+        one with the lower row, comes first.
+
+    Raises
+    ------
+    ValueError
+        If the radius is not positive.
+
+    References
+    ----------
+    Sutherland and Saunders 1992, MNRAS 259, 413, section 2: likelihood ratio and reliability.
+    """
+    if not radius_rad > 0.0:
+        raise ValueError(f"radius_rad is {radius_rad}; expected a positive angle")
+    pairs = candidate_pairs(stars, counterparts, radius_rad)
+    odds = match_odds(stars, counterparts, pairs, radius_rad, model)
+    i, j = pairs.star, pairs.counterpart
+    star_rank, n_stars = _rank(j, odds.log_ratio, pairs.separation_rad, i)
+    rank, n_candidates = _rank(i, odds.log_ratio, pairs.separation_rad, j)
+    verdict = _verdicts(i, j, rank, star_rank, odds, model)
+    order = np.lexsort((rank, i))
+    found = Matches(
+        i,
+        j,
+        rank,
+        star_rank,
+        n_candidates,
+        n_stars,
+        pairs.separation_rad,
+        counterparts.mag[j] - stars.mag[i],
+        pairs.epoch_jyear,
+        odds,
+        verdict,
+    )
+    return _taken(found, order)
+
+
+def _taken(found: Matches, order: Rows) -> Matches:
+    """Return the matches in another order."""
+    arrays = {name: value[order] for name, value in vars(found).items() if name != "odds"}
+    return Matches(**arrays, odds=found.odds.take(order))
+
+
+def candidate_pairs(stars: MovingStars, counterparts: MovingStars, radius_rad: float) -> Pairs:
+    """Find every pair within a radius at the epoch that the two are compared at.
+
+    Parameters
+    ----------
+    stars, counterparts : MovingStars
+        The two catalogs.
+    radius_rad : float
+        Radians, itself included.
+
+    Returns
+    -------
+    Pairs
+        In order of (star, counterpart).
+
+    Notes
+    -----
+    Both are first compared at one epoch in the middle, where each query's radius is wider by
+    what its proper motion can add up to the farthest epoch on the other side: Barnard's star
+    needs 10 arcsec a year of it, most stars next to nothing.
+    """
+    moving = np.flatnonzero(stars.has_motion)
+    still = np.flatnonzero(~stars.has_motion)
+    everyone = np.arange(len(counterparts.mag))
+    parts = []
+    if len(moving) and len(everyone):
+        middle, reach = _middle(counterparts.epoch_jyear)
+        drift = _speed(stars, moving) * reach
+        query = stars.at(moving, middle)
+        for near, found in _near(query, radius_rad + drift, counterparts.directions):
+            parts.append(_trim(stars, counterparts, moving[near], found, radius_rad))
+    if len(still) and len(everyone):
+        # Here it is the candidates that move, so they ask and the stars without motion answer.
+        middle, reach = _middle(stars.epoch_jyear[still])
+        drift = _speed(counterparts, everyone) * reach
+        query = counterparts.at(everyone, middle)
+        for near, found in _near(query, radius_rad + drift, stars.directions[still]):
+            parts.append(_trim(stars, counterparts, still[found], near, radius_rad))
+    if not parts:
+        nothing = np.empty(0)
+        return Pairs(np.empty(0, np.int64), np.empty(0, np.int64), nothing, nothing, nothing)
+    joined = Pairs(
+        np.concatenate([part.star for part in parts]),
+        np.concatenate([part.counterpart for part in parts]),
+        np.concatenate([part.separation_rad for part in parts]),
+        np.concatenate([part.epoch_jyear for part in parts]),
+        np.concatenate([part.unmoved_years for part in parts]),
+    )
+    return joined.take(np.lexsort((joined.counterpart, joined.star)))
+
+
+def _middle(epochs: Array) -> tuple[float, float]:
+    """Return the median epoch and the years from it to the farthest one."""
+    middle = float(np.median(epochs))
+    return middle, float(np.abs(epochs - middle).max())
+
+
+def _speed(stars: MovingStars, rows: Rows) -> Array:
+    """Return the proper motions of stars, radians a year."""
+    velocity = stars.velocities[rows]
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", velocity, velocity)))
+
+
+def _near(query: Array, radii: Array, others: Array) -> Iterator[tuple[Rows, Rows]]:
+    """Yield rows of queries and of others that are near each other, in pieces.
+
+    A piece is searched with the largest of its radii, at most half as wide again as its least:
+    most radii are nearly the same, and the few wide ones do not slow down the others.
+    """
+    tree = cKDTree(others, leafsize=32, balanced_tree=False)
+    order = np.argsort(radii, kind="stable")
+    ascending = radii[order]
+    start = 0
+    while start < len(order):
+        alike = int(np.searchsorted(ascending, 1.5 * ascending[start], side="right"))
+        end = min(alike, start + CHUNK)
+        piece = order[start:end]
+        part = cKDTree(query[piece], leafsize=32, balanced_tree=False)
+        chord = _chord(float(ascending[end - 1]))
+        found = part.sparse_distance_matrix(tree, chord, output_type="ndarray")
+        yield piece[found["i"]], found["j"].astype(np.int64)
+        start = end
+
+
+def _chord(separation_rad: float) -> float:
+    """Return the radius of a search, a hair wider than asked: the separation itself decides."""
+    return chord_from_separation(separation_rad) * (1.0 + 1e-9) + 1e-14
+
+
+def _trim(
+    stars: MovingStars, counterparts: MovingStars, i: Rows, j: Rows, radius_rad: float
+) -> Pairs:
+    """Return those of some pairs that are within the radius at their epoch."""
+    star_moves, other_moves = stars.has_motion[i], counterparts.has_motion[j]
+    epoch_i, epoch_j = stars.epoch_jyear[i], counterparts.epoch_jyear[j]
+    epoch = np.where(star_moves | ~other_moves, epoch_j, epoch_i)
+    angle = separation(stars.at(i, epoch), counterparts.at(j, epoch))
+    unmoved = np.where(star_moves | other_moves, 0.0, np.abs(epoch_j - epoch_i))
+    return Pairs(i, j, angle, epoch, unmoved).take(angle <= radius_rad)
+
+
+def _rank(group: Rows, log_ratio: Array, angle: Array, other: Rows) -> tuple[Rows, Rows]:
+    """Return each pair's rank within its group, from 1, and the size of the group."""
+    order = np.lexsort((other, angle, -log_ratio, group))
+    first, size = runs(group[order])
+    rank, count = np.empty_like(group), np.empty_like(group)
+    rank[order] = np.arange(len(group)) - np.repeat(first, size) + 1
+    count[order] = np.repeat(size, size)
+    return rank, count
+
+
+def _verdicts(i: Rows, j: Rows, rank: Rows, star_rank: Rows, odds: Odds, model: MatchModel) -> Rows:
+    """Return the verdict on each pair, as an index into `VERDICTS`."""
+    near = float(np.log(model.ambiguous_odds))
+    behind, lead = _gaps(i, rank, odds.log_ratio)
+    star_behind, star_lead = _gaps(j, star_rank, odds.log_ratio)
+    verdict = np.full(len(i), BEST)
+    alone = np.isinf(lead) & np.isinf(star_lead)
+    verdict[alone] = UNIQUE
+    verdict[(lead <= near) | (star_lead <= near) | (star_rank > 1)] = AMBIGUOUS
+    verdict[star_behind > near] = TAKEN
+    verdict[rank > 1] = np.where(behind[rank > 1] <= near, AMBIGUOUS, OTHER)
+    verdict[(odds.any_probability < model.min_probability) & (rank == 1)] = DOUBTFUL
+    verdict[(odds.any_probability < model.min_probability) & (rank > 1)] = OTHER
+    return verdict
+
+
+def _gaps(group: Rows, rank: Rows, log_ratio: Array) -> tuple[Array, Array]:
+    """Return how far each pair is behind the first of its group, and how far a first one leads.
+
+    The lead of a pair that is not the first, and of one that is alone, is infinite.
+    """
+    behind, lead = np.zeros(len(group)), np.full(len(group), np.inf)
+    order = np.lexsort((rank, group))
+    first, size = runs(group[order])
+    behind[order] = np.repeat(log_ratio[order[first]], size) - log_ratio[order]
+    several = first[size > 1]
+    lead[order[several]] = log_ratio[order[several]] - log_ratio[order[several + 1]]
+    return behind, lead

@@ -1,0 +1,160 @@
+"""Queries that people ask often, by name: one SQL file each.
+
+The comments above a query say what it finds, how many targets it needs where that is not one
+(``-- Targets: 2``), and its values with their defaults (``-- count = 10: how many``).
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from starcat.errors import QueryError
+
+FOLDER = Path(__file__).parent / "gallery"
+
+_VALUE = re.compile(r"-- (\w+) = (.+?): (.+)")
+_TARGETS = re.compile(r"-- Targets: (\d+)")
+
+Literal = int | float | str
+
+
+@dataclass(frozen=True)
+class Value:
+    """A value that a named query can be given.
+
+    Attributes
+    ----------
+    name : str
+        ``$name`` in the query.
+    default : int, float or str
+        Where none is given; one that is given has its type.
+    help : str
+        What it means.
+    """
+
+    name: str
+    default: Literal
+    help: str
+
+
+@dataclass(frozen=True)
+class NamedQuery:
+    """A query of the gallery.
+
+    Attributes
+    ----------
+    name : str
+        Of its file.
+    help : str
+        What it finds.
+    targets : int
+        How many it is about.
+    values : tuple of Value
+        What it can be given.
+    text : str
+        SQL.
+    """
+
+    name: str
+    help: str
+    targets: int
+    values: tuple[Value, ...]
+    text: str
+
+    def with_values(self, given: Mapping[str, str]) -> dict[str, Literal]:
+        """Return the values of the query, given or by default.
+
+        Parameters
+        ----------
+        given : mapping of str to str
+            Texts by name.
+
+        Returns
+        -------
+        dict of str to int, float or str
+            One for each ``$name``.
+
+        Raises
+        ------
+        QueryError
+            If a name is unknown, or a text is no number where one is wanted.
+        """
+        values: dict[str, Literal] = {value.name: value.default for value in self.values}
+        for name, text in given.items():
+            if name not in values:
+                known = ", ".join(values) or "none"
+                raise QueryError(f"{self.name} has no value {name!r}; it has: {known}")
+            values[name] = _as(type(values[name]), text, f"--set {name}={text}")
+        return values
+
+
+def _as(kind: type[Literal], text: str, where: str) -> Literal:
+    try:
+        return kind(text)
+    except ValueError as error:
+        wanted = {int: "a whole number", float: "a number"}[kind]
+        raise QueryError(f"{where}: {text!r} is not {wanted}") from error
+
+
+@cache
+def gallery() -> dict[str, NamedQuery]:
+    """Return all named queries.
+
+    Returns
+    -------
+    dict of str to NamedQuery
+        By name.
+
+    Examples
+    --------
+    >>> gallery()["densest-fields"].values[0].default
+    10
+    """
+    return {path.stem: _read(path) for path in sorted(FOLDER.glob("*.sql"))}
+
+
+def named_query(name: str) -> NamedQuery:
+    """Return a query of the gallery.
+
+    Parameters
+    ----------
+    name : str
+        As ``starcat sql --list`` shows it.
+
+    Returns
+    -------
+    NamedQuery
+        The query.
+
+    Raises
+    ------
+    QueryError
+        If there is none of that name.
+    """
+    known = gallery()
+    if name not in known:
+        near = difflib.get_close_matches(name, known, 1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        raise QueryError(f"no query named {name!r}{hint} 'starcat sql --list' shows all")
+    return known[name]
+
+
+def _read(path: Path) -> NamedQuery:
+    lines = path.read_text(encoding="utf-8").splitlines()
+    told, values, targets = [], [], 1
+    start = next(k for k, line in enumerate(lines) if not line.startswith("--"))
+    for line in lines[:start]:
+        if value := _VALUE.fullmatch(line):
+            values.append(Value(value[1], json.loads(value[2].replace("'", '"')), value[3]))
+        elif count := _TARGETS.fullmatch(line):
+            targets = int(count[1])
+        else:
+            told.append(line.removeprefix("-- "))
+    text = "\n".join(lines[start:])
+    return NamedQuery(path.stem, " ".join(told), targets, tuple(values), text)

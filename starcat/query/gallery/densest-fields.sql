@@ -1,0 +1,6 @@
+-- The fields of the tiling with most guide stars.
+-- count = 10: how many fields
+SELECT boresight, ra_deg, dec_deg, star_count
+FROM boresights
+ORDER BY star_count DESC, boresight
+LIMIT $count

@@ -1,0 +1,7 @@
+-- Everything that is known of a star, kept or not.
+-- designation = 'SAO 308': its name, as the table has it
+SELECT 'guide star' AS verdict, COLUMNS(* EXCLUDE (x, y, z)) FROM stars
+WHERE designation = $designation
+UNION ALL BY NAME
+SELECT reason AS verdict, COLUMNS(* EXCLUDE (reason)) FROM rejected
+WHERE designation = $designation

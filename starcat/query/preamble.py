@@ -1,0 +1,108 @@
+"""The SQL that makes the views and macros of some targets, for any DuckDB."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from starcat.errors import QueryError
+from starcat.query.columns import Facts
+from starcat.query.macros import macros
+from starcat.query.targets import Target, View, open_targets
+
+
+def schemas_of(targets: Sequence[Target]) -> dict[str, Target]:
+    """Return the schemas of some targets.
+
+    Parameters
+    ----------
+    targets : sequence of Target
+        In order.
+
+    Returns
+    -------
+    dict of str to Target
+        A target alone is ``main`` and its own name; several are ``a``, ``b``, ``c`` … and their
+        names.
+    """
+    short = ["main"] if len(targets) == 1 else [chr(ord("a") + k) for k in range(len(targets))]
+    named = {target.name: target for target in targets}
+    return {**dict(zip(short, targets, strict=True)), **named}
+
+
+def preamble(targets: Sequence[Target]) -> str:
+    """Return the SQL that makes the views and the macros of some targets.
+
+    Parameters
+    ----------
+    targets : sequence of Target
+        What the views are of.
+
+    Returns
+    -------
+    str
+        One statement a line or more.
+    """
+    lines = [macro.text + ";" for macro in macros() if not macro.is_table]
+    for schema, target in schemas_of(targets).items():
+        lines.append(f"CREATE SCHEMA IF NOT EXISTS {schema};")
+        for view in target.views:
+            lines += _view_statements(f"{schema}.{view.name}", view)
+        lines += [macro.statement(schema) + ";" for macro in macros() if macro.is_table]
+    return "\n".join(lines)
+
+
+def preamble_of(given: Sequence[str]) -> str:
+    """Return the preamble of targets by name, for use outside of starcat.
+
+    Parameters
+    ----------
+    given : sequence of str
+        Artifacts and Parquet files, as for `open_targets`.
+
+    Returns
+    -------
+    str
+        After it, any DuckDB has the views and macros; nothing limits what it may do.
+
+    Raises
+    ------
+    QueryError
+        If a target is an archive, which has no tables before it is ingested.
+    """
+    with tempfile.TemporaryDirectory(prefix="starcat-sql-") as folder:
+        targets = open_targets(given, Path(folder))
+        for target in targets:
+            if any(Path(folder) in p.parents for view in target.views for p in view.paths):
+                raise QueryError(
+                    f"{target.name}: an archive file has no tables that another DuckDB could "
+                    "read; write them with 'starcat ingest' and give the Parquet file"
+                )
+        return preamble(targets)
+
+
+def quoted(text: str) -> str:
+    """Return a text as SQL writes it.
+
+    Parameters
+    ----------
+    text : str
+        Any.
+
+    Returns
+    -------
+    str
+        In quotes, with those inside doubled.
+    """
+    return "'" + text.replace("'", "''") + "'"
+
+
+def _view_statements(name: str, view: View) -> list[str]:
+    files = ", ".join(quoted(str(path.resolve())) for path in view.paths)
+    made = [f"CREATE VIEW {name} AS FROM read_parquet([{files}], hive_partitioning = false);"]
+    if view.schema is None:
+        return made
+    facts = {c.name: str(Facts(c.unit, c.description)) for c in view.schema.columns}
+    made.append(f"COMMENT ON VIEW {name} IS {quoted(view.schema.description)};")
+    return made + [f"COMMENT ON COLUMN {name}.{c} IS {quoted(told)};" for c, told in facts.items()]

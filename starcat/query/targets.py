@@ -1,0 +1,240 @@
+"""What a query is about: artifacts, star tables, archive files, and the views on them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from starcat.errors import ProductError, QueryError
+from starcat.progress import Progress, no_progress
+from starcat.schema import ProductSchema, product_schema
+
+MANIFEST_NAME = "manifest.json"
+HATS_NAMES = ("hats.properties", "properties")
+SCHEMA_KEY = "starcat.schema"
+
+
+@dataclass(frozen=True)
+class View:
+    """A table as a query sees it.
+
+    Attributes
+    ----------
+    name : str
+        Of the product, or of the file where starcat did not write it.
+    paths : tuple of Path
+        Its Parquet files: one, or the partitions of a HATS catalog.
+    schema : ProductSchema, optional
+        Of the product: columns with their units and meanings.
+    """
+
+    name: str
+    paths: tuple[Path, ...]
+    schema: ProductSchema | None = None
+
+
+@dataclass(frozen=True)
+class Target:
+    """Something that a query is about.
+
+    Attributes
+    ----------
+    name : str
+        Schema of its views: the artifact's, the source's or the file's name.
+    version : str
+        Of an artifact; empty otherwise.
+    views : tuple of View
+        One a table.
+    """
+
+    name: str
+    version: str
+    views: tuple[View, ...]
+
+
+def open_targets(
+    given: Sequence[str], scratch: Path, progress: Progress = no_progress
+) -> tuple[Target, ...]:
+    """Find the tables of what was named.
+
+    Parameters
+    ----------
+    given : sequence of str
+        For each target the folder of an artifact or of a HATS catalog, a Parquet file, an
+        archive's file under its own name, ``SOURCE=PATH``, or the name of a source that `locate`
+        finds.
+    scratch : Path
+        Folder for the star tables of archive files.
+    progress : Progress
+        Called while archive files are read.
+
+    Returns
+    -------
+    tuple of Target
+        With names that differ: where two are the same, version or number is added.
+
+    Raises
+    ------
+    QueryError
+        If something is none of these.
+    ProductError, SchemaVersionError, SourceError
+        If it is, but cannot be read.
+    """
+    targets = [_open_target(text, scratch / str(k), progress) for k, text in enumerate(given)]
+    names = [target.name for target in targets]
+    if len(set(names)) < len(names):
+        names = [identifier(f"{target.name}_{target.version}".strip("_")) for target in targets]
+    numbered = [
+        f"{name}_{names[:k].count(name) + 1}" if name in names[:k] else name
+        for k, name in enumerate(names)
+    ]
+    return tuple(replace(target, name=name) for target, name in zip(targets, numbered, strict=True))
+
+
+def identifier(text: str) -> str:
+    """Return a name that SQL needs no quotes for.
+
+    Parameters
+    ----------
+    text : str
+        Any.
+
+    Returns
+    -------
+    str
+        Lower case letters, digits and underscores.
+
+    Examples
+    --------
+    >>> identifier("gaia-12deg"), identifier("2mass-8x6")
+    ('gaia_12deg', '_2mass_8x6')
+    """
+    name = re.sub(r"\W+", "_", text.lower(), flags=re.ASCII).strip("_") or "table"
+    return f"_{name}" if name[0].isdigit() else name
+
+
+def _open_target(text: str, scratch: Path, progress: Progress) -> Target:
+    path = Path(text)
+    if path.is_dir() and (path / MANIFEST_NAME).exists():
+        return _artifact(path)
+    if path.is_dir() and any((path / name).exists() for name in HATS_NAMES):
+        return _hats(path)
+    if path.is_file() and path.suffix == ".parquet":
+        return _tables(path)
+    source, inputs = _source_of(text, path)
+    if source is None:
+        what = "cannot tell what it is" if path.exists() else "does not exist"
+        raise QueryError(
+            f"{text}: {what}; give the folder of an artifact or a HATS catalog, a Parquet file, an "
+            "archive file (SOURCE=PATH where its name is not the archive's), or a source that "
+            "'starcat sources' lists"
+        )
+    return _archive(source, inputs, scratch, progress)
+
+
+def _artifact(folder: Path) -> Target:
+    from starcat.artifact.manifest import read_manifest
+
+    manifest = read_manifest(folder)
+    views = []
+    for product, facts in manifest["products"].items():
+        name, _, version = str(facts["schema"]).rpartition("-")
+        path = folder / str(facts["parquet"])
+        # A manifest names files of its own folder, and nothing else may be read.
+        if path.parent != folder or path.is_symlink() or not product.isidentifier():
+            raise ProductError(
+                f"{folder}: the manifest names {facts['parquet']!r} for {product}, which is no "
+                "file of the artifact; fetch or build it again",
+                product=product,
+                path=folder,
+            )
+        _check_file(path)
+        views.append(View(product, (path,), product_schema(name, version)))
+    return Target(identifier(manifest["name"]), manifest["version"], tuple(views))
+
+
+def _check_file(path: Path) -> None:
+    """Check that a Parquet file is whole enough to be opened."""
+    try:
+        with path.open("rb") as file:
+            begins = file.read(4)
+            file.seek(-4, 2)
+            is_parquet = begins == file.read(4) == b"PAR1"
+    except OSError as error:
+        raise ProductError(
+            f"{path}: cannot be read ({error.strerror}); fetch or build it again", path=path
+        ) from error
+    if not is_parquet:
+        raise ProductError(
+            f"{path}: not a whole Parquet file (PAR1 at both ends); fetch or build it again",
+            path=path,
+        )
+
+
+def _tables(path: Path) -> Target:
+    """Return a Parquet file, with the rejected rows beside it where there are any."""
+    views = [_table(path)]
+    beside = path.with_name(f"{path.stem}.rejected{path.suffix}")
+    if beside.is_file():
+        views.append(_table(beside))
+    return Target(identifier(path.stem), "", tuple(views))
+
+
+def _hats(folder: Path) -> Target:
+    """Return a HATS catalog: one table in many files, each a part of the sky."""
+    parts = tuple(sorted(folder.glob("dataset/Norder=*/Dir=*/Npix=*.parquet")))
+    if not parts:
+        raise ProductError(
+            f"{folder}: a HATS catalog without a partition "
+            "(dataset/Norder=*/Dir=*/Npix=*.parquet); get it again",
+            path=folder,
+        )
+    name = identifier(folder.resolve().name)
+    view = _table(parts[0])
+    return Target(name, "", (replace(view, name=view.name if view.schema else name, paths=parts),))
+
+
+def _table(path: Path) -> View:
+    import duckdb
+
+    _check_file(path)
+    asked = "SELECT decode(value) FROM parquet_kv_metadata($path) WHERE decode(key) = $key"
+    try:
+        with duckdb.connect() as connection:
+            found = connection.execute(asked, {"path": str(path), "key": SCHEMA_KEY}).fetchall()
+    except duckdb.Error as error:
+        raise ProductError(f"{path}: cannot be read ({error}); get the file again") from error
+    name, _, version = (found[0][0] if found else "").rpartition("-")
+    schema = product_schema(name, version) if name else None
+    return View(schema.product if schema else identifier(path.stem), (path,), schema)
+
+
+def _source_of(text: str, path: Path) -> tuple[str | None, list[Path]]:
+    """Return the source that a text names, and the files it names of it."""
+    from starcat.catalog.files import source_of_file
+    from starcat.catalog.source import data_source, source_names
+
+    name, separator, given = text.partition("=")
+    if separator and not path.exists():
+        return data_source(name).name, [Path(given)]
+    if path.is_file():
+        return source_of_file(path), [path]
+    return (text, []) if text in source_names() else (None, [])
+
+
+def _archive(source: str, inputs: list[Path], scratch: Path, progress: Progress) -> Target:
+    """Read an archive's files into Parquet files that a query can see."""
+    from starcat.catalog.ingest import ingest
+    from starcat.catalog.locate import locate
+    from starcat.parquet import write_parquet
+
+    read = ingest(source, locate(source, {source: inputs}), progress=progress)
+    scratch.mkdir(parents=True)
+    views = []
+    for name, table in (("stars", read.stars), ("rejected", read.rejected)):
+        path = scratch / f"{name}.parquet"
+        write_parquet(table, path)
+        views.append(View(name, (path,), product_schema(name)))
+    return Target(identifier(source), "", tuple(views))

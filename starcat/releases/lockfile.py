@@ -1,0 +1,204 @@
+"""``starcat.lock``: which version of which artifact a project uses, from where, by digest.
+
+One entry an artifact, sorted, without a clock: the same pins are the same bytes.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict
+
+from starcat.artifact.content import json_bytes
+from starcat.errors import ConfigError, ProductError
+from starcat.releases.files import locked, make_folder, replace_file, writing
+from starcat.releases.registry import is_address
+from starcat.releases.tree import Release, check_version, parse
+
+LOCK_NAME = "starcat.lock"
+LOCK_VERSION = "1.0.0"
+
+
+class Pin(Release):
+    """An artifact that a lock file pins.
+
+    Attributes
+    ----------
+    registry : str
+        Where it came from: an address, or a folder relative to the lock file's.
+    """
+
+    registry: str
+
+
+class _Head(BaseModel):
+    model_config = ConfigDict(frozen=True, strict=True)
+
+    format: Literal["starcat-lock"]
+    lock_version: str
+
+
+class _Lock(_Head):
+    artifacts: list[Pin]
+
+
+def read_pins(path: Path) -> dict[str, Pin]:
+    """Read a lock file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    dict of str to Pin
+        By name of the artifact; none if there is no file.
+
+    Raises
+    ------
+    ProductError
+        If it is damaged.
+    SchemaVersionError
+        If it is of a newer starcat.
+    """
+    try:
+        data = path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError):
+        return {}
+    try:
+        check_version("lock", parse(_Head, data, str(path)).lock_version, LOCK_VERSION, str(path))
+        lock = parse(_Lock, data, str(path))
+    except ProductError as error:
+        what = str(error).removesuffix("; the registry is damaged")
+        raise ProductError(
+            f"{what}; restore the lock file, or remove it and pull again", path=path
+        ) from error
+    return {pin.name: pin for pin in lock.artifacts}
+
+
+def prepare(path: Path) -> None:
+    """Make the folder of a lock file, before anything is pulled that could not be pinned.
+
+    Parameters
+    ----------
+    path : Path
+        The lock file.
+
+    Raises
+    ------
+    OutputError
+        If that is not possible.
+    """
+    with _writing(path):
+        make_folder(path.parent)
+
+
+def _writing(path: Path) -> AbstractContextManager[None]:
+    return writing(path, "choose another file with --lock")
+
+
+def write_pin(path: Path, release: Release, registry: str) -> None:
+    """Pin a release, in place of another version of the same artifact.
+
+    Parameters
+    ----------
+    path : Path
+        The lock file; made if need be. Other entries stay.
+    release : Release
+        What to pin.
+    registry : str
+        A folder or an address.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
+    given = registry if is_address(registry) else _seen_from(path.parent, registry)
+    pin = Pin(name=release.name, version=release.version, manifest=release.manifest, registry=given)
+    prepare(path)
+    with _writing(path), locked(path.parent):
+        pins = read_pins(path) | {pin.name: pin}
+        data = _lock_bytes(pins)
+        if not path.is_file() or path.read_bytes() != data:
+            replace_file(path, data, path.parent)
+
+
+def _lock_bytes(pins: Mapping[str, Pin]) -> bytes:
+    content = {
+        "format": "starcat-lock",
+        "lock_version": LOCK_VERSION,
+        "artifacts": [pins[name].model_dump() for name in sorted(pins)],
+    }
+    return json_bytes(content)
+
+
+def _seen_from(folder: Path, registry: str) -> str:
+    """Return a relative folder as seen from the lock file; an absolute one stays."""
+    if os.path.isabs(registry):
+        return registry
+    return Path(os.path.relpath(registry, folder)).as_posix()
+
+
+def pinned_registry(path: Path, pin: Pin) -> str:
+    """Return the registry of a pin as seen from here.
+
+    Parameters
+    ----------
+    path : Path
+        The lock file.
+    pin : Pin
+        One of its entries.
+
+    Returns
+    -------
+    str
+        A folder or an address.
+    """
+    return pin.registry if is_address(pin.registry) else str(path.parent / pin.registry)
+
+
+def pin_of(path: Path, pins: Mapping[str, Pin], name: str, version: str | None) -> Pin:
+    """Return the pin of an artifact.
+
+    Parameters
+    ----------
+    path : Path
+        The lock file, for messages.
+    pins : mapping of str to Pin
+        Its entries.
+    name : str
+        Of the artifact.
+    version : str, optional
+        The one that is asked for, if any.
+
+    Returns
+    -------
+    Pin
+        The entry.
+
+    Raises
+    ------
+    ConfigError
+        If there is none, or it is of another version.
+    """
+    if name not in pins:
+        there = ", ".join(sorted(pins)) or "nothing"
+        raise ConfigError(
+            f"{path} pins {there}, not {name}; pull it once without --locked",
+            key="locked",
+            value=name,
+        )
+    if version not in (None, pins[name].version):
+        raise ConfigError(
+            f"{path} pins {name} {pins[name].version}, not {version}; leave --locked out to pin "
+            "another version",
+            key="locked",
+            value=version,
+        )
+    return pins[name]

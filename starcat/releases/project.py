@@ -1,0 +1,136 @@
+"""What a project does with releases: pull what it asks for and pin it, or what is pinned."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from starcat.download import DownloadOptions
+from starcat.errors import ConfigError, ProductError
+from starcat.progress import Progress, no_progress
+from starcat.releases.lockfile import pin_of, pinned_registry, prepare, read_pins, write_pin
+from starcat.releases.pulling import Pulled, pull_release
+from starcat.releases.registry import open_registry
+from starcat.releases.tree import choose, parse_wanted
+
+
+def pull_wanted(
+    wanted: str,
+    registry: str | None,
+    output: Path,
+    lock: Path,
+    options: DownloadOptions | None = None,
+    progress: Progress = no_progress,
+) -> Pulled:
+    """Pull what a registry lists, and pin it.
+
+    Parameters
+    ----------
+    wanted : str
+        ``NAME@VERSION``, ``NAME@latest`` or ``NAME``, which is the latest.
+    registry : str, optional
+        A folder or an address; without it, the one that the artifact is pinned to.
+    output : Path
+        Folder to put ``<name>-<version>/`` into.
+    lock : Path
+        The lock file; written when all is there.
+    options : DownloadOptions, optional
+        How to download.
+    progress : Progress
+        Called with ("pull <name>", bytes done, bytes in all).
+
+    Returns
+    -------
+    Pulled
+        Where it is.
+
+    Raises
+    ------
+    ConfigError
+        If ``wanted`` is of another form, or there is no registry to pull from.
+    SourceMissing
+        If the registry has no such release.
+    OutputError
+        If there is no writing to the output or the lock file's folder.
+    ProductError
+        If the lock file pins the same version with another content; also as for
+        `pull_release`.
+    """
+    name, version = parse_wanted(wanted)
+    pin = read_pins(lock).get(name)
+    if registry is None and pin is None:
+        raise ConfigError(
+            f"{lock} does not pin {name}, so nothing says where it comes from; name a folder or "
+            "an address with --registry",
+            key="registry",
+        )
+    opened = open_registry(registry or (pinned_registry(lock, pin) if pin else ""), options)
+    release = choose(opened.releases(), name, version, opened.address)
+    if pin and pin.version == release.version and pin.manifest != release.manifest:
+        raise ProductError(
+            f"{opened.address}: the manifest of {release.title} is "
+            f"{release.manifest.sha256[:12]}; {lock} pins {pin.manifest.sha256[:12]}. A published "
+            "version never changes: find out who changed it, or remove the entry from the lock "
+            "file to accept it",
+            path=lock,
+        )
+    prepare(lock)
+    pulled = pull_release(opened, release, output, progress)
+    write_pin(lock, release, opened.address)
+    return pulled
+
+
+def pull_pinned(
+    wanted: str | None,
+    registry: str | None,
+    output: Path,
+    lock: Path,
+    options: DownloadOptions | None = None,
+    progress: Progress = no_progress,
+) -> list[Pulled]:
+    """Pull exactly what a lock file says; no index is read, and the lock file stays.
+
+    Parameters
+    ----------
+    wanted : str, optional
+        Only this artifact; with a version, it has to be the pinned one. None for all.
+    registry : str, optional
+        A folder or an address to take the content from; without it, those that are pinned.
+    output : Path
+        Folder to put ``<name>-<version>/`` into.
+    lock : Path
+        The lock file.
+    options : DownloadOptions, optional
+        How to download.
+    progress : Progress
+        Called with ("pull <name>", bytes done, bytes in all).
+
+    Returns
+    -------
+    list of Pulled
+        In the order of the names.
+
+    Raises
+    ------
+    ConfigError
+        If the lock file is missing, or does not pin what is asked for.
+    ProductError
+        As for `pull_release`.
+    DownloadError
+        As for `pull_release`.
+    """
+    pins = read_pins(lock)
+    if not pins:
+        raise ConfigError(
+            f"{lock}: pins nothing; 'starcat pull NAME@VERSION --registry ...' writes it",
+            key="lock",
+            value=str(lock),
+        )
+    chosen = [pins[name] for name in sorted(pins)]
+    if wanted is not None:
+        chosen = [pin_of(lock, pins, *parse_wanted(wanted))]
+    return [
+        pull_release(
+            open_registry(registry or pinned_registry(lock, pin), options), pin, output, progress
+        )
+        for pin in chosen
+    ]

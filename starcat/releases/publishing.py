@@ -1,0 +1,293 @@
+"""Publishing an artifact into a registry on disk.
+
+The order is what makes it safe: content first, each blob on disk under its digest; then the
+release, a file that is made once and never changed; the index last, made from the releases
+there are. Killed in between, it leaves content that nothing names yet, and the next run goes
+on. A release that is not in the index yet is put there by whoever publishes next.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from starcat.artifact.content import file_sha256, json_bytes
+from starcat.artifact.manifest import MANIFEST_NAME
+from starcat.artifact.verify import check_artifact
+from starcat.errors import ConfigError, OutputError, ProductError
+from starcat.progress import Progress, no_progress
+from starcat.releases.files import (
+    copy_to_part,
+    damaged,
+    locked,
+    make_folder,
+    replace_file,
+    sync_folder,
+    unique,
+    write_new,
+    writing,
+)
+from starcat.releases.registry import is_address
+from starcat.releases.tree import INDEX_NAME, Blob, Listed, files_of, index_bytes, parse
+
+INCOMING = ".incoming"
+"""Folder for what is not finished; may be removed while nobody publishes."""
+
+_LOCK = ".lock"
+_PARTS = {INCOMING, _LOCK, INDEX_NAME, "blobs", "versions"}
+
+
+@dataclass(frozen=True)
+class Published:
+    """What became of a publication.
+
+    Attributes
+    ----------
+    release : Listed
+        The release.
+    registry : Path
+        Where it is.
+    outcome : {"published", "unchanged"}
+        ``unchanged`` where it was there with the same manifest.
+    new_blobs, new_bytes : int
+        Content that the registry did not have.
+    """
+
+    release: Listed
+    registry: Path
+    outcome: Literal["published", "unchanged"]
+    new_blobs: int
+    new_bytes: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the outcome as plain values.
+
+        Returns
+        -------
+        dict
+            For JSON.
+        """
+        return {
+            "outcome": self.outcome,
+            "registry": str(self.registry),
+            "new_blobs": self.new_blobs,
+            "new_bytes": self.new_bytes,
+            **self.release.model_dump(),
+        }
+
+
+def publish_artifact(artifact: Path, registry: str, progress: Progress = no_progress) -> Published:
+    """Put an artifact into a registry.
+
+    Parameters
+    ----------
+    artifact : Path
+        The folder ``<name>-<version>``.
+    registry : str
+        A folder; made if need be.
+    progress : Progress
+        Called with ("publish", bytes done, bytes in all).
+
+    Returns
+    -------
+    Published
+        The release and what was new.
+
+    Raises
+    ------
+    ConfigError
+        If the registry is an address, which can only be read.
+    ProductError
+        If the artifact is not whole, or the registry is damaged.
+    OutputError
+        If the version is there with another content, or the folder cannot be written to.
+    """
+    if is_address(registry):
+        raise ConfigError(
+            f"{registry}: a registry behind an address can only be read; publish into a folder, "
+            "and upload that folder to where the address leads",
+            key="registry",
+            value=registry,
+        )
+    root = Path(registry)
+    contents, release = _contents(artifact)
+    with writing(root, "what has arrived is kept: publish again to go on"):
+        _prepare(root)
+        _check_not_taken(root, release)
+        new = _keep_all(root, contents, progress)
+        is_new = _record(root, release)
+        _make_index(root)
+    return Published(
+        release, root, "published" if is_new else "unchanged", len(new), sum(b.bytes for b in new)
+    )
+
+
+def _contents(artifact: Path) -> tuple[dict[Path, Blob], Listed]:
+    """Return the files of a whole artifact and the release that they make."""
+    manifest = check_artifact(artifact).manifest
+    files = files_of(manifest, str(artifact / MANIFEST_NAME))
+    path = artifact / MANIFEST_NAME
+    itself = Blob(sha256=file_sha256(path), bytes=path.stat().st_size)
+    contents = {**{artifact / name: blob for name, blob in files.items()}, path: itself}
+    facts = {
+        "name": manifest["name"],
+        "version": manifest["version"],
+        "manifest": itself.model_dump(),
+        "files": len(contents),
+        "bytes": sum(blob.bytes for blob in contents.values()),
+    }
+    try:
+        return contents, parse(Listed, json_bytes(facts), str(path))
+    except ProductError as error:
+        raise ProductError(
+            f"{path}: name {manifest['name']!r}, version {manifest['version']!r}: cannot be "
+            "published; expected lower-case letters, digits and hyphens, and a version like "
+            "1.10.0 without leading zeros. Change the spec and build again",
+            path=path,
+        ) from error
+
+
+def _prepare(root: Path) -> None:
+    """Make the folders of a registry, but not in a folder that holds something else."""
+    there = {path.name for path in root.iterdir()} if root.is_dir() else set()
+    if there and not there & _PARTS:
+        raise OutputError(
+            f"{root}: neither empty nor a registry; publish into a folder of its own", path=root
+        )
+    make_folder(root / INCOMING)
+
+
+def _check_not_taken(root: Path, release: Listed) -> bool:
+    """Return whether the release is there; refuse if it is another one."""
+    path = root / release.path
+    if not path.is_file():
+        return False
+    there = parse(Listed, path.read_bytes(), str(path))
+    if there != release:
+        raise OutputError(
+            f"{root}: has {release.title} already, with another content (manifest "
+            f"{there.manifest.sha256[:12]}, here {release.manifest.sha256[:12]}). A published "
+            "version never changes: raise the version in the spec, build, and publish that",
+            path=path,
+        )
+    return True
+
+
+def _keep_all(root: Path, contents: dict[Path, Blob], progress: Progress) -> set[Blob]:
+    """Have all content in the registry, and return what was new."""
+    total, done, new = sum(blob.bytes for blob in contents.values()), 0, set()
+    for path, blob in contents.items():
+        progress("publish", done, total)
+        if _keep(root, path, blob):
+            new.add(blob)
+        done += blob.bytes
+    progress("publish", done, total)
+    return new
+
+
+def _keep(root: Path, source: Path, blob: Blob) -> bool:
+    """Have content in the registry, and return whether it is new there."""
+    final = root / blob.path
+    part = root / INCOMING / f"{blob.sha256}.part"
+    with locked(part) as is_mine:
+        if os.path.lexists(final):
+            part.unlink(missing_ok=True)
+            _check_kept(final, blob)
+            return False
+        arriving = part if is_mine else unique(part.parent, part.name)
+        copy_to_part(source, blob, arriving)
+        make_folder(final.parent)
+        arriving.replace(final)
+        # Not before: a part has to be writable for who goes on with it.
+        final.chmod(final.stat().st_mode & 0o555)
+        if not is_mine:
+            part.unlink(missing_ok=True)
+        sync_folder(final.parent)
+    return True
+
+
+def _check_kept(path: Path, blob: Blob) -> None:
+    """Refuse to build a release upon a damaged blob."""
+    whole = path.is_file() and not path.is_symlink() and path.stat().st_size == blob.bytes
+    if not whole or file_sha256(path) != blob.sha256:
+        raise damaged(
+            path,
+            "not the content that its name says. The registry is damaged: remove that blob and "
+            "publish again",
+        )
+
+
+def _record(root: Path, release: Listed) -> bool:
+    """Make the file of a release, whole from the first moment; return False if it is there."""
+    final = root / release.path
+    make_folder(final.parent)
+    new = unique(root / INCOMING, f"{release.title}.json")
+    try:
+        write_new(new, json_bytes(release.model_dump()))
+        new.chmod(new.stat().st_mode & 0o555)
+        _give_free_name(root, new, final)
+    except FileExistsError:
+        return not _check_not_taken(root, release)
+    finally:
+        new.unlink(missing_ok=True)
+    sync_folder(final.parent)
+    return True
+
+
+def _give_free_name(root: Path, new: Path, final: Path) -> None:
+    """Rename a file, but never onto another: a hard link fails where the name is taken."""
+    try:
+        os.link(new, final)
+    except OSError as error:
+        if error.errno not in (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS):
+            raise
+        with locked(root / _LOCK):  # no links on this file system
+            if os.path.lexists(final):
+                raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST)) from error
+            new.rename(final)
+
+
+def _make_index(root: Path) -> None:
+    """Make the index from the releases there are.
+
+    Under a lock; and looking again afterwards, because a file system may have none. Whoever
+    writes last has looked after writing, so no release of another publisher is lost.
+    """
+    path = root / INDEX_NAME
+    with locked(root / _LOCK):
+        releases: list[Listed] | None = None
+        while releases != (found := recorded(root)):
+            releases = found
+            data = index_bytes(releases)
+            if not path.is_file() or path.read_bytes() != data:
+                replace_file(path, data, root / INCOMING)
+
+
+def recorded(root: Path) -> list[Listed]:
+    """Return the releases of a registry by their own files, which the index is made from.
+
+    Parameters
+    ----------
+    root : Path
+        The registry.
+
+    Returns
+    -------
+    list of Listed
+        By name, then by version.
+
+    Raises
+    ------
+    ProductError
+        If one is damaged, or under another name than its own.
+    """
+    found = []
+    for path in root.glob("versions/[!.]*/[!.]*.json"):
+        release = parse(Listed, path.read_bytes(), str(path))
+        if root / release.path != path:
+            raise damaged(path, f"holds {release.title}; the registry is damaged")
+        found.append(release)
+    return sorted(found, key=lambda release: release.order)

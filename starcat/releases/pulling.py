@@ -1,0 +1,222 @@
+"""Pulling a release: every file checked on arrival, the artifact as a whole, then its name.
+
+What arrives is kept in ``.<name>-<version>.<digest>.partial`` beside the final folder until
+all is there, and a pull that was killed goes on from it. Files are copied, not linked: who
+edits a pulled file must not change the registry.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from starcat.artifact.content import file_sha256
+from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
+from starcat.artifact.verify import check_artifact, verify_artifact
+from starcat.artifact.writer import publish
+from starcat.download import part_of
+from starcat.errors import OutputError, ProductError, SchemaError
+from starcat.progress import Progress, no_progress
+from starcat.releases.files import locked, sync_folder, writing
+from starcat.releases.registry import Registry
+from starcat.releases.tree import Blob, Release, files_of
+
+
+@dataclass(frozen=True)
+class Pulled:
+    """What became of a pull.
+
+    Attributes
+    ----------
+    release : Release
+        The release.
+    registry : str
+        Where it came from.
+    folder : Path
+        Where it is.
+    outcome : {"pulled", "unchanged"}
+        ``unchanged`` where it was there already, whole.
+    """
+
+    release: Release
+    registry: str
+    folder: Path
+    outcome: Literal["pulled", "unchanged"]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the outcome as plain values.
+
+        Returns
+        -------
+        dict
+            For JSON.
+        """
+        release = self.release
+        return {
+            "outcome": self.outcome,
+            "artifact": str(self.folder),
+            "registry": self.registry,
+            "name": release.name,
+            "version": release.version,
+            "manifest": release.manifest.model_dump(),
+        }
+
+
+def pull_release(
+    registry: Registry, release: Release, output: Path, progress: Progress = no_progress
+) -> Pulled:
+    """Pull a release into a folder.
+
+    Parameters
+    ----------
+    registry : Registry
+        Where from.
+    release : Release
+        What; its manifest is taken by its digest.
+    output : Path
+        Folder to put ``<name>-<version>/`` into.
+    progress : Progress
+        Called with ("pull <name>", bytes done, bytes in all).
+
+    Returns
+    -------
+    Pulled
+        Where it is.
+
+    Raises
+    ------
+    OutputError
+        If something else has the name there, or the folder cannot be written to.
+    DownloadError
+        If a file does not come; what has arrived is kept.
+    ProductError
+        If the registry is damaged, or what it holds is no whole artifact.
+    SchemaVersionError
+        If the artifact is of a newer starcat.
+    """
+    final = output / release.title
+    if _is_there(final, release) and not _place_for(final, release).exists():
+        return Pulled(release, registry.address, final, "unchanged")
+    with (
+        writing(output, "what has arrived is kept: pull again to go on, or into another --output"),
+        _workplace(final, release) as place,
+    ):
+        if _is_there(final, release):  # another pull was faster, or killed after the last step
+            return Pulled(release, registry.address, final, "unchanged")
+        whole = _assemble(registry, release, place, progress)
+        publish(whole, final, replace=False)
+        sync_folder(output)
+    return Pulled(release, registry.address, final, "pulled")
+
+
+def _is_there(final: Path, release: Release) -> bool:
+    """Return whether the release is at its final name; refuse if something else is."""
+    if not os.path.lexists(final):
+        return False
+    manifest = final / MANIFEST_NAME
+    if not manifest.is_file() or file_sha256(manifest) != release.manifest.sha256:
+        raise OutputError(
+            f"{final} already exists and is not {release.title} of the registry; move it away, or "
+            "choose another --output",
+            path=final,
+        )
+    findings = verify_artifact(final).findings
+    if findings:
+        raise OutputError(
+            f"{final} already exists and is damaged: {findings[0]}; move it away and pull again",
+            path=final,
+        )
+    return True
+
+
+def _place_for(final: Path, release: Release) -> Path:
+    return final.with_name(f".{final.name}.{release.manifest.sha256[:12]}.partial")
+
+
+@contextmanager
+def _workplace(final: Path, release: Release) -> Iterator[Path]:
+    """Give the folder for what has arrived; it stays if going on later makes sense."""
+    place = _place_for(final, release)
+    if place.is_symlink():
+        place.unlink()
+    with locked(place / "lock"):
+        try:
+            yield place
+        except (ProductError, SchemaError):
+            shutil.rmtree(place, ignore_errors=True)
+            raise
+        shutil.rmtree(place, ignore_errors=True)
+
+
+def _assemble(registry: Registry, release: Release, place: Path, progress: Progress) -> Path:
+    """Bring what is missing of a release, and return its folder, found whole."""
+    whole, stage = place / "artifact", f"pull {release.name}"
+    where = f"{registry.address}: {release.title}"
+    _remove_links(place)
+    _bring(registry, release.manifest, whole / MANIFEST_NAME, place)
+    manifest = _manifest_of(whole, where)
+    if (manifest["name"], manifest["version"]) != (release.name, release.version):
+        raise ProductError(
+            f"{where}: its manifest is that of {manifest['name']}-{manifest['version']}; the "
+            "registry is damaged"
+        )
+    files = files_of(manifest, where)
+    _remove_unlisted(whole, files)
+    done, total = 0, sum(blob.bytes for blob in files.values())
+    for name, blob in files.items():
+        _bring(registry, blob, whole / name, place, _from(done, total, stage, progress))
+        done += blob.bytes
+    progress(stage, done, total)
+    try:
+        check_artifact(whole)
+    except ProductError as error:
+        what = str(error).removeprefix(f"{whole}: ")
+        raise ProductError(f"{where}: not a whole artifact: {what}") from error
+    return whole
+
+
+def _manifest_of(folder: Path, where: str) -> dict[str, Any]:
+    try:
+        return read_manifest(folder)
+    except (ProductError, RecursionError) as error:
+        what = str(error).partition(": ")[2].partition("; ")[0]
+        raise ProductError(f"{where}: {what}; the registry is damaged") from error
+
+
+def _from(offset: int, total: int, stage: str, progress: Progress) -> Progress:
+    """Report the progress of one file as that of all."""
+    return lambda name, done, of: progress(stage, offset + done, total)
+
+
+def _remove_links(place: Path) -> None:
+    """Remove what would lead out of the workplace."""
+    for path in [*place.rglob("*")]:
+        if path.is_symlink():
+            path.unlink()
+
+
+def _remove_unlisted(folder: Path, files: Mapping[str, Blob]) -> None:
+    for path in [*folder.rglob("*")]:
+        name = path.relative_to(folder).as_posix()
+        if path.is_file() and name not in files and name != MANIFEST_NAME:
+            path.unlink()
+
+
+def _bring(
+    registry: Registry, blob: Blob, target: Path, place: Path, progress: Progress = no_progress
+) -> None:
+    """Have a file, either from an earlier pull or from the registry."""
+    if target.is_file() and target.stat().st_size == blob.bytes:
+        if file_sha256(target) == blob.sha256:
+            return
+        target.unlink()
+    arriving = place / "parts" / blob.sha256
+    for folder in (arriving.parent, target.parent):
+        folder.mkdir(parents=True, exist_ok=True)
+    registry.bring(blob, arriving, progress)
+    part_of(arriving).replace(target)

@@ -1,0 +1,251 @@
+"""Reading a registry: a folder, or the same tree behind an address of static hosting."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+from urllib.parse import urlsplit
+
+from starcat.artifact.content import file_sha256
+from starcat.download import DownloadOptions, NotFound, download, forget_part, part_of
+from starcat.errors import ConfigError, DownloadError, ProductError, SourceMissing, reason
+from starcat.progress import Progress
+from starcat.releases.files import copy_to_part
+from starcat.releases.tree import INDEX_NAME, MAX_INDEX_BYTES, Blob, Listed, read_index
+
+
+class Registry(Protocol):
+    """What a registry can be asked for."""
+
+    @property
+    def address(self) -> str:
+        """Folder or URL, for messages and the lock file."""
+        ...
+
+    def releases(self) -> list[Listed]:
+        """Return what the index lists, by name, then by version."""
+        ...
+
+    def bring(self, blob: Blob, path: Path, progress: Progress) -> None:
+        """Bring content, checked, to the part of a path (`part_of`)."""
+        ...
+
+
+@dataclass(frozen=True)
+class FolderRegistry:
+    """A registry on disk.
+
+    Attributes
+    ----------
+    root : Path
+        Its folder.
+    """
+
+    root: Path
+
+    @property
+    def address(self) -> str:
+        """The folder as it was given."""
+        return str(self.root)
+
+    def releases(self) -> list[Listed]:
+        """Return what the index lists.
+
+        Returns
+        -------
+        list of Listed
+            By name, then by version.
+
+        Raises
+        ------
+        SourceMissing
+            If there is no index.
+        ProductError
+            If it is damaged.
+        """
+        path = self.root / INDEX_NAME
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise SourceMissing(
+                f"{self.root}: no registry, {INDEX_NAME} cannot be read ({reason(error)}); "
+                "'starcat publish' makes one",
+                path=path,
+            ) from error
+        return read_index(data, str(path))
+
+    def bring(self, blob: Blob, path: Path, progress: Progress) -> None:
+        """Copy content, going on where an earlier copy ended.
+
+        Parameters
+        ----------
+        blob : Blob
+            Which.
+        path : Path
+            Whose part to fill.
+        progress : Progress
+            Called with ("pull", bytes there are, bytes in all).
+
+        Raises
+        ------
+        ProductError
+            If the registry lacks it, or holds something else under its digest.
+        """
+        try:
+            copy_to_part(self.root / blob.path, blob, part_of(path), progress)
+        except ProductError as error:
+            error.args = (
+                f"{error}. The registry is damaged: remove that blob if it is there, and "
+                "publish the artifact again",
+            )
+            raise
+
+
+@dataclass(frozen=True)
+class HttpRegistry:
+    """A registry that a web server offers as files.
+
+    Attributes
+    ----------
+    root : str
+        Its address, without a slash at the end.
+    options : DownloadOptions
+        How to download.
+    """
+
+    root: str
+    options: DownloadOptions
+
+    @property
+    def address(self) -> str:
+        """The address."""
+        return self.root
+
+    def releases(self) -> list[Listed]:
+        """Return what the index lists.
+
+        Returns
+        -------
+        list of Listed
+            By name, then by version.
+
+        Raises
+        ------
+        SourceMissing
+            If the server has no index.
+        DownloadError
+            If it does not answer.
+        ProductError
+            If the index is damaged.
+        """
+        url = f"{self.root}/{INDEX_NAME}"
+        with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
+            path = Path(folder) / INDEX_NAME
+            try:
+                download(url, path, replace(self.options, most_bytes=MAX_INDEX_BYTES))
+            except NotFound as error:
+                raise SourceMissing(f"{self.root}: no registry, {INDEX_NAME}: {error}") from error
+            except DownloadError as error:
+                raise DownloadError(f"{url}: {error}. Try again later") from error
+            return read_index(part_of(path).read_bytes(), url)
+
+    def bring(self, blob: Blob, path: Path, progress: Progress) -> None:
+        """Download content, going on where an earlier download ended.
+
+        Parameters
+        ----------
+        blob : Blob
+            Which.
+        path : Path
+            Whose part to fill.
+        progress : Progress
+            Called with (file name, bytes there are, bytes in all).
+
+        Raises
+        ------
+        DownloadError
+            If it does not come; what has arrived is kept.
+        ProductError
+            If the server has something else under its digest.
+        """
+        url = f"{self.root}/{blob.path}"
+        options = replace(self.options, fixed_bytes=blob.bytes, progress=progress)
+        arrival = "resumed"
+        # What is wrong in a part of an earlier attempt may be the part.
+        while arrival == "resumed":
+            try:
+                arrival = download(url, path, options)
+            except NotFound as error:
+                raise DownloadError(
+                    f"{url}: {error}. The registry is damaged, or not yet uploaded as a whole"
+                ) from error
+            except DownloadError as error:
+                raise DownloadError(
+                    f"{url}: {error}. What has arrived is kept: pull again to go on"
+                ) from error
+            digest = file_sha256(part_of(path))
+            if digest == blob.sha256:
+                return
+            forget_part(path)
+        raise ProductError(
+            f"{url}: its sha256 begins with {digest[:12]}; expected {blob.sha256[:12]}. The "
+            "registry is damaged, or something on the way changes files"
+        )
+
+
+def open_registry(text: str, options: DownloadOptions | None = None) -> Registry:
+    """Return the registry at a folder or an address; nothing is read yet.
+
+    Parameters
+    ----------
+    text : str
+        A folder, or an address of http or https.
+    options : DownloadOptions, optional
+        How to download.
+
+    Returns
+    -------
+    Registry
+        To be asked.
+
+    Raises
+    ------
+    ConfigError
+        If it is an address of another kind.
+    """
+    if is_address(text):
+        return HttpRegistry(text.rstrip("/"), options or DownloadOptions())
+    return FolderRegistry(Path(text))
+
+
+def is_address(text: str) -> bool:
+    """Return whether a registry is reached over HTTP.
+
+    Parameters
+    ----------
+    text : str
+        A folder or an address.
+
+    Returns
+    -------
+    bool
+        False for a folder.
+
+    Raises
+    ------
+    ConfigError
+        If it is an address of another kind.
+    """
+    if "://" not in text:
+        return False
+    address = urlsplit(text)
+    if address.scheme not in ("http", "https") or address.query or address.fragment:
+        raise ConfigError(
+            f"registry {text!r}: expected a folder, or an address that begins with http:// or "
+            "https:// and has no ? or #",
+            key="registry",
+            value=text,
+        )
+    return True

@@ -1,0 +1,335 @@
+"""The tree of a registry: which files it has, what they are called and what they hold.
+
+``blobs/sha256/ab/abcd...`` is content by its digest, the manifests among it. A file
+``versions/<name>/<version>.json`` is a release, ``index.json`` the list of them all. Whatever
+a registry says is checked here before it becomes part of a path; nothing here opens a file.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from itertools import pairwise
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+
+from starcat.artifact.content import json_bytes
+from starcat.artifact.manifest import MANIFEST_NAME
+from starcat.errors import ConfigError, ProductError, SchemaVersionError, SourceMissing
+
+INDEX_NAME = "index.json"
+REGISTRY_VERSION = "1.0.0"
+LATEST = "latest"
+MAX_INDEX_BYTES = 1 << 26
+
+_NUMBER = r"(0|[1-9][0-9]{0,17})"
+_STEP = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}"
+_FILE_NAME = re.compile(rf"{_STEP}(/{_STEP}){{0,7}}")
+_M = TypeVar("_M", bound=BaseModel)
+
+Name = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9-]{0,63}$")]
+Version = Annotated[str, StringConstraints(pattern=rf"^{_NUMBER}\.{_NUMBER}\.{_NUMBER}$")]
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, strict=True)
+
+
+class Blob(_Model):
+    """Content by its digest.
+
+    Attributes
+    ----------
+    sha256 : str
+        Hexadecimal.
+    bytes : int
+        Size.
+    """
+
+    sha256: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
+    bytes: int = Field(ge=0)
+
+    @property
+    def path(self) -> str:
+        """Where it is in the tree."""
+        return f"blobs/sha256/{self.sha256[:2]}/{self.sha256}"
+
+
+class Release(_Model):
+    """A version of an artifact.
+
+    Attributes
+    ----------
+    name, version : str
+        Of the artifact.
+    manifest : Blob
+        Its file ``manifest.json``, which names all the others.
+    """
+
+    name: Name
+    version: Version
+    manifest: Blob
+
+    @property
+    def title(self) -> str:
+        """Name of the artifact's folder."""
+        return f"{self.name}-{self.version}"
+
+    @property
+    def order(self) -> tuple[str, int, int, int]:
+        """Sorts by name, then as semantic versions go: 1.10.0 after 1.9.0."""
+        major, minor, patch = (int(number) for number in self.version.split("."))
+        return self.name, major, minor, patch
+
+
+class Listed(Release):
+    """A release as the registry lists it.
+
+    Attributes
+    ----------
+    files, bytes : int
+        How many files it has, the manifest among them, and their sizes together.
+    """
+
+    files: int = Field(ge=1)
+    bytes: int = Field(ge=0)
+
+    @property
+    def path(self) -> str:
+        """Where it is in the tree."""
+        return f"versions/{self.name}/{self.version}.json"
+
+
+class _Head(_Model):
+    format: Literal["starcat-registry"]
+    registry_version: str
+
+
+class _Index(_Head):
+    releases: list[Listed]
+
+
+class _Files(_Model):
+    files: dict[str, Blob]
+
+
+def index_bytes(releases: Iterable[Listed]) -> bytes:
+    """Return the index of some releases.
+
+    Parameters
+    ----------
+    releases : iterable of Listed
+        In any order.
+
+    Returns
+    -------
+    bytes
+        The same for the same releases.
+    """
+    content = {
+        "format": "starcat-registry",
+        "registry_version": REGISTRY_VERSION,
+        "releases": [r.model_dump() for r in sorted(releases, key=lambda r: r.order)],
+    }
+    return json_bytes(content)
+
+
+def read_index(data: bytes, where: str) -> list[Listed]:
+    """Read an index.
+
+    Parameters
+    ----------
+    data : bytes
+        The file.
+    where : str
+        For messages.
+
+    Returns
+    -------
+    list of Listed
+        By name, then by version.
+
+    Raises
+    ------
+    ProductError
+        If it is damaged.
+    SchemaVersionError
+        If it is of a newer starcat.
+    """
+    check_version("registry", parse(_Head, data, where).registry_version, REGISTRY_VERSION, where)
+    index = parse(_Index, data, where)
+    releases = sorted(index.releases, key=lambda release: release.order)
+    for one, other in pairwise(releases):
+        if one.order == other.order:
+            raise ProductError(f"{where}: lists {one.title} twice; the registry is damaged")
+    return releases
+
+
+def check_version(kind: str, found: str, known: str, where: str) -> None:
+    """Refuse a file of another major version, whose content may be anything.
+
+    Parameters
+    ----------
+    kind : str
+        Of file.
+    found, known : str
+        Version of the file, and the one that this starcat writes.
+    where : str
+        For messages.
+
+    Raises
+    ------
+    SchemaVersionError
+        If the major numbers differ.
+    """
+    if found.split(".")[0] != known.split(".")[0]:
+        raise SchemaVersionError(
+            f"{where}: {kind} version {found}; this starcat reads {known}. Install a newer starcat",
+            found=found,
+            expected=known,
+        )
+
+
+def parse(model: type[_M], data: bytes, where: str) -> _M:
+    """Read a JSON file of a registry.
+
+    Parameters
+    ----------
+    model : type of BaseModel
+        What it should be.
+    data : bytes
+        The file.
+    where : str
+        For messages.
+
+    Returns
+    -------
+    BaseModel
+        Of that type.
+
+    Raises
+    ------
+    ProductError
+        If it is not what it should be, naming the first thing that is wrong.
+    """
+    with _explained(where):
+        return model.model_validate_json(data)
+
+
+@contextmanager
+def _explained(where: str) -> Iterator[None]:
+    """Say what pydantic found, in one line."""
+    try:
+        yield
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(str(step) for step in first["loc"])
+        found = "" if first["type"] == "json_invalid" else f" (found {str(first['input'])[:80]!r})"
+        raise ProductError(
+            f"{where}: not what starcat writes: {place + ': ' if place else ''}{first['msg']}"
+            f"{found}; the registry is damaged"
+        ) from error
+
+
+def files_of(manifest: Mapping[str, Any], where: str) -> dict[str, Blob]:
+    """Return the files that a manifest lists, none of which lies outside the artifact.
+
+    Parameters
+    ----------
+    manifest : mapping
+        As read.
+    where : str
+        For messages.
+
+    Returns
+    -------
+    dict of str to Blob
+        By path within the artifact, sorted.
+
+    Raises
+    ------
+    ProductError
+        If a path is absolute, leads out, or is no plain path.
+    """
+    with _explained(where):
+        files = _Files.model_validate({"files": manifest["files"]}).files
+    folders = {name[:k] for name in files for k, letter in enumerate(name) if letter == "/"}
+    for name in files:
+        if not _FILE_NAME.fullmatch(name) or name == MANIFEST_NAME or name in folders:
+            raise ProductError(
+                f"{where}: lists a file {name[:200]!r}, which is no plain path within an artifact; "
+                "nothing was written"
+            )
+    return dict(sorted(files.items()))
+
+
+def parse_wanted(text: str) -> tuple[str, str | None]:
+    """Read ``NAME@VERSION``.
+
+    Parameters
+    ----------
+    text : str
+        ``NAME``, ``NAME@latest`` or ``NAME@VERSION``.
+
+    Returns
+    -------
+    name : str
+        Of the artifact.
+    version : str or None
+        None for the latest.
+
+    Raises
+    ------
+    ConfigError
+        If it is something else.
+    """
+    name, separator, version = text.partition("@")
+    version = version if separator else LATEST
+    zeros = Blob(sha256="0" * 64, bytes=0)
+    try:
+        Release(name=name, version="0.0.0" if version == LATEST else version, manifest=zeros)
+    except ValidationError as error:
+        raise ConfigError(
+            f"{text!r} is not NAME@VERSION, such as gaia-12deg@1.0.0 or gaia-12deg@latest",
+            key="wanted",
+            value=text,
+        ) from error
+    return name, None if version == LATEST else version
+
+
+def choose(releases: Iterable[Listed], name: str, version: str | None, where: str) -> Listed:
+    """Find a release.
+
+    Parameters
+    ----------
+    releases : iterable of Listed
+        Of a registry.
+    name : str
+        Of the artifact.
+    version : str, optional
+        None for the latest, which is the highest and not the newest.
+    where : str
+        For messages.
+
+    Returns
+    -------
+    Listed
+        The release.
+
+    Raises
+    ------
+    SourceMissing
+        If there is none, saying what there is.
+    """
+    listed = list(releases)
+    named = sorted((r for r in listed if r.name == name), key=lambda r: r.order)
+    found = [r for r in named if version in (None, r.version)]
+    if found:
+        return found[-1]
+    if not named:
+        there = ", ".join(sorted({r.name for r in listed})[:20]) or "nothing"
+        raise SourceMissing(f"{where} has no artifact {name!r}; it has {there}")
+    there = ", ".join(r.version for r in named[-20:])
+    raise SourceMissing(f"{where} has no version {version} of {name}; it has {there}")

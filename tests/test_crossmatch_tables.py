@@ -1,0 +1,390 @@
+"""Cross-identification in artifacts and files: built, checked, rebuilt, compared, and printed."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import struct
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pyarrow as pa
+import pytest
+from jsonschema import Draft202012Validator
+
+from starcat.artifact.content import content_sha256, file_sha256, json_bytes
+from starcat.artifact.counterparts import counterpart_problems, matched_stars, moving_stars
+from starcat.artifact.diff import diff_artifacts
+from starcat.artifact.manifest import manifest_digest
+from starcat.artifact.reader import open_artifact
+from starcat.artifact.verify import verify_artifact
+from starcat.catalog.ingest import ingest
+from starcat.catalog.proper_motion import MAS, Motion, propagate
+from starcat.catalog.selection import select_guide_stars
+from starcat.crossmatch import (
+    match_catalogs,
+    match_files,
+    match_tables,
+    read_star_table,
+    with_rivals,
+)
+from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
+from starcat.parquet import read_parquet, write_parquet
+from starcat.pipeline import build
+from starcat.products.crossmatch import VERDICTS
+from starcat.products.match_odds import ARCSEC
+from starcat.rebuild import rebuild
+from starcat.resources import resource_folder
+from starcat.schema import product_schema
+from starcat.spec import BuildSpec, Crossmatch, spec_from_dict
+
+FIRST_ID = 1000
+
+
+def spec_of(text: str, **crossmatch: object) -> BuildSpec:
+    content = tomllib.loads(text)
+    if crossmatch:
+        content["products"] = {"crossmatch": crossmatch}
+    return spec_from_dict(content, "spec.toml")
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> Path:
+    """SAO as the small artifact has it, and 500 of the 600 stars as Gaia would: at J2016."""
+    folder = tmp_path_factory.mktemp("crossmatch")
+    (folder / "sao.dat").write_bytes(b"".join(sao_lines))
+    stars = ingest("sao", [folder / "sao.dat"]).stars
+    names = ("ra_deg", "dec_deg", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")
+    then = propagate(Motion(*(stars[name].to_numpy() for name in names)), 16.0)
+    generator = np.random.default_rng(16)
+    records = []
+    for row in range(500):
+        dec = then.dec_deg[row] + generator.normal(scale=0.2) / 3600.0
+        mag = stars["mag"][row].as_py() - 0.4
+        values = (then.ra_deg[row], dec, mag, mag + 0.1, mag - 0.5)
+        records.append(struct.pack("<qddfff", FIRST_ID + row, *values))
+    header = b"GDR3" + struct.pack("<IQ", 1, len(records))
+    (folder / "gaia_merged.bin").write_bytes(header + b"".join(records))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def artifact(files: Path, small_spec: str) -> Path:
+    spec = spec_of(small_spec, enabled=True, catalogs=["gaia"])
+    return build(spec, {name: [files] for name in ("sao", "gaia")}, files / "dist").folder
+
+
+@pytest.fixture
+def copy(artifact: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(artifact, tmp_path / artifact.name))
+
+
+# In an artifact ------------------------------------------------------------------------------
+
+
+def test_an_artifact_names_the_counterparts(artifact: Path):
+    opened = open_artifact(artifact)
+    table, stars = opened.table("crossmatch"), opened.table("stars")
+    product_schema("crossmatch").check(table)
+    best = table.filter(pa.array(table["rank"].to_numpy() == 1))
+    star_id = stars["star_id"].to_numpy()[best["star"].to_numpy()]
+    # Star numbers count from 1, and Gaia has the first 500 of them.
+    assert best["counterpart_id"].to_numpy().tolist() == (star_id + FIRST_ID - 1).tolist()
+    assert len(best) == (stars["star_id"].to_numpy() <= 500).sum()
+    assert set(best["verdict"].to_pylist()) == {"unique"}
+    assert set(best["compared_jyear"].to_pylist()) == {2016.0}
+    assert set(best["catalog"].to_pylist()) == {"gaia"}
+    assert best["delta_mag"].to_numpy() == pytest.approx(-0.4, abs=1e-5)
+    assert best["designation"][0].as_py() == f"Gaia DR3 {star_id[0] + FIRST_ID - 1}"
+
+
+def test_its_manifest_is_of_the_version_that_knows_counterparts(
+    artifact: Path, small_artifact: Path
+):
+    manifest = json.loads((artifact / "manifest.json").read_bytes())
+    schema = json.loads((resource_folder("schemas") / "manifest-1.1.0.json").read_text())
+    Draft202012Validator(schema).validate(manifest)
+    roles = [(source["source"], source["role"]) for source in manifest["sources"]]
+    assert roles == [("sao", "stars"), ("gaia", "crossmatch")]
+    assert manifest["sources"][1]["joined"] == len(open_artifact(artifact).table("crossmatch"))
+    assert manifest["products"]["crossmatch"]["in_database"] is False
+    with h5py.File(artifact / "database.h5") as file:
+        assert "crossmatch" not in file
+    # One that asks for none is what it was before there were any.
+    before = json.loads((small_artifact / "manifest.json").read_bytes())
+    assert before["manifest_version"] == "1.0.0"
+    assert "crossmatch" not in before["spec"]["products"]
+
+
+def test_an_unused_section_is_not_dumped(small_spec: str):
+    plain = spec_of(small_spec)
+    assert "crossmatch" not in plain.model_dump(mode="json")["products"]
+    named = spec_of(small_spec, catalogs=["gaia"], radius_arcsec=5.0)
+    assert named.sources == ("sao",)
+    again = spec_from_dict(named.model_dump(mode="json"), "manifest.json")
+    assert again == named
+    assert spec_from_dict(plain.model_dump(mode="json"), "manifest.json") == plain
+
+
+def test_a_rebuild_gives_the_same_bytes(artifact: Path, files: Path):
+    assert rebuild(artifact, {name: [files] for name in ("sao", "gaia")}).is_identical
+
+
+def test_a_sound_artifact_passes(artifact: Path):
+    assert verify_artifact(artifact).findings == ()
+
+
+def test_diff_says_that_it_came(artifact: Path, small_artifact: Path):
+    found = diff_artifacts(open_artifact(small_artifact), open_artifact(artifact))
+    changes = {change.product: (change.rows_a, change.is_same) for change in found.products}
+    assert changes.pop("crossmatch") == (None, False)
+    assert all(is_same for _, is_same in changes.values())
+    assert {change.name for change in found.sources} >= {"gaia crossmatch kept"}
+    assert diff_artifacts(open_artifact(artifact), open_artifact(artifact)).is_same
+
+
+def seal(folder: Path, table: pa.Table) -> None:
+    """Replace the product, and make every digest fit."""
+    schema, path = product_schema("crossmatch"), folder / "crossmatch.parquet"
+    write_parquet(table, path)
+    manifest = json.loads((folder / "manifest.json").read_bytes())
+    facts = {"rows": len(table), "content_sha256": content_sha256(table, schema)}
+    manifest["products"]["crossmatch"] |= facts
+    held = {"bytes": path.stat().st_size, "sha256": file_sha256(path)}
+    manifest["files"]["crossmatch.parquet"] = held
+    manifest["manifest_sha256"] = manifest_digest(manifest)
+    (folder / "manifest.json").write_bytes(json_bytes(manifest))
+
+
+def changed(table: pa.Table, name: str, row: int, value: object) -> pa.Table:
+    values = table[name].to_pylist()
+    values[row] = value
+    place = table.column_names.index(name)
+    field = table.schema.field(name)
+    return table.set_column(place, field, pa.array(values, field.type))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("star", 90_000, "star refers to rows"),
+        ("rank", 2, "rank of row 7 is not 1"),
+        ("separation_arcsec", 3.0, "separation_arcsec of row 7 is not that of its star"),
+        ("ra_deg", 12.0, "separation_arcsec of row 7 is not that of its star"),
+        ("delta_mag", 0.1, "delta_mag of row 7 is not that of its star"),
+        ("delta_mag", None, "delta_mag of row 7 is not that of its star"),
+        ("n_candidates", 4, "n_candidates of row 7"),
+        ("probability", 1.5, "probability of row 7"),
+        ("probability", float("nan"), "probability of row 7"),
+        ("verdict", "sure", "verdict sure; expected one of unique, best"),
+        ("verdict", "doubtful", "stars have a counterpart, but the product crossmatch holds"),
+    ],
+)
+def test_what_is_wrong_is_found(name: str, value: object, words: str, copy: Path):
+    table = read_parquet(copy / "crossmatch.parquet")
+    seal(copy, changed(table, name, 7, value))
+    found = " | ".join(str(finding) for finding in verify_artifact(copy).findings)
+    assert words in found
+
+
+def test_rows_out_of_order_are_found(copy: Path):
+    table = read_parquet(copy / "crossmatch.parquet")
+    seal(copy, table.take([1, 0, *range(2, len(table))]))
+    found = " | ".join(str(finding) for finding in verify_artifact(copy).findings)
+    assert "in the order of star, catalog, rank" in found
+
+
+def test_an_empty_product_has_no_problems(artifact: Path):
+    opened = open_artifact(artifact)
+    none = opened.table("crossmatch").slice(0, 0)
+    assert list(counterpart_problems(none, opened.table("stars"))) == []
+    assert len(matched_stars(none)) == 0
+
+
+def test_the_radius_of_the_spec_is_kept(files: Path, small_spec: str):
+    spec = spec_of(
+        small_spec.replace('"small"', '"both"').replace('"sao"', '"gaia"'),
+        enabled=True,
+        catalogs=["sao"],
+        radius_arcsec=3.0,
+    )
+    folder = build(spec, {name: [files] for name in ("sao", "gaia")}, files / "dist").folder
+    table = open_artifact(folder).table("crossmatch")
+    assert set(table["catalog"].to_pylist()) == {"sao"}
+    assert table["separation_arcsec"].to_numpy().max() <= 3.0
+    # The stars stay at J2016, having no proper motion: their counterparts are moved there.
+    assert set(table["compared_jyear"].to_pylist()) == {2016.0}
+    assert verify_artifact(folder).findings == ()
+
+
+def test_a_rejected_companion_is_a_rival(
+    files: Path, small_spec: str, sao_lines: list[bytes], tmp_path: Path
+):
+    # A star too faint for the guide stars, 3 arcsec from star 10, which Gaia has but once.
+    dec = float(sao_lines[9][193:204]) + 3.0 * ARCSEC
+    line = b"   601" + sao_lines[9][6:80] + b" 6.3" + sao_lines[9][84:193]
+    (tmp_path / "sao.dat").write_bytes(b"".join([*sao_lines, line + f"{dec:+11.8f}\n".encode()]))
+    stars = ingest("sao", [tmp_path / "sao.dat"]).stars
+    spec = spec_of(small_spec, enabled=True, catalogs=["gaia"])
+    selected = select_guide_stars(stars, spec.selection)
+    assert 601 not in selected.guide_stars["star_id"].to_pylist()
+    both = with_rivals(selected, 10.0 * ARCSEC)
+    assert both["star_id"].to_pylist() == [*selected.guide_stars["star_id"].to_pylist(), 601]
+    found = match_catalogs(selected, spec, {"gaia": [files]})
+    table = found.products[0].table
+    row = table["counterpart_id"].to_pylist().index(FIRST_ID + 9)
+    assert table["star"][row].as_py() == 9
+    assert (table["n_stars"][row].as_py(), table["verdict"][row].as_py()) == (2, "best")
+    assert table["star"].to_numpy().max() < len(selected.guide_stars)
+    assert found.sources[0].joined == len(matched_stars(table)) == len(table)
+
+
+def test_a_missing_catalog_is_known_before_anything_is_read(
+    files: Path, small_spec: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("STARCAT_CACHE", str(tmp_path / "none"))
+    monkeypatch.delenv("STARCAT_CATALOGS", raising=False)
+    spec = spec_of(small_spec, enabled=True, catalogs=["hipparcos"])
+    stages: list[str] = []
+    with pytest.raises(SourceMissing, match="hipparcos"):
+        build(
+            spec,
+            {"sao": [files / "sao.dat"]},
+            tmp_path / "out",
+            progress=lambda stage, *_: stages.append(stage),
+        )
+    assert stages == []
+
+
+@pytest.mark.parametrize(
+    ("section", "words"),
+    [
+        ({"enabled": True}, "no catalogs; name some"),
+        ({"enabled": True, "catalogs": ["gaia", "gaia"]}, "named twice"),
+        ({"enabled": True, "catalogs": ["sao"]}, "sao is the catalog of the stars themselves"),
+        ({"enabled": True, "catalogs": ["gcvs"]}, "'gcvs'"),
+        ({"radius_arcsec": 0.0}, "greater than 0"),
+        ({"radius_arcsec": 700.0}, "less than or equal to 600"),
+        ({"outlier_share": 1.0}, "less than 1"),
+        ({"ambiguous_odds": 0.5}, "greater than or equal to 1"),
+        ({"radius": 5.0}, "did you mean 'radius_arcsec'"),
+    ],
+)
+def test_sections_that_make_no_sense_are_refused(
+    section: dict[str, object], words: str, small_spec: str
+):
+    with pytest.raises(ConfigError, match=words):
+        spec_of(small_spec, **section)
+
+
+# Of two files --------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def tables(files: Path) -> tuple[Path, Path]:
+    made = []
+    for name in ("sao", "gaia"):
+        write_parquet(ingest(name, [files]).stars, files / f"{name}.parquet")
+        made.append(files / f"{name}.parquet")
+    return made[0], made[1]
+
+
+def test_moving_stars_are_those_of_the_table(tables: tuple[Path, Path]):
+    table = read_star_table(tables[0])
+    stars = moving_stars(table)
+    moved = propagate(
+        Motion(*(table[name].to_numpy() for name in table.column_names[3:5]),
+               *(table[name].to_numpy() for name in table.column_names[6:8])), 30.0
+    )  # fmt: skip
+    expected = moving_stars(
+        table.set_column(3, "ra_deg", pa.array(moved.ra_deg)).set_column(
+            4, "dec_deg", pa.array(moved.dec_deg)
+        )
+    )
+    there = stars.at(np.arange(len(table)), 2030.0)
+    assert there == pytest.approx(expected.directions, abs=1e-15)
+    assert stars.has_motion.all()
+    speed = np.linalg.norm(stars.velocities, axis=1)
+    known = (table[name].to_numpy() for name in ("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr"))
+    assert speed == pytest.approx(np.hypot(*known) * MAS, rel=1e-12)
+
+
+def test_two_files_give_the_rows_of_the_product(tables: tuple[Path, Path], tmp_path: Path):
+    output = tmp_path / "made" / "x.parquet"
+    found = match_files(*tables, output, Crossmatch())
+    table = read_parquet(output)
+    assert table.column_names[:2] == ["star_id", "star_designation"]
+    assert table.column_names[2:] == [c.name for c in product_schema("crossmatch").columns]
+    assert table["star_id"].to_pylist() == list(range(1, 501))
+    assert table["counterpart_id"].to_pylist() == list(range(FIRST_ID, FIRST_ID + 500))
+    assert (found.stars, found.counterparts, found.matched, found.unmatched) == (600, 500, 500, 100)
+    assert (found.verdicts["unique"], found.no_candidate, found.mutual) == (500, 100, 500)
+    assert found.median_delta_mag == pytest.approx(-0.4, abs=1e-4)
+    again = tmp_path / "again.parquet"
+    match_files(*tables, again, Crossmatch())
+    assert again.read_bytes() == output.read_bytes()
+    assert table.schema.field("star_id").metadata[b"description"].startswith(b"Permanent number")
+
+
+def test_a_table_of_no_stars_is_matched_with_none(tables: tuple[Path, Path]):
+    stars, others = (read_star_table(path) for path in tables)
+    table, found = match_tables(stars.slice(0, 0), others, Crossmatch())
+    product_schema("crossmatch").check(table)
+    assert (len(table), found.stars, found.matched) == (0, 0, 0)
+    table, found = match_tables(stars, others.slice(0, 0), Crossmatch())
+    assert (len(table), found.unmatched, found.no_candidate) == (0, 600, 600)
+    assert found.median_separation_arcsec is None
+
+
+def test_the_command_prints_a_summary(
+    tables: tuple[Path, Path], tmp_path: Path, starcat: Callable[..., Any]
+):
+    output = tmp_path / "x.parquet"
+    ran = starcat(["crossmatch", *tables, "-o", output])
+    assert ran.code == 0
+    for word in (*VERDICTS[:5], "unmatched", "median separation", "completeness"):
+        assert word in ran.out
+    assert max(len(line) for line in ran.out.splitlines()) <= 100
+    assert f"wrote {output}" in ran.err
+    ran = starcat(["crossmatch", *tables, "-o", output, "--radius", 0.001, "--json"])
+    content = json.loads(ran.out)
+    assert (content["a"], content["b"], content["radius_arcsec"]) == ("sao", "gaia", 0.001)
+    assert content["matched"] + content["unmatched"] == 600
+    assert content["matched"] < 100
+
+
+def test_the_tables_of_an_artifact_are_star_tables(
+    artifact: Path, tables: tuple[Path, Path], tmp_path: Path
+):
+    found = match_files(artifact / "stars.parquet", tables[1], tmp_path / "x.parquet", Crossmatch())
+    assert found.matched == len(open_artifact(artifact).table("crossmatch"))
+
+
+def test_files_that_are_no_star_tables_are_refused(tables: tuple[Path, Path], tmp_path: Path):
+    with pytest.raises(SourceMissing, match="no such file"):
+        read_star_table(tmp_path / "none.parquet")
+    (tmp_path / "text.parquet").write_text("HIP 1")
+    with pytest.raises(ParseError, match="cannot be read as Parquet"):
+        read_star_table(tmp_path / "text.parquet")
+    with pytest.raises(ParseError, match="cannot be read as Parquet"):
+        read_star_table(tmp_path)
+    table = read_parquet(tables[0])
+    write_parquet(table.drop_columns(["epoch_jyear", "mag"]), tmp_path / "short.parquet")
+    with pytest.raises(SchemaError, match="no column epoch_jyear, mag"):
+        read_star_table(tmp_path / "short.parquet")
+    place = table.column_names.index("ra_deg")
+    text = table.set_column(place, "ra_deg", table["ra_deg"].cast(pa.string()))
+    write_parquet(text, tmp_path / "typed.parquet")
+    with pytest.raises(SchemaError, match="ra_deg: found string"):
+        read_star_table(tmp_path / "typed.parquet")
+    for value in (None, float("nan"), float("inf")):
+        blank = table.set_column(
+            place, "ra_deg", pa.array([value, *table["ra_deg"].to_pylist()[1:]])
+        )
+        write_parquet(blank, tmp_path / "blank.parquet")
+        with pytest.raises(SchemaError, match="ra_deg: found 1 rows without a value"):
+            read_star_table(tmp_path / "blank.parquet")

@@ -1,0 +1,627 @@
+"""Tables in other tools' formats: those tools read back what was written."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pcsv
+import pyarrow.parquet as pq
+import pytest
+from astropy import units
+from astropy.io import fits
+from astropy.io.votable import parse, validate
+from astropy.table import Table
+from hypothesis import given
+from hypothesis import strategies as st
+
+from starcat.artifact.reader import open_artifact
+from starcat.errors import ConfigError, OutputError, SchemaError
+from starcat.exchange.formats import (
+    FORMATS,
+    SUFFIXES,
+    format_of,
+    write_batches,
+    write_text_batches,
+)
+from starcat.resources import resource_folder
+from starcat.schema import product_schema
+
+ASTROPY = ("votable", "fits", "ecsv")
+GAIA_ID = 4472832130942575872  # Barnard's star: 2^62 and more
+PRODUCTS = sorted(
+    {path.stem.rpartition("-")[0] for path in resource_folder("schemas").glob("*-*.json")}
+)
+
+
+def written(table: pa.Table, folder: Path, file_format: str, rows_a_batch: int = 1000) -> Path:
+    path = folder / f"table{SUFFIXES[file_format][0]}"
+    reader = pa.RecordBatchReader.from_batches(table.schema, table.to_batches(rows_a_batch))
+    assert write_batches(reader, path, file_format) == len(table)
+    assert [entry.name for entry in folder.iterdir() if "partial" in entry.name] == []
+    return path
+
+
+def read_astropy(path: Path) -> Table:
+    table = Table.read(path)
+    if path.suffix == ".fits":
+        table.convert_bytestring_to_unicode()
+    return table
+
+
+def is_nothing(value: Any) -> bool:
+    return value is None or (isinstance(value, float) and math.isnan(value))
+
+
+def plain(value: Any) -> Any:
+    """A value as Python has it, with None for what is masked."""
+    if np.ma.is_masked(value) and not isinstance(value, np.ma.MaskedArray):
+        return None
+    if isinstance(value, np.ma.core.MaskedConstant):
+        return None
+    if isinstance(value, np.ndarray):
+        return [plain(item) for item in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def column_of(table: Table, name: str) -> list[Any]:
+    masked = np.ma.getmaskarray(table[name]) if hasattr(table[name], "mask") else ()
+    values = [plain(value) for value in table[name]]
+    # The mask of an object column is beside its values.
+    return [None if k < len(masked) and masked[k] else value for k, value in enumerate(values)]
+
+
+def shortest(kind: pa.DataType, value: Any) -> Any:
+    """A value of 4 bytes as the shortest decimal number that means it, others as they are."""
+    if pa.types.is_list(kind):
+        return None if value is None else [shortest(kind.value_type, item) for item in value]
+    known = kind == pa.float32() and not is_nothing(value)
+    return float(str(np.float32(value))) if known else value
+
+
+def expected_in(file_format: str, kind: pa.DataType, value: Any) -> Any:
+    """What a format makes of a value of Arrow: the losses that docs/formats.md names."""
+    if pa.types.is_list(kind):
+        items = [] if value is None else value
+        if value is None and file_format == "ecsv":
+            return None
+        if file_format == "votable" and kind.value_type == pa.float32():
+            # astropy reads the items of a list of them in 8 bytes, from their decimal digits.
+            items = [shortest(pa.float32(), item) for item in items]
+        return [expected_in(file_format, kind.value_type, item) for item in items]
+    if pa.types.is_string(kind):
+        if file_format == "votable":
+            return value or ""
+        return value or None if file_format == "fits" else value
+    return value
+
+
+def same(found: Any, wanted: Any) -> bool:
+    if isinstance(wanted, list):
+        return len(found) == len(wanted) and all(map(same, found, wanted))
+    if is_nothing(found) or is_nothing(wanted):
+        return is_nothing(found) and is_nothing(wanted)
+    return bool(found == wanted)
+
+
+def check_astropy(table: pa.Table, path: Path, file_format: str) -> None:
+    read = read_astropy(path)
+    assert read.colnames == table.column_names
+    assert len(read) == len(table)
+    for field in table.schema:
+        wanted = [
+            expected_in(file_format, field.type, value) for value in table[field.name].to_pylist()
+        ]
+        found = column_of(read, field.name)
+        wrong = [pair for pair in zip(found, wanted, strict=True) if not same(*pair)]
+        assert not wrong, f"{field.name}: {wrong[:3]}"
+        unit = (field.metadata or {}).get(b"unit")
+        assert read[field.name].unit == (units.Unit(unit.decode()) if unit else None)
+
+
+# Products ----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def products(small_artifact: Path) -> dict[str, pa.Table]:
+    artifact = open_artifact(small_artifact)
+    return {name: artifact.table(name) for name in artifact.products}
+
+
+@pytest.mark.parametrize("file_format", ASTROPY)
+def test_astropy_reads_every_product_as_it_was(
+    products: dict[str, pa.Table], tmp_path: Path, file_format: str
+) -> None:
+    assert {"stars", "rejected", "pairs", "neighbours", "hausdorff_l2"} <= set(products)
+    for table in products.values():
+        short = table.slice(0, 400)
+        check_astropy(short, written(short, tmp_path, file_format), file_format)
+
+
+@pytest.mark.parametrize("product", PRODUCTS)
+def test_every_unit_is_one_of_fits_and_votable(product: str) -> None:
+    if product == "manifest":
+        return
+    for column in product_schema(product).columns:
+        if column.unit:
+            unit = units.Unit(column.unit)
+            for standard in ("fits", "vounit", "generic"):
+                assert units.Unit(unit.to_string(standard), format=standard) == unit
+        assert column.description.isascii()
+
+
+def test_meanings_and_ucds_come_along(products: dict[str, pa.Table], tmp_path: Path) -> None:
+    stars = products["stars"]
+    column = {c.name: c for c in product_schema("stars").columns}["ra_deg"]
+    votable = parse(written(stars, tmp_path, "votable")).get_first_table()
+    field = {f.name: f for f in votable.fields}["ra_deg"]
+    assert (field.ucd, field.description) == (column.ucd, column.description)
+    header = fits.getheader(written(stars, tmp_path, "fits"), 1)
+    place = stars.column_names.index("ra_deg") + 1
+    assert header[f"TCOMM{place}"] == column.description
+    assert header[f"TUCD{place}"] == column.ucd
+    ecsv = Table.read(written(stars, tmp_path, "ecsv"))["ra_deg"]
+    assert (ecsv.meta["ucd"], ecsv.description) == (column.ucd, column.description)
+    parquet = pq.read_table(written(stars, tmp_path, "parquet"))
+    assert parquet.schema.field("ra_deg").metadata == stars.schema.field("ra_deg").metadata
+    assert Table.read(tmp_path / "table.parquet")["ra_deg"].unit == units.deg
+
+
+def test_votable_is_valid(products: dict[str, pa.Table], tmp_path: Path) -> None:
+    path = written(products["stars"], tmp_path, "votable")
+    report = io.StringIO()
+    assert validate(path, output=report, xmllint=False), report.getvalue()
+
+
+def test_fits_is_valid(products: dict[str, pa.Table], tmp_path: Path) -> None:
+    for product in ("stars", "neighbours", "rejected"):
+        with fits.open(written(products[product], tmp_path, "fits")) as file:
+            file.verify("exception")
+
+
+def test_parquet_is_the_product(products: dict[str, pa.Table], tmp_path: Path) -> None:
+    for table in products.values():
+        path = written(table, tmp_path, "parquet", rows_a_batch=777)
+        again = pq.read_table(path)
+        assert again.cast(table.schema).equals(table)
+        assert b"IVOA.VOTable-Parquet.content" in pq.read_metadata(path).metadata
+
+
+@pytest.mark.parametrize("file_format", FORMATS)
+def test_the_same_table_gives_the_same_bytes(
+    products: dict[str, pa.Table], tmp_path: Path, file_format: str
+) -> None:
+    for product in ("stars", "neighbours"):
+        first, second = (
+            written(products[product], tmp_path, file_format, rows).read_bytes()
+            for rows in (1000, 77)
+        )
+        assert first == second
+
+
+def test_csv_is_read_by_pyarrow_and_duckdb(products: dict[str, pa.Table], tmp_path: Path) -> None:
+    for product in ("stars", "pairs", "rejected"):
+        table = products[product]
+        path = written(table, tmp_path, "csv")
+        options = pcsv.ConvertOptions(
+            column_types=table.schema, strings_can_be_null=True, quoted_strings_can_be_null=False
+        )
+        assert pcsv.read_csv(path, convert_options=options).cast(table.schema).equals(table)
+        count = duckdb.sql(f"select count(*) from '{path}'").fetchall()
+        assert count == [(len(table),)]
+
+
+def test_ragged_columns_are_json_in_csv(products: dict[str, pa.Table], tmp_path: Path) -> None:
+    table = products["boresights"]
+    with written(table, tmp_path, "csv").open(newline="") as stream:
+        cells = [json.loads(row["brightest"]) for row in csv.DictReader(stream)]
+    assert cells == table["brightest"].to_pylist()
+
+
+def test_json_is_an_array_of_objects(products: dict[str, pa.Table], tmp_path: Path) -> None:
+    for product in ("stars", "boresights", "rejected"):
+        table = products[product]
+        read = json.loads(written(table, tmp_path, "json", 77).read_text(encoding="utf-8"))
+        assert read == table.to_pylist()
+
+
+def test_npz_has_one_array_a_column(products: dict[str, pa.Table], tmp_path: Path) -> None:
+    stars = products["stars"]
+    with np.load(written(stars, tmp_path, "npz"), allow_pickle=False) as file:
+        assert np.array_equal(file["star_id"], stars["star_id"].to_numpy())
+        assert file["designation"].tolist() == stars["designation"].to_pylist()
+        assert np.isnan(file["second_mag"]).tolist() == stars["second_mag"].is_null().to_pylist()
+        assert "star_id.is_null" not in file.files
+    boresights = products["boresights"]
+    with np.load(written(boresights, tmp_path, "npz"), allow_pickle=False) as file:
+        lists = np.split(file["brightest"], file["brightest.offsets"][1:-1])
+        assert [items.tolist() for items in lists] == boresights["brightest"].to_pylist()
+
+
+# Any table ---------------------------------------------------------------------------------
+
+INTEGERS = [pa.int8(), pa.int16(), pa.int32(), pa.int64(), pa.uint8(), pa.uint16(), pa.uint32()]
+
+
+def bounds(kind: pa.DataType) -> dict[str, int]:
+    info = np.iinfo(kind.to_pandas_dtype())
+    return {"min_value": int(info.min), "max_value": int(info.max)}
+
+
+def texts() -> st.SearchStrategy[str]:
+    """Texts without what some format cannot hold: control characters, blanks at the ends."""
+    letters = st.characters(exclude_categories=["Cs", "Cc", "Zl", "Zp", "Zs", "Cn"]) | st.just(" ")
+    return st.text(letters, max_size=6).map(str.strip).filter(lambda text: text[:1] != "#")
+
+
+def values_of(kind: pa.DataType) -> st.SearchStrategy[Any]:
+    if pa.types.is_list(kind):
+        return st.lists(values_of(kind.value_type), max_size=3)
+    if pa.types.is_integer(kind):
+        return st.integers(**bounds(kind))
+    if pa.types.is_floating(kind):
+        return st.floats(width=32 if kind == pa.float32() else 64)
+    return st.booleans() if pa.types.is_boolean(kind) else texts()
+
+
+KINDS = [
+    *INTEGERS,
+    pa.float32(),
+    pa.float64(),
+    pa.bool_(),
+    pa.string(),
+    pa.list_(pa.int32()),
+    pa.list_(pa.int64()),
+    pa.list_(pa.float32()),
+    pa.list_(pa.float64()),
+]
+
+
+@st.composite
+def tables(draw: st.DrawFn) -> pa.Table:
+    kinds = draw(st.lists(st.sampled_from(KINDS), min_size=1, max_size=4))
+    rows = draw(st.integers(0, 5))
+    columns = [
+        pa.array(draw(st.lists(st.none() | values_of(kind), min_size=rows, max_size=rows)), kind)
+        for kind in kinds
+    ]
+    fields = [
+        pa.field(f"c{k}", kind, metadata={"unit": draw(st.sampled_from(["deg", "mas/yr", "mag"]))})
+        for k, kind in enumerate(kinds)
+    ]
+    return pa.Table.from_arrays(columns, schema=pa.schema(fields))
+
+
+def ascii_only(table: pa.Table) -> pa.Table:
+    """The table with other letters than those of ASCII written out, as FITS needs it."""
+    for k, field in enumerate(table.schema):
+        if pa.types.is_string(field.type):
+            plain_texts = [
+                None if text is None else ascii(text) for text in table[field.name].to_pylist()
+            ]
+            table = table.set_column(k, field, pa.array(plain_texts, pa.string()))
+    return table
+
+
+@pytest.mark.parametrize("file_format", ASTROPY)
+@given(table=tables())
+def test_astropy_reads_any_table_as_it_was(
+    tmp_path_factory: pytest.TempPathFactory, file_format: str, table: pa.Table
+) -> None:
+    chosen = ascii_only(table) if file_format == "fits" else table
+    folder = tmp_path_factory.mktemp("any")
+    check_astropy(chosen, written(chosen, folder, file_format), file_format)
+
+
+@given(table=tables())
+def test_parquet_and_npz_keep_any_table(
+    tmp_path_factory: pytest.TempPathFactory, table: pa.Table
+) -> None:
+    folder = tmp_path_factory.mktemp("any")
+    again = pq.read_table(written(table, folder, "parquet", 2)).cast(table.schema)
+    with np.load(written(table, folder, "npz"), allow_pickle=False) as file:
+        for field in table.schema:
+            wanted = table[field.name].to_pylist()
+            assert same(again[field.name].to_pylist(), wanted)
+            values = file[field.name]
+            if pa.types.is_list(field.type):
+                values = np.split(values, file[f"{field.name}.offsets"][1:-1])[: len(wanted)]
+            null = file.get(f"{field.name}.is_null", np.zeros(len(wanted), bool))
+            found = [None if n else plain(v) for v, n in zip(values, null, strict=True)]
+            assert same(found, wanted)
+
+
+@given(table=tables())
+def test_json_and_csv_keep_any_table(table: pa.Table) -> None:
+    as_json, as_csv = io.StringIO(), io.StringIO(newline="")
+    for stream, file_format in ((as_json, "json"), (as_csv, "csv")):
+        reader = pa.RecordBatchReader.from_batches(table.schema, table.to_batches(2))
+        assert write_text_batches(reader, stream, file_format) == len(table)
+    rows = [
+        [
+            shortest(field.type, value)
+            for field, value in zip(table.schema, row.values(), strict=True)
+        ]
+        for row in table.to_pylist()
+    ]
+    as_objects = [list(row.values()) for row in json.loads(as_json.getvalue())]
+    assert as_objects == [[finite(value) for value in row] for row in rows]
+    _, *lines = csv.reader(io.StringIO(as_csv.getvalue(), newline=""))
+    for cells, row in zip(lines, rows, strict=True):
+        for cell, value in zip(cells, row, strict=True):
+            in_cell = finite(value) if isinstance(value, list) else value
+            assert same(cell_value(cell, value), in_cell)
+
+
+def finite(value: Any) -> Any:
+    """A value as JSON has it."""
+    if isinstance(value, list):
+        return [finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def cell_value(cell: str, like: Any) -> Any:
+    if like is None:
+        assert cell == ""
+        return None
+    if isinstance(like, bool | list):
+        return json.loads(cell)
+    return type(like)(cell)
+
+
+# What SQL gives ----------------------------------------------------------------------------
+
+SQL = """select 1::tinyint a, 2::utinyint b, 3::uhugeint c, sum(4) d, date '2026-01-31' e,
+timestamp '2026-01-31 12:00:00.5' f, timestamptz '2026-01-31 12:00:00+02' g,
+{'p': 1.5, 'q': 'x'} h, ['é', null] i, [[1], []] j, null k, 1.25 l, time '01:02:03' m,
+'dim'::enum('dim', 'bright') n, [1, 2]::int[2] o, 65535::usmallint p, 4294967295::uinteger q,
+4472832130942575872 r, 7::ubigint s, true t"""
+IN_TEXT = {
+    "a": 1,
+    "b": 2,
+    "c": 3,
+    "d": 4,
+    "e": "2026-01-31",
+    "f": "2026-01-31T12:00:00.500000",
+    "g": "2026-01-31T10:00:00.000000Z",
+    "h": {"p": 1.5, "q": "x"},
+    "i": ["é", None],
+    "j": [[1], []],
+    "k": None,
+    "l": 1.25,
+    "m": "01:02:03.000000",
+    "n": "dim",
+    "o": [1, 2],
+    "p": 65535,
+    "q": 4294967295,
+    "r": GAIA_ID,
+    "s": 7,
+    "t": True,
+}
+
+
+@pytest.fixture
+def result() -> pa.Table:
+    connection = duckdb.connect()
+    connection.execute("set timezone = 'UTC'")
+    return connection.sql(SQL).to_arrow_reader(10).read_all()
+
+
+def test_json_and_csv_hold_what_sql_gives(result: pa.Table, tmp_path: Path) -> None:
+    path = written(result, tmp_path, "json")
+    assert json.loads(path.read_text(encoding="utf-8")) == [IN_TEXT]
+    with written(result, tmp_path, "csv").open(encoding="utf-8", newline="") as stream:
+        (row,) = csv.DictReader(stream)
+    for name, value in IN_TEXT.items():
+        if isinstance(value, dict | list | bool):
+            assert json.loads(row[name]) == value
+        else:
+            assert row[name] == ("" if value is None else str(value))
+
+
+@pytest.mark.parametrize("file_format", ASTROPY)
+def test_astropy_reads_what_sql_gives(result: pa.Table, tmp_path: Path, file_format: str) -> None:
+    if file_format == "fits":
+        result = result.drop_columns("i")
+    read = read_astropy(written(result, tmp_path, file_format))
+    for name in read.colnames:
+        (value,) = column_of(read, name)
+        wanted = IN_TEXT[name]
+        if name in ("h", "i", "j"):  # records, and lists of anything but numbers
+            value = json.loads(value)
+        if wanted is None:
+            assert value in (None, "")
+        else:
+            assert value == wanted, name
+
+
+def test_parquet_keeps_the_types_of_sql(result: pa.Table, tmp_path: Path) -> None:
+    again = pq.read_table(written(result, tmp_path, "parquet"))
+    assert again.to_pylist() == result.to_pylist()
+    assert again.schema.field("e").type == pa.date32()
+    assert again.schema.field("h").type == result.schema.field("h").type
+
+
+@pytest.mark.parametrize(
+    ("query", "names", "words"),
+    [
+        ("select interval 1 day a", FORMATS, r"column 'a' .* epoch\(a\)"),
+        ("select 'x'::blob b", FORMATS, r"column 'b' .* hex\(b\)"),
+        ("select map {'k': 1} c", FORMATS, r"column 'c' .* map_entries\(c\)"),
+        ("select {'p': interval 1 day} d", FORMATS, r"column 'd.p' .* epoch"),
+        ("select 1 e, 2 e", FORMATS, r"column 'e' is there twice.* AS"),
+        ("select 1e30::hugeint f", ["votable", "fits", "ecsv", "npz"], r"column 'f'.*VARCHAR"),
+        ("select 18446744073709551615::ubigint g", ["votable", "fits"], r"column 'g'.*VARCHAR"),
+        ("select [1, null] h", ["votable", "fits", "ecsv", "npz"], r"column 'h'.*DOUBLE"),
+        ("select 'é' i", ["fits"], r"column 'i': text is ASCII .*votable"),
+        ('select 1 as "é"', ["fits"], r"names are ASCII in FITS; rename it with AS"),
+        ("select chr(1) j", ["votable"], r"column 'j'.*XML cannot hold"),
+        ("select 'a' || chr(13) k", ["votable", "ecsv"], r"column 'k'.*another format"),
+        ("select '#' l", ["ecsv"], r"column 'l'.*misread"),
+        (
+            "select chr(0) m",
+            ["votable", "fits", "ecsv", "npz"],
+            r"column 'm'.*another format|ASCII",
+        ),
+        ('select [1] n, 2 as "n.offsets"', ["npz"], r"'n.offsets'.* rename"),
+    ],
+)
+def test_what_a_format_cannot_hold_is_refused_by_name(
+    tmp_path: Path, query: str, names: list[str], words: str
+) -> None:
+    for file_format in names:
+        target = tmp_path / f"refused.{file_format}"
+        target.write_text("before")
+        with pytest.raises(SchemaError, match=words):
+            write_batches(duckdb.sql(query).to_arrow_reader(10), target, file_format)
+        assert [path.name for path in tmp_path.iterdir()] == [target.name]
+        assert target.read_text() == "before"
+        target.unlink()
+
+
+def test_fits_takes_a_and_capital_a_for_one_name(tmp_path: Path) -> None:
+    table = pa.table({"a": [1], "A": [2]})
+    with pytest.raises(SchemaError, match=r"'a' and 'A'.*rename one"):
+        written(table, tmp_path, "fits")
+
+
+def test_an_unknown_unit_is_refused_where_units_are_written(tmp_path: Path) -> None:
+    field = pa.field("a", pa.float64(), metadata={"unit": "furlong/fortnight"})
+    table = pa.Table.from_arrays([pa.array([1.0])], schema=pa.schema([field]))
+    for file_format in ASTROPY:
+        with pytest.raises(SchemaError, match="column 'a': unit 'furlong/fortnight'"):
+            written(table, tmp_path, file_format)
+    assert written(table, tmp_path, "csv").read_text() == '"a"\n1\n'
+
+
+@pytest.mark.parametrize(
+    "text", ["'", '"', ",", ";", "\\", "\t", "\n", "a\nb", "<&>]]>", "nan", "--", "é \U0001f52d"]
+)
+def test_texts_are_not_taken_for_something_else(tmp_path: Path, text: str) -> None:
+    table = pa.table({"a": [f"x{text}y", "", None], "b": [1, 2, 3]})
+    wanted = table.to_pylist()
+    assert json.loads(written(table, tmp_path, "json").read_text(encoding="utf-8")) == wanted
+    assert pq.read_table(written(table, tmp_path, "parquet")).to_pylist() == wanted
+    with np.load(written(table, tmp_path, "npz")) as file:
+        assert file["a"].tolist() == [f"x{text}y", "", ""]
+        assert file["a.is_null"].tolist() == [False, False, True]
+    options = pcsv.ParseOptions(newlines_in_values=True)
+    convert = pcsv.ConvertOptions(strings_can_be_null=True, quoted_strings_can_be_null=False)
+    csv_path = written(table, tmp_path, "csv")
+    read = pcsv.read_csv(csv_path, parse_options=options, convert_options=convert)
+    assert read.to_pylist() == wanted
+    ecsv = read_astropy(written(table, tmp_path, "ecsv"))
+    assert column_of(ecsv, "a") == table["a"].to_pylist()
+    votable = read_astropy(written(table, tmp_path, "votable"))
+    assert column_of(votable, "a") == [f"x{text}y", "", ""]
+
+
+def test_fits_chooses_a_null_that_no_value_is(tmp_path: Path) -> None:
+    low = int(np.iinfo(np.int32).min)
+    table = pa.table({"a": pa.array([low, low + 1, None], pa.int32()), "b": [True, None, False]})
+    path = written(table, tmp_path, "fits")
+    assert fits.getheader(path, 1)["TNULL1"] == low + 2
+    check_astropy(table, path, "fits")
+
+
+def test_numbers_that_are_none(tmp_path: Path) -> None:
+    table = pa.table({"a": [math.nan, math.inf, -math.inf, None, 0.1], "b": [1, 2, 3, 4, 5]})
+    path = written(table, tmp_path, "csv")
+    assert path.read_text() == '"a","b"\nnan,1\ninf,2\n-inf,3\n,4\n0.1,5\n'
+    read = json.loads(written(table, tmp_path, "json").read_text())
+    assert [row["a"] for row in read] == [None, None, None, None, 0.1]
+
+
+def test_a_null_alone_in_its_row_is_no_empty_line(tmp_path: Path) -> None:
+    path = written(pa.table({"a": [1, None, 3]}), tmp_path, "csv")
+    assert path.read_text() == '"a"\n"1"\n""\n"3"\n'
+    assert duckdb.sql(f"select a::int from '{path}'").fetchall() == [(1,), (None,), (3,)]
+
+
+@pytest.mark.parametrize("file_format", FORMATS)
+def test_a_table_without_rows(tmp_path: Path, file_format: str) -> None:
+    schema = pa.schema({"a": pa.int64(), "b": pa.list_(pa.float64()), "c": pa.string()})
+    path = written(schema.empty_table(), tmp_path, file_format)
+    if file_format in ASTROPY:
+        assert read_astropy(path).colnames == schema.names
+    elif file_format == "json":
+        assert json.loads(path.read_text()) == []
+    elif file_format == "csv":
+        assert path.read_text() == '"a","b","c"\n'
+    elif file_format == "parquet":
+        assert pq.read_table(path).schema.equals(schema)
+    else:
+        with np.load(path) as file:
+            assert file["b.offsets"].tolist() == [0]
+
+
+def test_text_formats_and_parquet_never_hold_the_table(tmp_path: Path) -> None:
+    held = []
+
+    def batches() -> Any:
+        for k in range(20):
+            held.append(pa.total_allocated_bytes())
+            yield pa.record_batch({"a": pa.array(np.full(100_000, k, dtype=np.int64))})
+
+    schema = pa.schema({"a": pa.int64()})
+    for file_format in ("csv", "json", "parquet"):
+        held.clear()
+        before = pa.total_allocated_bytes()
+        reader = pa.RecordBatchReader.from_batches(schema, batches())
+        assert write_batches(reader, tmp_path / "large", file_format) == 2_000_000
+        assert max(held) - before < 8e6, file_format  # the table is 16 MB
+
+
+@pytest.mark.parametrize(
+    ("name", "file_format"),
+    [
+        ("a.csv", "csv"),
+        ("a.JSON", "json"),
+        ("b.parquet", "parquet"),
+        ("c.vot", "votable"),
+        ("c.xml", "votable"),
+        ("d/e.fits", "fits"),
+        ("f.ecsv", "ecsv"),
+        ("g.npz", "npz"),
+    ],
+)
+def test_the_suffix_says_the_format(name: str, file_format: str) -> None:
+    assert format_of(name) == format_of(Path(name)) == file_format
+    assert file_format in FORMATS
+
+
+@pytest.mark.parametrize("name", ["a", "a.csv.gz", "stars.hdf5", ".csv"])
+def test_a_suffix_that_says_nothing(name: str) -> None:
+    with pytest.raises(ConfigError, match=r"end it with one of \.csv, .*\.npz"):
+        format_of(name)
+
+
+def test_formats_that_are_not_there(tmp_path: Path) -> None:
+    reader = pa.table({"a": [1]}).to_reader()
+    with pytest.raises(ConfigError, match="'xlsx' is unknown here; choose one of csv, json"):
+        write_batches(reader, tmp_path / "a.xlsx", "xlsx")
+    with pytest.raises(ConfigError, match="'fits' is unknown here; choose one of csv, json"):
+        write_text_batches(reader, io.StringIO(), "fits")
+
+
+def test_a_place_that_cannot_be_written_to(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for file_format in FORMATS:
+        with pytest.raises(OutputError, match="cannot be written"):
+            write_batches(pa.table({"a": [1]}).to_reader(), tmp_path / "file" / "a", file_format)
+
+
+def test_a_query_that_fails_halfway_is_no_error_of_the_file(tmp_path: Path) -> None:
+    query = "select if(i = 150000, error('boom'), i::varchar) a from range(200000) t(i)"
+    for file_format in FORMATS:
+        with pytest.raises(OSError, match="boom") as raised:
+            write_batches(duckdb.sql(query).to_arrow_reader(1000), tmp_path / "a", file_format)
+        assert not isinstance(raised.value, OutputError)
+        assert list(tmp_path.iterdir()) == []

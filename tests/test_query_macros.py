@@ -1,0 +1,157 @@
+"""The macros of SQL, against astropy, cdshealpix and the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from astropy import units as u
+from astropy.coordinates import angular_separation
+from cdshealpix.nested import lonlat_to_healpix
+
+from starcat.attitude import matrix_from_radec_roll
+from starcat.camera import Camera
+from starcat.catalog.photometry import combined_magnitude
+from starcat.query.macros import macros
+from starcat.query.session import Session, open_session
+from starcat.sphere import directions_from_radec
+
+POLES_AND_SEAMS = [(0.0, 90.0), (123.0, -90.0), (0.0, 0.0), (360.0, 0.0), (359.999999, 41.81),
+                   (45.0, 41.8103148957786), (90.0, -41.8103148957786), (270.0, 89.9999999),
+                   (180.0, -89.9999999), (-10.0, 12.0), (725.0, -3.0)]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def session(small_artifact: Path) -> Iterator[Session]:
+    with open_session([str(small_artifact)]) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def places() -> np.ndarray:
+    """Right ascensions and declinations, degrees: 2,000 at random, and the awkward ones."""
+    generator = np.random.default_rng(29)
+    ra = generator.uniform(0.0, 360.0, 2000)
+    dec = np.degrees(np.arcsin(generator.uniform(-1.0, 1.0, 2000)))
+    return np.concatenate([np.column_stack([ra, dec]), POLES_AND_SEAMS])
+
+
+def numbers_of(path: Path, text: str, **columns: np.ndarray) -> np.ndarray:
+    """Return the first column of a query about a Parquet file of these columns, in their order."""
+    count = len(next(iter(columns.values())))
+    pq.write_table(pa.table({**columns, "row": np.arange(count)}), path / "places.parquet")
+    with open_session([str(path / "places.parquet")]) as opened:
+        return column(opened, f"{text} FROM places ORDER BY row")
+
+
+def column(session: Session, text: str, **values: object) -> np.ndarray:
+    with session.ask(text, values) as answer:
+        return answer.batches().read_all()[0].to_numpy()
+
+
+def test_separations_are_those_of_astropy(tmp_path, places):
+    generator = np.random.default_rng(31)
+    near = places + generator.normal(scale=1e-7, size=places.shape)
+    far = generator.permutation(places)
+    opposite = np.column_stack([places[:, 0] + 180.0, -places[:, 1]])
+    others = np.concatenate([near, far, opposite, places])
+    ones = np.tile(places, (4, 1))
+    found = numbers_of(
+        tmp_path, "SELECT separation(a, b, c, d)", a=ones[:, 0], b=ones[:, 1],
+        c=others[:, 0], d=others[:, 1],
+    )  # fmt: skip
+    radians = np.radians(ones), np.radians(others)
+    expected = np.degrees(angular_separation(*radians[0].T, *radians[1].T))
+    assert np.abs(found - expected).max() < 1e-13 * 180.0
+    assert (found[: len(near)] > 0.0).all(), "a ten-thousandth of an arcsecond is not lost"
+
+
+@pytest.mark.parametrize("order", [0, 1, 3, 10, 20, 29])
+def test_healpix_cells_are_those_of_cdshealpix(tmp_path, places, order):
+    ra_deg, dec_deg = places.T
+    found = numbers_of(tmp_path, f"SELECT healpix({order}, ra, dec)", ra=ra_deg, dec=dec_deg)
+    expected = lonlat_to_healpix(ra_deg * u.deg, dec_deg * u.deg, order)
+    # At order 29 a cell is 0.4 mas: rounding decides for a few places, on lines between cells.
+    different = (found != expected.astype(np.int64)).sum()
+    assert different <= (len(POLES_AND_SEAMS) + 4 if order == 29 else 4)
+    assert different == 0 or order > 0
+
+
+def test_a_healpix_cell_is_a_quarter_of_one_of_the_order_before(session):
+    both = "SELECT {} FROM stars ORDER BY star_id"
+    fine = column(session, both.format("healpix(8, ra_deg, dec_deg)"))
+    coarse = column(session, both.format("healpix(7, ra_deg, dec_deg)"))
+    assert np.array_equal(fine >> 2, coarse)
+
+
+def test_magnitudes_merge_as_light_does(session):
+    (found,) = column(session, "SELECT mag_merge(4.0, 5.5)")
+    assert found == pytest.approx(combined_magnitude(np.array([4.0, 5.5])), abs=1e-12)
+
+
+@pytest.mark.parametrize("radius_deg", [0.0, 7.0, 60.0, 180.0])
+@pytest.mark.parametrize("place", [(10.0, 20.0), (0.0, 90.0), (359.0, -88.0)])
+def test_a_cone_holds_what_is_near(session, place, radius_deg):
+    ra, dec = (
+        column(session, "SELECT ra_deg FROM stars"),
+        column(session, "SELECT dec_deg FROM stars"),
+    )
+    ids = column(session, "SELECT star_id FROM stars")
+    apart = np.degrees(angular_separation(*np.radians([*place]), np.radians(ra), np.radians(dec)))
+    query = "SELECT star_id FROM cone($ra, $dec, $radius) ORDER BY star_id"
+    found = column(session, query, ra=place[0], dec=place[1], radius=radius_deg)
+    assert np.array_equal(found, np.sort(ids[apart <= radius_deg]))
+
+
+def test_a_cone_of_no_width_holds_the_star_at_its_place(session):
+    query = (
+        "SELECT count(*) FROM stars AS s WHERE star_id IN (SELECT star_id FROM cone($ra, $dec, 0))"
+    )
+    ra, dec = (column(session, f"SELECT {c} FROM stars LIMIT 1")[0] for c in ("ra_deg", "dec_deg"))
+    assert column(session, query, ra=ra, dec=dec)[0] == 1
+
+
+def test_a_cone_can_be_of_another_table(session):
+    query = "SELECT count(*) FROM cone(0, 0, 180, of := '{}')"
+    for view in ("rejected", "boresights"):
+        (every,) = column(session, f"SELECT count(*) FROM {view}")
+        assert column(session, query.format(view))[0] == every > 0
+
+
+def test_a_box_goes_through_zero(session):
+    (every,) = column(session, "SELECT count(*) FROM stars WHERE dec_deg BETWEEN -30 AND 30")
+    (through,) = column(session, "SELECT count(*) FROM box(300, 100, -30, 30)")
+    (rest,) = column(session, "SELECT count(*) FROM box(100, 300, -30, 30)")
+    assert 0 < through < every
+    assert through + rest == every, "no star is at either end"
+
+
+@pytest.mark.parametrize("pointing", [(83.6, -5.4, 0.0), (200.0, 89.5, 123.0), (0.0, -70.0, 300.0)])
+def test_a_field_is_what_the_camera_sees(session, pointing):
+    camera = Camera(800, 600, fov_x_deg=40.0)
+    stars = [column(session, f"SELECT {c} FROM stars ORDER BY star_id")
+             for c in ("ra_deg", "dec_deg", "star_id")]  # fmt: skip
+    body = directions_from_radec(stars[0], stars[1]) @ matrix_from_radec_roll(*pointing).T
+    pixels = camera.pixels_from_directions(body)
+    inside = (body[:, 2] > 0) & (pixels >= 0).all(axis=1) & (pixels <= [800, 600]).all(axis=1)
+    query = "SELECT {} FROM field($ra, $dec, $roll, $x, $y) ORDER BY star_id"
+    values = dict(zip(("ra", "dec", "roll"), pointing, strict=True))
+    values |= {"x": camera.fov_x_deg, "y": camera.fov_y_deg}
+    assert np.array_equal(column(session, query.format("star_id"), **values), stars[2][inside])
+    for name, part in (("field_x_deg", 0), ("field_y_deg", 1)):
+        angle = np.degrees(np.arctan2(body[inside, part], body[inside, 2]))
+        assert np.abs(column(session, query.format(name), **values) - angle).max() < 1e-11
+    assert inside.any()
+
+
+@pytest.mark.parametrize("macro", macros(), ids=lambda macro: macro.name)
+def test_every_macro_has_help_and_an_example_that_runs(session, macro):
+    assert macro.help.endswith(".")
+    assert f"{macro.name}(" in macro.example
+    with session.ask(macro.example) as answer:
+        assert answer.columns
+        answer.rows(10)

@@ -1,0 +1,990 @@
+"""Registries: publishing, pulling, pinning, and everything that a registry may get wrong.
+
+Served over HTTP by the standard library's file server as it is, which ignores ranges, and by
+one that heeds them.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import http.server
+import json
+import os
+import re
+import resource
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import starcat
+from starcat.artifact.verify import verify_artifact
+from starcat.download import DownloadOptions
+from starcat.errors import (
+    ConfigError,
+    DownloadError,
+    OutputError,
+    ProductError,
+    SchemaVersionError,
+    SourceMissing,
+)
+from starcat.releases import publishing
+from starcat.releases.files import replace_file
+from starcat.releases.lockfile import read_pins
+from starcat.releases.project import pull_pinned, pull_wanted
+from starcat.releases.publishing import publish_artifact
+from starcat.releases.pulling import Pulled
+from starcat.releases.registry import HttpRegistry, open_registry
+from starcat.releases.tree import (
+    Blob,
+    Listed,
+    choose,
+    files_of,
+    index_bytes,
+    parse_wanted,
+    read_index,
+)
+
+Version = Callable[[str], Path]
+QUICK = DownloadOptions(retries=1, timeout_s=5.0, backoff_s=0.0)
+
+
+def sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def files_below(folder: Path) -> dict[str, bytes]:
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+def write(path: Path, data: bytes | str) -> None:
+    """Write a file of a registry, whose files are read-only."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)
+    path.write_bytes(data.encode() if isinstance(data, str) else data)
+
+
+@dataclass
+class Served(http.server.ThreadingHTTPServer):
+    """A folder behind an address, with a record of what was sent."""
+
+    folder: Path
+    heeds_ranges: bool = True
+    cut_after: dict[str, list[int]] = field(default_factory=dict)
+    sent: list[tuple[str, int, int]] = field(default_factory=list)
+    stall: threading.Event | None = None
+
+    def __post_init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), Handler)
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.server_port}"
+
+    def handle_error(self, *_: object) -> None:
+        """Say nothing: clients that go away are part of the tests."""
+
+
+class Handler(http.server.SimpleHTTPRequestHandler):
+    server: Served
+
+    def translate_path(self, path: str) -> str:
+        return str(self.server.folder / path.lstrip("/"))
+
+    def do_GET(self) -> None:
+        asked = re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range", ""))
+        self.start = int(asked[1]) if asked and self.server.heeds_ranges else 0
+        super().do_GET()
+
+    def send_response(self, code: int, message: str | None = None) -> None:
+        super().send_response(206 if self.start and code == 200 else code, message)
+
+    def send_header(self, keyword: str, value: str) -> None:
+        if self.start and keyword == "Content-Length":
+            total = int(value)
+            value = str(total - self.start)
+            super().send_header("Content-Range", f"bytes {self.start}-{total - 1}/{total}")
+        super().send_header(keyword, value)
+
+    def copyfile(self, source: Any, outputfile: Any) -> None:
+        source.seek(self.start)
+        body = source.read()
+        cuts = self.server.cut_after.get(self.path)
+        body = body[: cuts.pop(0)] if cuts else body
+        self.server.sent.append((self.path, self.start, len(body)))
+        outputfile.write(body)
+        if cuts is not None and self.server.stall:
+            outputfile.flush()
+            self.server.stall.wait(20)
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@contextmanager
+def serving(folder: Path, *, heeds_ranges: bool = True) -> Iterator[Served]:
+    with Served(folder, heeds_ranges) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
+        thread.start()
+        try:
+            yield server
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture(scope="session")
+def published(small_artifact: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("published") / "registry"
+    publish_artifact(small_artifact, str(folder))
+    return folder
+
+
+@pytest.fixture
+def registry(published: Path, here: None) -> Path:
+    """A registry with one release; ``registry`` below the current folder."""
+    return Path(shutil.copytree(published, "registry"))
+
+
+def pull(wanted: str, registry: str | Path, output: str = "out") -> Pulled:
+    return pull_wanted(wanted, str(registry), Path(output), Path("starcat.lock"), QUICK)
+
+
+def manifest_of(registry: Path) -> Path:
+    """The blob of the first listed release's manifest."""
+    return registry / read_index((registry / "index.json").read_bytes(), "")[0].manifest.path
+
+
+# Round trips --------------------------------------------------------------------------------
+
+
+def test_a_folder_gives_back_every_byte(small_artifact: Path, registry: Path) -> None:
+    events: list[tuple[str, int, int | None]] = []
+    pulled = pull_wanted(
+        "small@1.0.0",
+        str(registry),
+        Path("out"),
+        Path("starcat.lock"),
+        progress=lambda *event: events.append(event),
+    )
+    assert (pulled.outcome, pulled.folder) == ("pulled", Path("out/small-1.0.0"))
+    assert files_below(pulled.folder) == files_below(small_artifact)
+    assert verify_artifact(pulled.folder).findings == ()
+    assert {path.name for path in Path("out").iterdir()} == {"small-1.0.0"}
+    done = [done for _, done, _ in events]
+    assert done == sorted(done)
+    assert events[-1] == ("pull small", events[-1][2], events[-1][2])
+
+
+@pytest.mark.parametrize("heeds_ranges", [True, False])
+def test_an_address_gives_back_every_byte(
+    small_artifact: Path, registry: Path, heeds_ranges: bool
+) -> None:
+    with serving(registry, heeds_ranges=heeds_ranges) as server:
+        pulled = pull("small@latest", server.url + "/")
+        assert files_below(pulled.folder) == files_below(small_artifact)
+        sent = len(server.sent)
+        assert pull("small@latest", server.url).outcome == "unchanged"
+        assert [path for path, *_ in server.sent[sent:]] == ["/index.json"]
+    (pin,) = read_pins(Path("starcat.lock")).values()
+    assert pin.registry == server.url
+
+
+def test_blobs_are_named_by_their_content_and_shared(
+    artifact_version: Version, registry: Path
+) -> None:
+    before = files_below(registry / "blobs")
+    published = publish_artifact(artifact_version("1.0.1"), "registry")
+    after = files_below(registry / "blobs")
+    assert all(Path(name).name == sha256(data) for name, data in after.items())
+    assert all(name == f"sha256/{Path(name).name[:2]}/{Path(name).name}" for name in after)
+    tables = len([*artifact_version("1.0.1").glob("*.parquet")])
+    assert tables > 5
+    assert published.new_blobs == len(after) - len(before) == published.release.files - tables
+    assert published.new_bytes == sum(len(after[name]) for name in after.keys() - before.keys())
+
+
+def test_pulled_files_are_copies_that_may_be_changed(registry: Path) -> None:
+    folder = pull("small", registry).folder
+    for path in folder.rglob("*"):
+        assert path.is_dir() or (path.stat().st_nlink == 1 and os.access(path, os.W_OK))
+        assert not path.is_file() or path.stat().st_mode & 0o200
+
+
+def test_an_artifact_of_the_builder_itself_in_two_versions(
+    tmp_path: Path, sao_lines: list[bytes], small_spec: str, starcat: Any
+) -> None:
+    (tmp_path / "sao.dat").write_bytes(b"".join(sao_lines))
+    for version in ("1.9.0", "1.10.0"):
+        Path("spec.toml").write_text(small_spec.replace("1.0.0", version))
+        assert starcat(["build", "spec.toml", "--input", "sao=sao.dat"]).code == 0
+        assert starcat(["publish", f"dist/small-{version}", "registry"]).code == 0
+    listed = json.loads(starcat(["releases", "registry", "--json"]).out)
+    assert [(entry["version"], entry["is_latest"]) for entry in listed] == [
+        ("1.9.0", False),
+        ("1.10.0", True),
+    ]
+    ran = starcat(["pull", "small@latest", "--registry", "registry", "-o", "out", "--json"])
+    assert json.loads(ran.out)[0]["artifact"] == "out/small-1.10.0"
+    assert starcat(["verify", "out/small-1.10.0"]).code == 0
+
+
+def test_tables_fit(registry: Path, starcat: Any, artifact_version: Version) -> None:
+    for arguments, outcome in (
+        (["publish", artifact_version("1.0.1"), "registry"], "published: small-1.0.1 in registry"),
+        (["publish", artifact_version("1.0.1"), "registry"], "unchanged: small-1.0.1 in registry"),
+        (["pull", "small@1.0.0", "--registry", "registry"], "pulled: dist/small-1.0.0"),
+        (["pull", "--locked"], "unchanged: dist/small-1.0.0"),
+        (["releases", "registry"], ""),
+    ):
+        ran = starcat(arguments)
+        assert (ran.code, ran.err.strip()) == (0, outcome)
+        assert "small" in ran.out
+        assert all(len(line) <= 100 for line in ran.out.splitlines())
+    ran = starcat(["publish", artifact_version("1.0.1"), "registry", "--json"])
+    assert json.loads(ran.out)["outcome"] == "unchanged"
+
+
+# Names and versions -------------------------------------------------------------------------
+
+
+def listed(version: str, name: str = "small") -> Listed:
+    blob = Blob(sha256=sha256(f"{name} {version}".encode()), bytes=1)
+    return Listed(name=name, version=version, manifest=blob, files=1, bytes=1)
+
+
+triples = st.tuples(*[st.integers(0, 10**17)] * 3)
+
+
+@given(st.lists(triples, min_size=1, unique=True))
+def test_latest_is_the_highest_version(versions: list[tuple[int, int, int]]) -> None:
+    texts = [".".join(map(str, version)) for version in versions]
+    releases = read_index(index_bytes(listed(text) for text in texts), "")
+    assert [r.version for r in releases] == [".".join(map(str, v)) for v in sorted(versions)]
+    assert choose(releases, "small", None, "").version == ".".join(map(str, max(versions)))
+
+
+def test_latest_is_not_the_newest_nor_the_last_of_the_alphabet(
+    artifact_version: Version, registry: Path
+) -> None:
+    for version in ("1.10.0", "1.9.0", "1.9.10"):
+        publish_artifact(artifact_version(version), "registry")
+    assert pull("small@latest", registry).release.version == "1.10.0"
+    assert [r.version for r in open_registry("registry").releases()] == [
+        "1.0.0",
+        "1.9.0",
+        "1.9.10",
+        "1.10.0",
+    ]
+
+
+def test_the_order_of_publishing_does_not_show(artifact_version: Version) -> None:
+    for folder, versions in (("a", ("1.0.1", "1.0.2")), ("b", ("1.0.2", "1.0.1"))):
+        for version in versions:
+            publish_artifact(artifact_version(version), folder)
+    assert files_below(Path("a")) == files_below(Path("b"))
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "@1.0.0", "small@", "small@1.0", "small@1.0.0-rc1", "small@01.0.0", "Small@1.0.0",
+     "../small@1.0.0", "small@1.0.0\n", "small@../1", "small@1.0.0@latest", "small@１.0.0"],
+)  # fmt: skip
+def test_what_is_no_name_and_version(text: str) -> None:
+    with pytest.raises(ConfigError, match="is not NAME@VERSION"):
+        parse_wanted(text)
+
+
+def test_names_and_versions() -> None:
+    assert parse_wanted("gaia-12deg@1.10.0") == ("gaia-12deg", "1.10.0")
+    assert parse_wanted("small@latest") == parse_wanted("small") == ("small", None)
+
+
+def test_what_a_registry_does_not_have(registry: Path, artifact_version: Version) -> None:
+    publish_artifact(artifact_version("1.9.0"), "registry")
+    with pytest.raises(SourceMissing, match=r"no version 2\.0\.0 of small; it has 1\.0\.0, 1\.9"):
+        pull("small@2.0.0", registry)
+    with pytest.raises(SourceMissing, match="no artifact 'smaller'; it has small"):
+        pull("smaller", registry)
+    with pytest.raises(SourceMissing, match="nowhere: no registry"):
+        pull("small", "nowhere")
+    with serving(Path("out"), heeds_ranges=False) as server:
+        with pytest.raises(SourceMissing, match=r"no registry, .*404"):
+            pull("small", server.url)
+        url = server.url
+    with pytest.raises(DownloadError, match=r"Connection refused.*\(attempts: 2\)"):
+        pull("small", url)
+    assert not Path("starcat.lock").exists()
+
+
+@pytest.mark.parametrize("text", ["ftp://host/registry", "file:///registry", "https://host/?a=b"])
+def test_other_kinds_of_address(text: str, small_artifact: Path) -> None:
+    with pytest.raises(ConfigError, match="expected a folder, or an address"):
+        open_registry(text)
+    with pytest.raises(ConfigError, match="expected a folder, or an address"):
+        publish_artifact(small_artifact, text)
+
+
+# Immutability -------------------------------------------------------------------------------
+
+
+def changed(artifact: Path, folder: Path) -> Path:
+    """The same version with other content."""
+    from starcat.artifact.content import json_bytes
+    from starcat.artifact.manifest import manifest_digest
+
+    made = Path(shutil.copytree(artifact, folder / artifact.name))
+    page = made / "report" / "index.html"
+    page.write_bytes(page.read_bytes() + b"<!-- more -->")
+    manifest = json.loads((made / "manifest.json").read_bytes())
+    data = page.read_bytes()
+    manifest["files"]["report/index.html"] = {"bytes": len(data), "sha256": sha256(data)}
+    manifest["manifest_sha256"] = manifest_digest(manifest)
+    (made / "manifest.json").write_bytes(json_bytes(manifest))
+    assert verify_artifact(made).findings == ()
+    return made
+
+
+def test_the_same_again_is_unchanged(small_artifact: Path, registry: Path) -> None:
+    times = {path: path.stat().st_mtime_ns for path in registry.rglob("*") if path.is_file()}
+    again = publish_artifact(small_artifact, "registry")
+    assert (again.outcome, again.new_blobs, again.new_bytes) == ("unchanged", 0, 0)
+    del times[registry / ".lock"]
+    assert all(path.stat().st_mtime_ns == time for path, time in times.items())
+
+
+def test_a_version_never_changes(small_artifact: Path, registry: Path, tmp_path: Path) -> None:
+    other = changed(small_artifact, tmp_path / "other")
+    before = files_below(registry)
+    with pytest.raises(OutputError, match=r"has small-1.0.0 already, with another content"):
+        publish_artifact(other, "registry")
+    assert files_below(registry) == before
+
+
+def test_a_version_whose_name_is_taken_at_the_last_moment(
+    small_artifact: Path, registry: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = changed(small_artifact, tmp_path / "other")
+    record = registry / "versions/small/1.0.0.json"
+    content = record.read_bytes()
+    record.unlink()
+    link = os.link
+
+    def just_before(source: Path, target: Path) -> None:
+        write(record, content)
+        link(source, target)
+
+    monkeypatch.setattr(os, "link", just_before)
+    with pytest.raises(OutputError, match=r"has small-1.0.0 already, with another content"):
+        publish_artifact(other, "registry")
+    assert record.read_bytes() == content
+
+
+def test_a_file_system_without_hard_links(
+    small_artifact: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refuse)
+    assert publish_artifact(small_artifact, "registry").outcome == "published"
+    assert publish_artifact(small_artifact, "registry").outcome == "unchanged"
+    with pytest.raises(OutputError, match="already, with another content"):
+        publish_artifact(changed(small_artifact, tmp_path / "other"), "registry")
+    assert pull("small", "registry").outcome == "pulled"
+
+
+def test_an_index_written_late_has_what_came_meanwhile(
+    small_artifact: Path, artifact_version: Version, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another publisher, on a file system without locks, comes and goes in the middle."""
+
+    def no_locks(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    def late(path: Path, data: bytes, beside: Path) -> None:
+        monkeypatch.setattr(publishing, "replace_file", replace_file)
+        publish_artifact(artifact_version("1.0.1"), "registry")
+        replace_file(path, data, beside)
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    monkeypatch.setattr(publishing, "replace_file", late)
+    publish_artifact(small_artifact, "registry")
+    assert [r.version for r in open_registry("registry").releases()] == ["1.0.0", "1.0.1"]
+
+
+def test_a_different_artifact_at_the_final_name_stays(
+    small_artifact: Path, registry: Path, tmp_path: Path
+) -> None:
+    other = changed(small_artifact, tmp_path / "out")
+    before = files_below(tmp_path / "out")
+    with pytest.raises(OutputError, match=r"already exists and is not small-1.0.0 of the registry"):
+        pull("small", registry)
+    assert files_below(tmp_path / "out") == before
+    shutil.rmtree(other)
+    pull("small", registry)
+    (other / "pairs.parquet").write_bytes(b"damaged")
+    with pytest.raises(OutputError, match=r"is damaged: pairs.parquet .* 7 bytes"):
+        pull("small", registry)
+    assert (other / "pairs.parquet").read_bytes() == b"damaged"
+
+
+def test_only_whole_artifacts_are_published(small_artifact: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(small_artifact, tmp_path / "copy"))
+    (copy / "pairs.parquet").write_bytes(b"damaged")
+    with pytest.raises(ProductError, match=r"pairs.parquet"):
+        publish_artifact(copy, "registry")
+    assert not Path("registry").exists()
+
+
+@pytest.mark.parametrize("version", ["01.0.0", "1.00.0"])
+def test_versions_that_are_not_semantic(artifact_version: Version, version: str) -> None:
+    with pytest.raises(ProductError, match=f"version '{version}': cannot be published"):
+        publish_artifact(artifact_version(version), "registry")
+    assert not Path("registry").exists()
+
+
+def test_links_are_not_published(small_artifact: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(small_artifact, tmp_path / "copy"))
+    (copy / "pairs.parquet").unlink()
+    (copy / "pairs.parquet").symlink_to(small_artifact / "pairs.parquet")
+    with pytest.raises(ProductError, match=r"pairs.parquet: a symbolic link; expected a file"):
+        publish_artifact(copy, "registry")
+
+
+def test_a_folder_with_other_things_is_no_registry(small_artifact: Path, tmp_path: Path) -> None:
+    write(tmp_path / "home" / "thesis.tex", "text")
+    with pytest.raises(OutputError, match="neither empty nor a registry"):
+        publish_artifact(small_artifact, "home")
+    assert files_below(tmp_path / "home") == {"thesis.tex": b"text"}
+    with pytest.raises(ConfigError, match=r"only be read; publish into a folder.*upload"):
+        publish_artifact(small_artifact, "https://example.org/registry")
+
+
+# The lock file ------------------------------------------------------------------------------
+
+
+def test_the_lock_file_is_sorted_and_the_same_every_time(
+    registry: Path, artifact_version: Version
+) -> None:
+    publish_artifact(artifact_version("1.0.1"), "registry")
+    pull("small@1.0.0", registry)
+    first = Path("starcat.lock").read_bytes()
+    pull("small@1.0.1", registry)
+    assert Path("starcat.lock").read_bytes() != first
+    pull("small@1.0.0", registry, "elsewhere")
+    assert Path("starcat.lock").read_bytes() == first
+    content = json.loads(first)
+    assert list(content) == sorted(content)
+    (entry,) = content["artifacts"]
+    manifest = (artifact_version("1.0.1").parent / "small-1.0.1/manifest.json").read_bytes()
+    assert entry["version"] == "1.0.0"
+    assert entry["registry"] == "registry"
+    assert entry["manifest"]["sha256"] == manifest_of(registry).name != sha256(manifest)
+
+
+def test_locked_pulls_what_is_pinned_whatever_the_index_says(
+    registry: Path, artifact_version: Version
+) -> None:
+    pull("small@1.0.0", registry)
+    publish_artifact(artifact_version("1.0.1"), "registry")
+    write(registry / "index.json", "damaged")
+    before = Path("starcat.lock").read_bytes()
+    lock = Path("starcat.lock")
+    for wanted in (None, "small", "small@latest", "small@1.0.0"):
+        (pulled,) = pull_pinned(wanted, None, Path(f"out-{wanted}"), lock)
+        assert (pulled.outcome, pulled.release.version) == ("pulled", "1.0.0")
+    with pytest.raises(ConfigError, match=r"pins small 1\.0\.0, not 1\.0\.1"):
+        pull_pinned("small@1.0.1", None, Path("out"), lock)
+    with pytest.raises(ConfigError, match="pins small, not gaia"):
+        pull_pinned("gaia", None, Path("out"), lock)
+    assert lock.read_bytes() == before
+
+
+def test_locked_works_from_another_folder_and_another_registry(
+    registry: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lock = Path("project/starcat.lock")
+    pull_wanted("small", "registry", Path("out"), lock)
+    assert read_pins(lock)["small"].registry == "../registry"
+    monkeypatch.chdir(tmp_path / "out")
+    lock = Path("../project/starcat.lock")
+    assert pull_pinned(None, None, Path("a"), lock)[0].outcome == "pulled"
+    shutil.move(tmp_path / "registry", tmp_path / "moved")
+    with pytest.raises(ProductError, match="missing"):
+        pull_pinned(None, None, Path("b"), lock)
+    assert pull_pinned(None, str(tmp_path / "moved"), Path("b"), lock)[0].outcome == "pulled"
+    assert pull_wanted("small", str(tmp_path / "moved"), Path("c"), lock).outcome == "pulled"
+    assert read_pins(lock)["small"].registry == str(tmp_path / "moved")
+
+
+def test_without_a_registry_the_pinned_one_is_asked(
+    registry: Path, artifact_version: Version
+) -> None:
+    lock = Path("starcat.lock")
+    with pytest.raises(ConfigError, match=r"starcat.lock does not pin small.*--registry"):
+        pull_wanted("small", None, Path("out"), lock)
+    pull("small", registry)
+    publish_artifact(artifact_version("1.0.1"), "registry")
+    assert pull_wanted("small", None, Path("out"), lock).release.version == "1.0.1"
+    assert read_pins(lock)["small"].version == "1.0.1"
+
+
+def test_a_registry_that_was_made_anew_is_noticed(
+    small_artifact: Path, registry: Path, tmp_path: Path
+) -> None:
+    pull("small", registry)
+    shutil.rmtree(registry)
+    publish_artifact(changed(small_artifact, tmp_path / "other"), "registry")
+    before = Path("starcat.lock").read_bytes()
+    with pytest.raises(ProductError, match="A published version never changes: find out"):
+        pull("small", registry, "again")
+    assert Path("starcat.lock").read_bytes() == before
+    assert not Path("again").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "not what starcat writes.*restore the lock file"),
+        ("[]", "not what starcat writes"),
+        ('{"format": "starcat-lock", "lock_version": "1.0.0"}', "artifacts: Field required"),
+    ],
+)
+def test_damaged_lock_files(registry: Path, text: str, message: str) -> None:
+    Path("starcat.lock").write_text(text)
+    for call in (
+        lambda: pull("small", registry),
+        lambda: pull_pinned(None, None, Path("out"), Path("starcat.lock")),
+    ):
+        with pytest.raises(ProductError, match=message):
+            call()
+    assert Path("starcat.lock").read_text() == text
+    assert not Path("out").exists()
+
+
+def test_lock_file_of_a_newer_starcat_and_an_empty_one(registry: Path) -> None:
+    newer = {"format": "starcat-lock", "lock_version": "2.0.0", "pins": []}
+    Path("starcat.lock").write_text(json.dumps(newer))
+    with pytest.raises(SchemaVersionError, match=r"lock version 2\.0\.0"):
+        pull("small", registry)
+    with pytest.raises(ConfigError, match="pins nothing"):
+        pull_pinned(None, None, Path("out"), Path("none.lock"))
+
+
+def test_a_lock_file_below_a_file(registry: Path) -> None:
+    Path("file").write_text("")
+    with pytest.raises(OutputError, match="choose another file with --lock"):
+        pull_wanted("small", "registry", Path("out"), Path("file/starcat.lock"))
+
+
+# Damaged and hostile registries -------------------------------------------------------------
+
+Damage = Callable[[Path], object]
+
+
+def edit_index(registry: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    content = json.loads((registry / "index.json").read_bytes())
+    change(content)
+    write(registry / "index.json", json.dumps(content))
+
+
+def edit_manifest(registry: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change the manifest, and everything that names it, as somebody who knows how would."""
+    from starcat.artifact.content import json_bytes
+    from starcat.artifact.manifest import manifest_digest
+
+    manifest = json.loads(manifest_of(registry).read_bytes())
+    change(manifest)
+    manifest["manifest_sha256"] = manifest_digest(manifest)
+    put_manifest(registry, json_bytes(manifest))
+
+
+def put_manifest(registry: Path, data: bytes) -> None:
+    blob = Blob(sha256=sha256(data), bytes=len(data))
+    write(registry / blob.path, data)
+    edit_index(registry, lambda index: index["releases"][0].update(manifest=blob.model_dump()))
+
+
+def add_file(registry: Path, name: str) -> None:
+    data = b"outside"
+    blob = Blob(sha256=sha256(data), bytes=len(data))
+    write(registry / blob.path, data)
+    edit_manifest(registry, lambda content: content["files"].update({name: blob.model_dump()}))
+
+
+def blob_of(registry: Path, name: str = "pairs.parquet") -> Path:
+    manifest = json.loads(manifest_of(registry).read_bytes())
+    return registry / Blob(**manifest["files"][name]).path
+
+
+def change_byte(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    write(path, bytes(data))
+
+
+def link_to_copy(path: Path) -> None:
+    shutil.copy(path, "copy")
+    path.unlink()
+    path.symlink_to(Path("copy").resolve())
+
+
+def first(**values: object) -> Damage:
+    return lambda registry: edit_index(registry, lambda index: index["releases"][0].update(values))
+
+
+DAMAGE: dict[str, tuple[Damage, str]] = {
+    "blob missing": (lambda r: blob_of(r).unlink(), "missing|404"),
+    "blob with wrong bytes": (lambda r: change_byte(blob_of(r)), "its sha256 begins with"),
+    "blob cut off": (lambda r: write(blob_of(r), b"cut"), "3 bytes; expected|has 3 bytes"),
+    "blob empty": (lambda r: write(blob_of(r), b""), "0 bytes; expected|has 0 bytes"),
+    "manifest missing": (lambda r: manifest_of(r).unlink(), "missing|404"),
+    "manifest with wrong bytes": (lambda r: change_byte(manifest_of(r)), "its sha256 begins"),
+    "manifest not JSON": (lambda r: put_manifest(r, b"{"), "not a starcat manifest"),
+    "manifest of deep lists": (lambda r: put_manifest(r, b"[" * 100_000), "registry is damaged"),
+    "manifest without files": (
+        lambda r: edit_manifest(r, lambda content: content.pop("files")), "no files"
+    ),
+    "manifest of another name": (
+        lambda r: edit_manifest(r, lambda content: content.update(name="other")),
+        "its manifest is that of other-1.0.0",
+    ),
+    "manifest of another version": (
+        lambda r: edit_manifest(r, lambda content: content.update(version="2.0.0")),
+        r"its manifest is that of small-2\.0\.0",
+    ),
+    "manifest with a strange digest": (
+        lambda r: edit_manifest(
+            r, lambda c: c["files"]["pairs.parquet"].update(sha256="../" * 21 + "x")
+        ),
+        "files.pairs.parquet.sha256: String should match pattern",
+    ),
+    "manifest with a size that is none": (
+        lambda r: edit_manifest(r, lambda c: c["files"]["pairs.parquet"].update(bytes=1e99)),
+        "files.pairs.parquet.bytes: Input should be a valid integer",
+    ),
+    "no whole artifact": (
+        lambda r: edit_manifest(r, lambda content: content["files"].pop("pairs.parquet")),
+        "not a whole artifact: .*pairs.parquet is not among the files",
+    ),
+    "index not JSON": (lambda r: write(r / "index.json", "<html>"), "not what starcat writes"),
+    "index empty": (lambda r: write(r / "index.json", ""), "not what starcat writes"),
+    "index of deep lists": (
+        lambda r: write(r / "index.json", "[" * 100_000), "not what starcat writes"
+    ),
+    "index of something else": (lambda r: write(r / "index.json", "{}"), "format: Field required"),
+    "index with a release twice": (
+        lambda r: edit_index(r, lambda index: index["releases"].append(index["releases"][0])),
+        "lists small-1.0.0 twice",
+    ),
+    "index with a name that leads out": (first(name="../../x"), "releases.0.name: String should"),
+    "index with a version that leads out": (first(version="../../../x"), "releases.0.version"),
+    "index with a digest that leads out": (
+        first(manifest={"sha256": "../../x", "bytes": 1}), "releases.0.manifest.sha256"
+    ),
+    "index with a wrong size": (
+        lambda r: edit_index(r, lambda index: index["releases"][0]["manifest"].update(bytes=7)),
+        r"bytes; expected 7",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", DAMAGE)
+def test_a_damaged_folder_is_refused_and_nothing_is_left(kind: str, registry: Path) -> None:
+    damage, message = DAMAGE[kind]
+    damage(registry)
+    before = files_below(Path())
+    with pytest.raises(ProductError, match=message) as caught:
+        pull("small", registry)
+    assert caught.value.exit_code == 5
+    assert files_below(Path()) == before
+
+
+@pytest.mark.parametrize("kind", DAMAGE)
+def test_a_damaged_address_is_refused(kind: str, registry: Path, tmp_path: Path) -> None:
+    damage, message = DAMAGE[kind]
+    damage(registry)
+    with serving(registry) as server, pytest.raises((ProductError, DownloadError)) as caught:
+        pull("small", server.url)
+    assert re.search(message, str(caught.value))
+    assert isinstance(caught.value, ProductError) == (
+        not re.search(r"missing|cut|empty$|wrong size", kind) or kind == "index empty"
+    )
+    # What did arrive is kept for the next time where that can be better.
+    assert not [*Path("out").glob("small*")]
+    assert {path.name for path in tmp_path.iterdir()} <= {"registry", "out", "copy"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../../x", "/tmp/starcat-x", "report/../../../x", "..", ".", "", "report/", "report//x",
+     "./x", ".hidden", "report/.x", "a\\..\\x", "C:x", "x\n", "x\0", "manifest.json",
+     "report/index.html/x", "~/x", "-x", "é", "x" * 200, "a/" * 20 + "x"],
+)  # fmt: skip
+def test_file_names_that_lead_out(registry: Path, name: str) -> None:
+    add_file(registry, name)
+    before = files_below(Path())
+    with pytest.raises(ProductError, match="no plain path within an artifact; nothing was"):
+        pull("small", registry)
+    assert files_below(Path()) == before
+    assert not Path("/tmp/starcat-x").exists()
+
+
+@given(st.text())
+def test_whatever_the_name_it_stays_inside(name: str) -> None:
+    facts = {"sha256": "0" * 64, "bytes": 0}
+    try:
+        (found,) = files_of({"files": {name: facts}}, "x")
+    except ProductError:
+        return
+    path = Path(os.path.normpath(Path("/inside") / found))
+    assert path.is_relative_to("/inside")
+    assert path != Path("/inside")
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
+def test_a_blob_that_is_no_file_is_refused(registry: Path, make: Callable[[Path], None]) -> None:
+    blob = blob_of(registry)
+    blob.unlink()
+    make(blob)
+    with pytest.raises(ProductError, match="not a file"):
+        pull("small", registry)
+
+
+def test_a_blob_that_is_a_link_is_refused(registry: Path) -> None:
+    link_to_copy(blob_of(registry))
+    with pytest.raises(ProductError, match="a symbolic link; expected a file"):
+        pull("small", registry)
+
+
+def test_links_in_the_output_folder_are_not_followed(
+    small_artifact: Path, registry: Path, tmp_path: Path
+) -> None:
+    digest = manifest_of(registry).name[:12]
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    place = tmp_path / "out" / f".small-1.0.0.{digest}.partial"
+    for planted in (place, place / "artifact", place / "artifact" / "report", place / "parts"):
+        planted.parent.mkdir(parents=True, exist_ok=True)
+        planted.symlink_to(outside)
+        assert files_below(pull("small", registry).folder) == files_below(small_artifact)
+        assert [*outside.iterdir()] == []
+        shutil.rmtree("out")
+
+
+def test_a_damaged_registry_is_not_built_upon(registry: Path, artifact_version: Version) -> None:
+    blob = blob_of(registry)
+    change_byte(blob)
+    with pytest.raises(ProductError, match="remove that blob and publish again"):
+        publish_artifact(artifact_version("1.0.1"), "registry")
+    assert [r.version for r in open_registry("registry").releases()] == ["1.0.0"]
+    blob.unlink()
+    publish_artifact(artifact_version("1.0.1"), "registry")
+    assert pull("small@1.0.0", registry).outcome == "pulled"
+
+
+def test_a_damaged_release_file_is_refused(registry: Path, artifact_version: Version) -> None:
+    record = registry / "versions/small/1.0.0.json"
+    good = record.read_bytes()
+    write(record.with_name("1.0.7.json"), good)
+    with pytest.raises(ProductError, match=r"1\.0\.7\.json: holds small-1\.0\.0"):
+        publish_artifact(artifact_version("1.0.1"), "registry")
+    record.with_name("1.0.7.json").unlink()
+    write(record, good[:50])
+    with pytest.raises(ProductError, match="not what starcat writes"):
+        publish_artifact(artifact_version("1.0.1"), "registry")
+
+
+def test_a_lost_index_is_made_again(registry: Path, small_artifact: Path) -> None:
+    index = (registry / "index.json").read_bytes()
+    for damage in (lambda: (registry / "index.json").unlink(), lambda: first(name="x")(registry)):
+        damage()
+        assert publish_artifact(small_artifact, "registry").outcome == "unchanged"
+        assert (registry / "index.json").read_bytes() == index
+
+
+def test_a_registry_of_a_newer_starcat(registry: Path, published: Path) -> None:
+    edit_index(registry, lambda index: index.update(registry_version="2.0.0", releases={}))
+    with pytest.raises(SchemaVersionError, match=r"registry version 2\.0\.0; this starcat reads"):
+        pull("small", registry)
+    shutil.copy(published / "index.json", registry / "index.json")
+    edit_index(registry, lambda index: index.update(registry_version="1.7.0", news=1))
+    assert pull("small", registry).outcome == "pulled"
+
+
+# Going on -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("heeds_ranges", [True, False])
+def test_an_interrupted_download_goes_on(
+    small_artifact: Path, registry: Path, heeds_ranges: bool
+) -> None:
+    blob = blob_of(registry, "database.h5")
+    path, size = f"/{blob.relative_to(registry).as_posix()}", blob.stat().st_size
+    with serving(registry, heeds_ranges=heeds_ranges) as server:
+        server.cut_after[path] = [size // 2, 0]
+        with pytest.raises(DownloadError, match=r"received \d+ of .* pull again to go on"):
+            pull("small", server.url)
+        before, server.sent = server.sent, []
+        assert not Path("out/small-1.0.0").exists()
+        assert files_below(pull("small", server.url).folder) == files_below(small_artifact)
+    came = [name for name, *_ in before if name != "/index.json"]
+    assert not {name for name, *_ in server.sent} & {*came[: came.index(path)]}
+    (rest,) = [(start, sent) for name, start, sent in server.sent if name == path]
+    half = size // 2 if heeds_ranges else 0
+    assert rest == (half, size - half)
+    assert {path.name for path in Path("out").iterdir()} == {"small-1.0.0"}
+
+
+def test_a_killed_download_goes_on(small_artifact: Path, registry: Path) -> None:
+    blob = blob_of(registry, "database.h5")
+    path, size = f"/{blob.relative_to(registry).as_posix()}", blob.stat().st_size
+    part = Path("out") / f".small-1.0.0.{manifest_of(registry).name[:12]}.partial"
+    part = part / "parts" / f"{blob.name}.part"
+    command = ["pull", "small", "-o", "out", "--registry"]
+    with serving(registry) as server:
+        server.cut_after[path], server.stall = [size // 2], threading.Event()
+        environment = os.environ | {"PYTHONPATH": str(Path(starcat.__file__).parents[1])}
+        with subprocess.Popen(
+            [sys.executable, "-m", "starcat", *command, server.url], env=environment
+        ) as process:
+            deadline = time.monotonic() + 30
+            while not (part.exists() and part.stat().st_size == size // 2):
+                assert process.poll() is None, "it ended before it was killed"
+                assert time.monotonic() < deadline
+                time.sleep(0.02)
+            process.kill()
+        server.stall.set()
+        assert not Path("out/small-1.0.0").exists()
+        assert not Path("starcat.lock").exists()
+        pulled = pull("small", server.url)
+    assert [sent for sent in server.sent if sent[0] == path] == [
+        (path, 0, size // 2),
+        (path, size // 2, size - size // 2),
+    ]
+    # Each other blob came once: in all, every byte was sent once.
+    blobs = [sent for sent in server.sent if sent[0] != "/index.json"]
+    assert sum(length for *_, length in blobs) == sum(map(len, files_below(pulled.folder).values()))
+    assert files_below(pulled.folder) == files_below(small_artifact)
+
+
+def test_a_part_is_continued_from_another_address(small_artifact: Path, registry: Path) -> None:
+    blob = blob_of(registry, "database.h5")
+    path, size = f"/{blob.relative_to(registry).as_posix()}", blob.stat().st_size
+    with serving(registry) as server, serving(registry) as mirror:
+        server.cut_after[path] = [1000, 0]
+        with pytest.raises(DownloadError):
+            pull("small", server.url)
+        pulled = pull("small", mirror.url)
+        assert (path, 1000, size - 1000) in mirror.sent
+    assert files_below(pulled.folder) == files_below(small_artifact)
+
+
+@pytest.mark.parametrize("over_http", [True, False])
+@pytest.mark.parametrize("length", [1000, None, 1 << 26])
+def test_a_wrong_part_is_not_built_upon(
+    small_artifact: Path, registry: Path, over_http: bool, length: int | None
+) -> None:
+    blob = blob_of(registry, "database.h5")
+    place = Path("out") / f".small-1.0.0.{manifest_of(registry).name[:12]}.partial"
+    length = blob.stat().st_size if length is None else length
+    write(place / "parts" / f"{blob.name}.part", b"x" * length)
+    write(place / "artifact" / "pairs.parquet", b"x" * blob_of(registry).stat().st_size)
+    write(place / "artifact" / "not-listed", b"x")
+    with serving(registry) as server:
+        pulled = pull("small", server.url if over_http else registry)
+    assert files_below(pulled.folder) == files_below(small_artifact)
+
+
+def test_a_server_that_sends_more_or_other_than_it_should(registry: Path) -> None:
+    blob = blob_of(registry)
+    size = blob.stat().st_size
+    opened = open_registry("http://127.0.0.1:9", QUICK)
+    assert isinstance(opened, HttpRegistry)
+    with serving(registry) as server:
+        write(blob, b"x" * (size + 1))
+        with pytest.raises(DownloadError, match=f"has {size + 1} bytes; expected {size}"):
+            pull("small", server.url)
+        write(blob, b"x" * size)
+        with pytest.raises(ProductError, match="something on the way changes files"):
+            pull("small", server.url)
+    assert not [*Path("out").iterdir()]
+
+
+def limited(most: int, call: Callable[[], object]) -> None:
+    """Fail to write as on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most, hard))
+    try:
+        with pytest.raises(OutputError, match=r"(writing failed|cannot write).*[Tt]oo large"):
+            call()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("over_http", [True, False])
+def test_a_full_disk_ends_a_pull_which_goes_on_later(
+    small_artifact: Path, registry: Path, over_http: bool
+) -> None:
+    with serving(registry) as server:
+        address = server.url if over_http else registry
+        limited(1_000_000, lambda: pull("small", address))
+        assert not Path("out/small-1.0.0").exists()
+        assert not Path("starcat.lock").exists()
+        assert files_below(pull("small", address).folder) == files_below(small_artifact)
+    if over_http:
+        assert any(start == 1_000_000 for _, start, _ in server.sent)
+
+
+def test_a_full_disk_ends_a_publication_which_goes_on_later(small_artifact: Path) -> None:
+    limited(1_000_000, lambda: publish_artifact(small_artifact, "registry"))
+    there = files_below(Path("registry"))
+    assert "index.json" not in there
+    assert not [name for name in there if name.startswith("versions")]
+    database = sha256((small_artifact / "database.h5").read_bytes())
+    assert len(there[f".incoming/{database}.part"]) == 1_000_000
+    published = publish_artifact(small_artifact, "registry")
+    assert 0 < published.new_blobs < published.release.files
+    assert pull("small", "registry").outcome == "pulled"
+    assert [*Path("registry/.incoming").iterdir()] == []
+
+
+def test_a_registry_that_may_only_be_read(registry: Path) -> None:
+    for folder in [registry, *registry.rglob("*")]:
+        folder.chmod(0o555 if folder.is_dir() else 0o444)
+    try:
+        assert pull("small", registry).outcome == "pulled"
+    finally:
+        for folder in [registry, *registry.rglob("*")]:
+            folder.chmod(0o755)
+
+
+def test_output_below_a_file(registry: Path) -> None:
+    Path("file").write_text("")
+    with pytest.raises(OutputError, match="file: writing failed"):
+        pull("small", registry, "file")
+    with pytest.raises(OutputError, match="file/registry: writing failed"):
+        publish_artifact(pull("small", registry).folder, "file/registry")

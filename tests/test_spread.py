@@ -1,0 +1,215 @@
+"""Spread: what the matched stars hold, against the errors of many attitudes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from starcat.attitude import solve_wahba_svd
+from starcat.camera import Camera
+from starcat.matcher.observation import Observation, observe
+from starcat.matcher.spread import (
+    corner_deviation,
+    explained_share,
+    information,
+    is_scaled,
+    share_of_frame,
+)
+
+CAMERA = Camera(1024, 768, fov_x_deg=20.0)
+
+CORNERS_PX = np.array([[0.0, 0.0], [1024.0, 0.0], [0.0, 768.0], [1024.0, 768.0]])
+
+
+def places(count: int, seed: int, spread_px: float = 1000.0) -> np.ndarray:
+    """Return places on the detector, uniform over a square around its middle or all of it."""
+    half = np.minimum(0.5 * spread_px, [512.0, 384.0])
+    off = np.random.default_rng(seed).uniform(-half, half, (count, 2))
+    return np.asarray(np.array([512.0, 384.0]) + off)
+
+
+def rays(centroids_px: np.ndarray) -> np.ndarray:
+    return CAMERA.directions_from_pixels(centroids_px)
+
+
+def covariance_of(centroids_px: np.ndarray) -> np.ndarray:
+    return np.asarray(np.linalg.inv(information(rays(centroids_px))))
+
+
+def attitudes_from(centroids_px: np.ndarray, sigma_px: float, count: int) -> np.ndarray:
+    """Return the attitudes that noisy centroids of stars give where the identity is right."""
+    noise = np.random.default_rng(1).normal(scale=sigma_px, size=(count, *centroids_px.shape))
+    body = rays((centroids_px + noise).reshape(-1, 2)).reshape(count, -1, 3)
+    stars = np.broadcast_to(rays(centroids_px), body.shape)
+    return np.asarray(solve_wahba_svd(body, stars))
+
+
+# --- Information
+
+
+@pytest.mark.parametrize(("count", "spread_px"), [(4, 900.0), (10, 60.0), (30, 1000.0)])
+def test_attitudes_scatter_as_the_information_says(count, spread_px):
+    centroids_px, sigma_px = places(count, 2, spread_px), 0.1
+    turns = Rotation.from_matrix(attitudes_from(centroids_px, sigma_px, 4000)).as_rotvec()
+    expected = (sigma_px / CAMERA.focal_length_px) ** 2 * covariance_of(centroids_px)
+    # 4,000 scatter by 2 % each; a pixel off the axis is 3 % smaller an angle.
+    scale = np.sqrt(np.diag(expected))
+    assert np.cov(turns.T) / np.outer(scale, scale) == pytest.approx(
+        expected / np.outer(scale, scale), abs=0.1
+    )
+
+
+@pytest.mark.parametrize(("count", "spread_px"), [(5, 900.0), (10, 100.0)])
+def test_the_worst_corner_scatters_as_predicted(count, spread_px):
+    centroids_px, sigma_px = places(count, 3, spread_px), 0.1
+    matrices = attitudes_from(centroids_px, sigma_px, 4000)
+    turned = np.einsum("kij,nj->kni", matrices, rays(CORNERS_PX))
+    # The angle, as the corners are so far off the axis that pixels are 5 % smaller there.
+    apart = np.linalg.norm(turned - rays(CORNERS_PX), axis=2)
+    worst = np.sqrt((apart**2).mean(axis=0)).max() * CAMERA.focal_length_px / sigma_px
+    assert corner_deviation(covariance_of(centroids_px), CAMERA) == pytest.approx(worst, rel=0.06)
+
+
+# --- Share
+
+
+def test_all_stars_are_the_whole_share():
+    for count in (3, 5, 40):
+        centroids_px = places(count, count)
+        share = explained_share(covariance_of(centroids_px), rays(centroids_px))
+        assert share == pytest.approx(1.0, abs=1e-9)
+
+
+def test_of_stars_that_are_spread_alike_the_share_is_that_of_their_number():
+    # Turned about the axis by quarters a square of places is spread as before.
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    ring = np.array([[0.1, 0.05, 1.0], [-0.1, -0.05, 1.0], [0.05, -0.1, 1.0], [-0.05, 0.1, 1.0]])
+    ring /= np.linalg.norm(ring, axis=1)[:, None]
+    covariance = np.linalg.inv(information(ring))
+    twice = np.concatenate([ring, ring @ quarter.T])
+    assert explained_share(covariance, twice) == pytest.approx(0.5, rel=1e-9)
+
+
+def test_the_weights_are_the_variances_of_the_places():
+    matched_px, others_px = places(6, 4, 200.0), places(9, 5)
+    covariance = covariance_of(matched_px)
+    step, axes = 1e-6, np.eye(3)
+    weights = []
+    for ray in rays(np.concatenate([matched_px, others_px])):
+        slopes = np.array([(Rotation.from_rotvec(step * a).apply(ray) - ray) / step for a in axes])
+        weights.append(np.trace(slopes.T @ covariance @ slopes))
+    assert sum(weights[:6]) == pytest.approx(3.0, rel=1e-5)
+    found = explained_share(covariance, rays(np.concatenate([matched_px, others_px])))
+    assert found == pytest.approx(3.0 / sum(weights), rel=1e-5)
+
+
+def test_ten_stars_50_px_around_leave_one_at_500_px_a_weight_of_ten():
+    # Plus 2 / 10 for the two directions that all ten hold, and 3 for the ten themselves.
+    angle = 0.2 * np.pi * np.arange(10.0)
+    ring_px = [512.0, 384.0] + 50.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    every = rays(np.vstack([ring_px, [1012.0, 384.0]]))
+    # At 10 degrees off the axis pixels are 3 % smaller across the radius.
+    assert explained_share(covariance_of(ring_px), every) == pytest.approx(3.0 / 13.2, rel=0.03)
+
+
+@given(st.integers(4, 12), st.integers(0, 99), st.floats(0.0, 6.0))
+def test_the_share_does_not_depend_on_the_axes(count, seed, angle):
+    turn = Rotation.from_rotvec(angle * np.array([0.6, 0.0, 0.8])).as_matrix()
+    matched, others = rays(places(count, seed, 600.0)), rays(places(count, seed + 100))
+    every = np.concatenate([matched, others])
+    one = explained_share(np.linalg.inv(information(matched)), every)
+    other = explained_share(np.linalg.inv(information(matched @ turn.T)), every @ turn.T)
+    assert one == pytest.approx(other, rel=1e-6)
+
+
+@given(st.integers(0, 99), st.floats(0.0, 6.2), st.floats(60.0, 300.0))
+def test_a_missed_star_counts_the_more_the_farther_it_is(seed, angle, distance_px):
+    matched_px = places(10, seed, 100.0)
+    covariance = covariance_of(matched_px)
+    along = np.array([np.cos(angle), np.sin(angle)])
+    shares = [
+        explained_share(
+            covariance,
+            rays(np.vstack([matched_px, matched_px.mean(axis=0) + r * along])),
+        )
+        for r in (0.0, distance_px, 1.2 * distance_px)
+    ]
+    assert 1.0 > shares[0] > shares[1] > shares[2]
+
+
+# --- The share of a frame
+
+
+def seen(centroids_px: np.ndarray) -> Observation:
+    return observe(centroids_px, CAMERA, 2.0)
+
+
+def test_fewer_stars_or_fewer_centroids_in_the_frame_are_no_fault():
+    matched_px, others_px = places(8, 6), places(12, 7)
+    all_px = np.concatenate([matched_px, others_px])
+    matched, all_rays, residual_rad = rays(matched_px), rays(all_px), 0.5 / CAMERA.focal_length_px
+    assert share_of_frame(matched, all_rays, residual_rad, seen(matched_px)) == pytest.approx(1.0)
+    assert share_of_frame(matched, matched, residual_rad, seen(all_px)) == pytest.approx(1.0)
+    both = share_of_frame(matched, all_rays, residual_rad, seen(all_px))
+    assert both == pytest.approx(explained_share(covariance_of(matched_px), all_rays))
+    assert 0.2 < both < 0.5
+
+
+def test_a_cluster_alone_does_not_explain_the_frame():
+    cluster_px, outside_px = places(10, 8, 60.0), places(10, 9)
+    stars = rays(np.concatenate([cluster_px, outside_px]))
+    residual_rad = 0.5 / CAMERA.focal_length_px
+    observation = seen(np.concatenate([cluster_px, outside_px]))
+    assert share_of_frame(rays(cluster_px), stars, residual_rad, observation) < 0.05
+
+
+@pytest.mark.parametrize(("residual_px", "is_held"), [(0.1, True), (1.0, False)])
+def test_that_nothing_else_was_seen_counts_if_the_corners_are_held(residual_px, is_held):
+    cluster_px, outside_px = places(10, 8, 60.0), places(10, 9)
+    stars = rays(np.concatenate([cluster_px, outside_px]))
+    residual_rad = residual_px / CAMERA.focal_length_px
+    # About 20 px from the middle of the cluster, ten stars: 640 / (20 sqrt(10)) = 10 times.
+    assert 5.0 < corner_deviation(covariance_of(cluster_px), CAMERA) < 15.0
+    found = share_of_frame(rays(cluster_px), stars, residual_rad, seen(cluster_px))
+    assert found == pytest.approx(1.0) if is_held else found < 0.05
+
+
+def test_stars_in_one_place_explain_nothing():
+    same = np.tile([0.0, 0.0, 1.0], (5, 1))
+    assert share_of_frame(same, same, 0.0, seen(places(5, 10))) == 0.0
+
+
+# --- Scale
+
+
+def scaled(centroids_px: np.ndarray, factor: float) -> np.ndarray:
+    middle = np.array([512.0, 384.0])
+    return np.asarray(middle + factor * (centroids_px - middle))
+
+
+@pytest.mark.parametrize(("factor", "is_plain"), [(1.0, False), (1.002, False), (1.01, True)])
+def test_a_frame_is_scaled_if_its_corners_move_farther_than_the_tolerance(factor, is_plain):
+    # The corner is 640 px from the middle: 1.3 and 6.4 px for a tolerance of 2 px.
+    generator, found = np.random.default_rng(11), []
+    for seed in range(50):
+        predicted_px = places(12, seed)
+        noise = generator.normal(scale=0.3, size=predicted_px.shape)
+        for scale in (factor, 1.0 / factor):
+            centroids_px = scaled(predicted_px, scale) + noise
+            found.append(is_scaled(predicted_px, centroids_px, seen(places(12, seed))))
+    assert all(found) if is_plain else not any(found)
+
+
+def test_a_difference_of_scale_within_the_noise_is_none():
+    # Four stars within 60 px: noise alone makes a scale that moves the corner by many pixels.
+    generator = np.random.default_rng(12)
+    found = []
+    for seed in range(200):
+        predicted_px = places(6, seed, 60.0)
+        noisy_px = predicted_px + generator.normal(scale=0.5, size=predicted_px.shape)
+        found.append(is_scaled(predicted_px, noisy_px, seen(noisy_px)))
+    # Three deviations, estimated from eight degrees of freedom: 2 %.
+    assert np.mean(found) < 0.06

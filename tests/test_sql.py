@@ -1,0 +1,455 @@
+"""`starcat sql`: targets, views, the gallery, the formats of answers, the prompt."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from astropy.table import Table
+
+from starcat.artifact.reader import open_artifact
+from starcat.errors import ProductError, QueryError, SchemaVersionError, SourceError
+from starcat.query.gallery import gallery, named_query
+from starcat.query.session import Session, open_session
+from starcat.query.targets import identifier
+from starcat.sql_prompt import prompt, words
+
+Run = Callable[[list[Any]], Any]
+
+HEAVY = {"numpy", "pyarrow", "pandas", "astropy", "scipy", "matplotlib", "h5py"}
+
+
+@pytest.fixture(scope="module")
+def session(small_artifact: Path) -> Iterator[Session]:
+    with open_session([str(small_artifact)]) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> Path:
+    path = tmp_path_factory.mktemp("archive") / "sao.dat"
+    path.write_bytes(b"".join(sao_lines))
+    return path
+
+
+def rows(session: Session, text: str, **values: Any) -> list[tuple[Any, ...]]:
+    with session.ask(text, values) as answer:
+        return answer.rows(100_000)
+
+
+# Targets and views ----------------------------------------------------------------------------
+
+
+def test_every_product_is_a_view_with_all_its_rows(session, small_artifact):
+    artifact = open_artifact(small_artifact)
+    for product in artifact.products:
+        assert rows(session, f"SELECT count(*) FROM {product}") == [(len(artifact.table(product)),)]
+        assert rows(session, f"SELECT count(*) FROM small.{product}")
+
+
+def test_columns_are_described_with_their_units(session, small_artifact):
+    schema = open_artifact(small_artifact).schema("pairs")
+    described = rows(session, "DESCRIBE pairs")
+    assert [row[0] for row in described] == [column.name for column in schema.columns]
+    assert [row[2:] for row in described] == [(c.unit, c.description) for c in schema.columns]
+    comments = dict(
+        rows(session, "SELECT column_name, comment FROM duckdb_columns() "
+                      "WHERE table_name = 'pairs' AND schema_name = 'main'")
+    )  # fmt: skip
+    assert comments["separation_rad"].endswith("[rad]")
+    assert "[" not in comments["i"]
+
+
+def test_units_of_an_answer_are_those_of_the_columns_and_of_the_names(session):
+    text = "SELECT ra_deg, mag, mag - 1 AS other_mag, 1.5 AS x_mas_yr, 3 AS plain FROM stars"
+    with session.ask(text) as answer:
+        assert [facts.unit for facts in answer.facts] == ["deg", "mag", "mag", "mas/yr", ""]
+        assert answer.batches().schema.field("mag").metadata[b"unit"] == b"mag"
+
+
+def test_several_targets_have_schemas(small_artifact, archive):
+    given = [str(small_artifact), str(archive)]
+    with open_session(given) as session:
+        for schema in ("a", "small", "b", "sao"):
+            assert rows(session, f"SELECT count(*) FROM {schema}.stars")[0][0] > 500
+        assert len(rows(session, "SELECT * FROM small.stars JOIN sao.stars USING (star_id)")) > 500
+        with pytest.raises(QueryError, match="stars"):
+            rows(session, "FROM stars")
+
+
+def test_two_versions_of_an_artifact_have_schemas_of_their_own(small_artifact, artifact_version):
+    with open_session([str(small_artifact), str(artifact_version("1.1.0"))]) as session:
+        names = [target.name for target in session.targets]
+    assert names == ["small_1_0_0", "small_1_1_0"]
+
+
+def test_one_thing_twice_is_numbered(small_artifact):
+    with open_session([str(small_artifact)] * 3) as session:
+        assert len({target.name for target in session.targets}) == 3
+
+
+def test_archives_are_read_with_their_rejected_rows(archive, tmp_path):
+    broken = tmp_path / "sao.dat"
+    lines = archive.read_bytes().splitlines(keepends=True)
+    broken.write_bytes(b"".join([b"garbage\n", *lines]))
+    with open_session([str(broken)]) as session:
+        assert rows(session, "SELECT count(*) FROM stars") == [(len(lines),)]
+        [(reason, line)] = rows(session, "SELECT reason, source_line FROM rejected")
+    assert (reason, line) == ("malformed_record", 1)
+
+
+def test_archives_of_another_name_need_their_source(archive, tmp_path):
+    copied = tmp_path / "mine.txt"
+    shutil.copy(archive, copied)
+    with (
+        pytest.raises(QueryError, match=r"cannot tell what it is.*SOURCE=PATH"),
+        open_session([str(copied)]),
+    ):
+        pass
+    with open_session([f"sao={copied}"]) as session:
+        assert rows(session, "SELECT count(*) FROM stars")[0][0] > 500
+
+
+def test_ingested_tables_are_targets(starcat, archive, tmp_path):
+    assert starcat(["ingest", "sao", "--input", archive, "-o", tmp_path / "t.parquet"]).code == 0
+    with open_session([str(tmp_path / "t.parquet")]) as session:
+        assert session.targets[0].name == "t"
+        assert [facts for _, _, facts, _ in rows(session, "DESCRIBE stars")][5] == "deg"
+
+
+def test_parquet_files_of_others_are_tables_of_their_name(tmp_path):
+    pq.write_table(pa.table({"a": [1, 2]}), tmp_path / "My Table.parquet")
+    with open_session([str(tmp_path / "My Table.parquet")]) as session:
+        assert rows(session, "SELECT sum(a) FROM my_table") == [(3,)]
+
+
+def test_hats_catalogs_are_one_table(starcat, small_artifact, session, tmp_path):
+    exported = ["export", small_artifact, "--to", "hats", "--product", "stars", "-o", tmp_path]
+    assert starcat(exported).code == 0
+    count = "SELECT count(*), min(ra_deg), sum(mag) FROM stars"
+    with open_session([str(tmp_path / "stars")]) as opened:
+        assert len(opened.views[0].paths) > 1
+        assert rows(opened, count) == [pytest.approx(row) for row in rows(session, count)]
+
+
+@pytest.mark.parametrize("text", ["2MASS 8x6", "a.b-c", "", "Ä", "select"])
+def test_identifiers_need_no_quotes(text):
+    name = identifier(text)
+    assert duckdb.connect().execute(f"CREATE SCHEMA s_{name}") is not None
+    assert name.isidentifier()
+
+
+def damaged(small_artifact: Path, folder: Path, damage: str) -> Path:
+    copied = folder / "artifact"
+    shutil.copytree(small_artifact, copied)
+    manifest = json.loads((copied / "manifest.json").read_text())
+    if damage == "cut":
+        data = (copied / "pairs.parquet").read_bytes()
+        (copied / "pairs.parquet").write_bytes(data[: len(data) // 2])
+    elif damage == "footer":
+        data = bytearray((copied / "pairs.parquet").read_bytes())
+        data[-8:-4] = b"\xff\xff\xff\x0f"
+        (copied / "pairs.parquet").write_bytes(data)
+    elif damage == "gone":
+        (copied / "pairs.parquet").unlink()
+    elif damage == "link":
+        (copied / "pairs.parquet").unlink()
+        (copied / "pairs.parquet").symlink_to("/etc/passwd")
+    elif damage == "outside":
+        manifest["products"]["pairs"]["parquet"] = "../../secret.parquet"
+    elif damage == "injection":
+        manifest["products"]["x; DROP VIEW stars"] = manifest["products"].pop("pairs")
+    elif damage == "schema":
+        manifest["products"]["pairs"]["schema"] = "pairs-9.0.0"
+    (copied / "manifest.json").write_text(json.dumps(manifest))
+    return copied
+
+
+@pytest.mark.parametrize(
+    "damage", ["cut", "footer", "gone", "link", "outside", "injection", "schema"]
+)
+def test_damaged_artifacts_are_told(small_artifact, tmp_path, damage):
+    folder = damaged(small_artifact, tmp_path, damage)
+    expected = SchemaVersionError if damage == "schema" else ProductError
+    with pytest.raises(expected, match=r"pairs|small"), open_session([str(folder)]):
+        pass
+
+
+@pytest.mark.parametrize("given", ["nothing", "nothing.parquet", "nosource=x", "sao=nothing.dat"])
+def test_what_is_no_target_is_told(given):
+    with pytest.raises((QueryError, SourceError, ValueError), match="no"), open_session([given]):
+        pass
+
+
+# The gallery ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("query", gallery().values(), ids=gallery())
+def test_every_named_query_answers(query, small_artifact, artifact_version):
+    given = [str(small_artifact), str(artifact_version("1.1.0"))][: query.targets]
+    with open_session(given) as session, session.ask(query.text, query.with_values({})) as answer:
+        found = answer.rows(1000)
+        assert answer.columns
+    needs_none = {"rejected-near", "changed-stars", "star", "near-equal-pairs"}
+    assert found or query.name in needs_none
+    assert query.help.endswith(".")
+    assert {value.name for value in query.values} == set(re.findall(r"\$(\w+)", query.text))
+
+
+def test_the_values_of_a_named_query_have_its_types():
+    query = named_query("crossmatch")
+    assert query.with_values({"radius_arcsec": "3"}) == {"radius_arcsec": 3.0}
+    with pytest.raises(QueryError, match="'x' is not a number"):
+        query.with_values({"radius_arcsec": "x"})
+    with pytest.raises(QueryError, match="no value 'radius'; it has: radius_arcsec"):
+        query.with_values({"radius": "1"})
+    with pytest.raises(QueryError, match="did you mean crossmatch"):
+        named_query("crosmatch")
+
+
+def test_emptiest_fields_are_those_of_the_boresights(session, small_artifact):
+    counts = np.sort(open_artifact(small_artifact).table("boresights")["star_count"].to_numpy())
+    for name, expected in (("emptiest-fields", counts), ("densest-fields", counts[::-1])):
+        query = named_query(name)
+        found = rows(session, query.text, **query.with_values({"count": "7"}))
+        assert [row[3] for row in found] == expected[:7].tolist()
+
+
+def test_near_equal_pairs_are_those_of_numpy(session, small_artifact):
+    table = open_artifact(small_artifact).table("pairs")
+    gaps = 3600 * np.degrees(np.diff(table["separation_rad"].to_numpy()))
+    query = named_query("near-equal-pairs")
+    found = rows(
+        session, query.text, **query.with_values({"difference_arcsec": "20", "count": "5"})
+    )
+    assert np.allclose([row[3] for row in found], np.sort(gaps)[:5], rtol=1e-6)
+
+
+def test_the_cells_of_the_sky_hold_all_stars(session, small_artifact):
+    query = named_query("sky-density")
+    found = rows(session, query.text, **query.with_values({"cell_order": "1", "count": "48"}))
+    assert len(found) == 48
+    assert sum(row[1] for row in found) == len(open_artifact(small_artifact).table("stars"))
+
+
+def test_what_changed_between_versions(archive, small_artifact, tmp_path):
+    table = open_artifact(small_artifact).table("stars")
+    mag = table["mag"].to_numpy().copy()
+    mag[5] += 0.5
+    dec = table["dec_deg"].to_numpy().copy()
+    dec[7] += 1e-5
+    names = table.column_names
+    changed = table.set_column(names.index("mag"), table.schema.field("mag"), pa.array(mag))
+    changed = changed.set_column(
+        names.index("dec_deg"), table.schema.field("dec_deg"), pa.array(dec)
+    )
+    pq.write_table(table.slice(1), tmp_path / "old.parquet")
+    pq.write_table(changed.slice(0, len(table) - 2), tmp_path / "new.parquet")
+    query = named_query("changed-stars")
+    with open_session([str(tmp_path / "old.parquet"), str(tmp_path / "new.parquet")]) as session:
+        found = rows(session, query.text, **query.with_values({}))
+    names = table["designation"].to_pylist()
+    expected = [("came", names[0]), ("magnitude", names[5]), ("moved", names[7]),
+                ("went", names[-2]), ("went", names[-1])]  # fmt: skip
+    assert [row[:2] for row in found] == expected
+    assert found[2][4] == pytest.approx(36.0, rel=1e-6)
+
+
+def test_stars_of_two_tables_are_matched_by_place(small_artifact, session):
+    given = [str(small_artifact)] * 2
+    query = named_query("crossmatch")
+    with open_session(given) as both:
+        found = rows(both, query.text, **query.with_values({"radius_arcsec": "36000"}))
+    [(count,)] = rows(session, "SELECT count(*) FROM stars")
+    [(near,)] = rows(session, "SELECT count(*) FROM stars a JOIN stars b ON separation(a.ra_deg, "
+                              "a.dec_deg, b.ra_deg, b.dec_deg) <= 10")  # fmt: skip
+    assert len(found) == near > count
+    assert sum(row[0] == row[2] and row[4] == 0.0 for row in found) == count
+
+
+# Where answers go -----------------------------------------------------------------------------
+
+COLUMNS = ("star_id", "designation", "mag", "ra_deg", "hip_number")
+QUERY = f"SELECT {', '.join(COLUMNS)} FROM stars ORDER BY mag LIMIT 7"
+
+
+def test_a_table_fits_and_has_its_units(starcat, small_artifact):
+    run = starcat(["sql", small_artifact, QUERY])
+    assert run.code == 0
+    assert re.findall(r"\[\w+\]", run.out) == ["[mag]", "[deg]"]
+    assert len(run.out.splitlines()) == 9
+
+
+def test_wide_answers_stand_one_row_below_the_other(starcat, small_artifact):
+    run = starcat(["sql", small_artifact, "FROM stars", "--rows", "2"])
+    assert all(len(line) <= 100 for line in run.out.splitlines())
+    assert "row 2" in run.out
+    assert "row 3" not in run.out
+    assert "the first 2 rows" in run.err
+
+
+@pytest.mark.parametrize("form", ["csv", "json"])
+def test_text_goes_to_the_terminal(starcat, small_artifact, form):
+    run = starcat(["sql", small_artifact, QUERY, "--format", form])
+    assert run.code == 0
+    if form == "json":
+        assert len(json.loads(run.out)) == 7
+        assert run.out == starcat(["sql", small_artifact, QUERY, "--json"]).out
+    else:
+        assert run.out.splitlines()[0] == ",".join(f'"{name}"' for name in COLUMNS)
+
+
+@pytest.mark.parametrize("suffix", ["vot", "fits", "ecsv", "parquet", "csv", "json", "npz"])
+def test_files_have_the_same_values_and_units(starcat, session, small_artifact, tmp_path, suffix):
+    path = tmp_path / f"answer.{suffix}"
+    run = starcat(["sql", small_artifact, QUERY, "-o", path])
+    assert (run.code, run.out) == (0, "")
+    expected = rows(session, QUERY)
+    if suffix in ("vot", "fits", "ecsv"):
+        table = Table.read(path)
+        assert str(table["ra_deg"].unit) == "deg"
+        assert np.array_equal(table["ra_deg"], [row[3] for row in expected])
+        assert list(table["designation"]) == [row[1] for row in expected]
+    elif suffix == "parquet":
+        table = pq.read_table(path)
+        assert table.schema.field("mag").metadata[b"unit"] == b"mag"
+        assert table["star_id"].to_pylist() == [row[0] for row in expected]
+    elif suffix == "npz":
+        with np.load(path) as arrays:
+            assert arrays["mag"].tolist() == [row[2] for row in expected]
+    else:
+        assert path.read_text().count("\n") >= 7
+
+
+STOPS = (
+    "SELECT CASE WHEN range < 900000 THEN range ELSE error('no more') END AS n FROM range(2000000)"
+)
+LASTS = "SELECT a.range AS n, b.range AS m FROM range(1000000) a, range(1000000) b"
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet", "fits"])
+@pytest.mark.parametrize(
+    ("query", "code", "words"), [(STOPS, 2, "no more"), (LASTS, 1, "stopped after")]
+)
+def test_an_answer_that_stops_halfway_leaves_no_file(
+    starcat, small_artifact, tmp_path, suffix, query, code, words
+):
+    path = tmp_path / f"answer.{suffix}"
+    run = starcat(["sql", small_artifact, query, "-o", path, "--time-limit-s", "0.5"])
+    assert run.code == code
+    assert words in run.err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["sql"], "name what the query is about"),
+        (["sql", "{}", "SELECT 1", "--format", "fits"], "give a file with -o"),
+        (["sql", "{}", "SELECT 1", "--format", "excel"], "choose table, csv"),
+        (["sql", "{}", "SELECT 1", "-o", "answer.xls"], "no format that starcat writes"),
+        (["sql", "{}", "SELECT 1", "--format", "table", "-o", "a.txt"], "choose csv"),
+        (["sql", "{}", "SELECT 1", "--named", "magnitudes"], "either a query or --named"),
+        (["sql", "{}", "--named", "crossmatch"], "about 2 targets; 1 given"),
+        (["sql", "{}", "--named", "magnitudes", "--set", "x"], "not NAME=VALUE"),
+        (["sql", "nosuch", "SELECT 1"], "does not exist"),
+        (["sql", "{}", "COPY stars TO 'x.csv'"], "COPY is refused"),
+        (["sql", "{}", "SELEC " + "x, " * 200], "no valid SQL"),
+    ],
+)  # fmt: skip
+def test_wrong_questions_are_told(starcat, small_artifact, arguments, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = starcat([small_artifact if text == "{}" else text for text in arguments])
+    assert run.code == 2
+    assert words in run.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_lists(starcat, small_artifact):
+    assert "densest-fields" in starcat(["sql", "--list"]).out
+    assert "FROM cone(ra, dec, radius" in starcat(["sql", "--macros"]).out
+    views = starcat(["sql", small_artifact, "--views"]).out
+    assert "small.triangles" in views
+    for arguments in (["--list"], ["--macros"], [small_artifact, "--views"]):
+        assert json.loads(starcat(["sql", *arguments, "--json"]).out)
+    for arguments in (["--list"], ["--macros"], [small_artifact, "--views"]):
+        assert all(len(line) <= 100 for line in starcat(["sql", *arguments]).out.splitlines())
+
+
+def test_the_preamble_gives_any_duckdb_the_same_views(starcat, small_artifact, session):
+    text = starcat(["sql", small_artifact, "--preamble"]).out
+    count = "SELECT count(*) FROM cone(10, 20, 30)"
+    with duckdb.connect() as connection:
+        connection.execute(text)
+        assert connection.execute(count).fetchall() == rows(session, count)
+
+
+def test_a_query_comes_from_stdin(small_artifact):
+    command = [sys.executable, "-m", "starcat", "sql", str(small_artifact)]
+    text = "SELECT 1 AS one;\nSELECT ';' AS two"
+    for extra, count in (([], 2), (["-"], 0)):
+        given = text if count else "SELECT 1 AS one"
+        done = subprocess.run(
+            [*command, *extra, "--format", "csv"], input=given, capture_output=True, text=True,
+            check=False, timeout=50,
+        )  # fmt: skip
+        assert (done.returncode, done.stderr) == (0, "")
+        assert done.stdout.startswith('"one"\n1\n')
+        assert ("two" in done.stdout) == bool(count)
+
+
+def test_a_query_loads_nothing_heavy(small_artifact):
+    code = (
+        "import sys\nsys.argv = ['starcat', 'sql', sys.argv[1], 'SELECT 1']\n"
+        "from starcat.cli import main\ntry:\n    main()\nexcept SystemExit:\n    pass\n"
+        "print(*{name.split('.')[0] for name in sys.modules})"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(small_artifact)], capture_output=True, text=True,
+        check=True, timeout=50,
+    )  # fmt: skip
+    loaded = set(done.stdout.split())
+    assert "duckdb" in loaded
+    assert not loaded & HEAVY
+
+
+# The prompt -----------------------------------------------------------------------------------
+
+
+def test_the_prompt_answers_until_it_ends(session, capsys, monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    lines = iter(["SELECT count(*)", "  AS stars", "FROM stars;", "", "SELECT nosuch;", ".views",
+                  ".named densest-fields count=1", ".rows 1", "FROM pairs;", ".help", ".quit",
+                  "SELECT 'not asked';"])  # fmt: skip
+    prompts: list[str] = []
+
+    def read(text: str) -> str:
+        prompts.append(text)
+        return next(lines)
+
+    prompt(session, 40, read)
+    out, err = capsys.readouterr()
+    assert prompts[:4] == ["starcat> ", "   ...> ", "   ...> ", "starcat> "]
+    assert "small.pairs" in out
+    assert "star_count" in out
+    assert "error: " in err
+    assert "the first 1 rows" in err
+    assert ".macros" in err
+    assert "not asked" not in out
+    assert (tmp_path / "starcat" / "sql_history").exists()
+
+
+def test_the_prompt_completes_what_there_is(session):
+    known = words(session)
+    assert {"stars", "small.pairs", "separation_rad", "cone(", "densest-fields"} <= set(known)
