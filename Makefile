@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help install check format test test-all demo bench reproduction docs golden release clean
+.PHONY: help install check format test test-all demo bench reproduction docs pictures golden release clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -53,7 +53,11 @@ reproduction: $(READY) ## measure what the papers print (half an hour), rewrite 
 
 docs: $(READY) ## rewrite the generated pages of docs/, build the site in dist/docs
 	$(BIN)/python tests/builders/docs.py
+	$(BIN)/python tests/builders/star_page.py
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs dist/docs
+
+pictures: $(READY) ## draw the pictures of README.md again
+	$(BIN)/python tests/builders/pictures.py
 
 golden: $(READY) ## rewrite the golden digests; look at the difference before committing it
 	$(BIN)/python tests/builders/golden.py

@@ -22,6 +22,9 @@ napoleon_use_rtype = False
 autodoc_typehints = "none"
 autodoc_member_order = "bysource"
 
+# The lexer of SQL knows no $name.
+suppress_warnings = ["misc.highlighting_failure"]
+
 html_theme = "furo"
 html_title = f"starcat {__version__}"
 html_show_copyright = False

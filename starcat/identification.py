@@ -199,14 +199,14 @@ def short_name(designation: str) -> str:
     Returns
     -------
     str
-        Long numbers keep their last six digits.
+        Long numbers keep their last eight digits: of six, Gaia's have 15,625 endings only.
 
     Examples
     --------
     >>> short_name("Gaia DR3 3221269181884277504"), short_name("SAO 308")
-    ('Gaia …277504', 'SAO 308')
+    ('Gaia …84277504', 'SAO 308')
     """
     words = designation.split()
     if len(words[-1]) <= 12:
         return designation
-    return f"{words[0]} …{words[-1][-6:]}"
+    return f"{words[0]} …{words[-1][-8:]}"

@@ -2,11 +2,11 @@
 
 import re
 import shlex
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from sphinx.cmd.build import build_main as sphinx_build
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "builders"))
@@ -27,7 +27,13 @@ def commands(page):
     return [line[2:] for line in lines if line.startswith("$ starcat ")]
 
 
-WALKED = ["README.md", "docs/tutorial.md", "docs/howto-prove.md", "docs/howto-query.md"]
+WALKED = [
+    "README.md",
+    "docs/tutorial.md",
+    "docs/howto-prove.md",
+    "docs/howto-query.md",
+    "docs/howto-release.md",
+]
 
 
 @pytest.mark.parametrize("name", WALKED)
@@ -55,7 +61,11 @@ def test_links_between_pages_lead_somewhere():
 
 
 def test_the_site_builds_without_a_warning(tmp_path):
-    built = sphinx_build(["-W", "--keep-going", "-q", "-b", "html", str(ROOT / "docs"), str(tmp_path)])
-    assert built == 0
+    # In a process of its own: Sphinx 9 itself uses what Python will drop.
+    made = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"]
+    done = subprocess.run(
+        [*made, ROOT / "docs", tmp_path], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
     every = {page.stem for page in (ROOT / "docs").glob("*.md")}
     assert every == {page.stem for page in tmp_path.glob("*.html")} - {"genindex", "search"}

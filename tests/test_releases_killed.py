@@ -127,7 +127,11 @@ class Workers:
 @pytest.fixture(scope="module")
 def workers() -> Iterator[Workers]:
     package = Path(starcat.__file__).parents[1]
-    environment = os.environ | {"PYTHONPATH": str(package), "NO_PROXY": "127.0.0.1"}
+    environment = os.environ | {
+        "PYTHONPATH": str(package),
+        "NO_PROXY": "127.0.0.1",
+        "OMP_NUM_THREADS": "1",
+    }
     with subprocess.Popen(
         [sys.executable, "-c", WORKERS],
         stdin=subprocess.PIPE,
@@ -293,14 +297,15 @@ def _rounds(
             assert seen(output) == ({artifact.name} if check_output(output, artifact) else set())
         assert workers.run(**order) in DONE
         assert check_output(output, artifact)
-        # A version of earlier, which may share files with one whose publisher was killed.
-        older = dice.randint(0, k)
-        order |= {"pull": f"small@1.{older}.0", "output": str(folder / "older")}
-        assert workers.run(**order) in DONE
-        assert check_output(folder / "older", version(f"1.{older}.0"))
+        if k % 4 == 3:
+            # A version of earlier, which may share files with one whose publisher was killed.
+            older = dice.randint(0, k)
+            order |= {"pull": f"small@1.{older}.0", "output": str(folder / "older")}
+            assert workers.run(**order) in DONE
+            assert check_output(folder / "older", version(f"1.{older}.0"))
+            shutil.rmtree(folder / "older")
         assert verify_artifact(output / artifact.name).findings == ()
-        for used in (output, folder / "older"):
-            shutil.rmtree(used)
+        shutil.rmtree(output)
     assert len(reader.look()) == rounds
     assert [*(folder / "registry" / ".incoming").glob("*.part")] == []
     return kills
