@@ -24,7 +24,8 @@ from starcat.attitude import (
 from starcat.camera import Camera
 from starcat.errors import ConfigError, ProductError, SchemaVersionError
 from starcat.evaluation.selftest import answers_rightly, self_test
-from starcat.evaluation.simulate import Frame, Noise, simulate_frames
+from starcat.evaluation.simulate import Frame, Noise, simulate_frame, simulate_frames
+from starcat.evaluation.sky import Sky
 from starcat.matcher import pairs, pyramid, triangle
 from starcat.matcher.candidates import Candidates
 from starcat.matcher.database import Database, ProductArrays, open_database, products_in
@@ -225,6 +226,43 @@ def test_the_residual_is_that_of_the_attitude_that_is_returned(sky):
         # And the attitude is the best one for the stars that are named.
         q = solve_wahba_quest(seen.body[named], sky.directions[found.star_index[named]])
         assert np.abs(matrix_from_quaternion(q) - found.matrix).max() < 1e-9
+
+
+def cluster_sky(random_directions) -> Database:
+    """Return a sky with ten stars within 100 px of its north pole."""
+    offset = np.random.default_rng(5).normal(scale=25.0 / CAMERA.focal_length_px, size=(10, 2))
+    cluster = np.column_stack([offset, np.ones(10)])
+    cluster /= np.linalg.norm(cluster, axis=1)[:, None]
+    return sky_of(np.concatenate([random_directions(1200, 5), cluster]))
+
+
+def test_the_stars_outside_of_a_cluster_outweigh_a_wrong_one(random_directions):
+    # Turned about the cluster by 8 px at 400 px another star takes the first centroid outside:
+    # together with the cluster it holds the attitude there, for all that the others miss.
+    cluster = cluster_sky(random_directions).directions[1200:]
+    angle, turn = 0.7 * np.arange(8.0), 8.0 / 400.0
+    outside_px = 512.0 + 400.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    outside = CAMERA.directions_from_pixels(outside_px)
+    wrong = matrix_from_quaternion(np.array([0.0, 0.0, 0.5 * turn, 1.0]))
+    database = sky_of(np.concatenate([cluster, outside, outside[:1] @ wrong]), boresights=10)
+    stars = np.arange(18)
+    seen = observe(CAMERA.pixels_from_directions(database.directions[stars]), CAMERA, 2.0)
+    found = agree(wrong, seen, database)
+    assert np.abs(found.matrix - np.eye(3)).max() < 1e-12
+    assert found.star_index.tolist() == stars[seen.rows].tolist()
+    assert found.false_match_probability < 1e-30
+
+
+def test_the_agreement_of_a_cluster_alone_is_refused(random_directions):
+    # The stars outside are seen elsewhere: no attitude near this one explains them.
+    database, matrix = cluster_sky(random_directions), matrix_from_radec_roll(0.0, 90.0, 30.0)
+    place = CAMERA.pixels_from_directions(database.directions @ matrix.T)
+    stars = np.flatnonzero(CAMERA.contains(place))
+    outside = stars[stars < 1200]
+    place[outside] = np.random.default_rng(37).random((len(outside), 2)) * 1024.0
+    found = agree(matrix, observe(place[stars], CAMERA, 2.0), database)
+    assert found.n_matched >= 10
+    assert found.false_match_probability == 1.0
 
 
 def test_an_attitude_elsewhere_agrees_with_too_few(sky):
@@ -621,6 +659,22 @@ def test_the_truth_is_found_at_the_poles_and_in_any_roll(triangles):
             found = triangles.identify(place[CAMERA.contains(place)])
             assert found.status == "identified"
             assert np.abs(matrix_from_quaternion(found.q_body_from_icrs) - matrix).max() < 1e-12
+
+
+@pytest.mark.parametrize("method", IN_MEMORY)
+def test_a_cluster_of_stars_is_not_taken_for_the_whole_frame(random_directions, method):
+    # Ten stars within 100 px hardly say how the camera is turned about them: an attitude that
+    # only they agree with is no chance, and yet wrong.
+    generator, database = np.random.default_rng(5), cluster_sky(random_directions)
+    stars = Sky(database.directions, database.mag, np.arange(1210, dtype=np.int32))
+    for _ in range(300):
+        ra_deg, roll_deg = generator.uniform(0.0, 360.0, 2)
+        matrix = matrix_from_radec_roll(ra_deg, generator.uniform(83.0, 90.0), roll_deg)
+        frame = simulate_frame(stars, CAMERA, matrix, Noise(0.5), generator)
+        found = Matcher(database, method).identify(frame.centroids_px)
+        if found.status == "identified":
+            turn = matrix_from_quaternion(found.q_body_from_icrs) - matrix
+            assert np.linalg.norm(turn, axis=1).max() * CAMERA.focal_length_px < 6.0
 
 
 def test_lists_do_as_well_as_arrays(triangles):

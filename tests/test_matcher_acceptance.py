@@ -37,6 +37,9 @@ RIGHT_PX = 3.0
 REACH_PX = 3.0
 """A centroid may carry the name of a star this near to it, in the attitude that was found."""
 
+PLEIADES = (56.6, 24.1)
+"""Right ascension and declination of a cluster of stars, degrees."""
+
 ARCSEC = np.pi / (180.0 * 3600.0)
 
 RATED = [name for name in METHODS if not name.startswith("hausdorff_l")]
@@ -63,7 +66,10 @@ class Ground:
         return self.random_share == 1.0
 
 
-@pytest.fixture(scope="module", params=["small", pytest.param("sao-12deg", marks=pytest.mark.slow)])
+WHOLE = pytest.param("sao-12deg", marks=pytest.mark.slow)
+
+
+@pytest.fixture(scope="module", params=["small", WHOLE])
 def ground(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Ground:
     if request.param == "small":
         return Ground(request.getfixturevalue("small_artifact"), 60, 0.01, 0.25)
@@ -158,13 +164,12 @@ def test_the_other_methods_identify_most_and_nothing_wrongly(ground, method):
         assert count_identified(found for _, found in answered) >= 0.95 * len(answered)
 
 
+@pytest.mark.parametrize("ground", [WHOLE], indirect=True)
 def test_no_answer_is_wrong_where_stars_crowd(ground):
-    if not ground.is_whole:
-        pytest.skip("the small sky has no cluster of stars")
     for method in ("triangle", "pairs", "pyramid"):
         matcher = Matcher.open(ground.artifact, method)
         for noise in (CLEAN, HARD):
-            some = around(matcher, 56.6, 24.1, 1000, noise)  # the Pleiades
+            some = around(matcher, *PLEIADES, 1000, noise)
             answered = [(frame, matcher.identify(frame.centroids_px)) for frame in some]
             assert not wrong(answered, matcher), (method, noise)
 
@@ -270,7 +275,8 @@ def test_order_and_magnitudes_change_no_answer(answers, matcher, noise):
 @pytest.mark.parametrize("method", METHODS)
 def test_mirrored_frames_are_never_identified(ground, method):
     matcher = Matcher.open(ground.artifact, method)
-    count = ground.frames if method == "triangle" else 20 if ground.is_whole else 3
+    whole, rest = (ground.frames, 20) if ground.is_whole else (20, 2)
+    count = whole if method == "triangle" else rest
     for frame in frames(matcher, count, CLEAN):
         mirrored_px = frame.centroids_px * [-1.0, 1.0] + [matcher.database.camera.width_px, 0.0]
         # Pyramids are looked for on all triangles, however many.
@@ -284,15 +290,18 @@ def test_a_wrong_focal_length_gives_no_wrong_answer(ground, matcher, factor):
     told = Camera(camera.width_px, camera.height_px, factor * camera.focal_length_px)
     # A hundredth of the half diagonal is where the corner goes.
     corner_px = 0.005 * np.hypot(camera.width_px, camera.height_px)
+    some = frames(matcher, ground.frames if ground.is_whole else 20, CLEAN)
+    if ground.is_whole:
+        some += around(matcher, *PLEIADES, 200, CLEAN)
     names = false = 0
-    for frame in frames(matcher, ground.frames, CLEAN):
+    for frame in some:
         found = matcher.identify(frame.centroids_px, told)
         if found.status == "identified":
             assert error_px(found, frame.matrix, camera) <= corner_px + RIGHT_PX
             names += found.n_matched
             false += int(((found.star_index >= 0) & (found.star_index != frame.star_index)).sum())
-    # Where stars stand close together the corner's one may be taken for its neighbour.
-    assert false <= 0.002 * names
+    # One that 1 % moves by 5 px may be taken for its neighbour, in a rich field.
+    assert false <= max(1.0, 0.002 * names)
 
 
 ROUNDS = [("triangle", turn) for turn in range(4)]

@@ -99,6 +99,11 @@ def _l1(observation: Observation, database: Database) -> Rows:
     return _reference_alone(observation, stars)
 
 
+def _l1_limited(observation: Observation, database: Database) -> Rows:
+    named = hausdorff_l1.identify_bare(observation, database)
+    return _reference_alone(observation, np.array([named], dtype=np.intp))
+
+
 def _reference_alone(observation: Observation, stars: Rows) -> Rows:
     named = np.full(len(observation), -1, dtype=np.intp)
     named[references(observation)[0]] = stars[0]
@@ -111,5 +116,6 @@ ANSWERS: dict[str, Answer] = {
     "S5 capped": bare(_angular_capped),
     "S1 L2": bare(_l2),
     "S1 L1": bare(_l1),
+    "S1 L1 limited": bare(_l1_limited),
 }
 """Ways to answer, by the name that a trial gives."""

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -36,6 +36,9 @@ _TYPES = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string
 
 AT_ONCE = 250
 """Frames of one task of a process."""
+
+BASICS = ("attitude", "camera", "distortion", "kvector", "sphere")
+"""Modules that the matcher carries along."""
 
 
 @dataclass(frozen=True)
@@ -188,12 +191,31 @@ def description(trial: Trial, artifact: Path) -> bytes:
     Returns
     -------
     bytes
-        JSON with sorted keys, with the digest of the artifact's manifest.
+        JSON with sorted keys, with the digests of the artifact's manifest and of the code.
     """
     manifest = (artifact / "manifest.json").read_bytes()
-    facts = {**asdict(trial), "artifact": artifact.name}
+    facts = {**asdict(trial), "artifact": artifact.name, "code_sha256": code_sha256()}
     facts["manifest_sha256"] = hashlib.sha256(manifest).hexdigest()
     return json.dumps(facts, sort_keys=True, default=str).encode()
+
+
+@cache
+def code_sha256() -> str:
+    """Return the digest of the code that simulates, identifies and judges.
+
+    Returns
+    -------
+    str
+        SHA-256, hexadecimal, of the modules of these rooms and of what the matcher carries along.
+        Records of other code are not taken for results of this.
+    """
+    package = Path(__file__).parents[1]
+    paths = [package / f"{name}.py" for name in BASICS]
+    paths += [path for room in ("matcher", "evaluation") for path in (package / room).glob("*.py")]
+    digest = hashlib.sha256()
+    for path in sorted(paths):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def frame_count(trial: Trial) -> int:

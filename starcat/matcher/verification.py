@@ -19,6 +19,7 @@ from starcat.matcher.candidates import Candidates
 from starcat.matcher.chance import false_match_probability
 from starcat.matcher.database import Database
 from starcat.matcher.observation import Observation
+from starcat.matcher.spread import is_scaled, share_of_frame
 from starcat.matcher.star_cells import StarCells, star_cells
 
 Array = NDArray[np.float64]
@@ -26,17 +27,21 @@ Array = NDArray[np.float64]
 MIN_STARS = 4
 """Three stars make an attitude; at least one more has to agree with it."""
 
-MIN_SHARE = 0.4
-"""An attitude has to explain this share of the centroids, or of the stars if they are fewer.
+MIN_SHARE = 1.0 / 3.0
+"""An attitude has to explain this share of the centroids, or of the stars if that is more.
 
-Stars crowd in clusters, where a part of them agrees with an attitude that is off.
+Each counts by how little the matched ones say of its place (`explained_share`): stars crowd in
+clusters, and those of a cluster may agree with an attitude that is off.
 """
+
+SURE_SHARE = 2.0 / 3.0
+"""If it explains less than this, the frame is searched for more, within wider reaches."""
+
+WIDER = (4.0, 2.0)
+"""These reaches, in units of the final one."""
 
 REACH = 1.5
 """Stars and centroids agree within this many tolerances: an attitude from few stars errs too."""
-
-SCALE_DEVIATIONS = 3.0
-"""Standard deviations from which on a difference of scale is none of chance."""
 
 MAX_REFINEMENTS = 4
 """The matched stars rarely change after the first."""
@@ -167,77 +172,93 @@ def agree(matrix: Array, observation: Observation, database: Database) -> Agreem
     -------
     Agreement
         After refinement on all stars that matched, until they no longer change. Each star has
-        one centroid at most.
+        one centroid at most. Its false-match probability is 1 if it leaves too much of the frame
+        unexplained (`MIN_SHARE`) or if the frame is scaled.
     """
+    fit = _refined(matrix, observation, database)
+    found, share = _judged(fit, observation)
+    if share < SURE_SHARE:
+        # No chance, and yet much is unexplained: the attitude may be the right one but for a
+        # wrong star or two at the edge of a cluster.
+        wider, _ = _judged(_refined(fit.matrix, observation, database, WIDER), observation)
+        if wider.false_match_probability < found.false_match_probability:
+            return wider
+    return found
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """An attitude, the stars around its field and which of them the centroids are."""
+
+    matrix: Array
+    near: NDArray[np.int64]
+    icrs: Array
+    predicted_px: Array
+    star: NDArray[np.int64]
+    matched: NDArray[np.int64]
+    square_px: Array
+
+
+def _refined(
+    matrix: Array,
+    observation: Observation,
+    database: Database,
+    wider: tuple[float, ...] = (),
+) -> _Fit:
+    """Refine an attitude on all stars that match, first within wider reaches."""
     camera, body = observation.camera, observation.body
-    near = np.flatnonzero(database.directions @ matrix[2] >= np.cos(camera.radius_rad))
+    near = np.flatnonzero(database.directions @ matrix[2] >= math.cos(camera.radius_rad))
     u = database.directions[near]
     before: NDArray[np.int64] = np.empty(0, dtype=np.int64)
-    for _ in range(MAX_REFINEMENTS):
+    for factor in (*wider, *MAX_REFINEMENTS * (1.0,)):
         predicted = camera.pixels_from_directions(u @ matrix.T)
-        star, residual_px = _mutually_nearest(predicted, observation)
+        reach_px = factor * REACH * observation.tolerance_px
+        star, square_px = _mutually_nearest(predicted, observation, reach_px)
         matched = np.flatnonzero(star >= 0)
-        if len(matched) < MIN_STARS or np.array_equal(star, before):
+        if len(matched) < MIN_STARS or (factor == 1.0 and np.array_equal(star, before)):
             break
         before = star
         matrix = solve_wahba_svd(body[matched], u[star[matched]])
-    index = np.full(len(body), -1, dtype=np.int32)
-    index[matched] = near[star[matched]]
+    return _Fit(matrix, near, u, predicted, star, matched, square_px)
+
+
+def _judged(fit: _Fit, observation: Observation) -> tuple[Agreement, float]:
+    """Return the agreement of a fit and the share of the frame that it explains, 1 if chance."""
+    camera, matched, star = observation.camera, fit.matched, fit.star[fit.matched]
+    index = np.full(len(observation), -1, dtype=np.int32)
+    index[matched] = fit.near[star]
     if len(matched) < MIN_STARS:
-        return Agreement(matrix, index, math.nan, 1.0)
-    seen = body[matched]
-    difference = seen - u[star[matched]] @ matrix.T
-    square = float(np.vdot(difference, difference)) / len(matched)
-    stars = _within_reach_of_frame(predicted, observation)
-    explained = len(matched) >= MIN_SHARE * min(len(body), stars)
-    if not explained or _is_scaled(
-        predicted[star[matched]], observation.centroids_px[matched], observation
+        return Agreement(fit.matrix, index, math.nan, 1.0), 1.0
+    seen = observation.body[matched]
+    difference = seen - fit.icrs[star] @ fit.matrix.T
+    residual_rad = math.sqrt(float(np.vdot(difference, difference)) / len(matched))
+    within = _within_reach_of_frame(fit.predicted_px, observation)
+    square_px = float(fit.square_px[matched].sum())
+    chance = false_match_probability(square_px, seen, len(observation), len(within), camera)
+    share = 1.0
+    if chance < 1.0 and len(matched) < len(within):
+        stars = fit.icrs[within] @ fit.matrix.T
+        share = share_of_frame(seen, stars, residual_rad, observation)
+    if share < MIN_SHARE or (
+        chance < 1.0
+        and is_scaled(fit.predicted_px[star], observation.centroids_px[matched], observation)
     ):
-        return Agreement(matrix, index, math.sqrt(square), 1.0)
-    distance = residual_px[matched]
-    chance = false_match_probability(
-        float(distance @ distance),
-        seen,
-        len(body),
-        stars,
-        camera,
-    )
-    return Agreement(matrix, index, math.sqrt(square), chance)
+        chance = 1.0
+    return Agreement(fit.matrix, index, residual_rad, chance), share
 
 
-def _within_reach_of_frame(predicted_px: Array, observation: Observation) -> int:
-    """Count the stars that some centroid of the frame could agree with."""
+def _within_reach_of_frame(predicted_px: Array, observation: Observation) -> NDArray[np.int64]:
+    """Return which stars some centroid of the frame could agree with."""
     camera, reach_px = observation.camera, REACH * observation.tolerance_px
     size = np.array([camera.width_px, camera.height_px])
     near = np.abs(predicted_px - 0.5 * size) <= 0.5 * size + reach_px
-    return int(near.all(axis=1).sum())
-
-
-def _is_scaled(predicted_px: Array, centroids_px: Array, observation: Observation) -> bool:
-    """Return whether the frame is plainly larger or smaller than the stars that it matches.
-
-    Then the camera's focal length is wrong: the attitude may be right, but towards the edge
-    stars are taken for their neighbours. Plainly is by more than `SCALE_DEVIATIONS`, and so
-    much that the corner of the frame is off by more than the largest error of a centroid.
-    """
-    camera = observation.camera
-    inner = predicted_px - predicted_px.sum(axis=0) / len(predicted_px)
-    extent = float(np.vdot(inner, inner))
-    offset = centroids_px - predicted_px
-    excess = float(np.vdot(inner, offset)) / extent
-    corner_px = 0.5 * math.hypot(camera.width_px, camera.height_px)
-    if abs(excess) * corner_px <= observation.tolerance_px:
-        return False
-    left = offset - excess * inner
-    left -= left.sum(axis=0) / len(left)
-    variance = float(np.vdot(left, left)) / (2 * len(left) - 4) / extent
-    return excess * excess > SCALE_DEVIATIONS**2 * variance
+    return np.flatnonzero(near[:, 0] & near[:, 1])
 
 
 def _mutually_nearest(
-    predicted_px: Array, observation: Observation
+    predicted_px: Array, observation: Observation, reach_px: float
 ) -> tuple[NDArray[np.int64], Array]:
-    """Return each centroid's star and its distance, if neither has a nearer one; -1 for none."""
+    """Return each centroid's star and its squared distance; -1 unless neither has a nearer one."""
     count = len(observation)
     if not len(predicted_px):
         return np.full(count, -1), np.full(count, np.inf)
@@ -247,6 +268,5 @@ def _mutually_nearest(
     square = np.fmin(dx * dx + dy * dy, np.inf)
     star, rows = square.argmin(axis=1), np.arange(count)
     nearest = square[rows, star]
-    reach = (REACH * observation.tolerance_px) ** 2
-    mutual = (square.argmin(axis=0)[star] == rows) & (nearest <= reach)
-    return np.where(mutual, star, -1), np.sqrt(nearest)
+    mutual = (square.argmin(axis=0)[star] == rows) & (nearest <= reach_px * reach_px)
+    return np.where(mutual, star, -1), nearest

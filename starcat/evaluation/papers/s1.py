@@ -19,7 +19,11 @@ ROLLS_DEG = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 5.0, 45.0, 90.0, 180.0)
 
 SCALES = (1.0, 1.05, 2.0, 3.0, 4.0)
 
-WAYS = {"L2": ("hausdorff_l2", "S1 L2"), "L1": ("hausdorff_l1", "S1 L1")}
+WAYS = {
+    "L2": ("hausdorff_l2", "S1 L2"),
+    "L1": ("hausdorff_l1", "S1 L1"),
+    "L1 within 12 px": ("hausdorff_l1", "S1 L1 limited"),
+}
 """Label to method and bare answer."""
 
 
@@ -84,8 +88,9 @@ def _whole_library(count: int) -> list[Row]:
             ("L2 with starcat, centred on a star", "stars", "matcher"),
             ("L2 with starcat, anywhere", "random", "matcher"),
         ):
-            slug = f"library-{value:g}-{label}".lower().replace(" ", "-").replace(",", "")
-            trial = _trial(slug, "hausdorff_l2", answer, Attitudes(kind, count), noise)
+            trial = _trial(
+                f"library-{value:g}-{label}", "hausdorff_l2", answer, Attitudes(kind, count), noise
+            )
             made.append(Row(group, f"{label}, {value:g} px", PRESET, trial, "reference", x=value))
     return made
 
@@ -100,7 +105,7 @@ def _trial(
     assumed: Camera | None = None,
 ) -> Trial:
     return Trial(
-        f"s1-{name.lower()}",
+        f"s1-{name}".lower().replace(" ", "-").replace(",", ""),
         method,
         attitudes,
         noise,
@@ -150,7 +155,9 @@ PAPER = Paper(
         "L1 compares planar coordinates with north up and the nominal scale, L2 distances over "
         "the smallest one; both without verification in those rows. The paper says that L1 fails "
         "from 1.5 to 2 degrees of roll on and at a scale of 1.05, without the form of its L1: the "
-        "averaged one here fails later, as 2 degrees move a neighbour 3 degrees away by 0.1.",
+        "averaged one here fails later, as 2 degrees move a neighbour 3 degrees away by 0.1. With "
+        "a limit of 12 px to the mean difference that is accepted (ours, the paper states none) it "
+        "fails where the paper's does, and misses some upright frames.",
         "A scaled frame shows the same field on a larger detector; the matcher is told the nominal "
         "focal length.",
     ),

@@ -1,0 +1,178 @@
+"""Spread: whether the matched stars hold an attitude, and the scale, over the whole frame.
+
+Ten stars within 100 px hardly say how the camera is turned about them. An attitude that only
+they agree with is no chance, and yet it may be far off at the edge of the frame. What the
+matched stars tell of the attitude is compared with what the whole frame could tell.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.camera import Camera
+from starcat.matcher.observation import Observation
+
+Array = NDArray[np.float64]
+
+SCALE_DEVIATIONS = 3.0
+"""Standard deviations from which on a difference of scale is none of chance."""
+
+_UNIT = np.eye(3)
+
+
+def share_of_frame(
+    matched: Array, stars: Array, residual_rad: float, observation: Observation
+) -> float:
+    """Return which share of a frame an attitude explains, by weight.
+
+    Parameters
+    ----------
+    matched : ndarray of float64, shape (n, 3)
+        Directions of the matched centroids in the camera frame, n >= 2.
+    stars : ndarray of float64, shape (M, 3)
+        Directions of the stars that the attitude puts on the detector or within reach of it.
+    residual_rad : float
+        Root mean square separation of the matched centroids and their stars.
+    observation : Observation
+        The frame, with all centroids.
+
+    Returns
+    -------
+    float
+        `explained_share` of the stars or of the centroids, whichever is more: a camera may see
+        fewer stars than the database holds, or more. That of the stars where the matched do
+        not hold the corners of the frame to the tolerance: that a camera saw nothing else
+        tells no more about the attitude. 0 if they fix no attitude at all.
+    """
+    try:
+        covariance = np.asarray(np.linalg.inv(information(matched)), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        return 0.0
+    of_stars = explained_share(covariance, stars)
+    of_centroids = explained_share(covariance, observation.body)
+    if of_centroids <= of_stars:
+        return of_stars
+    # Three of the 2n components went into the attitude.
+    deviation_rad = residual_rad * math.sqrt(len(matched) / (2 * len(matched) - 3))
+    corner_rad = deviation_rad * corner_deviation(covariance, observation.camera)
+    return of_stars if corner_rad > observation.tolerance_rad else of_centroids
+
+
+def information(directions: Array) -> Array:
+    """Return what the centroids of stars tell of an attitude.
+
+    Parameters
+    ----------
+    directions : ndarray of float64, shape (N, 3)
+        Unit vectors of the stars, in any frame.
+
+    Returns
+    -------
+    ndarray of float64, shape (3, 3)
+        Inverse of the covariance of the three small angles about the axes of that frame, in
+        units of the variance of a direction along each of the two axes across it.
+
+    References
+    ----------
+    Shuster and Oh 1981, "Three-axis attitude determination from vector observations".
+    """
+    return np.asarray(len(directions) * _UNIT - directions.T @ directions)
+
+
+def explained_share(covariance: Array, directions: Array) -> float:
+    """Return which share of the stars of a frame an attitude explains, by their weight.
+
+    Parameters
+    ----------
+    covariance : ndarray of float64, shape (3, 3)
+        Inverse of the `information` of the matched stars.
+    directions : ndarray of float64, shape (N, 3)
+        Unit vectors of all stars, matched or not, in the same frame.
+
+    Returns
+    -------
+    float
+        1 if all are matched; about n / N if n matched ones are spread as all are; far less if
+        they stand together.
+
+    Notes
+    -----
+    A star's weight is the variance that the matched stars leave to its place. Those of the
+    matched themselves add up to three, the number of angles, wherever they are. Outside of
+    them it grows with the square of the distance: ten stars 50 px around their middle leave
+    one at 500 px a weight of ten.
+
+    Examples
+    --------
+    >>> place = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    >>> near = np.column_stack([0.01 * place, np.ones(4)])
+    >>> near /= np.linalg.norm(near, axis=1)[:, None]
+    >>> far = np.array([[0.1, 0.1, 1.0], [-0.1, 0.0, 1.0]]) / np.sqrt([[1.02], [1.01]])
+    >>> covariance = np.linalg.inv(information(near))
+    >>> round(explained_share(covariance, near), 6)
+    1.0
+    >>> round(explained_share(covariance, np.concatenate([near, far])), 3)
+    0.02
+    """
+    return 3.0 / float(np.vdot(covariance, information(directions)))
+
+
+def corner_deviation(covariance: Array, camera: Camera) -> float:
+    """Return how far an attitude may put a corner of the frame from its place.
+
+    Parameters
+    ----------
+    covariance : ndarray of float64, shape (3, 3)
+        Inverse of the `information` of the matched stars in the camera frame.
+    camera : Camera
+        The camera.
+
+    Returns
+    -------
+    float
+        Root mean square over both axes of the worst corner, in units of the error of a
+        direction along one axis.
+    """
+    w, h = float(camera.width_px), float(camera.height_px)
+    corners = camera.directions_from_pixels(np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]]))
+    along = np.einsum("ni,ij,nj->n", corners, covariance, corners)
+    # Rounding may leave less than nothing where the stars all but coincide.
+    return math.sqrt(max(0.0, float(np.trace(covariance) - along.min())))
+
+
+def is_scaled(predicted_px: Array, centroids_px: Array, observation: Observation) -> bool:
+    """Return whether a frame is plainly larger or smaller than the stars that it matches.
+
+    Parameters
+    ----------
+    predicted_px, centroids_px : ndarray of float64, shape (n, 2)
+        Places of the matched stars and their centroids, n >= 3.
+    observation : Observation
+        The frame.
+
+    Returns
+    -------
+    bool
+        True if it is so by more than `SCALE_DEVIATIONS`, and so much that the corner of the
+        frame is off by more than the largest error of a centroid.
+
+    Notes
+    -----
+    Then the camera's focal length is wrong: the attitude may be right, but towards the edge
+    stars are taken for their neighbours.
+    """
+    camera = observation.camera
+    inner = predicted_px - predicted_px.sum(axis=0) / len(predicted_px)
+    extent = float(np.vdot(inner, inner))
+    offset = centroids_px - predicted_px
+    excess = float(np.vdot(inner, offset)) / extent
+    corner_px = 0.5 * math.hypot(camera.width_px, camera.height_px)
+    if abs(excess) * corner_px <= observation.tolerance_px:
+        return False
+    left = offset - excess * inner
+    left -= left.sum(axis=0) / len(left)
+    variance = float(np.vdot(left, left)) / (2 * len(left) - 4) / extent
+    return excess * excess > SCALE_DEVIATIONS**2 * variance
