@@ -205,12 +205,6 @@ def open_session(
     ------
     QueryError, ProductError, SourceError
         If a target cannot be read.
-
-    Examples
-    --------
-    >>> with open_session(["dist/gaia-12deg-1.0.0"]) as session:  # doctest: +SKIP
-    ...     with session.ask("SELECT count(*) FROM stars") as answer:
-    ...         print(answer.rows(1))
     """
     allowed = limits or Limits()
     scratch = Path(tempfile.mkdtemp(prefix="starcat-sql-"))
