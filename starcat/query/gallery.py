@@ -16,7 +16,7 @@ from pathlib import Path
 
 from starcat.errors import QueryError
 
-FOLDER = Path(__file__).parent / "gallery"
+FOLDER = Path(__file__).parent / "sql" / "gallery"
 
 _VALUE = re.compile(r"-- (\w+) = (.+?): (.+)")
 _TARGETS = re.compile(r"-- Targets: (\d+)")

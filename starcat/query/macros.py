@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-FOLDER = Path(__file__).parent / "macros"
+FOLDER = Path(__file__).parent / "sql" / "macros"
 
 FIRST = ("cosd", "sind", "separation")
 """Macros that others use, in the order to make them."""
