@@ -165,9 +165,13 @@ def _give(
     output: Path | None,
     rows: int,
 ) -> None:
-    with session.ask(query, values) as found:
+    with ExitStack() as stack:
+        progress = stack.enter_context(progress_bars())
+        found = stack.enter_context(session.ask(query, values, progress))
         if form == "table":
-            print_answer(found, rows)
+            first = found.rows(rows + 1)
+            stack.close()
+            print_answer(found, first, rows)
             return
         from starcat.exchange.formats import write_batches, write_text_batches
 
@@ -175,4 +179,5 @@ def _give(
             write_text_batches(found.batches(), sys.stdout, form)
         else:
             count = write_batches(found.batches(), output, form)
+            stack.close()
             say(f"{output}: {count:,} rows")

@@ -23,17 +23,18 @@ SHOWN_ITEMS = 6
 """Of a list in a cell."""
 
 
-def print_answer(answer: Answer, rows: int) -> None:
+def print_answer(answer: Answer, found: Sequence[tuple[Any, ...]], rows: int) -> None:
     """Print the first rows of an answer: as a table, or one below the other if that is too wide.
 
     Parameters
     ----------
     answer : Answer
         What a query finds.
+    found : sequence of tuple
+        Its first rows, one more than to print where there are more.
     rows : int
-        How many at most.
+        How many to print at most.
     """
-    found = answer.rows(rows + 1)
     cells = [[cell_text(value) for value in row] for row in found[:rows]]
     units = [facts.unit for facts in answer.facts]
     headings = [

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
-from starcat.console import say
+from starcat.console import progress_bars, say
 from starcat.errors import StarcatError
 from starcat.query.gallery import gallery, named_query
 from starcat.query.macros import macros
@@ -103,15 +104,19 @@ class _Shell:
         elif word == ".named" and rest:
             query = named_query(rest[0])
             given = dict(item.split("=", 1) for item in rest[1:] if "=" in item)
-            with self.session.ask(query.text, query.with_values(given)) as answer:
-                print_answer(answer, self.rows)
+            self.answer(query.text, query.with_values(given))
         elif word == ".rows" and rest and rest[0].isdigit():
             self.rows = max(1, int(rest[0]))
         elif word.startswith("."):
             say(HELP)
         elif text:
-            with self.session.ask(text) as answer:
-                print_answer(answer, self.rows)
+            self.answer(text, {})
+
+    def answer(self, text: str, values: Mapping[str, Any]) -> None:
+        """Answer a query, with a bar while it runs."""
+        with progress_bars() as progress, self.session.ask(text, values, progress) as answer:
+            found = answer.rows(self.rows + 1)
+        print_answer(answer, found, self.rows)
 
 
 def words(session: Session) -> list[str]:

@@ -424,6 +424,17 @@ def test_a_query_loads_nothing_heavy(small_artifact):
     assert not loaded & HEAVY
 
 
+def test_the_progress_of_a_query_is_told(session):
+    events: list[tuple[str, int, int | None]] = []
+    text = "SELECT sum(sin(range)) FROM range(60000000)"
+    with session.ask(text, progress=lambda *event: events.append(event)) as answer:
+        answer.rows(1)
+    assert events
+    assert {(stage, total) for stage, _, total in events} == {("query", 100)}
+    done = [done for _, done, _ in events]
+    assert done == sorted(done)
+
+
 # The prompt -----------------------------------------------------------------------------------
 
 

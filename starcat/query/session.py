@@ -11,6 +11,7 @@ import re
 import shutil
 import tempfile
 import threading
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -28,6 +29,9 @@ from starcat.query.macros import macros
 from starcat.query.preamble import preamble, quoted, schemas_of
 from starcat.query.statement import Statement, check_statement
 from starcat.query.targets import Target, View, open_targets
+
+WATCH_S = 0.2
+"""How often a running query is looked at."""
 
 _DESCRIBED = re.compile(r"(?:describe|desc|show)\s+(?:(\w+)\.)?(\w+)\s*;?", re.IGNORECASE)
 
@@ -96,7 +100,12 @@ class Session:
         return check_statement(text, self.connection, names)
 
     @contextmanager
-    def ask(self, text: str, values: Mapping[str, Any] | None = None) -> Iterator[Answer]:
+    def ask(
+        self,
+        text: str,
+        values: Mapping[str, Any] | None = None,
+        progress: Progress = no_progress,
+    ) -> Iterator[Answer]:
         """Ask a query; its rows are read within the context.
 
         Parameters
@@ -105,6 +114,8 @@ class Session:
             SQL, one statement that reads.
         values : mapping of str to object, optional
             Of the ``$name`` in it.
+        progress : Progress
+            Called with ("query", percent, 100) while it runs.
 
         Yields
         ------
@@ -124,7 +135,7 @@ class Session:
             if name not in given:
                 raise QueryError(f"the query has ${name}: give its value with --set {name}=VALUE")
         used = {name: given[name] for name in statement.parameters} or None
-        with self._limited():
+        with self._watched(progress):
             query = self._described(statement) if statement.is_description else statement.text
             yield Answer(self.connection, query, used, facts_by_name(self.views))
 
@@ -148,11 +159,11 @@ class Session:
         return [v for v in target.views if v.name == found[2]] if found and target else []
 
     @contextmanager
-    def _limited(self) -> Iterator[None]:
-        """Stop what runs too long, and say in our own words what DuckDB refuses."""
-        timer = threading.Timer(self.limits.time_s, self.connection.interrupt)
-        timer.daemon = True
-        timer.start()
+    def _watched(self, progress: Progress) -> Iterator[None]:
+        """Tell how far a query is, stop it when it takes too long, say why DuckDB refuses."""
+        done = threading.Event()
+        watcher = threading.Thread(target=self._watch, args=(done, progress), daemon=True)
+        watcher.start()
         try:
             yield
         except duckdb.InterruptException as error:
@@ -169,7 +180,17 @@ class Session:
         except duckdb.Error as error:
             raise QueryError(_told(error)) from error
         finally:
-            timer.cancel()
+            done.set()
+            watcher.join()
+
+    def _watch(self, done: threading.Event, progress: Progress) -> None:
+        end = time.monotonic() + self.limits.time_s
+        while not done.wait(min(WATCH_S, self.limits.time_s)):
+            if time.monotonic() >= end:
+                self.connection.interrupt()
+            percent = self.connection.query_progress()
+            if percent >= 0.0:
+                progress("query", int(percent), 100)
 
 
 def _told(error: duckdb.Error) -> str:
@@ -246,6 +267,8 @@ def _make_views(connection: DuckDBPyConnection, targets: Sequence[Target]) -> No
 
 def _lock(connection: DuckDBPyConnection, files: Sequence[Path]) -> None:
     """Allow no other file and no other setting from here on."""
+    # Progress is kept, and printed by who asks for it.
+    connection.execute("SET enable_progress_bar = true; SET enable_progress_bar_print = false")
     connection.execute("SET allowed_paths = $files", {"files": [str(p.resolve()) for p in files]})
     connection.execute("SET enable_external_access = false")
     connection.execute("SET lock_configuration = true")
