@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +72,7 @@ class Session:
     targets: tuple[Target, ...]
     limits: Limits
     connection: DuckDBPyConnection
+    _checked: dict[str, Statement] = field(default_factory=dict, repr=False)
 
     @property
     def views(self) -> tuple[View, ...]:
@@ -96,8 +97,10 @@ class Session:
         QueryError
             If it may not.
         """
-        names = frozenset(macro.name for macro in macros() if macro.is_table)
-        return check_statement(text, self.connection, names)
+        if text not in self._checked:
+            names = frozenset(macro.name for macro in macros() if macro.is_table)
+            self._checked[text] = check_statement(text, self.connection, names)
+        return self._checked[text]
 
     @contextmanager
     def ask(
