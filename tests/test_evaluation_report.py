@@ -26,7 +26,6 @@ from starcat import evaluate
 from starcat.camera import Camera
 from starcat.errors import ConfigError, ProductError
 from starcat.evaluate import Evaluation, evaluate_artifact, evaluate_papers, noise_values
-from starcat.evaluate_reports import print_evaluation
 from starcat.evaluation import registry, trial
 from starcat.evaluation.axes import AXES, axis_label
 from starcat.evaluation.campaign import Measured, Outcome, _measured, is_goal_reached, run_paper
@@ -62,6 +61,7 @@ from starcat.report.evaluation_plots import (
 )
 from starcat.report.evaluation_tables import failure_table, rate_tables, summary_table
 from starcat.spec import spec_from_dict
+from starcat.terminal.evaluations import print_evaluation
 
 FRAMES = Attitudes("random", 8)
 

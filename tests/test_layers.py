@@ -27,7 +27,8 @@ ROOMS = [
     "exchange",
     "query",
     "releases",
-    "surface",
+    "tasks",
+    "terminal",
     "commands",
     "entry",
 ]
@@ -61,22 +62,7 @@ SINGLE_MODULES = {
         "pipeline",
         "rebuild",
     ],
-    "surface": [
-        "console",
-        "coverage_tables",
-        "reports",
-        "artifact_reports",
-        "crossmatch_reports",
-        "identification",
-        "match_reports",
-        "evaluate",
-        "evaluate_reports",
-        "exchange_reports",
-        "query_reports",
-        "sql_prompt",
-        "asking",
-        "release_reports",
-    ],
+    "tasks": ["identification", "evaluate"],
     "entry": ["cli", "__main__"],
 }
 

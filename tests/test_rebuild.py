@@ -13,10 +13,10 @@ from starcat.artifact import manifest as manifest_module
 from starcat.artifact.content import json_bytes
 from starcat.artifact.diff import Change
 from starcat.artifact.manifest import MANIFEST_NAME, manifest_digest
-from starcat.artifact_reports import print_rebuilt
 from starcat.errors import ChecksumMismatch, ConfigError, ProductError, SourceMissing
 from starcat.parquet import read_parquet, write_parquet
 from starcat.rebuild import FileChange, Rebuilt, rebuild
+from starcat.terminal.artifacts import print_rebuilt
 
 
 @pytest.fixture

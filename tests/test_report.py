@@ -22,7 +22,6 @@ import numpy as np
 import pytest
 
 from starcat.artifact.reader import Artifact, open_artifact
-from starcat.coverage_tables import artifact_coverage, histogram_rows
 from starcat.pipeline import build
 from starcat.products.coverage import coverage_from_counts
 from starcat.report.coverage import report_coverage
@@ -32,6 +31,7 @@ from starcat.report.report import count_magnitudes
 from starcat.report.sky_map import HALF_HEIGHT, HALF_WIDTH, nearest_raster, project
 from starcat.spec import BuildSpec, spec_from_dict
 from starcat.sphere import directions_from_radec, saff_kuijlaars
+from starcat.terminal.coverage import artifact_coverage, histogram_rows
 
 FILES = {
     "coverage.csv",

@@ -23,7 +23,7 @@ from starcat.errors import ProductError, QueryError, SchemaVersionError, SourceE
 from starcat.query.gallery import gallery, named_query
 from starcat.query.session import Session, open_session
 from starcat.query.targets import identifier
-from starcat.sql_prompt import prompt, words
+from starcat.terminal.prompt import prompt, words
 
 Run = Callable[[list[Any]], Any]
 

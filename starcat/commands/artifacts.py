@@ -19,7 +19,7 @@ def presets(json: Json = False) -> None:
 
     Example: starcat presets
     """
-    from starcat.reports import print_presets
+    from starcat.terminal.builds import print_presets
 
     print_presets(as_json=json)
 
@@ -44,9 +44,9 @@ def build(
 
     Example: starcat build --preset sao-12deg --input sao=sao.dat.gz -o dist
     """
-    from starcat.console import progress_bars
     from starcat.pipeline import build as run_build
-    from starcat.reports import print_built
+    from starcat.terminal.builds import print_built
+    from starcat.terminal.console import progress_bars
 
     chosen, given = chosen_spec(spec, preset), inputs_by_source(inputs)
     with progress_bars() as progress:
@@ -66,7 +66,7 @@ def inspect(
     Example: starcat inspect dist/gaia-12deg-1.0.0
     """
     from starcat.artifact.reader import open_artifact
-    from starcat.reports import print_artifact
+    from starcat.terminal.builds import print_artifact
 
     print_artifact(open_artifact(artifact), as_json=json)
 
@@ -84,7 +84,7 @@ def coverage(
     Example: starcat coverage dist/gaia-12deg-1.0.0 -o coverage
     """
     from starcat.artifact.reader import open_artifact
-    from starcat.coverage_tables import print_coverage
+    from starcat.terminal.coverage import print_coverage
 
     print_coverage(open_artifact(artifact), output, as_json=json)
 
@@ -101,7 +101,7 @@ def verify(
     Example: starcat verify dist/gaia-12deg-1.0.0
     """
     from starcat.artifact.verify import verify_artifact
-    from starcat.artifact_reports import print_verification
+    from starcat.terminal.artifacts import print_verification
 
     found = verify_artifact(artifact)
     print_verification(found, as_json=json)
@@ -121,7 +121,7 @@ def diff(
     """
     from starcat.artifact.diff import diff_artifacts
     from starcat.artifact.reader import open_artifact
-    from starcat.artifact_reports import print_difference
+    from starcat.terminal.artifacts import print_difference
 
     found = diff_artifacts(open_artifact(a), open_artifact(b))
     print_difference(found, (a.resolve().name, b.resolve().name), as_json=json)
@@ -142,9 +142,9 @@ def rebuild(
 
     Example: starcat rebuild dist/sao-12deg-1.0.0 --input sao=sao.dat.gz
     """
-    from starcat.artifact_reports import print_rebuilt
-    from starcat.console import progress_bars
     from starcat.rebuild import rebuild as build_again
+    from starcat.terminal.artifacts import print_rebuilt
+    from starcat.terminal.console import progress_bars
 
     given = inputs_by_source(inputs)
     with progress_bars() as progress:

@@ -18,7 +18,7 @@ def sources(json: Json = False) -> None:
 
     Example: starcat sources
     """
-    from starcat.reports import print_sources
+    from starcat.terminal.builds import print_sources
 
     print_sources(as_json=json)
 
@@ -41,8 +41,8 @@ def fetch(
     """
     from starcat.catalog.fetch import cache_folder, fetch_source
     from starcat.catalog.source import data_source
-    from starcat.console import progress_bars
-    from starcat.reports import print_fetched
+    from starcat.terminal.builds import print_fetched
+    from starcat.terminal.console import progress_bars
 
     with progress_bars() as progress:
         report = fetch_source(
@@ -83,8 +83,8 @@ def ingest(
     from starcat.catalog.export import write_star_tables
     from starcat.catalog.ingest import ingest as read_catalog
     from starcat.catalog.locate import locate
-    from starcat.console import progress_bars
-    from starcat.reports import print_ingested
+    from starcat.terminal.builds import print_ingested
+    from starcat.terminal.console import progress_bars
 
     with progress_bars() as progress:
         read = read_catalog(
@@ -118,8 +118,8 @@ def crossmatch(
     Example: starcat crossmatch sao.parquet hipparcos.parquet -o found.parquet
     """
     from starcat.crossmatch import match_files
-    from starcat.crossmatch_reports import print_crossmatch
     from starcat.spec import Crossmatch
+    from starcat.terminal.crossmatches import print_crossmatch
 
     found = match_files(a, b, output, Crossmatch(radius_arcsec=radius))
     print_crossmatch(found, (a.stem, b.stem), output, as_json=json)

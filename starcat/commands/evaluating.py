@@ -53,10 +53,10 @@ def evaluate(
     Example: starcat evaluate dist/gaia-12deg-1.0.0 --noise noise_px=0,0.5,1 --frames 200
     """
     from starcat.camera_file import read_camera
-    from starcat.console import progress_bars
     from starcat.evaluate import evaluate_artifact, evaluate_papers, noise_values
-    from starcat.evaluate_reports import print_evaluation
     from starcat.evaluation.sweep import plan_sweep
+    from starcat.terminal.console import progress_bars
+    from starcat.terminal.evaluations import print_evaluation
 
     if (artifact is None) == (paper is None):
         raise ConfigError("give either an artifact or --paper")

@@ -47,7 +47,7 @@ def export(
     Example: starcat export dist/gaia-12deg-1.0.0 --to fits -o fits
     """
     from starcat.exchange.export import export_tables
-    from starcat.exchange_reports import print_exported
+    from starcat.terminal.exports import print_exported
 
     exported = export_tables(
         _tables(source, from_peer),

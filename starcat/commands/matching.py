@@ -18,7 +18,7 @@ def methods(json: Json = False) -> None:
 
     Example: starcat methods
     """
-    from starcat.match_reports import print_methods
+    from starcat.terminal.matches import print_methods
 
     print_methods(as_json=json)
 
@@ -75,10 +75,10 @@ def identify(
     Example: starcat identify dist/gaia-12deg-1.0.0 frame.csv --picture frame.png
     """
     from starcat.camera_file import read_camera
-    from starcat.console import say
     from starcat.identification import draw, identify_frames, measure
-    from starcat.match_reports import print_matches
     from starcat.matcher.matcher import Matcher
+    from starcat.terminal.console import say
+    from starcat.terminal.matches import print_matches
 
     matcher = Matcher.open(
         artifact,
@@ -109,10 +109,10 @@ def selftest(
 
     Example: starcat selftest dist/gaia-12deg-1.0.0 --frames 1000
     """
-    from starcat.console import progress_bars
     from starcat.evaluation.selftest import self_test
     from starcat.matcher.matcher import Matcher
-    from starcat.reports import print_rates
+    from starcat.terminal.builds import print_rates
+    from starcat.terminal.console import progress_bars
 
     matcher = Matcher.open(artifact, method, tolerance_px=max(0.5, 4.0 * noise_px))
     with progress_bars() as progress:

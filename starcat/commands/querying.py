@@ -56,7 +56,7 @@ def sql(
 
     Example: starcat sql dist/gaia-12deg-1.0.0 "SELECT designation, mag FROM cone(37.95, 89.26, 5)"
     """
-    from starcat.query_reports import print_gallery, print_macros
+    from starcat.terminal.queries import print_gallery, print_macros
 
     if show_list:
         print_gallery(as_json=json)
@@ -64,8 +64,8 @@ def sql(
     if show_macros:
         print_macros(as_json=json)
         return
-    from starcat.asking import Wish, answer, print_preamble, show
     from starcat.query.session import Limits
+    from starcat.terminal.asking import Wish, answer, print_preamble, show
 
     limits = Limits(time_limit_s, memory_limit_gb)
     targets, query = _split(arguments or [], named)

@@ -25,9 +25,9 @@ def publish(
 
     Example: starcat publish dist/gaia-12deg-1.0.0 registry
     """
-    from starcat.console import progress_bars
-    from starcat.release_reports import print_published
     from starcat.releases.publishing import publish_artifact
+    from starcat.terminal.console import progress_bars
+    from starcat.terminal.published import print_published
 
     with progress_bars() as progress:
         published = publish_artifact(artifact, registry, progress)
@@ -59,10 +59,10 @@ def pull(
 
     Example: starcat pull gaia-12deg@latest --registry registry -o onboard
     """
-    from starcat.console import progress_bars
     from starcat.download import DownloadOptions
-    from starcat.release_reports import print_pulled
     from starcat.releases.project import pull_pinned, pull_wanted
+    from starcat.terminal.console import progress_bars
+    from starcat.terminal.published import print_pulled
 
     options = DownloadOptions(retries)
     with progress_bars() as progress:
@@ -86,8 +86,8 @@ def releases(
     Example: starcat releases registry
     """
     from starcat.download import DownloadOptions
-    from starcat.release_reports import print_releases
     from starcat.releases.registry import open_registry
+    from starcat.terminal.published import print_releases
 
     opened = open_registry(registry, DownloadOptions(retries))
     print_releases(opened.releases(), as_json=json)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from starcat.console import MAX_WIDTH, print_json, print_table, say
+from starcat.terminal.console import MAX_WIDTH, print_json, print_table, say
 
 if TYPE_CHECKING:
     from starcat.query.answer import Answer

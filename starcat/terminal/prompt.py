@@ -8,12 +8,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from starcat.console import progress_bars, say
 from starcat.errors import StarcatError
 from starcat.query.gallery import gallery, named_query
 from starcat.query.macros import macros
 from starcat.query.session import Session
-from starcat.query_reports import print_answer, print_gallery, print_macros, print_views
+from starcat.terminal.console import progress_bars, say
+from starcat.terminal.queries import print_answer, print_gallery, print_macros, print_views
 
 HELP = """\
 A query ends with a semicolon. Also:

@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from starcat.console import progress_bars, say
 from starcat.errors import QueryError
 from starcat.query.gallery import named_query
 from starcat.query.preamble import preamble_of
 from starcat.query.session import Limits, Session, open_session
-from starcat.query_reports import print_answer, print_views
+from starcat.terminal.console import progress_bars, say
+from starcat.terminal.queries import print_answer, print_views
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def answer(targets: Sequence[str], wish: Wish, limits: Limits, rows: int) -> Non
         if query is not None:
             _give(session, query, values, form, wish.output, rows)
         elif sys.stdin.isatty():
-            from starcat.sql_prompt import prompt
+            from starcat.terminal.prompt import prompt
 
             prompt(session, rows)
         else:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from starcat.console import print_json, print_table, say
 from starcat.report.evaluation_columns import SHORT, verdict
 from starcat.report.evaluation_tables import (
     Table,
@@ -14,6 +13,7 @@ from starcat.report.evaluation_tables import (
     statistic_tables,
     summary_table,
 )
+from starcat.terminal.console import print_json, print_table, say
 
 if TYPE_CHECKING:
     from starcat.evaluate import Evaluation

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from rich.markup import escape
 
-from starcat.console import print_json, print_table, say
+from starcat.terminal.console import print_json, print_table, say
 
 if TYPE_CHECKING:
     from starcat.releases.publishing import Published

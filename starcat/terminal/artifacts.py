@@ -9,8 +9,8 @@ from rich.markup import escape
 
 from starcat.artifact.diff import Change, Difference, Moved, OneSided
 from starcat.artifact.verify import Verification
-from starcat.console import print_json, print_table
 from starcat.rebuild import Rebuilt
+from starcat.terminal.console import print_json, print_table
 
 MAX_STARS = 20
 """Stars of each kind that a table shows; JSON has all."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from rich.markup import escape
 
-from starcat.console import print_json, print_table, say
 from starcat.exchange.export import COLUMNS_NAME, Exported
+from starcat.terminal.console import print_json, print_table, say
 
 
 def print_exported(exported: Exported, *, as_json: bool) -> None:

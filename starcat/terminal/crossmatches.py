@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starcat.console import print_json, print_table, say
+from starcat.terminal.console import print_json, print_table, say
 
 if TYPE_CHECKING:
     from starcat.crossmatch import Summary

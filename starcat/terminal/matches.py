@@ -6,11 +6,11 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
-from starcat.console import print_json, print_table
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.database import Database
 from starcat.matcher.methods import METHODS
 from starcat.matcher.result import MatchResult
+from starcat.terminal.console import print_json, print_table
 
 
 def print_matches(

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starcat.console import print_json, print_table, say
-from starcat.coverage_tables import print_coverage_table
 from starcat.errors import SourceError
+from starcat.terminal.console import print_json, print_table, say
+from starcat.terminal.coverage import print_coverage_table
 
 if TYPE_CHECKING:
     from starcat.artifact.reader import Artifact

@@ -1,0 +1,1 @@
+"""What people see at a terminal: tables, bars, prompts; and JSON for machines."""
