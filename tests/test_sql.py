@@ -409,6 +409,33 @@ def test_a_query_comes_from_stdin(small_artifact):
         assert ("two" in done.stdout) == bool(count)
 
 
+def test_two_answers_do_not_share_a_file(small_artifact, tmp_path):
+    command = [
+        sys.executable,
+        "-m",
+        "starcat",
+        "sql",
+        str(small_artifact),
+        "-o",
+        tmp_path / "a.csv",
+    ]
+    done = subprocess.run(
+        command, input="SELECT 1; SELECT 2", capture_output=True, text=True, check=False, timeout=50
+    )
+    assert done.returncode == 2
+    assert "2 queries for one file" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_stdin_has_that_is_no_sql_is_told(small_artifact):
+    command = [sys.executable, "-m", "starcat", "sql", str(small_artifact)]
+    done = subprocess.run(
+        command, input="SELEC 1; SELECT 2", capture_output=True, text=True, check=False, timeout=50
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("starcat: error: no valid SQL")
+
+
 def test_a_query_loads_nothing_heavy(small_artifact):
     code = (
         "import sys\nsys.argv = ['starcat', 'sql', sys.argv[1], 'SELECT 1']\n"

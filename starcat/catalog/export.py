@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcat.errors import OutputError, reason
-from starcat.parquet import write_parquet
 
 if TYPE_CHECKING:  # other rooms write files without reading a catalog
     import pyarrow as pa
@@ -71,6 +70,8 @@ def write_table(table: pa.Table, path: Path) -> None:
     OutputError
         If the file cannot be written.
     """
+    from starcat.parquet import write_parquet  # with pyarrow, which naming a file does without
+
     with whole_file(path) as partial:
         write_parquet(table, partial)
 

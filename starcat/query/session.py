@@ -79,6 +79,24 @@ class Session:
         """The views of all targets."""
         return tuple(view for target in self.targets for view in target.views)
 
+    def statements(self, text: str) -> list[str]:
+        """Return the queries of a text.
+
+        Parameters
+        ----------
+        text : str
+            SQL, queries with semicolons between them.
+
+        Returns
+        -------
+        list of str
+            Not checked; a text that is no SQL is one query, which `ask` refuses with the place.
+        """
+        try:
+            return [statement.query for statement in self.connection.extract_statements(text)]
+        except duckdb.Error:
+            return [text]
+
     def check(self, text: str) -> Statement:
         """Check that a text is a query that may run.
 

@@ -7,11 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
+from starcat.catalog.export import rejected_path
 from starcat.errors import ProductError, QueryError
 from starcat.progress import Progress, no_progress
 from starcat.schema import ProductSchema, product_schema
 
-MANIFEST_NAME = "manifest.json"
 HATS_NAMES = ("hats.properties", "properties")
 SCHEMA_KEY = "starcat.schema"
 
@@ -135,8 +136,6 @@ def _open_target(text: str, scratch: Path, progress: Progress) -> Target:
 
 
 def _artifact(folder: Path) -> Target:
-    from starcat.artifact.manifest import read_manifest
-
     manifest = read_manifest(folder)
     views = []
     for product, facts in manifest["products"].items():
@@ -176,7 +175,7 @@ def _check_file(path: Path) -> None:
 def _tables(path: Path) -> Target:
     """Return a Parquet file, with the rejected rows beside it where there are any."""
     views = [_table(path)]
-    beside = path.with_name(f"{path.stem}.rejected{path.suffix}")
+    beside = rejected_path(path)
     if beside.is_file():
         views.append(_table(beside))
     return Target(identifier(path.stem), "", tuple(views))

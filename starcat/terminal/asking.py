@@ -14,7 +14,7 @@ from starcat.query.gallery import named_query
 from starcat.query.preamble import preamble_of
 from starcat.query.session import Limits, Session, open_session
 from starcat.terminal.console import progress_bars, say
-from starcat.terminal.queries import print_answer, print_views
+from starcat.terminal.queries import print_first_rows, print_views
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,10 @@ def answer(targets: Sequence[str], wish: Wish, limits: Limits, rows: int) -> Non
 
             prompt(session, rows)
         else:
-            for text in _statements(sys.stdin.read()):
+            texts = session.statements(sys.stdin.read())
+            if wish.output is not None and len(texts) > 1:
+                raise QueryError(f"{len(texts)} queries for one file; give one, or leave out -o")
+            for text in texts:
                 _give(session, text, values, form, wish.output, rows)
 
 
@@ -151,12 +154,6 @@ def _literal(text: str) -> int | float | str:
     return text
 
 
-def _statements(text: str) -> list[str]:
-    import duckdb
-
-    return [statement.query for statement in duckdb.extract_statements(text)]
-
-
 def _give(
     session: Session,
     query: str,
@@ -165,19 +162,14 @@ def _give(
     output: Path | None,
     rows: int,
 ) -> None:
-    with ExitStack() as stack:
-        progress = stack.enter_context(progress_bars())
-        found = stack.enter_context(session.ask(query, values, progress))
-        if form == "table":
-            first = found.rows(rows + 1)
-            stack.close()
-            print_answer(found, first, rows)
-            return
-        from starcat.exchange.formats import write_batches, write_text_batches
+    if form == "table":
+        print_first_rows(session, query, values, rows)
+        return
+    from starcat.exchange.formats import write_batches, write_text_batches
 
+    with progress_bars() as progress, session.ask(query, values, progress) as found:
         if output is None:
             write_text_batches(found.batches(), sys.stdout, form)
-        else:
-            count = write_batches(found.batches(), output, form)
-            stack.close()
-            say(f"{output}: {count:,} rows")
+            return
+        count = write_batches(found.batches(), output, form)
+    say(f"{output}: {count:,} rows")

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from starcat.errors import StarcatError
 from starcat.query.gallery import gallery, named_query
 from starcat.query.macros import macros
 from starcat.query.session import Session
-from starcat.terminal.console import progress_bars, say
-from starcat.terminal.queries import print_answer, print_gallery, print_macros, print_views
+from starcat.terminal.console import say
+from starcat.terminal.queries import print_first_rows, print_gallery, print_macros, print_views
 
 HELP = """\
 A query ends with a semicolon. Also:
@@ -104,19 +103,13 @@ class _Shell:
         elif word == ".named" and rest:
             query = named_query(rest[0])
             given = dict(item.split("=", 1) for item in rest[1:] if "=" in item)
-            self.answer(query.text, query.with_values(given))
+            print_first_rows(self.session, query.text, query.with_values(given), self.rows)
         elif word == ".rows" and rest and rest[0].isdigit():
             self.rows = max(1, int(rest[0]))
         elif word.startswith("."):
             say(HELP)
         elif text:
-            self.answer(text, {})
-
-    def answer(self, text: str, values: Mapping[str, Any]) -> None:
-        """Answer a query, with a bar while it runs."""
-        with progress_bars() as progress, self.session.ask(text, values, progress) as answer:
-            found = answer.rows(self.rows + 1)
-        print_answer(answer, found, self.rows)
+            print_first_rows(self.session, text, {}, self.rows)
 
 
 def words(session: Session) -> list[str]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 import sys
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from starcat.terminal.console import MAX_WIDTH, print_json, print_table, say
+from starcat.terminal.console import MAX_WIDTH, print_json, print_table, progress_bars, say
 
 if TYPE_CHECKING:
     from starcat.query.answer import Answer
@@ -21,6 +21,25 @@ FOLDED_CHARACTERS = 28
 
 SHOWN_ITEMS = 6
 """Of a list in a cell."""
+
+
+def print_first_rows(session: Session, query: str, values: Mapping[str, Any], rows: int) -> None:
+    """Ask a query, with a bar while it runs, and print the first rows of its answer.
+
+    Parameters
+    ----------
+    session : Session
+        About some targets.
+    query : str
+        SQL.
+    values : mapping of str to object
+        Of the ``$name`` in it.
+    rows : int
+        How many at most.
+    """
+    with progress_bars() as progress, session.ask(query, values, progress) as answer:
+        found = answer.rows(rows + 1)
+    print_answer(answer, found, rows)
 
 
 def print_answer(answer: Answer, found: Sequence[tuple[Any, ...]], rows: int) -> None:
