@@ -122,8 +122,8 @@ def starcat(
 @pytest.fixture(scope="session")
 def small_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> Path:
     """The artifact of `small_spec`; to be copied by who changes it."""
-    from starcat.pipeline import build
-    from starcat.spec import spec_from_dict
+    from starcat.pipeline.build import build
+    from starcat.specs.build_spec import spec_from_dict
 
     folder = tmp_path_factory.mktemp("small")
     (folder / "sao.dat").write_bytes(b"".join(sao_lines))
@@ -142,8 +142,8 @@ def artifact_version(
     """
     import h5py
 
-    from starcat.artifact.content import file_sha256, json_bytes
     from starcat.artifact.manifest import manifest_digest
+    from starcat.storage.digests import file_sha256, json_bytes
 
     folder = tmp_path_factory.mktemp("versions")
 

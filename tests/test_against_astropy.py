@@ -16,7 +16,7 @@ from astropy.io import ascii as astropy_ascii
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from starcat.catalog.fixed_width import parse_fixed_width
+from starcat.catalog.readers.fixed_width import parse_fixed_width
 from starcat.catalog.source import RecordFile, data_source
 
 READ_ME = {

@@ -5,12 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from starcat.attitude import matrix_from_radec_roll
-from starcat.camera import Camera
+from starcat.geometry.attitude import matrix_from_radec_roll
+from starcat.geometry.camera import Camera
+from starcat.geometry.proximity import nearest_neighbours, pairs_within
+from starcat.geometry.sphere import (
+    directions_from_radec,
+    radec_from_directions,
+    saff_kuijlaars,
+    separation,
+)
 from starcat.products.boresights import FieldStars, NominalField, stars_in_fields, tile_sphere
 from starcat.products.pairs import find_pairs
-from starcat.proximity import nearest_neighbours, pairs_within
-from starcat.sphere import directions_from_radec, radec_from_directions, saff_kuijlaars, separation
 
 # Both sides round their coordinates; nothing else differs.
 ROUNDING_RAD = 1e-15

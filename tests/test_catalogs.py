@@ -13,16 +13,16 @@ import erfa
 import numpy as np
 import pytest
 
-from starcat.catalog.gaia import embedded_sky
+from starcat.catalog.archives.gaia import embedded_sky
+from starcat.catalog.archives.sao import PRINTED_PM_DEC_ARCSEC_YR, icrs_from_fk5
 from starcat.catalog.ingest import Ingested, ingest
 from starcat.catalog.proper_motion import Motion, propagate
 from starcat.catalog.quality import Quality
-from starcat.catalog.sao import PRINTED_PM_DEC_ARCSEC_YR, icrs_from_fk5
 from starcat.catalog.source import data_source
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.errors import ConfigError, ParseError, SourceMissing
-from starcat.schema import product_schema
-from starcat.sphere import directions_from_radec, separation
+from starcat.geometry.sphere import directions_from_radec, separation
+from starcat.tables.schema import product_schema
 
 MAS = 1.0 / 3.6e6  # degrees in a milliarcsecond
 ARCSEC_RAD = np.radians(1.0 / 3600.0)
@@ -1076,7 +1076,7 @@ def test_a_file_cut_off_in_its_last_line(read: Callable[..., Ingested], source: 
 def test_a_block_without_a_good_record(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str
 ) -> None:
-    monkeypatch.setattr("starcat.catalog.files.BLOCK_BYTES", 600)
+    monkeypatch.setattr("starcat.catalog.readers.files.BLOCK_BYTES", 600)
     path = tmp_path / FILES[source]
     path.write_bytes((GENUINE[source] + b"\n") * 4 + b"bad\n" * 9)
     read = ingest(source, [path])
@@ -1159,7 +1159,7 @@ def test_nearest_neighbours_are_those_of_all_that_was_read(read: Callable[..., I
 
 def test_blocks_do_not_matter(catalogs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = ingest("sao", [catalogs / "sao.dat.gz"], neighbours=False)
-    monkeypatch.setattr("starcat.catalog.files.BLOCK_BYTES", 200_001)
+    monkeypatch.setattr("starcat.catalog.readers.files.BLOCK_BYTES", 200_001)
     parts = ingest("sao", [catalogs / "sao.dat.gz"], neighbours=False)
     for name in ("star_id", "source_line", "mag", "designation", "double_flag"):
         assert parts.stars[name].equals(whole.stars[name]), name

@@ -11,13 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from starcat.attitude import solve_wahba_svd
-from starcat.camera import Camera
+from starcat.geometry.attitude import solve_wahba_svd
+from starcat.geometry.camera import Camera
+from starcat.geometry.sphere import separation
 from starcat.matcher.chance import false_match_probability
 from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.matcher import Matcher
 from starcat.products.pairs import find_pairs
-from starcat.sphere import separation
 
 CAMERA = Camera(1024, 1024, fov_x_deg=30.0)
 

@@ -19,9 +19,9 @@ import starcat as package
 from starcat.artifact.content import content_sha256
 from starcat.catalog.source import source_names
 from starcat.cli import app
-from starcat.matcher.methods import METHODS
-from starcat.schema import product_schema
-from starcat.spec import preset_names
+from starcat.matcher.methods.table import METHODS
+from starcat.specs.build_spec import preset_names
+from starcat.tables.schema import product_schema
 
 COMMANDS = tuple(sorted(typer.main.get_command(app).commands))  # type: ignore[attr-defined]
 

@@ -20,8 +20,10 @@ from starcat.catalog.ingest import count_by_reason, ingest
 from starcat.catalog.selection import Selected, reject_dense, select_guide_stars
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.errors import BuildError, ConfigError
-from starcat.guide_stars import check_fields
-from starcat.pipeline import Built, build
+from starcat.geometry.sphere import saff_kuijlaars, separation
+from starcat.pipeline.build import Built, build
+from starcat.pipeline.guide_stars import check_fields
+from starcat.pipeline.recipes import tile_guide_stars
 from starcat.products.boresights import FieldStars, NominalField, tile_sphere
 from starcat.products.coverage import (
     coverage_from_counts,
@@ -30,9 +32,7 @@ from starcat.products.coverage import (
     summarise_coverage,
     tiling_gap,
 )
-from starcat.recipes import tile_guide_stars
-from starcat.spec import BuildSpec, preset, spec_from_dict
-from starcat.sphere import saff_kuijlaars, separation
+from starcat.specs.build_spec import BuildSpec, preset, spec_from_dict
 
 Array = NDArray[np.float64]
 Draw = Callable[[int, int], Array]

@@ -14,16 +14,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from starcat.products.crossmatch import VERDICTS, Matches, MovingStars, candidate_pairs, crossmatch
-from starcat.products.match_odds import ARCSEC, TILES, MatchModel, magnitude_density
-from starcat.products.match_probability import pair_probabilities
-from starcat.sphere import (
+from starcat.geometry.sphere import (
     directions_from_radec,
     radec_from_directions,
     saff_kuijlaars,
     separation,
     tangent_axes,
 )
+from starcat.products.crossmatch import VERDICTS, Matches, MovingStars, candidate_pairs, crossmatch
+from starcat.products.match_odds import ARCSEC, TILES, MatchModel, magnitude_density
+from starcat.products.match_probability import pair_probabilities
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ import pyarrow as pa
 import pytest
 from jsonschema import Draft202012Validator
 
-from starcat.artifact.content import content_sha256, file_sha256, json_bytes
+from starcat.artifact.content import content_sha256
 from starcat.artifact.counterparts import counterpart_problems, matched_stars, moving_stars
 from starcat.artifact.diff import diff_artifacts
 from starcat.artifact.manifest import manifest_digest
@@ -25,22 +25,23 @@ from starcat.artifact.verify import verify_artifact
 from starcat.catalog.ingest import ingest
 from starcat.catalog.proper_motion import MAS, Motion, propagate
 from starcat.catalog.selection import select_guide_stars
-from starcat.crossmatch import (
+from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
+from starcat.pipeline.build import build
+from starcat.pipeline.counterparts import (
     match_catalogs,
     match_files,
     match_tables,
     read_star_table,
     with_rivals,
 )
-from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
-from starcat.parquet import read_parquet, write_parquet
-from starcat.pipeline import build
+from starcat.pipeline.rebuild import rebuild
 from starcat.products.crossmatch import VERDICTS
 from starcat.products.match_odds import ARCSEC
-from starcat.rebuild import rebuild
 from starcat.resources import resource_folder
-from starcat.schema import product_schema
-from starcat.spec import BuildSpec, Crossmatch, spec_from_dict
+from starcat.specs.build_spec import BuildSpec, Crossmatch, spec_from_dict
+from starcat.storage.digests import file_sha256, json_bytes
+from starcat.tables.parquet import read_parquet, write_parquet
+from starcat.tables.schema import product_schema
 
 FIRST_ID = 1000
 

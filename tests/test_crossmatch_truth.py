@@ -20,15 +20,15 @@ import pytest
 from starcat.artifact.counterparts import matched_stars, moving_stars
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import verify_artifact
-from starcat.catalog.gaia import embedded_sky
+from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest
 from starcat.catalog.stars import floats_of
-from starcat.crossmatch import match_tables
-from starcat.pipeline import build
+from starcat.pipeline.build import build
+from starcat.pipeline.counterparts import match_tables
+from starcat.pipeline.rebuild import rebuild
 from starcat.products.crossmatch import VERDICTS, crossmatch
 from starcat.products.match_odds import ARCSEC, MatchModel
-from starcat.rebuild import rebuild
-from starcat.spec import Crossmatch, spec_from_dict
+from starcat.specs.build_spec import Crossmatch, spec_from_dict
 
 FILES = {"sao": "sao.dat.gz", "hipparcos": "hip_main.dat.gz", "tycho2": "tyc2.dat.gz"}
 

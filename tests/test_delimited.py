@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from starcat.catalog.delimited import parse_delimited
-from starcat.catalog.records import Problem
+from starcat.catalog.readers.delimited import parse_delimited
+from starcat.catalog.readers.records import Problem
 from starcat.catalog.source import Column, RecordFile, data_source
 
 # The genuine record of samples/twomass_psc_record.txt.

@@ -13,8 +13,8 @@ import pytest
 from starcat.artifact.diff import MOVED_ARCSEC, NOT_READ, Change, Difference, diff_artifacts
 from starcat.artifact.reader import Artifact, open_artifact
 from starcat.artifact.verify import check_artifact
-from starcat.pipeline import build
-from starcat.spec import spec_from_dict
+from starcat.pipeline.build import build
+from starcat.specs.build_spec import spec_from_dict
 
 Make = Callable[..., Artifact]
 

@@ -22,11 +22,9 @@ import pyarrow.parquet as pq
 import pytest
 from astropy.stats import binom_conf_interval
 
-from starcat import evaluate
-from starcat.camera import Camera
 from starcat.errors import ConfigError, ProductError
-from starcat.evaluate import Evaluation, evaluate_artifact, evaluate_papers, noise_values
 from starcat.evaluation import registry, trial
+from starcat.evaluation import run as evaluate
 from starcat.evaluation.axes import AXES, axis_label
 from starcat.evaluation.campaign import Measured, Outcome, _measured, is_goal_reached, run_paper
 from starcat.evaluation.judge import FIELDS
@@ -40,27 +38,29 @@ from starcat.evaluation.rates import (
     failures_of,
     rates_of,
 )
-from starcat.evaluation.simulate import Noise
-from starcat.evaluation.sweep import plan_sweep, sweep_paper
-from starcat.evaluation.trial import Attitudes, Trial
-from starcat.matcher.methods import METHODS, Method
-from starcat.report.evaluation import (
+from starcat.evaluation.report.columns import LONG, SHORT, milliseconds
+from starcat.evaluation.report.files import (
     RESULTS,
     rates_csv,
     reproduction_page,
     write_evaluation,
     write_reproduction,
 )
-from starcat.report.evaluation_columns import LONG, SHORT, milliseconds
-from starcat.report.evaluation_plots import (
+from starcat.evaluation.report.plots import (
     curves,
     draw_rates,
     save_small_svg,
     series_of,
     series_order,
 )
-from starcat.report.evaluation_tables import failure_table, rate_tables, summary_table
-from starcat.spec import spec_from_dict
+from starcat.evaluation.report.tables import failure_table, rate_tables, summary_table
+from starcat.evaluation.run import Evaluation, evaluate_artifact, evaluate_papers, noise_values
+from starcat.evaluation.sweep import plan_sweep, sweep_paper
+from starcat.evaluation.trial import Attitudes, Trial
+from starcat.geometry.camera import Camera
+from starcat.matcher.methods.table import METHODS, Method
+from starcat.simulation.simulate import Noise
+from starcat.specs.build_spec import spec_from_dict
 from starcat.terminal.evaluations import print_evaluation
 
 FRAMES = Attitudes("random", 8)

@@ -32,7 +32,7 @@ from starcat.exchange.formats import (
     write_text_batches,
 )
 from starcat.resources import resource_folder
-from starcat.schema import product_schema
+from starcat.tables.schema import product_schema
 
 ASTROPY = ("votable", "fits", "ecsv")
 GAIA_ID = 4472832130942575872  # Barnard's star: 2^62 and more

@@ -22,8 +22,8 @@ from typing import Any
 import pytest
 
 import starcat
-from starcat.catalog.arrival import LOCK_NAME, read_lock
-from starcat.catalog.fetch import FetchReport, cache_folder, fetch_source
+from starcat.catalog.fetching.arrival import LOCK_NAME, read_lock
+from starcat.catalog.fetching.fetch import FetchReport, cache_folder, fetch_source
 from starcat.catalog.source import DataSource
 from starcat.errors import (
     ChecksumMismatch,
@@ -423,7 +423,7 @@ def test_killed_download_is_resumed(archive: Archive, tmp_path: Path) -> None:
     url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], stall=stall)
     program = (
         "import sys; from pathlib import Path\n"
-        "from starcat.catalog.fetch import fetch_source\n"
+        "from starcat.catalog.fetching.fetch import fetch_source\n"
         "from starcat.catalog.source import DataSource\n"
         "source = DataSource.model_validate_json(sys.argv[1])\n"
         "fetch_source(source, Path(sys.argv[2]), timeout_s=20)\n"
@@ -465,7 +465,7 @@ def test_waits_double_between_attempts(
     archive: Archive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waits: list[float] = []
-    monkeypatch.setattr("starcat.download.time.sleep", waits.append)
+    monkeypatch.setattr("starcat.storage.download.time.sleep", waits.append)
     url = archive.serve("/tiny.dat", BODY, statuses=[500] * 9)
     with pytest.raises(DownloadError):
         fetch(tiny_source(url), tmp_path, retries=8, backoff_s=1.0)
@@ -626,7 +626,7 @@ def test_harmless_line_ends_and_comments_are_accepted(
 def test_lines_are_numbered_across_blocks(
     archive: Archive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("starcat.catalog.files.BLOCK_BYTES", 1000)
+    monkeypatch.setattr("starcat.catalog.readers.files.BLOCK_BYTES", 1000)
     url = archive.serve("/tiny.dat", line_edited(2345, b"\r\n"))
     with pytest.raises(ParseError, match="holds 2999 records"):
         fetch(tiny_source(url), tmp_path)

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from starcat.catalog import files
-from starcat.catalog.binary import parse_binary
-from starcat.catalog.files import (
+from starcat.catalog.readers import files
+from starcat.catalog.readers.binary import parse_binary
+from starcat.catalog.readers.files import (
     Block,
     DigestReader,
     InputFile,

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from starcat.catalog.fixed_width import parse_fixed_width
-from starcat.catalog.records import Problem, Records
+from starcat.catalog.readers.fixed_width import parse_fixed_width
+from starcat.catalog.readers.records import Problem, Records
 from starcat.catalog.source import Column, RecordFile, data_source
 
 LINE = b"T|   1    13 1| |00 04 30.12|+02 16 02.6| 8.50| | |001.12551719|+02.26739188|"

@@ -15,8 +15,8 @@ from synthetic import SAO_ROWS, TYCHO2_ROWS, make_sao, make_tycho2
 
 from starcat.catalog.ingest import Ingested, ingest
 from starcat.catalog.stars import directions_of
+from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars, separation
 from starcat.products.coverage import tiling_gap
-from starcat.sphere import directions_from_radec, saff_kuijlaars, separation
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from starcat.catalog import gunzip
-from starcat.catalog.gunzip import GzipReader
+from starcat.catalog.readers import gunzip
+from starcat.catalog.readers.gunzip import GzipReader
 
 CONTENT = b"0123456789 the quick brown fox\n" * 40
 

@@ -12,32 +12,32 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from starcat.attitude import matrix_from_quaternion, matrix_from_radec_roll
-from starcat.camera import Camera
-from starcat.evaluation.simulate import Noise, simulate_frames
-from starcat.matcher import hausdorff_angular, hausdorff_l1, hausdorff_l2, reference_sets
-from starcat.matcher.consensus import (
+from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
+from starcat.geometry.camera import Camera
+from starcat.geometry.sphere import radec_from_directions, separation
+from starcat.matcher.database import Database, ProductArrays
+from starcat.matcher.matcher import Matcher
+from starcat.matcher.methods import hausdorff_angular, hausdorff_l1, hausdorff_l2, reference_sets
+from starcat.matcher.methods.consensus import (
     _all_agreeing,
     consistent,
     consistent_candidates,
     neighbour_candidates,
     support,
 )
-from starcat.matcher.database import Database, ProductArrays
-from starcat.matcher.matcher import Matcher
-from starcat.matcher.observation import Observation, observe
-from starcat.matcher.pairs import side_tolerance_rad
-from starcat.matcher.reference import references
-from starcat.matcher.reference_sets import (
+from starcat.matcher.methods.pairs import side_tolerance_rad
+from starcat.matcher.methods.reference import references
+from starcat.matcher.methods.reference_sets import (
     lowest,
     means_of_minima,
     smallest_differences,
     within_reach,
 )
-from starcat.matcher.selection import Selection
+from starcat.matcher.methods.triangle_order import Selection
+from starcat.matcher.observation import Observation, observe
 from starcat.products.hausdorff_angular import angular_reference_sets
 from starcat.products.hausdorff_l2 import planar_reference_sets
-from starcat.sphere import radec_from_directions, separation
+from starcat.simulation.simulate import Noise, simulate_frames
 
 CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
 FOCAL_PX = CAMERA.focal_length_px

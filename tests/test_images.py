@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from starcat.attitude import matrix_from_radec_roll
 from starcat.errors import ConfigError, OutputError
+from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.images.background import SMALLEST_PX, repair_hot_pixels, subtract_background
 from starcat.images.centroiding import Spots, brightest_first, find_spots
 from starcat.images.image_file import read_image, write_image

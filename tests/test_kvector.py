@@ -9,7 +9,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from starcat.kvector import build_kvector
+from starcat.geometry.kvector import build_kvector
 
 MOST_STEPS_BEYOND = 1.0
 """How far beyond an end of the interval ``range`` may reach, in steps of the line."""

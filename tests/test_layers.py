@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import graphlib
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -14,63 +15,24 @@ import starcat
 
 PACKAGE = Path(starcat.__file__).parent
 
-ROOMS = [
-    "basics",
-    "catalog",
-    "products",
-    "artifact",
-    "matcher",
-    "evaluation",
-    "images",
-    "report",
-    "pipeline",
-    "exchange",
-    "query",
-    "releases",
-    "tasks",
-    "terminal",
-    "commands",
-    "entry",
-]
-"""A module imports from its own room and from those before it."""
+HOUSE = Path(__file__).parents[1] / "docs" / "house.md"
+
+
+def rooms_of_the_house() -> list[str]:
+    """Return the rooms of the table in docs/house.md, in its order."""
+    return re.findall(r"^\| `(\w+)` \|", HOUSE.read_text(encoding="utf-8"), re.MULTILINE)
+
+
+ROOMS = rooms_of_the_house()
 
 SINGLE_MODULES = {
-    "basics": [
-        "",  # starcat itself, for its version
-        "errors",
-        "resources",
-        "progress",
-        "schema",
-        "sphere",
-        "kvector",
-        "attitude",
-        "distortion",
-        "camera",
-        "camera_file",
-        "proximity",
-        "spec",
-        "votable",
-        "parquet",
-        "download",
-    ],
-    "pipeline": [
-        "recipes",
-        "guide_stars",
-        "build_log",
-        "build_report",
-        "crossmatch",
-        "pipeline",
-        "rebuild",
-    ],
-    "tasks": ["identification", "evaluate"],
-    "entry": ["cli", "__main__"],
+    "ground": ["", "errors", "progress", "resources"],  # "" is starcat itself, for its version
+    "faces": ["cli", "__main__"],
 }
 
-LIGHT = {
-    "starcat." + name
-    for name in ("errors", "sphere", "kvector", "attitude", "distortion", "camera")
-}
-"""The basic modules that a small machine carries along with the matcher."""
+GEOMETRY = ("attitude", "camera", "distortion", "kvector", "sphere")
+LIGHT = {"starcat.errors", *(f"starcat.geometry.{name}" for name in GEOMETRY)}
+"""What a small machine carries along with the matcher."""
 
 
 def module_name(path: Path) -> str:
@@ -125,28 +87,35 @@ def loaded_by(code: str) -> set[str]:
     return set(done.stdout.split())
 
 
+def test_the_house_has_few_rooms_and_each_is_a_place():
+    assert 18 <= len(ROOMS) == len(set(ROOMS)) <= 23
+    folders = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+    assert folders == set(ROOMS) - set(SINGLE_MODULES)
+
+
 def test_imports_are_seen_wherever_they_stand():
     source = """
 from typing import TYPE_CHECKING
-from starcat import __version__, sphere
+from starcat.geometry import sphere
+from starcat import __version__
 if TYPE_CHECKING:
-    from starcat.spec import BuildSpec
+    from starcat.specs.build_spec import BuildSpec
 def f():
-    import starcat.pipeline
-    from starcat.catalog import gaia
+    import starcat.pipeline.build
+    from starcat.catalog.archives import gaia
 """
     assert of_starcat(imports_in(source)) == {
         "starcat",
-        "starcat.sphere",
-        "starcat.spec",
-        "starcat.pipeline",
-        "starcat.catalog.gaia",
+        "starcat.geometry.sphere",
+        "starcat.specs.build_spec",
+        "starcat.pipeline.build",
+        "starcat.catalog.archives.gaia",
     }
 
 
 @pytest.mark.parametrize("module", MODULES)
 def test_every_module_has_a_room(module):
-    assert room_of(module) in ROOMS, f"{module}: say in {Path(__file__).name} where it belongs"
+    assert room_of(module) in ROOMS, f"{module}: say in {HOUSE.name} where it belongs"
 
 
 @pytest.mark.parametrize("module", MODULES)
@@ -165,7 +134,7 @@ def test_no_imports_go_in_circles():
 @pytest.mark.parametrize("module", [name for name in MODULES if room_of(name) == "products"])
 def test_products_know_neither_catalogs_nor_artifacts(module):
     rooms = {room_of(name) for name in of_starcat(imports_of(module))}
-    assert rooms <= {"basics", "products"}
+    assert rooms <= {"ground", "geometry", "products"}
 
 
 @pytest.mark.parametrize("module", [name for name in MODULES if room_of(name) == "matcher"])
@@ -197,7 +166,7 @@ MATCHER = [name for name in MODULES if room_of(name) == "matcher"]
 
 
 def test_every_method_is_a_module_of_the_matcher():
-    from starcat.matcher.methods import METHODS
+    from starcat.matcher.methods.table import METHODS
 
     assert {method.propose.__module__ for method in METHODS.values()} <= set(MATCHER)
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from starcat.catalog.gaia import embedded_sky
-from starcat.catalog.locate import locate
+from starcat.catalog.archives.gaia import embedded_sky
+from starcat.catalog.fetching.locate import locate
 from starcat.errors import ConfigError, SourceMissing
 
 PLACES = ("given", "beside", "variable", "cache")

@@ -15,29 +15,29 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from starcat.attitude import (
+from starcat.errors import ConfigError, ProductError, SchemaVersionError
+from starcat.geometry.attitude import (
     matrix_from_quaternion,
     matrix_from_radec_roll,
     quaternion_from_matrix,
     solve_wahba_quest,
 )
-from starcat.camera import Camera
-from starcat.errors import ConfigError, ProductError, SchemaVersionError
-from starcat.evaluation.selftest import answers_rightly, self_test
-from starcat.evaluation.simulate import Frame, Noise, simulate_frame, simulate_frames
-from starcat.evaluation.sky import Sky
-from starcat.matcher import pairs, pyramid, triangle
-from starcat.matcher.candidates import Candidates
+from starcat.geometry.camera import Camera
+from starcat.geometry.sphere import separation
 from starcat.matcher.database import Database, ProductArrays, open_database, products_in
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.methods import METHODS, best_method
+from starcat.matcher.methods import pairs, pyramid, triangle
+from starcat.matcher.methods.candidates import Candidates
+from starcat.matcher.methods.table import METHODS, best_method
+from starcat.matcher.methods.triangle_order import DEFAULT, Selection
 from starcat.matcher.observation import Observation, observe
-from starcat.matcher.selection import DEFAULT, Selection
 from starcat.matcher.verification import REACH, agree, agreeing_centroids, verify
 from starcat.products.boresights import tile_sphere
 from starcat.products.pairs import find_pairs
 from starcat.products.triangles import find_triangles
-from starcat.sphere import separation
+from starcat.simulation.selftest import answers_rightly, self_test
+from starcat.simulation.simulate import Frame, Noise, simulate_frame, simulate_frames
+from starcat.simulation.sky import Sky
 
 CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
 

@@ -10,20 +10,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from starcat.attitude import (
+from starcat.geometry.attitude import (
     matrix_from_quaternion,
     matrix_from_radec_roll,
     solve_wahba_quest,
     solve_wahba_svd,
 )
-from starcat.camera import Camera
-from starcat.evaluation.simulate import Frame, Noise, simulate_frame, simulate_frames
-from starcat.evaluation.sky import Sky
+from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.methods import METHODS
+from starcat.matcher.methods.table import METHODS
 from starcat.matcher.result import MatchResult
-from starcat.pipeline import build
-from starcat.spec import preset
+from starcat.pipeline.build import build
+from starcat.simulation.simulate import Frame, Noise, simulate_frame, simulate_frames
+from starcat.simulation.sky import Sky
+from starcat.specs.build_spec import preset
 
 pytestmark = pytest.mark.timeout(600)
 

@@ -10,22 +10,28 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from starcat.attitude import matrix_from_quaternion, matrix_from_radec_roll
-from starcat.camera import Camera
-from starcat.evaluation.simulate import Frame, Noise, simulate_frames
-from starcat.matcher import dynamic_angle, grid, radial
+from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
+from starcat.geometry.camera import Camera
+from starcat.geometry.sphere import radec_from_directions, separation
 from starcat.matcher.database import Database, ProductArrays
-from starcat.matcher.dynamic_angle import Tolerance
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.methods import METHODS
+from starcat.matcher.methods import dynamic_angle, grid, radial
+from starcat.matcher.methods.dynamic_angle import Tolerance
+from starcat.matcher.methods.reference import (
+    RANKS,
+    by_reference,
+    references,
+    rows_between,
+    surroundings,
+)
+from starcat.matcher.methods.table import METHODS
+from starcat.matcher.methods.triangle_order import DEFAULT
 from starcat.matcher.observation import Observation, observe
-from starcat.matcher.reference import RANKS, by_reference, references, rows_between, surroundings
-from starcat.matcher.selection import DEFAULT
 from starcat.products.grid import cell_of, grid_patterns
 from starcat.products.index import Index, Ragged
 from starcat.products.neighbours import bin_of, find_neighbours
 from starcat.products.radial import radial_patterns, ring_of, smallest_shift
-from starcat.sphere import radec_from_directions, separation
+from starcat.simulation.simulate import Frame, Noise, simulate_frames
 
 NAMES = ["dynamic_angle", "grid", "radial"]
 
@@ -84,7 +90,7 @@ def sky(random_directions) -> Database:
 
 
 def module(name: str):
-    return import_module(f"starcat.matcher.{name}")
+    return import_module(f"starcat.matcher.methods.{name}")
 
 
 def frames(sky: Database, count: int, noise: Noise | None = None, seed: int = 3) -> list[Frame]:

@@ -22,8 +22,8 @@ import pytest
 from starcat.artifact.verify import check_artifact
 from starcat.artifact.writer import publish
 from starcat.errors import BuildError, OutputError, ProductError, StarcatError
-from starcat.pipeline import Built, build
-from starcat.spec import preset, spec_from_dict
+from starcat.pipeline.build import Built, build
+from starcat.specs.build_spec import preset, spec_from_dict
 
 FILES = {
     "database.h5",

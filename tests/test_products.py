@@ -12,7 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from starcat.attitude import matrix_from_radec_roll
+from starcat.geometry.attitude import matrix_from_radec_roll
+from starcat.geometry.sphere import directions_from_radec, radec_from_directions
+from starcat.pipeline.recipes import table_from_result
 from starcat.products.boresights import NominalField, tile_sphere
 from starcat.products.grid import cell_of, grid_patterns
 from starcat.products.hausdorff_angular import angular_reference_sets
@@ -22,9 +24,7 @@ from starcat.products.neighbours import bin_of, find_neighbours, position_angles
 from starcat.products.pairs import find_pairs
 from starcat.products.radial import radial_patterns, ring_of
 from starcat.products.triangles import find_triangles
-from starcat.recipes import table_from_result
-from starcat.schema import product_schema
-from starcat.sphere import directions_from_radec, radec_from_directions
+from starcat.tables.schema import product_schema
 
 RADIUS, BUFFER = 0.6, 0.1
 # An odd grid has the alignment star in the middle of a row, not on an edge.

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from starcat.catalog.proper_motion import Motion, propagate, propagate_directions
-from starcat.sphere import directions_from_radec, separation
+from starcat.geometry.sphere import directions_from_radec, separation
 
 ARCSEC = np.pi / (180.0 * 3600.0)
 

@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 
 from starcat.artifact import manifest as manifest_module
-from starcat.artifact.content import json_bytes
 from starcat.artifact.diff import Change
 from starcat.artifact.manifest import MANIFEST_NAME, manifest_digest
 from starcat.errors import ChecksumMismatch, ConfigError, ProductError, SourceMissing
-from starcat.parquet import read_parquet, write_parquet
-from starcat.rebuild import FileChange, Rebuilt, rebuild
+from starcat.pipeline.rebuild import FileChange, Rebuilt, rebuild
+from starcat.storage.digests import json_bytes
+from starcat.tables.parquet import read_parquet, write_parquet
 from starcat.terminal.artifacts import print_rebuilt
 
 
@@ -139,7 +139,7 @@ def test_columns_that_came_out_differently_are_named(copy: Path, stars: Path) ->
     write_parquet(short, copy / "pairs.parquet")
 
     def change(manifest: dict[str, Any]) -> None:
-        from starcat.artifact.content import file_sha256
+        from starcat.storage.digests import file_sha256
 
         for name in ("stars.parquet", "pairs.parquet"):
             manifest["files"][name]["sha256"] = file_sha256(copy / name)

@@ -31,7 +31,6 @@ from hypothesis import strategies as st
 
 import starcat
 from starcat.artifact.verify import verify_artifact
-from starcat.download import DownloadOptions
 from starcat.errors import (
     ConfigError,
     DownloadError,
@@ -56,6 +55,7 @@ from starcat.releases.tree import (
     parse_wanted,
     read_index,
 )
+from starcat.storage.download import DownloadOptions
 
 Version = Callable[[str], Path]
 QUICK = DownloadOptions(retries=1, timeout_s=5.0, backoff_s=0.0)
@@ -352,8 +352,8 @@ def test_other_kinds_of_address(text: str, small_artifact: Path) -> None:
 
 def changed(artifact: Path, folder: Path) -> Path:
     """The same version with other content."""
-    from starcat.artifact.content import json_bytes
     from starcat.artifact.manifest import manifest_digest
+    from starcat.storage.digests import json_bytes
 
     made = Path(shutil.copytree(artifact, folder / artifact.name))
     page = made / "report" / "index.html"
@@ -613,8 +613,8 @@ def edit_index(registry: Path, change: Callable[[dict[str, Any]], object]) -> No
 
 def edit_manifest(registry: Path, change: Callable[[dict[str, Any]], object]) -> None:
     """Change the manifest, and everything that names it, as somebody who knows how would."""
-    from starcat.artifact.content import json_bytes
     from starcat.artifact.manifest import manifest_digest
+    from starcat.storage.digests import json_bytes
 
     manifest = json.loads(manifest_of(registry).read_bytes())
     change(manifest)

@@ -22,16 +22,17 @@ import numpy as np
 import pytest
 
 from starcat.artifact.reader import Artifact, open_artifact
-from starcat.pipeline import build
+from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars
+from starcat.pipeline.build import build
+from starcat.pipeline.facts import artifact_coverage
 from starcat.products.coverage import coverage_from_counts
 from starcat.report.coverage import report_coverage
 from starcat.report.page import table
 from starcat.report.plots import draw_histogram, draw_magnitudes, save_plot
 from starcat.report.report import count_magnitudes
 from starcat.report.sky_map import HALF_HEIGHT, HALF_WIDTH, nearest_raster, project
-from starcat.spec import BuildSpec, spec_from_dict
-from starcat.sphere import directions_from_radec, saff_kuijlaars
-from starcat.terminal.coverage import artifact_coverage, histogram_rows
+from starcat.specs.build_spec import BuildSpec, spec_from_dict
+from starcat.terminal.coverage import histogram_rows
 
 FILES = {
     "coverage.csv",
@@ -105,8 +106,8 @@ def test_a_second_build_elsewhere_has_the_same_bytes(
     (tmp_path / "matplotlibrc").write_text(settings)
     program = (
         "import sys, pathlib\n"
-        "from starcat.pipeline import build\n"
-        "from starcat.spec import BuildSpec\n"
+        "from starcat.pipeline.build import build\n"
+        "from starcat.specs.build_spec import BuildSpec\n"
         "spec = BuildSpec.model_validate_json(pathlib.Path('spec.json').read_text())\n"
         "build(spec, {'sao': [pathlib.Path(sys.argv[1])]}, pathlib.Path('out'))\n"
     )

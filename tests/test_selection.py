@@ -17,8 +17,8 @@ from starcat.catalog.ingest import count_by_reason
 from starcat.catalog.quality import Quality
 from starcat.catalog.selection import Selected, select_guide_stars
 from starcat.catalog.stars import directions_of, floats_of, table_from_columns
-from starcat.spec import Doubles, Selection, Variables
-from starcat.sphere import directions_from_radec, radec_from_directions, separation
+from starcat.geometry.sphere import directions_from_radec, radec_from_directions, separation
+from starcat.specs.build_spec import Doubles, Selection, Variables
 
 ALONE = 10.0  # degrees between stars that have nothing to do with each other
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from starcat.catalog.delimited import parse_delimited
-from starcat.catalog.fixed_width import parse_fixed_width
-from starcat.catalog.records import Records
+from starcat.catalog.readers.delimited import parse_delimited
+from starcat.catalog.readers.fixed_width import parse_fixed_width
+from starcat.catalog.readers.records import Records
 from starcat.catalog.source import (
     Column,
     DataSource,

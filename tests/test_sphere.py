@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from starcat.attitude import random_attitudes
-from starcat.proximity import nearest_neighbours
-from starcat.sphere import (
+from starcat.geometry.attitude import random_attitudes
+from starcat.geometry.proximity import nearest_neighbours
+from starcat.geometry.sphere import (
     chord_from_separation,
     directions_from_radec,
     radec_from_directions,

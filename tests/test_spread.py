@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from starcat.attitude import solve_wahba_svd
-from starcat.camera import Camera
+from starcat.geometry.attitude import solve_wahba_svd
+from starcat.geometry.camera import Camera
 from starcat.matcher.observation import Observation, observe
 from starcat.matcher.spread import (
     corner_deviation,

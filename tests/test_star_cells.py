@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from starcat.geometry.sphere import separation
 from starcat.matcher.star_cells import star_cells
-from starcat.sphere import separation
 
 
 @pytest.mark.parametrize("reach_rad", [1e-4, 0.004, 0.03])

@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from starcat.camera import Camera
-from starcat.matcher.observation import Observation, observe
-from starcat.matcher.selection import (
+from starcat.geometry.camera import Camera
+from starcat.matcher.methods.triangle_order import (
     Selection,
     is_well_shaped,
     optimised_triangle,
     select_triangles,
 )
+from starcat.matcher.observation import Observation, observe
 
 CAMERA = Camera(1024, 1024, fov_x_deg=12.0)
 

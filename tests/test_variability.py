@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from starcat.catalog.gcvs import Gcvs, read_gcvs
+from starcat.catalog.archives.gcvs import Gcvs, read_gcvs
 from starcat.catalog.ingest import ingest
 from starcat.catalog.source import data_source
 from starcat.catalog.stars import floats_of, table_from_columns

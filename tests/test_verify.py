@@ -16,12 +16,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from starcat.artifact.content import content_sha256, file_sha256, json_bytes
+from starcat.artifact.content import content_sha256
 from starcat.artifact.manifest import DATABASE_NAME, MANIFEST_NAME, manifest_digest
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import Finding, check_artifact, verify_artifact
 from starcat.errors import ProductError
-from starcat.parquet import read_parquet, write_parquet
+from starcat.storage.digests import file_sha256, json_bytes
+from starcat.tables.parquet import read_parquet, write_parquet
 
 Change = Callable[[dict[str, Any]], object]
 

@@ -7,49 +7,12 @@ it does not change with the version of the library that wrote the file.
 from __future__ import annotations
 
 import hashlib
-import json
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from starcat.schema import ProductSchema
-
-
-def file_sha256(path: Path) -> str:
-    """Return the digest of a file.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    str
-        SHA-256, hexadecimal.
-    """
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def json_bytes(content: Any) -> bytes:
-    """Return a value as JSON with sorted keys, the same bytes for the same value.
-
-    Parameters
-    ----------
-    content : object
-        Dicts, lists, texts, numbers.
-
-    Returns
-    -------
-    bytes
-        UTF-8, indented, with a final newline.
-    """
-    text = json.dumps(content, indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False)
-    return text.encode() + b"\n"
+from starcat.tables.schema import ProductSchema
 
 
 def content_sha256(table: pa.Table, schema: ProductSchema) -> str:

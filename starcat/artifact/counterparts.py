@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from starcat.catalog.proper_motion import MAS, Motion, propagate_directions
 from starcat.catalog.stars import floats_of
+from starcat.geometry.sphere import directions_from_radec, separation, tangent_axes
 from starcat.products.crossmatch import VERDICTS, Matches, MovingStars
-from starcat.schema import product_schema
-from starcat.sphere import directions_from_radec, separation, tangent_axes
+from starcat.tables.schema import product_schema
 
 Array = NDArray[np.float64]
 

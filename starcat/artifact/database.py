@@ -20,7 +20,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from starcat.products.index import Index
-from starcat.schema import ProductSchema, SchemaColumn
+from starcat.tables.schema import ProductSchema, SchemaColumn
 
 LAYOUT_VERSION = "1.0.0"
 """Of the arrangement of groups, datasets and attributes described above."""

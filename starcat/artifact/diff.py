@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from starcat.artifact.reader import Artifact
 from starcat.catalog.stars import directions_of, floats_of
-from starcat.sphere import separation
+from starcat.geometry.sphere import separation
 
 MOVED_ARCSEC = 1e-3
 """Stars that are further from where they were have moved."""

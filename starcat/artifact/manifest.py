@@ -20,7 +20,7 @@ from starcat.errors import ProductError, SchemaVersionError
 
 if TYPE_CHECKING:  # reading a manifest needs none of these
     from starcat.catalog.ingest import FileFacts
-    from starcat.schema import ProductSchema
+    from starcat.tables.schema import ProductSchema
 
 MANIFEST_NAME = "manifest.json"
 MANIFEST_VERSION = "1.0.0"
@@ -165,7 +165,7 @@ def manifest_digest(manifest: Mapping[str, Any]) -> str:
     str
         SHA-256, hexadecimal, of the canonical JSON of all other keys.
     """
-    from starcat.artifact.content import json_bytes  # with pyarrow, which reading does without
+    from starcat.storage.digests import json_bytes  # with pyarrow, which reading does without
 
     others = {key: value for key, value in manifest.items() if key != "manifest_sha256"}
     return hashlib.sha256(json_bytes(others)).hexdigest()

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from starcat.artifact.content import content_sha256
 from starcat.artifact.counterparts import counterpart_problems
 from starcat.errors import SchemaError
-from starcat.schema import ProductSchema
-from starcat.sphere import directions_from_radec, separation
+from starcat.geometry.sphere import directions_from_radec, separation
+from starcat.tables.schema import ProductSchema
 
 UNIT_TOLERANCE = 1e-14
 """Of the length of a direction and of its components: a few roundings of float64."""

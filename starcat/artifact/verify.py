@@ -17,7 +17,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from starcat.artifact.content import file_sha256, json_bytes
 from starcat.artifact.counterparts import counterparts_of
 from starcat.artifact.database_checks import (
     group_problems,
@@ -40,6 +39,7 @@ from starcat.artifact.table_checks import (
 )
 from starcat.catalog.stars import directions_of
 from starcat.errors import ProductError, StarcatError
+from starcat.storage.digests import file_sha256, json_bytes
 
 T = TypeVar("T")
 

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import pyarrow as pa
 
-from starcat.artifact.content import content_sha256, file_sha256, json_bytes
+from starcat.artifact.content import content_sha256
 from starcat.artifact.database import open_for_writing, write_product, write_root
 from starcat.artifact.manifest import (
     DATABASE_NAME,
@@ -26,9 +26,10 @@ from starcat.artifact.manifest import (
     software_versions,
 )
 from starcat.errors import OutputError, reason
-from starcat.parquet import write_parquet
 from starcat.products.index import Index
-from starcat.schema import product_schema
+from starcat.storage.digests import file_sha256, json_bytes
+from starcat.tables.parquet import write_parquet
+from starcat.tables.schema import product_schema
 
 Outcome = Literal["written", "unchanged", "replaced"]
 

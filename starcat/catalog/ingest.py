@@ -15,10 +15,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from starcat.catalog import gaia, hipparcos, sao, twomass, tycho1, tycho2
-from starcat.catalog.binary import parse_binary
-from starcat.catalog.delimited import parse_delimited
-from starcat.catalog.files import (
+from starcat.catalog.archives import gaia, hipparcos, sao, twomass, tycho1, tycho2
+from starcat.catalog.nearest import add_nearest_neighbours
+from starcat.catalog.photometry import blend_weights
+from starcat.catalog.readers.binary import parse_binary
+from starcat.catalog.readers.delimited import parse_delimited
+from starcat.catalog.readers.files import (
     Block,
     DigestReader,
     InputFile,
@@ -26,11 +28,9 @@ from starcat.catalog.files import (
     map_in_order,
     read_blocks,
 )
-from starcat.catalog.fixed_width import parse_fixed_width
-from starcat.catalog.malformed import check_malformed, malformed_rows, not_this_archive
-from starcat.catalog.nearest import add_nearest_neighbours
-from starcat.catalog.photometry import blend_weights
-from starcat.catalog.records import Problem, Records
+from starcat.catalog.readers.fixed_width import parse_fixed_width
+from starcat.catalog.readers.malformed import check_malformed, malformed_rows, not_this_archive
+from starcat.catalog.readers.records import Problem, Records
 from starcat.catalog.source import DataSource, data_source
 from starcat.catalog.stars import (
     StarBlock,
@@ -42,7 +42,7 @@ from starcat.catalog.stars import (
 from starcat.catalog.verdict import Reason
 from starcat.errors import ConfigError, SourceMissing
 from starcat.progress import Progress, no_progress
-from starcat.schema import product_schema
+from starcat.tables.schema import product_schema
 
 _PARSERS = {
     "fixed_width": parse_fixed_width,

@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 
 from starcat.catalog.stars import directions_of, floats_of, with_columns
-from starcat.proximity import nearest_neighbours
+from starcat.geometry.proximity import nearest_neighbours
 
 
 def add_nearest_neighbours(stars: pa.Table, workers: int = 2) -> pa.Table:

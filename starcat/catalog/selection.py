@@ -20,10 +20,10 @@ from starcat.catalog.photometry import combined_magnitude
 from starcat.catalog.quality import Quality
 from starcat.catalog.stars import directions_of, floats_of, sort_rows, with_columns
 from starcat.catalog.verdict import Reason, Verdicts
-from starcat.proximity import pairs_within
-from starcat.schema import product_schema
-from starcat.spec import Doubles, Selection, Variables
-from starcat.sphere import radec_from_directions
+from starcat.geometry.proximity import pairs_within
+from starcat.geometry.sphere import radec_from_directions
+from starcat.specs.build_spec import Doubles, Selection, Variables
+from starcat.tables.schema import product_schema
 
 Flags = NDArray[np.bool_]
 Array = NDArray[np.float64]

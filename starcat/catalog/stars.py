@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from starcat.catalog.proper_motion import Motion, propagate_directions
 from starcat.catalog.quality import Quality
 from starcat.catalog.verdict import Verdicts
-from starcat.schema import product_schema
-from starcat.sphere import directions_from_radec
+from starcat.geometry.sphere import directions_from_radec
+from starcat.tables.schema import product_schema
 
 Values: TypeAlias = NDArray[Any] | pa.Array | str | float | int | bool
 

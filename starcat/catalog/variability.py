@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from starcat.catalog.gcvs import read_gcvs
+from starcat.catalog.archives.gcvs import read_gcvs
 from starcat.catalog.ingest import FileFacts, ingest
 from starcat.catalog.stars import floats_of, with_columns
 from starcat.progress import Progress, no_progress

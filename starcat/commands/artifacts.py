@@ -44,7 +44,7 @@ def build(
 
     Example: starcat build --preset sao-12deg --input sao=sao.dat.gz -o dist
     """
-    from starcat.pipeline import build as run_build
+    from starcat.pipeline.build import build as run_build
     from starcat.terminal.builds import print_built
     from starcat.terminal.console import progress_bars
 
@@ -142,7 +142,7 @@ def rebuild(
 
     Example: starcat rebuild dist/sao-12deg-1.0.0 --input sao=sao.dat.gz
     """
-    from starcat.rebuild import rebuild as build_again
+    from starcat.pipeline.rebuild import rebuild as build_again
     from starcat.terminal.artifacts import print_rebuilt
     from starcat.terminal.console import progress_bars
 

@@ -39,7 +39,7 @@ def fetch(
 
     Example: starcat fetch tycho2
     """
-    from starcat.catalog.fetch import cache_folder, fetch_source
+    from starcat.catalog.fetching.fetch import cache_folder, fetch_source
     from starcat.catalog.source import data_source
     from starcat.terminal.builds import print_fetched
     from starcat.terminal.console import progress_bars
@@ -81,8 +81,8 @@ def ingest(
     Example: starcat ingest sao --input sao.dat.gz -o sao.parquet --epoch 2026.0
     """
     from starcat.catalog.export import write_star_tables
+    from starcat.catalog.fetching.locate import locate
     from starcat.catalog.ingest import ingest as read_catalog
-    from starcat.catalog.locate import locate
     from starcat.terminal.builds import print_ingested
     from starcat.terminal.console import progress_bars
 
@@ -117,8 +117,8 @@ def crossmatch(
 
     Example: starcat crossmatch sao.parquet hipparcos.parquet -o found.parquet
     """
-    from starcat.crossmatch import match_files
-    from starcat.spec import Crossmatch
+    from starcat.pipeline.counterparts import match_files
+    from starcat.specs.build_spec import Crossmatch
     from starcat.terminal.crossmatches import print_crossmatch
 
     found = match_files(a, b, output, Crossmatch(radius_arcsec=radius))

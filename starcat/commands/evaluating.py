@@ -52,9 +52,9 @@ def evaluate(
 
     Example: starcat evaluate dist/gaia-12deg-1.0.0 --noise noise_px=0,0.5,1 --frames 200
     """
-    from starcat.camera_file import read_camera
-    from starcat.evaluate import evaluate_artifact, evaluate_papers, noise_values
+    from starcat.evaluation.run import evaluate_artifact, evaluate_papers, noise_values
     from starcat.evaluation.sweep import plan_sweep
+    from starcat.specs.camera_file import read_camera
     from starcat.terminal.console import progress_bars
     from starcat.terminal.evaluations import print_evaluation
 

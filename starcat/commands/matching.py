@@ -35,9 +35,9 @@ def simulate(
 
     Example: starcat simulate dist/gaia-12deg-1.0.0 -o frame.csv --seed 7
     """
-    from starcat.evaluation.simulate import Noise, simulate_frames
-    from starcat.identification import write_simulated
+    from starcat.images.identification import write_simulated
     from starcat.matcher.database import open_database
+    from starcat.simulation.simulate import Noise, simulate_frames
 
     database = open_database(artifact)
     noise = Noise(noise_px, false_stars=false_stars)
@@ -74,9 +74,9 @@ def identify(
 
     Example: starcat identify dist/gaia-12deg-1.0.0 frame.csv --picture frame.png
     """
-    from starcat.camera_file import read_camera
-    from starcat.identification import draw, identify_frames, measure
+    from starcat.images.identification import draw, identify_frames, measure
     from starcat.matcher.matcher import Matcher
+    from starcat.specs.camera_file import read_camera
     from starcat.terminal.console import say
     from starcat.terminal.matches import print_matches
 
@@ -109,8 +109,8 @@ def selftest(
 
     Example: starcat selftest dist/gaia-12deg-1.0.0 --frames 1000
     """
-    from starcat.evaluation.selftest import self_test
     from starcat.matcher.matcher import Matcher
+    from starcat.simulation.selftest import self_test
     from starcat.terminal.builds import print_rates
     from starcat.terminal.console import progress_bars
 

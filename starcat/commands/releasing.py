@@ -59,8 +59,8 @@ def pull(
 
     Example: starcat pull gaia-12deg@latest --registry registry -o onboard
     """
-    from starcat.download import DownloadOptions
     from starcat.releases.project import pull_pinned, pull_wanted
+    from starcat.storage.download import DownloadOptions
     from starcat.terminal.console import progress_bars
     from starcat.terminal.published import print_pulled
 
@@ -85,8 +85,8 @@ def releases(
 
     Example: starcat releases registry
     """
-    from starcat.download import DownloadOptions
     from starcat.releases.registry import open_registry
+    from starcat.storage.download import DownloadOptions
     from starcat.terminal.published import print_releases
 
     opened = open_registry(registry, DownloadOptions(retries))

@@ -11,7 +11,7 @@ import typer
 from starcat.errors import ConfigError
 
 if TYPE_CHECKING:
-    from starcat.spec import BuildSpec
+    from starcat.specs.build_spec import BuildSpec
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 Input = Annotated[
@@ -44,8 +44,8 @@ def chosen_spec(path: Path | None, name: str | None) -> BuildSpec:
     ConfigError
         If both are given, or the spec is wrong.
     """
-    from starcat.spec import preset as named_preset
-    from starcat.spec import preset_names, read_spec
+    from starcat.specs.build_spec import preset as named_preset
+    from starcat.specs.build_spec import preset_names, read_spec
 
     if path is not None and name is not None:
         raise ConfigError("give either a spec file or --preset, not both")

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.camera import Camera
-from starcat.matcher import hausdorff_angular, hausdorff_l1, hausdorff_l2
+from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.methods import hausdorff_angular, hausdorff_l1, hausdorff_l2
+from starcat.matcher.methods.reference import references
 from starcat.matcher.observation import Observation, observe
-from starcat.matcher.reference import references
 from starcat.matcher.result import MatchResult, unidentified
 
 Array = NDArray[np.float64]

@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from starcat.camera import Camera
 from starcat.errors import ConfigError
-from starcat.evaluation.simulate import Noise
 from starcat.evaluation.trial import Attitudes, Trial
+from starcat.geometry.camera import Camera
+from starcat.simulation.simulate import Noise
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,11 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.attitude import matrix_from_quaternion
-from starcat.camera import Camera
-from starcat.evaluation.simulate import Frame
+from starcat.geometry.attitude import matrix_from_quaternion
+from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
 from starcat.matcher.result import MatchResult
+from starcat.simulation.simulate import Frame
 
 Array = NDArray[np.float64]
 

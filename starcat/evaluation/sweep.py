@@ -10,14 +10,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from starcat.artifact.reader import open_artifact
-from starcat.camera import Camera
 from starcat.errors import ConfigError
 from starcat.evaluation.axes import AXES
 from starcat.evaluation.paper import Paper, Row, Statistic, tolerance_for
-from starcat.evaluation.simulate import Noise
 from starcat.evaluation.trial import Attitudes, Trial
+from starcat.geometry.camera import Camera
 from starcat.matcher.database import open_database, products_in
-from starcat.matcher.methods import METHODS, best_method, method_named
+from starcat.matcher.methods.table import METHODS, best_method, method_named
+from starcat.simulation.simulate import Noise
 
 FRAMES, FEW_FRAMES = 500, 100
 """Of a trial, unless a sweep says otherwise; of a quick one."""

@@ -21,24 +21,25 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from starcat.attitude import matrix_from_quaternion, matrix_from_radec_roll
-from starcat.camera import Camera
 from starcat.evaluation.answers import ANSWERS
+from starcat.evaluation.catalog_sky import sky_of_artifact
 from starcat.evaluation.judge import Verdict, judge
-from starcat.evaluation.simulate import Noise, simulate_frame
-from starcat.evaluation.sky import Sky, sky_of_artifact
+from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
+from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.selection import Selection
+from starcat.matcher.methods.triangle_order import Selection
 from starcat.matcher.verification import REACH
 from starcat.progress import Progress, no_progress
+from starcat.simulation.simulate import Noise, simulate_frame
+from starcat.simulation.sky import Sky
 
 _TYPES = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}
 
 AT_ONCE = 250
 """Frames of one task of a process."""
 
-BASICS = ("attitude", "camera", "distortion", "kvector", "sphere")
-"""Modules that the matcher carries along."""
+MEASURED_ROOMS = ("geometry", "matcher", "simulation", "evaluation")
+"""The rooms whose code decides what a trial finds."""
 
 
 @dataclass(frozen=True)
@@ -206,12 +207,11 @@ def code_sha256() -> str:
     Returns
     -------
     str
-        SHA-256, hexadecimal, of the modules of these rooms and of what the matcher carries along.
+        SHA-256, hexadecimal, of the modules of the rooms that do so.
         Records of other code are not taken for results of this.
     """
     package = Path(__file__).parents[1]
-    paths = [package / f"{name}.py" for name in BASICS]
-    paths += [path for room in ("matcher", "evaluation") for path in (package / room).glob("*.py")]
+    paths = [path for room in MEASURED_ROOMS for path in (package / room).rglob("*.py")]
     digest = hashlib.sha256()
     for path in sorted(paths):
         digest.update(path.read_bytes())

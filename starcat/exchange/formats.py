@@ -13,7 +13,6 @@ from typing import IO
 
 import pyarrow as pa
 
-from starcat.catalog.export import whole_file
 from starcat.errors import ConfigError, OutputError
 from starcat.exchange.ecsv_file import write_ecsv
 from starcat.exchange.fits_file import write_fits
@@ -22,6 +21,7 @@ from starcat.exchange.numpy_columns import numpy_columns
 from starcat.exchange.parquet_stream import write_parquet_stream
 from starcat.exchange.text import csv_chunks, json_chunks
 from starcat.exchange.votable_file import write_votable
+from starcat.storage.atomic import whole_file
 
 SUFFIXES = {
     "csv": (".csv",),

@@ -20,13 +20,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from starcat.catalog.gaia import embedded_sky
+from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest
 from starcat.catalog.quality import Quality
 from starcat.catalog.stars import numbered, sort_rows, table_from_columns
 from starcat.errors import ConfigError, SourceError, SourceMissing, reason
 from starcat.exchange.tables import NamedTables, in_memory
-from starcat.sphere import directions_from_radec
+from starcat.geometry.sphere import directions_from_radec
 
 _COLUMNS = 6
 _DIRECTION_TOLERANCE = 1e-6

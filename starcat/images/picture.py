@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.attitude import radec_roll_from_matrix
 from starcat.errors import ConfigError, OutputError, reason
+from starcat.geometry.attitude import radec_roll_from_matrix
 from starcat.images.plate import (
     SKY,
     Plate,
@@ -121,7 +121,7 @@ def compass_from_matrix(matrix: Array) -> tuple[Array, Array]:
 
     Examples
     --------
-    >>> from starcat.attitude import matrix_from_radec_roll
+    >>> from starcat.geometry.attitude import matrix_from_radec_roll
     >>> north, east = compass_from_matrix(matrix_from_radec_roll(80.0, -5.0, 0.0))
     >>> (np.round(north) + 0.0).tolist(), (np.round(east) + 0.0).tolist()
     ([0.0, -1.0], [-1.0, 0.0])

@@ -12,8 +12,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.attitude import determinant
-from starcat.camera import Camera
+from starcat.geometry.attitude import determinant
+from starcat.geometry.camera import Camera
 
 Array = NDArray[np.float64]
 

@@ -18,8 +18,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.camera import Camera
 from starcat.errors import ProductError, SchemaVersionError
+from starcat.geometry.camera import Camera
 
 Made = TypeVar("Made")
 

@@ -12,12 +12,12 @@ from pathlib import Path
 
 from numpy.typing import ArrayLike
 
-from starcat.camera import Camera
+from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database, open_database, products_in
-from starcat.matcher.methods import METHODS, best_method, method_named
+from starcat.matcher.methods.table import METHODS, best_method, method_named
+from starcat.matcher.methods.triangle_order import DEFAULT, Selection
 from starcat.matcher.observation import Observation, observe
 from starcat.matcher.result import MatchResult, identified, unidentified
-from starcat.matcher.selection import DEFAULT, Selection
 from starcat.matcher.verification import MIN_STARS, Agreement, verify
 
 CERTAIN = 1e-9

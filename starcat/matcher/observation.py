@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from starcat.camera import Camera
+from starcat.geometry.camera import Camera
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.attitude import quaternion_from_matrix, radec_roll_from_matrix
+from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.matcher.observation import Observation
 from starcat.matcher.verification import Agreement
 

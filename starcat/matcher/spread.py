@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.camera import Camera
+from starcat.geometry.camera import Camera
 from starcat.matcher.observation import Observation
 
 Array = NDArray[np.float64]

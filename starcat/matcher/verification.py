@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.attitude import solve_wahba_svd
-from starcat.matcher.candidates import Candidates
+from starcat.geometry.attitude import solve_wahba_svd
 from starcat.matcher.chance import false_match_probability
 from starcat.matcher.database import Database
+from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.observation import Observation
 from starcat.matcher.spread import is_scaled, share_of_frame
 from starcat.matcher.star_cells import StarCells, star_cells

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from starcat.sphere import (
+from starcat.geometry.sphere import (
     chord_from_separation,
     radec_from_directions,
     saff_kuijlaars,

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from starcat.geometry.sphere import radec_from_directions, separation
 from starcat.products.boresights import FieldStars
-from starcat.sphere import radec_from_directions, separation
 
 Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
@@ -221,7 +221,7 @@ def tiling_gap(boresights: Array, tile_radius_rad: float) -> TilingGap:
 
     Examples
     --------
-    >>> from starcat.sphere import saff_kuijlaars
+    >>> from starcat.geometry.sphere import saff_kuijlaars
     >>> tiling_gap(saff_kuijlaars(10_000), np.radians(6.0)).has_holes
     False
     """

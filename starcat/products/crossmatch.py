@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from starcat.geometry.sphere import chord_from_separation, separation
 from starcat.products.match_odds import MatchModel, Odds, match_odds
 from starcat.products.match_probability import runs
-from starcat.sphere import chord_from_separation, separation
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]

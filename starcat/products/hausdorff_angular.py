@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.geometry.proximity import pairs_within
 from starcat.products.index import Index, row_offsets, stable_order
-from starcat.proximity import pairs_within
 
 STARS_AT_ONCE = 4096
 """Sorted together: their rows stay in the processor's cache, however large the sky is."""

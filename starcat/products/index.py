@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.kvector import KVector
+from starcat.geometry.kvector import KVector
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from starcat.geometry.sphere import saff_kuijlaars
 from starcat.products.match_probability import pair_probabilities
-from starcat.sphere import saff_kuijlaars
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from starcat.geometry.sphere import radec_from_directions, tangent_axes
 from starcat.products.hausdorff_angular import angular_reference_sets
 from starcat.products.index import Index, row_offsets
-from starcat.sphere import radec_from_directions, tangent_axes
 
 Array = NDArray[np.float64]
 

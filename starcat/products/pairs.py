@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.kvector import KVector, build_kvector
+from starcat.geometry.kvector import KVector, build_kvector
+from starcat.geometry.proximity import pairs_within
 from starcat.products.index import Index, kvector_index
-from starcat.proximity import pairs_within
 
 
 @dataclass(frozen=True)

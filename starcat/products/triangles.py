@@ -12,10 +12,10 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.kvector import build_kvector
+from starcat.geometry.kvector import build_kvector
+from starcat.geometry.sphere import separation
 from starcat.products.boresights import FieldStars
 from starcat.products.index import Index, kvector_index
-from starcat.sphere import separation
 
 Array = NDArray[np.float64]
 

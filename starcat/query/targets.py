@@ -11,7 +11,7 @@ from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
 from starcat.catalog.export import rejected_path
 from starcat.errors import ProductError, QueryError
 from starcat.progress import Progress, no_progress
-from starcat.schema import ProductSchema, product_schema
+from starcat.tables.schema import ProductSchema, product_schema
 
 HATS_NAMES = ("hats.properties", "properties")
 SCHEMA_KEY = "starcat.schema"
@@ -212,7 +212,7 @@ def _table(path: Path) -> View:
 
 def _source_of(text: str, path: Path) -> tuple[str | None, list[Path]]:
     """Return the source that a text names, and the files it names of it."""
-    from starcat.catalog.files import source_of_file
+    from starcat.catalog.readers.files import source_of_file
     from starcat.catalog.source import data_source, source_names
 
     name, separator, given = text.partition("=")
@@ -225,9 +225,9 @@ def _source_of(text: str, path: Path) -> tuple[str | None, list[Path]]:
 
 def _archive(source: str, inputs: list[Path], scratch: Path, progress: Progress) -> Target:
     """Read an archive's files into Parquet files that a query can see."""
+    from starcat.catalog.fetching.locate import locate
     from starcat.catalog.ingest import ingest
-    from starcat.catalog.locate import locate
-    from starcat.parquet import write_parquet
+    from starcat.tables.parquet import write_parquet
 
     read = ingest(source, locate(source, {source: inputs}), progress=progress)
     scratch.mkdir(parents=True)

@@ -16,10 +16,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from starcat.artifact.content import file_sha256
 from starcat.errors import OutputError, ProductError, reason
 from starcat.progress import Progress, no_progress
 from starcat.releases.tree import Blob
+from starcat.storage.digests import file_sha256
 
 _logger = logging.getLogger(__name__)
 _BLOCK_BYTES = 1 << 20

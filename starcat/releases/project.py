@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from starcat.download import DownloadOptions
 from starcat.errors import ConfigError, ProductError
 from starcat.progress import Progress, no_progress
 from starcat.releases.lockfile import pin_of, pinned_registry, prepare, read_pins, write_pin
 from starcat.releases.pulling import Pulled, pull_release
 from starcat.releases.registry import open_registry
 from starcat.releases.tree import choose, parse_wanted
+from starcat.storage.download import DownloadOptions
 
 
 def pull_wanted(

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from starcat.artifact.content import file_sha256, json_bytes
 from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.artifact.verify import check_artifact
 from starcat.errors import ConfigError, OutputError, ProductError
@@ -32,6 +31,7 @@ from starcat.releases.files import (
 )
 from starcat.releases.registry import is_address
 from starcat.releases.tree import INDEX_NAME, Blob, Listed, files_of, index_bytes, parse
+from starcat.storage.digests import file_sha256, json_bytes
 
 INCOMING = ".incoming"
 """Folder for what is not finished; may be removed while nobody publishes."""

@@ -15,16 +15,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from starcat.artifact.content import file_sha256
 from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
 from starcat.artifact.verify import check_artifact, verify_artifact
 from starcat.artifact.writer import publish
-from starcat.download import part_of
 from starcat.errors import OutputError, ProductError, SchemaError
 from starcat.progress import Progress, no_progress
 from starcat.releases.files import locked, sync_folder, writing
 from starcat.releases.registry import Registry
 from starcat.releases.tree import Blob, Release, files_of
+from starcat.storage.digests import file_sha256
+from starcat.storage.download import part_of
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Protocol
 from urllib.parse import urlsplit
 
-from starcat.artifact.content import file_sha256
-from starcat.download import DownloadOptions, NotFound, download, forget_part, part_of
 from starcat.errors import ConfigError, DownloadError, ProductError, SourceMissing, reason
 from starcat.progress import Progress
 from starcat.releases.files import copy_to_part
 from starcat.releases.tree import INDEX_NAME, MAX_INDEX_BYTES, Blob, Listed, read_index
+from starcat.storage.digests import file_sha256
+from starcat.storage.download import DownloadOptions, NotFound, download, forget_part, part_of
 
 
 class Registry(Protocol):

@@ -15,9 +15,9 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
-from starcat.artifact.content import json_bytes
 from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.errors import ConfigError, ProductError, SchemaVersionError, SourceMissing
+from starcat.storage.digests import json_bytes
 
 INDEX_NAME = "index.json"
 REGISTRY_VERSION = "1.0.0"

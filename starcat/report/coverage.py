@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from starcat.artifact.content import json_bytes
+from starcat.geometry.sphere import radec_from_directions
 from starcat.products.coverage import (
     Coverage,
     CoverageSummary,
@@ -17,7 +17,7 @@ from starcat.products.coverage import (
     tiling_gap,
 )
 from starcat.report.plots import draw_histogram, draw_map, save_plot
-from starcat.sphere import radec_from_directions
+from starcat.storage.digests import json_bytes
 
 DECIMALS = 6
 """Of degrees in a report: 4 milliarcseconds."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from starcat.sphere import directions_from_radec, radec_from_directions
+from starcat.geometry.sphere import directions_from_radec, radec_from_directions
 
 Array = NDArray[np.float64]
 

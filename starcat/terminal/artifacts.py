@@ -9,7 +9,7 @@ from rich.markup import escape
 
 from starcat.artifact.diff import Change, Difference, Moved, OneSided
 from starcat.artifact.verify import Verification
-from starcat.rebuild import Rebuilt
+from starcat.pipeline.rebuild import Rebuilt
 from starcat.terminal.console import print_json, print_table
 
 MAX_STARS = 20

@@ -12,10 +12,10 @@ from starcat.terminal.coverage import print_coverage_table
 
 if TYPE_CHECKING:
     from starcat.artifact.reader import Artifact
-    from starcat.catalog.fetch import FetchReport
+    from starcat.catalog.fetching.fetch import FetchReport
     from starcat.catalog.ingest import Ingested
-    from starcat.evaluation.selftest import Rates
-    from starcat.pipeline import Built
+    from starcat.pipeline.build import Built
+    from starcat.simulation.selftest import Rates
 
 
 def print_sources(*, as_json: bool) -> None:
@@ -26,7 +26,7 @@ def print_sources(*, as_json: bool) -> None:
     as_json : bool
         Whether to print JSON.
     """
-    from starcat.catalog.locate import locate
+    from starcat.catalog.fetching.locate import locate
     from starcat.catalog.source import data_source, source_names
 
     found: list[dict[str, Any]] = []
@@ -77,7 +77,7 @@ def print_presets(*, as_json: bool) -> None:
     as_json : bool
         Whether to print JSON, with every key of every spec.
     """
-    from starcat.spec import preset, preset_names
+    from starcat.specs.build_spec import preset, preset_names
 
     specs = [preset(name) for name in preset_names()]
     if as_json:

@@ -16,31 +16,6 @@ if TYPE_CHECKING:
 _BARS, _BAR_WIDTH = 20, 50
 
 
-def artifact_coverage(artifact: Artifact) -> CoverageReport:
-    """Return the coverage of an artifact, from its own boresights.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        Open.
-
-    Returns
-    -------
-    CoverageReport
-        The same as the report of its build has.
-    """
-    from starcat.build_report import coverage_report
-    from starcat.products.coverage import coverage_from_counts
-    from starcat.spec import spec_from_dict
-
-    table = artifact.table("boresights")
-    boresights = np.stack([table[name].to_numpy() for name in ("x", "y", "z")], axis=-1)
-    spec = spec_from_dict(artifact.manifest["spec"], "manifest.json")
-    counts = table["star_count"].to_numpy()
-    coverage = coverage_from_counts(boresights, counts, spec.boresights.brightest)
-    return coverage_report(coverage, spec)
-
-
 def print_coverage(artifact: Artifact, folder: Path | None, *, as_json: bool) -> None:
     """Print the coverage of an artifact, and write its tables and plots where asked to.
 
@@ -53,6 +28,7 @@ def print_coverage(artifact: Artifact, folder: Path | None, *, as_json: bool) ->
     as_json : bool
         Whether to print JSON.
     """
+    from starcat.pipeline.facts import artifact_coverage
     from starcat.report.coverage import holes_warning, write_coverage
 
     report = artifact_coverage(artifact)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from starcat.terminal.console import print_json, print_table, say
 
 if TYPE_CHECKING:
-    from starcat.crossmatch import Summary
+    from starcat.pipeline.counterparts import Summary
 
 MEANINGS = {
     "unique": "the only candidate, and no other star's",

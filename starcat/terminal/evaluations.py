@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from starcat.report.evaluation_columns import SHORT, verdict
-from starcat.report.evaluation_tables import (
+from starcat.evaluation.report.columns import SHORT, verdict
+from starcat.evaluation.report.tables import (
     Table,
     failure_table,
     rate_tables,
@@ -16,7 +16,7 @@ from starcat.report.evaluation_tables import (
 from starcat.terminal.console import print_json, print_table, say
 
 if TYPE_CHECKING:
-    from starcat.evaluate import Evaluation
+    from starcat.evaluation.run import Evaluation
 
 
 def print_evaluation(evaluation: Evaluation, *, as_json: bool) -> None:

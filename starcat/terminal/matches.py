@@ -8,7 +8,7 @@ from typing import Any
 
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.database import Database
-from starcat.matcher.methods import METHODS
+from starcat.matcher.methods.table import METHODS
 from starcat.matcher.result import MatchResult
 from starcat.terminal.console import print_json, print_table
 

@@ -33,13 +33,13 @@ sys.path.insert(0, str(Path(__file__).parent))
 import peers
 from synthetic import catalogs_folder
 
-from starcat.attitude import matrix_from_quaternion
-from starcat.evaluation.simulate import Frame, Noise, simulate_frames
+from starcat.geometry.attitude import matrix_from_quaternion
 from starcat.matcher.database import Database, open_database
 from starcat.matcher.matcher import MIN_STARS, Matcher
-from starcat.matcher.methods import METHODS
-from starcat.pipeline import build
-from starcat.spec import preset
+from starcat.matcher.methods.table import METHODS
+from starcat.pipeline.build import build
+from starcat.simulation.simulate import Frame, Noise, simulate_frames
+from starcat.specs.build_spec import preset
 
 SEED = 86_028_121
 NOISE_PX = 0.5

@@ -78,7 +78,7 @@ class Driver:
 
 def drive_starcat(sky: Sky, artifact: str, method: str, magnitudes: bool) -> Driver:
     """Its database is built already."""
-    from starcat.attitude import matrix_from_quaternion
+    from starcat.geometry.attitude import matrix_from_quaternion
     from starcat.matcher.matcher import Matcher
 
     matcher = Matcher.open(Path(artifact), method)

@@ -19,14 +19,14 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from starcat.artifact.database import open_for_writing, write_product
-from starcat.catalog.gaia import embedded_sky
+from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest
 from starcat.catalog.selection import select_guide_stars
 from starcat.catalog.stars import directions_of
-from starcat.parquet import write_parquet
-from starcat.recipes import RECIPES, Sky, cook, tile_guide_stars
-from starcat.schema import product_schema
-from starcat.spec import BuildSpec, preset
+from starcat.pipeline.recipes import RECIPES, Sky, cook, tile_guide_stars
+from starcat.specs.build_spec import BuildSpec, preset
+from starcat.tables.parquet import write_parquet
+from starcat.tables.schema import product_schema
 
 LIMITS_MAG = (6.0, 7.0, 8.0, 9.0)
 STARS_A_FIELD = 16

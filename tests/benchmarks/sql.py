@@ -14,14 +14,14 @@ from pathlib import Path
 
 import duckdb
 
-from starcat.catalog.gaia import embedded_sky
+from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest
 from starcat.catalog.selection import select_guide_stars
 from starcat.catalog.stars import directions_of
-from starcat.parquet import write_parquet
+from starcat.pipeline.recipes import Sky, cook, tile_guide_stars
 from starcat.query.session import open_session
-from starcat.recipes import Sky, cook, tile_guide_stars
-from starcat.spec import preset, spec_from_dict
+from starcat.specs.build_spec import preset, spec_from_dict
+from starcat.tables.parquet import write_parquet
 
 LIMIT_MAG = 8.0
 ROUNDS = 15

@@ -17,8 +17,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from starcat.artifact.reader import open_artifact
-from starcat.pipeline import build
-from starcat.spec import preset
+from starcat.pipeline.build import build
+from starcat.specs.build_spec import preset
 
 PRESETS = ("gaia-12deg", "sao-12deg")
 GOLDEN = Path(__file__).parents[1] / "golden"

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from starcat.evaluation.simulate import Noise, simulate_frames
-from starcat.identification import Measured, draw
+from starcat.images.identification import Measured, draw
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.matcher import Matcher
-from starcat.pipeline import build
-from starcat.spec import preset
+from starcat.pipeline.build import build
+from starcat.simulation.simulate import Noise, simulate_frames
+from starcat.specs.build_spec import preset
 
 FIGURES = Path(__file__).parents[2] / "docs" / "figures"
 NAME, SEED = "orion", 552

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from starcat.evaluate import write_reproduction
+from starcat.evaluation.run import write_reproduction
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -9,17 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 from star_story import Story, arcsec, link, table
 
-from starcat.attitude import matrix_from_radec_roll, quaternion_from_matrix, solve_wahba_svd
 from starcat.catalog.stars import floats_of
-from starcat.evaluation.selftest import HARD, answers_rightly
-from starcat.evaluation.simulate import Frame, Noise, simulate_frame, simulate_frames
-from starcat.evaluation.sky import Sky
-from starcat.kvector import KVector
-from starcat.matcher import triangle
+from starcat.geometry.attitude import (
+    matrix_from_radec_roll,
+    quaternion_from_matrix,
+    solve_wahba_svd,
+)
+from starcat.geometry.kvector import KVector
+from starcat.geometry.sphere import radec_from_directions, tangent_axes
 from starcat.matcher.matcher import CERTAIN, Matcher
+from starcat.matcher.methods import triangle
+from starcat.matcher.methods.triangle_order import select_triangles
 from starcat.matcher.observation import observe
-from starcat.matcher.selection import select_triangles
-from starcat.sphere import radec_from_directions, tangent_axes
+from starcat.simulation.selftest import HARD, answers_rightly
+from starcat.simulation.simulate import Frame, Noise, simulate_frame, simulate_frames
+from starcat.simulation.sky import Sky
 
 Array = NDArray[np.float64]
 
@@ -96,20 +100,20 @@ def matcher_section(shot: Shot) -> str:
     return f"""## 9. A frame
 
 Now a camera ({camera.width_px} x {camera.height_px} pixels) looks near the pole, at RA
-{POINTING[0]:g}, Dec {POINTING[1]:g} deg. {link("starcat/evaluation/simulate.py")} turns every star
+{POINTING[0]:g}, Dec {POINTING[1]:g} deg. {link("starcat/simulation/simulate.py")} turns every star
 by that attitude; the unit vector of Polaris becomes ({body}) in the camera's frame.
-{link("starcat/camera.py")} makes a pixel of it, ({true_x:.1f}, {true_y:.1f}), and {NOISE_PX} px of
-noise in each axis (seed {SEED}) move it to ({x:.1f}, {y:.1f}). What the matcher gets are
-{len(frame.centroids_px)} such dots and their brightness, in no order and without a name.
+{link("starcat/geometry/camera.py")} makes a pixel of it, ({true_x:.1f}, {true_y:.1f}), and
+{NOISE_PX} px of noise in each axis (seed {SEED}) move it to ({x:.1f}, {y:.1f}). What the matcher
+gets are {len(frame.centroids_px)} such dots and their brightness, in no order and without a name.
 
-{link("starcat/matcher/triangle.py")} takes the brightest dots first. Triangle {rank + 1} of its
-list has Polaris in it:
+{link("starcat/matcher/methods/triangle.py")} takes the brightest dots first. Triangle
+{rank + 1} of its list has Polaris in it:
 
 {table(("what", "value"), rows)}
 
-The K-vector ({link("starcat/kvector.py")}) is why this is fast: a straight line through the
-sorted areas says where in the list to begin and where to end, without a search. Handedness is the
-sense of rotation: a mirror image is no match."""
+The K-vector ({link("starcat/geometry/kvector.py")}) is why this is fast: a straight line through
+the sorted areas says where in the list to begin and where to end, without a search. Handedness
+is the sense of rotation: a mirror image is no match."""
 
 
 def attitude_errors(found: Array, true: Array) -> tuple[Array, Array]:
@@ -169,9 +173,9 @@ answer.
 {table(("the answer", ""), answer)}
 
 The attitude is the rotation that fits all matched stars best, Polaris among them
-({link("starcat/attitude.py")}: Wahba's problem by singular values). What is one star worth? The
-same fit with and without it, errors in arcseconds of the camera's axis and about it; then the root
-mean square over {DRAWS:,} such frames with other noise, because one frame is luck:
+({link("starcat/geometry/attitude.py")}: Wahba's problem by singular values). What is one star
+worth? The same fit with and without it, errors in arcseconds of the camera's axis and about it;
+then the root mean square over {DRAWS:,} such frames with other noise, because one frame is luck:
 
 {table(heads, _least_squares_rows(shot))}"""
 
@@ -212,7 +216,7 @@ def evaluation_section(shot: Shot) -> str:
     rows.append(near_rates(shot, "at Polaris, hard", Noise(wanted.noise_px, **HARD)))
     return f"""## 11. Does it work anywhere else?
 
-One frame proves little. Before a build ends, {link("starcat/evaluation/selftest.py")} lets the
+One frame proves little. Before a build ends, {link("starcat/simulation/selftest.py")} lets the
 new database identify {wanted.frames} clean frames of random attitudes and {wanted.frames} hard
 ones, with {HARD["drop_probability"]:.0%} of the stars missing and {HARD["false_stars"]} false dots
 added; a single wrong answer fails the build. A frame is a small part of the sky: Polaris is in

@@ -18,8 +18,8 @@ from typer.testing import CliRunner
 from starcat.artifact.reader import Artifact, open_artifact
 from starcat.catalog.stars import directions_of
 from starcat.cli import app
-from starcat.pipeline import Built, build
-from starcat.spec import BuildSpec, preset
+from starcat.pipeline.build import Built, build
+from starcat.specs.build_spec import BuildSpec, preset
 
 Array = NDArray[np.float64]
 

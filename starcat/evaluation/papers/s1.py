@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from starcat.camera import Camera
 from starcat.evaluation.paper import Paper, Row, Statistic, product_mib, tolerance_for
-from starcat.evaluation.simulate import Noise
 from starcat.evaluation.trial import Attitudes, Trial
+from starcat.geometry.camera import Camera
+from starcat.simulation.simulate import Noise
 
 PRESET = "sao-6deg"
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from starcat.camera import Camera
-from starcat.distortion import Distortion
 from starcat.evaluation.paper import Paper, Row, Statistic, tolerance_for
-from starcat.evaluation.simulate import Noise
 from starcat.evaluation.trial import Attitudes, Trial
+from starcat.geometry.camera import Camera
+from starcat.geometry.distortion import Distortion
+from starcat.simulation.simulate import Noise
 
 PRESET = "sao-12deg"
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from starcat.evaluation.paper import Paper, Row, Statistic, product_mib, tolerance_for
-from starcat.evaluation.simulate import Noise
 from starcat.evaluation.trial import Attitudes, Trial
+from starcat.simulation.simulate import Noise
 
 PRESET = "2mass-8x6"
 

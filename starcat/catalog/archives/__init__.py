@@ -1,0 +1,1 @@
+"""Archives: one module a catalog turns its records into star-table columns."""

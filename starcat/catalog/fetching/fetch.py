@@ -1,0 +1,248 @@
+"""Get the files of a data source into a folder, whole and checked, or not at all.
+
+Input is a `DataSource` and a folder; output is a `FetchReport`. A body goes to
+``<name>.part``, is continued there after an interruption, is checked on arrival and only
+then gets its name; a file that fails the checks is kept as ``<name>.rejected``.
+
+pooch gives the cache folder, the digests and FTP; `starcat.storage.download` continues downloads.
+Several addresses for one file and keeping a file whose digest is wrong are done here. This
+module does not unpack, and reads no star.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import pooch
+
+from starcat.catalog.fetching.arrival import (
+    ExpectedFile,
+    LockEntry,
+    examine,
+    expected_files,
+    read_lock,
+)
+from starcat.catalog.source import DataSource
+from starcat.errors import DownloadError, OutputError, SourceError
+from starcat.progress import Progress, no_progress
+from starcat.storage.download import (
+    DownloadOptions,
+    beside,
+    download,
+    forget_part,
+    part_of,
+    rename,
+)
+
+Status = Literal["downloaded", "resumed", "present"]
+"""Fetched in one go; continued from an earlier part; already in the folder."""
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class FetchedFile:
+    """One file that is in the folder and is what it should be.
+
+    Attributes
+    ----------
+    name : str
+        File name.
+    path : Path
+        Where it is.
+    bytes : int
+        Size as published, that is before unpacking.
+    sha256 : str
+        Digest.
+    rows : int
+        Records.
+    url : str
+        Where it came from; empty for a file that somebody put there by hand.
+    status : {"downloaded", "resumed", "present"}
+        What was done.
+    """
+
+    name: str
+    path: Path
+    bytes: int
+    sha256: str
+    rows: int
+    url: str
+    status: Status
+
+
+@dataclass(frozen=True)
+class FetchReport:
+    """What `fetch_source` did.
+
+    Attributes
+    ----------
+    source : str
+        Name of the data source.
+    files : tuple of FetchedFile
+        In the order of the data source.
+    """
+
+    source: str
+    files: tuple[FetchedFile, ...]
+
+
+def cache_folder() -> Path:
+    """Return the folder that downloads go to by default.
+
+    Returns
+    -------
+    Path
+        ``$STARCAT_CACHE`` if it is set, else the cache folder of the operating system. It
+        need not exist.
+    """
+    chosen = os.environ.get("STARCAT_CACHE")
+    return Path(chosen).expanduser() if chosen else Path(pooch.os_cache("starcat"))
+
+
+def fetch_source(
+    source: DataSource,
+    folder: Path,
+    *,
+    parts: Sequence[str] = (),
+    retries: int = 3,
+    timeout_s: float = 60.0,
+    backoff_s: float = 1.0,
+    progress: Progress = no_progress,
+) -> FetchReport:
+    """Get the files of a source into a folder and check them.
+
+    Parameters
+    ----------
+    source : DataSource
+        What to get.
+    folder : Path
+        Where to; made if need be.
+    parts : sequence of str
+        Of the files in several parts, only these; empty for all. Single files always come.
+    retries : int
+        Further attempts at an address after the first has failed, before the next address.
+    timeout_s : float
+        Seconds to wait for a connection, and for each block of data.
+    backoff_s : float
+        Seconds before the second attempt; doubled for each further one, up to 60.
+    progress : Progress
+        Called with file name, bytes there are, and bytes in all or None.
+
+    Returns
+    -------
+    FetchReport
+        Every file, with its digest, records and what was done.
+
+    Raises
+    ------
+    ConfigError
+        If a part is unknown or an address is not http, https or ftp.
+    SourceMissing
+        If the source has no address.
+    OutputError
+        If the folder cannot be written to.
+    DownloadError
+        If a file came from none of its addresses.
+    ChecksumMismatch
+        If a file has another digest than the one committed or recorded at its first arrival.
+    ParseError
+        If the number of records or the length of one is wrong.
+    SourceError
+        If a gzip file or the lock file is damaged.
+
+    Notes
+    -----
+    The number of records of a file in parts is checked when its last part arrives. A file
+    with the right digest is not asked for again.
+    """
+    wanted = expected_files(source, parts)
+    _make_writable(folder)
+    read_lock(folder)
+    options = DownloadOptions(retries, timeout_s, backoff_s, progress)
+    return FetchReport(source.name, tuple(_fetch_file(file, folder, options) for file in wanted))
+
+
+def _make_writable(folder: Path) -> None:
+    """Make the folder and try it out, before anything is downloaded."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OutputError(
+            f"cannot write to the folder {folder}: {error}. Name another one, or set "
+            "STARCAT_CACHE.",
+            path=folder,
+        ) from error
+
+
+def _fetch_file(expected: ExpectedFile, folder: Path, options: DownloadOptions) -> FetchedFile:
+    """Take the file that is there, or else the first address that delivers."""
+    for name in expected.names:
+        if (folder / name).exists():
+            return _take_present(expected, folder / name)
+    failures: list[tuple[str, SourceError]] = []
+    for name, url in expected.addresses:
+        try:
+            status = download(url, folder / name, options)
+            return _take_arrived(expected, folder / name, url, status)
+        except SourceError as error:
+            _logger.warning("%s: %s", url, error)
+            failures.append((url, error))
+    raise _none_delivered(expected, failures)
+
+
+def _none_delivered(
+    expected: ExpectedFile, failures: Sequence[tuple[str, SourceError]]
+) -> SourceError:
+    """Sum up why: a file that came and was wrong says more than one that did not come."""
+    wrong = [error for _, error in failures if not isinstance(error, DownloadError)]
+    reasons = "\n".join(f"  {url}: {error}" for url, error in failures)
+    if not wrong:
+        return DownloadError(
+            f"{expected.names[0]} came from none of its addresses:\n{reasons}\n"
+            "Try again later: what has arrived is kept. Or put the file there by hand.",
+            source=expected.source.name,
+        )
+    if len(failures) > 1:
+        wrong[0].args = (f"{wrong[0]}\nAll addresses failed:\n{reasons}",)
+    return wrong[0]
+
+
+def _take_present(expected: ExpectedFile, path: Path) -> FetchedFile:
+    """Check a file that is in the folder; it is left as it is."""
+    if not path.is_file():
+        raise OutputError(f"{path} is in the way: it is not a file. Move it.", path=path)
+    try:
+        entry = examine(expected, path, path, url="")
+    except SourceError as error:
+        error.args = (f"{error} The file is {path}: move it away to fetch it again.",)
+        raise
+    return _fetched(path, entry, entry.url, "present")
+
+
+def _take_arrived(expected: ExpectedFile, path: Path, url: str, status: Status) -> FetchedFile:
+    """Check a file that has come, then give it its name or set it aside."""
+    part = part_of(path)
+    try:
+        entry = examine(expected, part, path, url=url)
+    except SourceError as error:
+        error.path = beside(path, ".rejected")
+        rename(part, error.path)
+        forget_part(path)
+        error.args = (f"{str(error).rstrip('.')}. The file is kept as {error.path}.",)
+        raise
+    rename(part, path)
+    forget_part(path)
+    return _fetched(path, entry, url, status)
+
+
+def _fetched(path: Path, entry: LockEntry, url: str, status: Status) -> FetchedFile:
+    return FetchedFile(path.name, path, entry.bytes, entry.sha256, entry.rows, url, status)

@@ -1,0 +1,144 @@
+"""The reader of delimited records, driven by a source's column table.
+
+pyarrow's CSV reader parses whole blocks. Only when a block holds a field that is not of its
+column's kind is the block read again as text, to find the line and to keep the other records.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+from pyarrow import csv
+
+from starcat.catalog.readers.records import (
+    Problem,
+    Records,
+    apply_nulls,
+    number_from_text,
+    reject_required_blanks,
+)
+from starcat.catalog.source import Column, RecordFile
+
+
+def parse_delimited(
+    data: bytes, layout: RecordFile, names: Sequence[str], first_line: int = 1
+) -> Records:
+    """Parse a block of delimited lines.
+
+    Parameters
+    ----------
+    data : bytes
+        Whole lines, LF or CRLF. Empty lines and comments are skipped.
+    layout : RecordFile
+        Delimiter, comment mark and columns in order.
+    names : sequence of str
+        Columns to parse.
+    first_line : int, default 1
+        Line number of the first line.
+
+    Returns
+    -------
+    Records
+        The good records and the problems of the others.
+    """
+    lines = data.splitlines()
+    delimiter, comment = layout.delimiter.encode(), layout.comment.encode()
+    number, kept, problems = [], [], []
+    for offset, text in enumerate(lines):
+        if not text or (comment and text.startswith(comment)):
+            continue
+        fields = text.count(delimiter) + 1
+        if fields == len(layout.columns):
+            number.append(first_line + offset)
+            kept.append(text)
+        else:
+            expected = f"{len(layout.columns)} fields"
+            problems.append(
+                Problem(first_line + offset, "record", None, f"{fields} fields", expected)
+            )
+    line = np.array(number, dtype=np.int64)
+    if not kept:
+        empty: dict[str, NDArray[Any]] = {
+            name: np.empty(0, "S1" if layout.column(name).is_text else float) for name in names
+        }
+        return Records(layout.name, line, empty, problems)
+    clean = b"\n".join(kept)
+    chosen = [layout.column(name) for name in names]
+    try:
+        table = _read_csv(clean, layout, chosen, as_text=False)
+        columns = {column.name: _array(table[column.name], column) for column in chosen}
+        bad = np.zeros(len(line), dtype=bool)
+    except (pa.ArrowInvalid, pa.ArrowKeyError):
+        table = _read_csv(clean, layout, chosen, as_text=True)
+        bad = np.zeros(len(line), dtype=bool)
+        columns = {c.name: _array_by_field(table[c.name], c, line, bad, problems) for c in chosen}
+    records = Records(layout.name, line, columns).without(bad, problems)
+    return reject_required_blanks(records, layout)
+
+
+def _read_csv(
+    data: bytes, layout: RecordFile, chosen: Sequence[Column], *, as_text: bool
+) -> pa.Table:
+    nulls = sorted({"", *(text for column in chosen for text in column.null)})
+    kinds = {c.name: pa.binary() if as_text or c.is_text else pa.float64() for c in chosen}
+    return csv.read_csv(
+        pa.BufferReader(data),
+        read_options=csv.ReadOptions(
+            column_names=[column.name for column in layout.columns],
+            use_threads=False,
+            block_size=max(len(data) + 1, 1 << 16),
+        ),
+        parse_options=csv.ParseOptions(delimiter=layout.delimiter, quote_char=False),
+        convert_options=csv.ConvertOptions(
+            include_columns=[column.name for column in chosen],
+            column_types=kinds,
+            null_values=nulls,
+            strings_can_be_null=True,
+            check_utf8=False,
+        ),
+    )
+
+
+def _array(values: pa.ChunkedArray, column: Column) -> NDArray[Any]:
+    if column.is_text:
+        return _text_array(values)
+    if not pc.all(pc.is_finite(values), min_count=0).as_py():
+        raise pa.ArrowInvalid("nan or inf")  # which pyarrow takes for numbers
+    numbers: NDArray[np.float64] = pc.fill_null(values, float("nan")).to_numpy().copy()
+    apply_nulls(numbers, column)
+    return numbers
+
+
+def _text_array(values: pa.ChunkedArray) -> NDArray[Any]:
+    """Return text as fixed-width bytes padded with blanks, as the fixed-width reader does."""
+    filled = pc.fill_null(values.cast(pa.binary()), b"")
+    width = max(1, pc.max(pc.binary_length(filled)).as_py() or 1)
+    return np.array([text.ljust(width) for text in filled.to_pylist()], dtype=f"S{width}")
+
+
+def _array_by_field(
+    values: pa.ChunkedArray,
+    column: Column,
+    line: NDArray[np.int64],
+    bad: NDArray[np.bool_],
+    problems: list[Problem],
+) -> NDArray[Any]:
+    """Parse one column field by field; mark and report the records that cannot be read."""
+    if column.is_text:
+        return _text_array(values)
+    numbers = np.full(len(values), np.nan)
+    for i, text in enumerate(values.to_pylist()):
+        try:
+            numbers[i] = np.nan if text is None else number_from_text(text)
+        except ValueError:
+            if not bad[i]:
+                found, kind = repr(text.decode("latin-1")), f"a number like {column.format}"
+                problems.append(Problem(int(line[i]), column.name, None, found, kind))
+            bad[i] = True
+    apply_nulls(numbers, column)
+    return numbers

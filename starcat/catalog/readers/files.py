@@ -1,0 +1,430 @@
+"""The files of a source on disk: finding them, and reading them in blocks of whole lines.
+
+A source is given as a file (plain or ``.gz``), several files, or a folder that holds them
+under the archive's names, in parts or whole. Blocks are read in order and parsed by two
+workers, so that decompression and parsing overlap and memory stays flat; the order of the
+results is the order of the files.
+"""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import io
+import re
+import zlib
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from starcat.catalog.readers.gunzip import MAGIC, GzipReader, Readable
+from starcat.catalog.source import DataSource, RecordFile, data_source, source_names
+from starcat.errors import ParseError, SourceError, SourceMissing
+
+BLOCK_BYTES = 1 << 22
+
+MAX_LINE_BYTES = 1 << 24
+"""Text without a line end for longer than this is no archive's, and is not read to its end."""
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+
+@dataclass(frozen=True)
+class InputFile:
+    """One file on disk and the layout of its records."""
+
+    path: Path
+    layout: RecordFile
+
+
+@dataclass(frozen=True)
+class Block:
+    """Whole lines (or whole binary records) of one file.
+
+    Attributes
+    ----------
+    file : InputFile
+        Where it is from.
+    data : bytes
+        The lines.
+    first_line : int
+        1-based number of the first line (or record) in the file.
+    """
+
+    file: InputFile
+    data: bytes
+    first_line: int
+
+
+class DigestReader(io.RawIOBase):
+    """A binary file that hashes what is read from it.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("rb", buffering=0)
+        self._hash = hashlib.sha256()
+        self.bytes_read = 0
+
+    def readable(self) -> bool:
+        """Return True: the file is open for reading."""
+        return True
+
+    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+        """Read into a buffer and hash what was read.
+
+        Parameters
+        ----------
+        buffer : memoryview
+            Filled from its start.
+
+        Returns
+        -------
+        int
+            Bytes read; 0 at the end.
+        """
+        count = self._file.readinto(buffer)
+        self._hash.update(memoryview(buffer)[:count])
+        self.bytes_read += count
+        return count
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+        super().close()
+
+    @property
+    def sha256(self) -> str:
+        """Digest of all that has been read, hexadecimal."""
+        return self._hash.hexdigest()
+
+
+def find_files(source: DataSource, paths: Sequence[Path]) -> list[InputFile]:
+    """Find the files of a source.
+
+    Parameters
+    ----------
+    source : DataSource
+        What to look for.
+    paths : sequence of Path
+        Files, or folders that hold them under the archive's names with or without ``.gz``.
+
+    Returns
+    -------
+    list of InputFile
+        In reading order.
+
+    Raises
+    ------
+    SourceMissing
+        If a path does not exist, or a folder lacks a file or a part that is not optional.
+    """
+    found: list[InputFile] = []
+    for path in paths:
+        if path.is_dir():
+            found += _files_in_folder(source, path)
+        elif path.exists():
+            found.append(InputFile(path, _layout_of(source, path)))
+        else:
+            raise SourceMissing(
+                f"{source.name}: {path} does not exist; give a file or a folder with "
+                f"{_expected_names(source)}",
+                source=source.name,
+                path=path,
+            )
+    return found
+
+
+def holds_source(source: DataSource, folder: Path) -> bool:
+    """Return whether a folder has at least one file of the source.
+
+    Parameters
+    ----------
+    source : DataSource
+        What to look for.
+    folder : Path
+        Where.
+
+    Returns
+    -------
+    bool
+        True if any file or part is there under an archive name.
+    """
+    return any(
+        _existing(folder, name) for layout in source.files for name in _archive_names(layout)
+    )
+
+
+def _archive_names(layout: RecordFile) -> list[str]:
+    names: list[str] = []
+    for name in layout.file_names:
+        if "{part}" in name:
+            names += [name.replace("{part}", part) for part in layout.parts]
+        else:
+            names.append(name)
+    return names
+
+
+def _expected_names(source: DataSource) -> str:
+    return " and ".join(source_file.file_names[0] + "[.gz]" for source_file in source.files)
+
+
+def _existing(folder: Path, name: str) -> Path | None:
+    for candidate in (folder / name, folder / f"{name}.gz"):
+        if candidate.is_file():
+            return candidate
+    return None
+
+
+def source_of_file(path: Path) -> str | None:
+    """Return the source whose archive name a file has.
+
+    Parameters
+    ----------
+    path : Path
+        The file, with or without ``.gz``.
+
+    Returns
+    -------
+    str or None
+        A name of ``data_sources``; None where no archive has a file of that name.
+    """
+    named = (name for name in source_names() if _named_layout(data_source(name), path))
+    return next(named, None)
+
+
+def _layout_of(source: DataSource, path: Path) -> RecordFile:
+    """Return the layout whose archive name the file has; the first where none fits."""
+    return _named_layout(source, path) or source.files[0]
+
+
+def _named_layout(source: DataSource, path: Path) -> RecordFile | None:
+    name = path.name.removesuffix(".gz")
+    for layout in source.files:
+        for pattern in layout.file_names:
+            stem = re.escape(pattern).replace(re.escape("{part}"), r"\w+")
+            if re.fullmatch(stem, name):
+                return layout
+    return None
+
+
+def _files_in_folder(source: DataSource, folder: Path) -> list[InputFile]:
+    found: list[InputFile] = []
+    for layout in source.files:
+        paths = _layout_in_folder(source, layout, folder)
+        if not paths and not layout.optional:
+            raise SourceMissing(
+                f"{source.name}: {folder} has no {layout.file_names[0]}[.gz]; fetch it with "
+                f"'starcat fetch {source.name}' or name the file itself",
+                source=source.name,
+                path=folder,
+            )
+        found += [InputFile(path, layout) for path in paths]
+    return found
+
+
+def _layout_in_folder(source: DataSource, layout: RecordFile, folder: Path) -> list[Path]:
+    for name in layout.file_names:
+        if "{part}" not in name:
+            path = _existing(folder, name)
+            if path:
+                return [path]
+            continue
+        parts = {part: _existing(folder, name.replace("{part}", part)) for part in layout.parts}
+        missing = [part for part, path in parts.items() if path is None]
+        if missing and len(missing) < len(parts):
+            raise SourceMissing(
+                f"{source.name}: {folder} has {len(parts) - len(missing)} of {len(parts)} parts "
+                f"of {name}; missing: {', '.join(missing[:8])}{' …' if len(missing) > 8 else ''}. "
+                "Fetch the rest, or name the parts one by one to use only them",
+                source=source.name,
+                path=folder,
+            )
+        if not missing:
+            return [path for path in parts.values() if path is not None]
+    return []
+
+
+def open_input(path: Path) -> tuple[DigestReader, Readable]:
+    """Open a plain or gzipped file for reading, with the digest of its raw bytes.
+
+    Parameters
+    ----------
+    path : Path
+        The file; compression is recognised by content, not by name.
+
+    Returns
+    -------
+    tuple of DigestReader and binary stream
+        The digest is complete once the stream has been read to its end.
+
+    Raises
+    ------
+    SourceError
+        If the file cannot be opened.
+    """
+    try:
+        with path.open("rb") as file:
+            is_gzip = file.read(2) == MAGIC
+        raw = DigestReader(path)
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read: {error.strerror}", path=path) from error
+    buffered = io.BufferedReader(raw, 1 << 20)
+    return raw, GzipReader(buffered) if is_gzip else buffered
+
+
+def read_blocks(
+    file: InputFile, source_name: str, on_end: Callable[[DigestReader], None]
+) -> Iterator[Block]:
+    """Read a file in blocks of whole lines or whole binary records.
+
+    Parameters
+    ----------
+    file : InputFile
+        The file.
+    source_name : str
+        For messages.
+    on_end : callable
+        Called with the reader when the last byte has been read.
+
+    Yields
+    ------
+    Block
+        In file order.
+
+    Raises
+    ------
+    ParseError
+        If the compressed data is truncated or damaged, or the file is empty.
+    """
+    raw, stream = open_input(file.path)
+    line, tail = 1, b""
+    try:
+        if file.layout.layout == "binary":
+            check_magic(stream.read(file.layout.header_bytes), file, source_name)
+        size = _read_size(file.layout)
+        while chunk := stream.read(size):
+            data = tail + chunk
+            cut = _last_whole(data, file.layout)
+            tail = data[cut:]
+            if len(tail) > MAX_LINE_BYTES:
+                raise _endless_line(file, source_name, line)
+            if cut:
+                yield Block(file, data[:cut], line)
+                line += _count(data[:cut], file.layout)
+        if tail:
+            yield Block(file, tail, line)
+        elif line == 1:
+            raise ParseError(
+                f"{file.path}: the file is empty; expected records of {source_name}",
+                source=source_name,
+                path=file.path,
+            )
+        on_end(raw)
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        what = "cut off" if isinstance(error, EOFError) else "damaged"
+        where = f" after line {line - 1}" if line > 1 else ""
+        raise ParseError(
+            f"{file.path}: the compressed data is {what}{where} ({error}); fetch the file again",
+            source=source_name,
+            path=file.path,
+            line=line - 1,
+        ) from error
+    finally:
+        stream.close()
+        raw.close()
+
+
+def _endless_line(file: InputFile, source_name: str, line: int) -> ParseError:
+    length = file.layout.record_bytes
+    expected = f"records of {length} bytes" if length else "lines"
+    return ParseError(
+        f"{file.path}: line {line} has no end within {MAX_LINE_BYTES >> 20} MiB; expected "
+        f"{expected} of {source_name} ({file.layout.name}). Is this the right archive?",
+        source=source_name,
+        path=file.path,
+        line=line,
+    )
+
+
+def check_magic(header: bytes, file: InputFile, source_name: str) -> None:
+    """Check the first bytes of a binary file.
+
+    Parameters
+    ----------
+    header : bytes
+        The bytes before the first record.
+    file : InputFile
+        The file.
+    source_name : str
+        For the message.
+
+    Raises
+    ------
+    ParseError
+        If the header is cut off or does not begin with the layout's magic text.
+    """
+    magic = file.layout.magic.encode()
+    if len(header) < file.layout.header_bytes or not header.startswith(magic):
+        raise ParseError(
+            f"{file.path}: begins with {header[:8]!r}; expected {magic!r} and a header of "
+            f"{file.layout.header_bytes} bytes ({source_name})",
+            source=source_name,
+            path=file.path,
+            byte_range=(1, file.layout.header_bytes),
+        )
+
+
+def _read_size(layout: RecordFile) -> int:
+    """Return a whole number of records, so that a regular file never has to be cut and joined."""
+    record = (layout.record_bytes or 1) + (layout.layout == "fixed_width")
+    return max(1, BLOCK_BYTES // record) * record
+
+
+def _last_whole(data: bytes, layout: RecordFile) -> int:
+    if layout.layout == "binary":
+        return len(data) - len(data) % (layout.record_bytes or 1)
+    return data.rfind(b"\n") + 1
+
+
+def _count(data: bytes, layout: RecordFile) -> int:
+    if layout.layout == "binary":
+        return len(data) // (layout.record_bytes or 1)
+    return data.count(b"\n")
+
+
+def map_in_order(
+    function: Callable[[_Item], _Result], items: Iterator[_Item], workers: int = 2
+) -> Iterator[_Result]:
+    """Apply a function to items with a few threads, keeping their order.
+
+    Parameters
+    ----------
+    function : callable
+        Applied to every item; numpy and pyarrow release the interpreter while they work.
+    items : iterator
+        Read by the calling thread, a few items ahead of the results.
+    workers : int, default 2
+        Number of threads.
+
+    Yields
+    ------
+    object
+        Results in the order of the items.
+    """
+    pending: deque[Future[_Result]] = deque()
+    with ThreadPoolExecutor(workers) as pool:
+        for item in items:
+            pending.append(pool.submit(function, item))
+            if len(pending) > workers + 1:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()

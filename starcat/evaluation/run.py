@@ -1,0 +1,244 @@
+"""What ``starcat evaluate`` does: artifacts, trials, report.
+
+An output folder holds ``artifacts/``, ``records/`` with a Parquet file a trial, and a folder a
+report, named after what was asked for.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from starcat import __version__
+from starcat.errors import ConfigError
+from starcat.evaluation.campaign import Outcome, run_paper
+from starcat.evaluation.registry import papers_named
+from starcat.evaluation.report.files import RESULTS, write_evaluation
+from starcat.evaluation.report.files import write_reproduction as write_page
+from starcat.evaluation.sweep import Sweep, sweep_paper
+from starcat.pipeline.build import Inputs, build
+from starcat.progress import Progress, no_progress
+from starcat.specs.build_spec import preset
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What was measured, and where it is written down.
+
+    Attributes
+    ----------
+    contents : tuple of dict
+        `Outcome.as_dict` of each paper or sweep.
+    page : Path
+        The report, ``index.html``; its tables and curves are beside it.
+    """
+
+    contents: tuple[dict[str, Any], ...]
+    page: Path
+
+
+def prepare_artifacts(
+    presets: Iterable[str],
+    inputs: Inputs,
+    folder: Path,
+    *,
+    workers: int = 2,
+    progress: Progress = no_progress,
+) -> dict[str, Path]:
+    """Build the artifacts that papers need.
+
+    Parameters
+    ----------
+    presets : iterable of str
+        Names of specs that ship with starcat.
+    inputs : mapping of str to sequence of Path
+        Input files or folders by source; others are looked for.
+    folder : Path
+        Where to build them. An artifact that is there already is left as it is if the build
+        gives the same one, else replaced.
+    workers : int, default 2
+        Threads.
+    progress : Progress
+        Called with (what is built, done, total).
+
+    Returns
+    -------
+    dict of str to Path
+        Artifact by preset.
+
+    Raises
+    ------
+    SourceError, BuildError, OutputError
+        As `build` does.
+    """
+    artifacts = {}
+    for name in dict.fromkeys(presets):
+
+        def forward(stage: str, done: int, total: int | None, name: str = name) -> None:
+            progress(f"build {name}", done, total)
+
+        spec = preset(name)
+        given = {source: paths for source, paths in inputs.items() if source in spec.sources}
+        built = build(spec, given, folder, replace=True, workers=workers, progress=forward)
+        artifacts[name] = built.folder
+    return artifacts
+
+
+def evaluate_papers(
+    name: str,
+    inputs: Inputs,
+    output: Path,
+    *,
+    quick: bool = False,
+    workers: int = 2,
+    progress: Progress = no_progress,
+) -> Evaluation:
+    """Measure what papers print, and write the report.
+
+    Parameters
+    ----------
+    name : str
+        ``S1`` to ``S5``, or ``all``.
+    inputs : mapping of str to sequence of Path
+        Catalogs, as for a build.
+    output : Path
+        Folder of artifacts, records and reports. Trials whose records are there are not run.
+    quick : bool, default False
+        Whether fewer frames will do.
+    workers : int, default 2
+        Processes.
+    progress : Progress
+        Called with (what is done, done, total).
+
+    Returns
+    -------
+    Evaluation
+        One content a paper.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such paper.
+    """
+    papers = papers_named(name)
+    presets = [preset for paper in papers for preset in paper.presets]
+    artifacts = prepare_artifacts(
+        presets, inputs, output / "artifacts", workers=workers, progress=progress
+    )
+    outcomes = [
+        run_paper(
+            paper, artifacts, output / "records", quick=quick, workers=workers, progress=progress
+        )
+        for paper in papers
+    ]
+    folder = "all" if name.lower() == "all" else papers[0].name
+    return _write(output / _quick(folder, quick), "The papers, reproduced", outcomes)
+
+
+def evaluate_artifact(
+    sweep: Sweep, output: Path, *, workers: int = 2, progress: Progress = no_progress
+) -> Evaluation:
+    """Measure how often an artifact identifies, and write the report.
+
+    Parameters
+    ----------
+    sweep : Sweep
+        What is tried.
+    output : Path
+        Folder of records and reports.
+    workers : int, default 2
+        Processes.
+    progress : Progress
+        Called with (name of the artifact, frames done, frames in all).
+
+    Returns
+    -------
+    Evaluation
+        One content, with a group a quantity that varies.
+    """
+    paper = sweep_paper(sweep)
+    outcome = run_paper(
+        paper,
+        {paper.name: sweep.artifact},
+        output / "records",
+        quick=sweep.is_quick,
+        workers=workers,
+        progress=progress,
+    )
+    folder = output / _quick(paper.name, sweep.is_quick)
+    return _write(folder, f"{paper.name}, evaluated", [outcome])
+
+
+def write_reproduction(output: Path, docs: Path) -> Path:
+    """Write ``reproduction.md`` and its figures from the full run of all papers.
+
+    Parameters
+    ----------
+    output : Path
+        Folder of `evaluate_papers`.
+    docs : Path
+        Folder of the documentation.
+
+    Returns
+    -------
+    Path
+        The page.
+
+    Raises
+    ------
+    ConfigError
+        If all papers were not evaluated there.
+    """
+    return write_page(output / "all" / RESULTS, docs)
+
+
+def noise_values(given: Sequence[str]) -> Mapping[str, tuple[float, ...]]:
+    """Read the values that a user gives to quantities.
+
+    Parameters
+    ----------
+    given : sequence of str
+        Each ``name=value,value,...``.
+
+    Returns
+    -------
+    mapping of str to tuple of float
+        By name.
+
+    Raises
+    ------
+    ConfigError
+        If a text is not of that form, or says a name again.
+    """
+    values: dict[str, tuple[float, ...]] = {}
+    for text in given:
+        name, _, numbers = text.partition("=")
+        try:
+            found = tuple(float(number) for number in numbers.split(","))
+        except ValueError:
+            found = ()
+        if not found or name in values:
+            raise ConfigError(
+                f"--noise {text!r}: expected NAME=VALUE,VALUE,... with each name once, such as "
+                "noise_px=0,0.5,1",
+                value=text,
+            )
+        values[name] = found
+    return values
+
+
+def _quick(name: str, is_quick: bool) -> str:
+    return f"{name}-quick" if is_quick else name
+
+
+def _write(folder: Path, title: str, outcomes: Sequence[Outcome]) -> Evaluation:
+    machine = (
+        f"mean over the frames, processors: {os.cpu_count()} ({platform.machine()}), "
+        f"starcat {__version__}, Python {platform.python_version()}"
+    )
+    contents = tuple(outcome.as_dict() for outcome in outcomes)
+    return Evaluation(contents, write_evaluation(folder, title, contents, machine))

@@ -1,0 +1,1 @@
+"""Geometry: directions, attitudes, cameras and the indices over them; arrays in, arrays out."""

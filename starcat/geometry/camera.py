@@ -1,0 +1,267 @@
+"""The camera: pixels from directions and back.
+
+Camera frame: x right, y down, z along the optical axis. Pixel coordinates start at the outer
+corner of the top-left pixel, so the centre of that pixel is (0.5, 0.5) and the optical axis
+of a centred camera is at (width/2, height/2). ``camera_file`` reads and writes its TOML.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from numbers import Integral
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.geometry.distortion import NO_DISTORTION, Distortion, checked_number
+from starcat.geometry.sphere import separation
+
+Array = NDArray[np.float64]
+
+LARGEST_PX = 1_000_000
+"""No detector is larger; a number that is came from somewhere else."""
+
+
+@dataclass(frozen=True, init=False)
+class Camera:
+    """A camera with square pixels.
+
+    Parameters
+    ----------
+    width_px, height_px : int
+        Size of the detector.
+    focal_length_px, fov_x_deg, fov_y_deg : float, optional
+        One of the three: the focal length, or the full angle across the width or the height
+        as it were without distortion and with the axis in the middle. Both angles will do
+        if their focal lengths agree to 1e-3; the one across the width is used.
+    principal_point_px : pair of float, optional
+        Where the optical axis meets the detector's plane; the middle by default.
+    distortion : Distortion, optional
+        Of the lens; none by default.
+
+    Raises
+    ------
+    ValueError
+        If a value is out of range, the scale is missing or contradictory, or the distortion
+        folds the image back on the detector.
+
+    Examples
+    --------
+    >>> Camera(1024, 768, 512.0).fov_x_deg
+    90.0
+    """
+
+    width_px: int
+    height_px: int
+    focal_length_px: float
+    principal_point_px: tuple[float, float]
+    distortion: Distortion
+
+    def __init__(
+        self,
+        width_px: int,
+        height_px: int,
+        focal_length_px: float | None = None,
+        *,
+        fov_x_deg: float | None = None,
+        fov_y_deg: float | None = None,
+        principal_point_px: Iterable[float] | None = None,
+        distortion: Distortion = NO_DISTORTION,
+    ) -> None:
+        w, h = _size("width_px", width_px), _size("height_px", height_px)
+        if not isinstance(distortion, Distortion):
+            raise ValueError(f"distortion is {distortion!r}; expected a Distortion")
+        # The dictionary lies behind the guard of a frozen class.
+        vars(self).update(
+            width_px=w,
+            height_px=h,
+            focal_length_px=_focal_length_px(w, h, focal_length_px, fov_x_deg, fov_y_deg),
+            principal_point_px=(0.5 * w, 0.5 * h)
+            if principal_point_px is None
+            else _point("principal_point_px", principal_point_px),
+            distortion=distortion,
+        )
+        self._refuse_fold()
+
+    def _refuse_fold(self) -> None:
+        """Raise ValueError unless all of the detector lies inside the fold."""
+        reach_px = float(np.hypot(*(self._corners - self.principal_point_px).T).max())
+        fold_px = self.distortion.image_radius * self.focal_length_px
+        if reach_px >= fold_px and not self.distortion.is_none:
+            raise ValueError(
+                f"distortion folds the image back at {fold_px:.6g} px from the principal point, "
+                f"but the detector reaches out to {reach_px:.6g} px; expected a fold beyond that"
+            )
+
+    @property
+    def _corners(self) -> Array:
+        w, h = float(self.width_px), float(self.height_px)
+        return np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]])
+
+    @cached_property
+    def _is_plain(self) -> bool:
+        """Whether the axis is in the middle and nothing is distorted."""
+        middle = (0.5 * self.width_px, 0.5 * self.height_px)
+        return self.distortion.is_none and self.principal_point_px == middle
+
+    def _widest_rad(self, centroids_px: Array) -> float:
+        """Return the largest separation between the directions of pixels."""
+        body = self.directions_from_pixels(centroids_px)
+        return float(separation(body[:, None], body[None]).max())
+
+    @cached_property
+    def fov_x_deg(self) -> float:
+        """Separation of the middles of the left and the right edge, degrees."""
+        if self._is_plain:
+            return float(2.0 * np.degrees(np.arctan(0.5 * self.width_px / self.focal_length_px)))
+        y = 0.5 * self.height_px
+        return float(np.degrees(self._widest_rad(np.array([[0.0, y], [self.width_px, y]]))))
+
+    @cached_property
+    def fov_y_deg(self) -> float:
+        """Separation of the middles of the top and the bottom edge, degrees."""
+        if self._is_plain:
+            return float(2.0 * np.degrees(np.arctan(0.5 * self.height_px / self.focal_length_px)))
+        x = 0.5 * self.width_px
+        return float(np.degrees(self._widest_rad(np.array([[x, 0.0], [x, self.height_px]]))))
+
+    @cached_property
+    def diagonal_rad(self) -> float:
+        """Largest separation of two corners, radians."""
+        return 2.0 * self.radius_rad if self._is_plain else self._widest_rad(self._corners)
+
+    @cached_property
+    def radius_rad(self) -> float:
+        """Largest angle from the optical axis to a corner, radians."""
+        if self._is_plain:
+            half = 0.5 * np.hypot(self.width_px, self.height_px)
+            return float(np.arctan(half / self.focal_length_px))
+        x, y, z = self.directions_from_pixels(self._corners).T
+        return float(np.arctan2(np.hypot(x, y), z).max())
+
+    def pixels_from_directions(self, body: Array) -> Array:
+        """Project directions in the camera frame.
+
+        Parameters
+        ----------
+        body : ndarray of float64, shape (N, 3)
+            Directions in the camera frame, of any length.
+
+        Returns
+        -------
+        ndarray of float64, shape (N, 2)
+            Pixels (x right, y down); NaN where a direction lies behind the camera, or so far
+            off the axis that the distortion folds its image back.
+        """
+        z = body[:, 2]
+        z = np.where(z > 0.0, z, np.nan)
+        pixels = np.empty((len(body), 2))
+        x, y = pixels[:, 0], pixels[:, 1]
+        if self.distortion.is_none:
+            scale = self.focal_length_px / z
+            np.multiply(body[:, 0], scale, out=x)
+            np.multiply(body[:, 1], scale, out=y)
+        else:
+            np.divide(body[:, :2], z[:, None], out=pixels)
+            image = self.distortion.distorted(pixels.view(np.complex128)[:, 0])
+            np.multiply(image.real, self.focal_length_px, out=x)
+            np.multiply(image.imag, self.focal_length_px, out=y)
+        x += self.principal_point_px[0]
+        y += self.principal_point_px[1]
+        return pixels
+
+    def directions_from_pixels(self, centroids_px: Array) -> Array:
+        """Return the directions that centroids point at.
+
+        Parameters
+        ----------
+        centroids_px : ndarray of float64, shape (N, 2)
+            Pixels (x right, y down, origin at the outer corner of the top-left pixel).
+
+        Returns
+        -------
+        ndarray of float64, shape (N, 3)
+            Unit vectors in the camera frame; NaN where no direction inside the fold has that
+            image, which happens off the detector only.
+        """
+        x_px, y_px = self.principal_point_px
+        body = np.empty((len(centroids_px), 3))
+        np.subtract(centroids_px[:, 0], x_px, out=body[:, 0])
+        np.subtract(centroids_px[:, 1], y_px, out=body[:, 1])
+        body[:, 2] = self.focal_length_px
+        if not self.distortion.is_none:
+            image = (body[:, :2] / self.focal_length_px).view(np.complex128)[:, 0]
+            z = self.distortion.undistorted(image)
+            body[:, 0], body[:, 1], body[:, 2] = z.real, z.imag, 1.0
+        body /= np.sqrt(np.einsum("ij,ij->i", body, body))[:, None]
+        return body
+
+    def contains(self, centroids_px: Array) -> NDArray[np.bool_]:
+        """Return which pixels lie on the detector.
+
+        Parameters
+        ----------
+        centroids_px : ndarray of float64, shape (N, 2)
+            Pixels; NaN lies outside.
+
+        Returns
+        -------
+        ndarray of bool, shape (N,)
+            Closed at the left and top edge, open at the right and bottom.
+        """
+        x, y = centroids_px[:, 0], centroids_px[:, 1]
+        return np.asarray((x >= 0) & (x < self.width_px) & (y >= 0) & (y < self.height_px))
+
+
+def _size(name: str, value: object) -> int:
+    if isinstance(value, Integral) and not isinstance(value, bool):
+        size = int(value)
+        if 1 <= size <= LARGEST_PX:
+            return size
+    raise ValueError(f"{name} is {value!r}; expected a whole number from 1 to {LARGEST_PX}")
+
+
+def _point(name: str, value: Iterable[object]) -> tuple[float, float]:
+    try:
+        x, y = (checked_number(name, entry) for entry in value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} is {value!r}; expected two finite numbers, x and y") from None
+    return x, y
+
+
+def _focal_length_px(
+    width_px: int,
+    height_px: int,
+    focal_length_px: float | None,
+    fov_x_deg: float | None,
+    fov_y_deg: float | None,
+) -> float:
+    """Return the focal length that one of the three, or both angles, stand for."""
+    if focal_length_px is not None and fov_x_deg is None and fov_y_deg is None:
+        return checked_number("focal_length_px", focal_length_px, 0.0)
+    scales = {"focal_length_px": focal_length_px, "fov_x_deg": fov_x_deg, "fov_y_deg": fov_y_deg}
+    given = [name for name, value in scales.items() if value is not None]
+    if not given or focal_length_px is not None:
+        raise ValueError(
+            f"found {' and '.join(given) or 'no scale'}; "
+            "expected one of focal_length_px, fov_x_deg and fov_y_deg"
+        )
+    if fov_x_deg is None:
+        return _focal_length_from_fov("fov_y_deg", fov_y_deg, height_px)
+    focal = _focal_length_from_fov("fov_x_deg", fov_x_deg, width_px)
+    if fov_y_deg is not None:
+        other = _focal_length_from_fov("fov_y_deg", fov_y_deg, height_px)
+        if abs(other - focal) > 1e-3 * focal:
+            square = np.degrees(2.0 * np.arctan(0.5 * height_px / focal))
+            raise ValueError(
+                f"fov_y_deg is {fov_y_deg!r}; expected {square:.6g}, "
+                f"which square pixels give with fov_x_deg {fov_x_deg!r}, or neither of the two"
+            )
+    return focal
+
+
+def _focal_length_from_fov(name: str, fov_deg: object, size_px: int) -> float:
+    half_rad = np.radians(0.5 * checked_number(name, fov_deg, 0.0, 180.0))
+    return float(0.5 * size_px / np.tan(half_rad))

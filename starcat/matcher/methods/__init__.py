@@ -1,0 +1,1 @@
+"""Methods: one module a way to propose which spot is which star."""

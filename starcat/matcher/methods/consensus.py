@@ -1,0 +1,246 @@
+"""Consensus: which stars named for single centroids agree with each other.
+
+A method that ranks stars for every centroid on its own ends here: two of its names can both
+be right only if the two stars are as far apart as the two centroids. The names with the most
+such partners come first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.geometry.sphere import separation
+from starcat.matcher.database import Database, ProductArrays
+from starcat.matcher.methods.candidates import Candidates
+from starcat.matcher.methods.pairs import side_tolerance_rad
+from starcat.matcher.methods.reference import rows_between
+from starcat.matcher.observation import Observation
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
+Flags = NDArray[np.bool_]
+
+BATCHES = (4, 16, 64)
+"""Pairs yielded together: the first batches, then the last size again and again."""
+
+MOST_NAMES = 2048
+"""Names compared with each other; of more the lower ranks are left out."""
+
+
+def consistent_candidates(
+    ranked: NDArray[np.integer], observation: Observation, database: Database, most: int = 1000
+) -> Iterator[Candidates]:
+    """Propose the names of centroids that agree with each other.
+
+    Parameters
+    ----------
+    ranked : ndarray of int, shape (N, K)
+        Rows of the database's stars, for every centroid the best first; -1 where there is
+        none.
+    observation : Observation
+        The frame, of N centroids.
+    database : Database
+        The stars.
+    most : int, default 1000
+        Pairs proposed at the most.
+
+    Yields
+    ------
+    Candidates
+        First the pair of the highest support together with all names that agree with both
+        and with each other, in one correspondence; then every pair by falling support, of
+        equal ones the farthest apart.
+
+    Notes
+    -----
+    The support of a name is the number of other centroids with a name that agrees with it:
+    true names support each other, false ones hardly, however many there are. The support of
+    a pair is the sum of both.
+    """
+    centroid, star = _names(ranked)
+    fits = consistent(centroid, star, observation, database)
+    first, second = np.nonzero(np.triu(fits))
+    if not len(first):
+        return
+    count = support(fits, centroid, len(observation))
+    apart = observation.separation_rad[centroid[first], centroid[second]]
+    order = np.lexsort((-apart, -(count[first] + count[second])))[:most]
+    pairs = np.stack([first[order], second[order]], axis=-1)
+    largest = _all_agreeing(pairs[0], fits, count)
+    if len(largest) > 2:
+        yield Candidates(centroid[largest][None, :], star[largest][None, :])
+    done = step = 0
+    while done < len(pairs):
+        size = BATCHES[min(step, len(BATCHES) - 1)]
+        batch = pairs[done : done + size]
+        yield Candidates(centroid[batch], star[batch])
+        done, step = done + size, step + 1
+
+
+def consistent(centroid: Rows, star: Rows, observation: Observation, database: Database) -> Flags:
+    """Return which names are as far apart as their centroids.
+
+    Parameters
+    ----------
+    centroid : ndarray of int, shape (L,)
+        Rows of the observation.
+    star : ndarray of int, shape (L,)
+        Rows of the database's stars: the name of each.
+    observation : Observation
+        The frame.
+    database : Database
+        The stars.
+
+    Returns
+    -------
+    ndarray of bool, shape (L, L)
+        Symmetric. False for two names of one centroid and for one star at two centroids.
+
+    Notes
+    -----
+    The bounds on the separation are compared as squared chords, ``2 - 2 u.v``, which one
+    matrix product yields to 4e-16: 4 mas at separation 0 and less beyond.
+    """
+    low, high = _squared_chords(observation)
+    u = database.directions[star]
+    square = 2.0 - 2.0 * (u @ u.T)
+    fits = square >= low[centroid][:, centroid]
+    fits &= square <= high[centroid][:, centroid]
+    fits &= star[:, None] != star
+    return np.asarray(fits)
+
+
+def support(fits: Flags, centroid: Rows, count: int) -> NDArray[np.int64]:
+    """Count for each name the other centroids with a name that agrees with it.
+
+    Parameters
+    ----------
+    fits : ndarray of bool, shape (L, L)
+        Which names agree.
+    centroid : ndarray of int, shape (L,)
+        Row of each name's centroid.
+    count : int
+        Number of centroids.
+
+    Returns
+    -------
+    ndarray of int64, shape (L,)
+        0 to ``count - 1``.
+    """
+    agrees = np.zeros((len(centroid), count), dtype=bool)
+    name, other = np.nonzero(fits)
+    agrees[name, centroid[other]] = True
+    return np.asarray(agrees.sum(axis=1))
+
+
+def _names(ranked: NDArray[np.integer]) -> tuple[Rows, Rows]:
+    """Return centroid and star of every name, the first ranks of all centroids first."""
+    rank, centroid = np.nonzero(ranked.T >= 0)
+    rank, centroid = rank[:MOST_NAMES], centroid[:MOST_NAMES]
+    # Products may keep rows in few bits.
+    return centroid, ranked[centroid, rank].astype(np.intp)
+
+
+def _all_agreeing(pair: Rows, fits: Flags, count: NDArray[np.int64]) -> Rows:
+    """Return a pair and what agrees with it and each other, the best supported first."""
+    chosen = list(pair)
+    left = fits[pair[0]] & fits[pair[1]]
+    while left.any():
+        best = int(np.argmax(np.where(left, count, -1)))
+        chosen.append(best)
+        left &= fits[best]
+    return np.array(chosen)
+
+
+def neighbour_candidates(
+    reference: int,
+    stars: Rows,
+    product: ProductArrays,
+    observation: Observation,
+    database: Database,
+) -> Candidates:
+    """Return the stars that a reference star may be, with two neighbours that agree.
+
+    Parameters
+    ----------
+    reference : int
+        Row of the observation.
+    stars : ndarray of int, shape (K,)
+        Rows of the database's stars, none twice: what the reference star may be.
+    product : ProductArrays
+        With the rows of every star's neighbours: ``star_offsets`` and ``neighbour``.
+    observation : Observation
+        The frame.
+    database : Database
+        The stars.
+
+    Returns
+    -------
+    Candidates
+        At most one of each star, in three correspondences, the best supported first: the
+        reference star, and two centroids with neighbours of the star that are as far apart
+        and as far from it.
+    """
+    owner, star, centroid = _named_by_neighbours(reference, stars, product, observation, database)
+    first, second = _agreeing_pairs(owner, star, centroid, observation, database)
+    agrees = np.zeros((len(owner), len(observation)), dtype=bool)
+    agrees[first, centroid[second]] = agrees[second, centroid[first]] = True
+    count = agrees.sum(axis=1)
+    apart = observation.separation_rad[centroid[first], centroid[second]]
+    order = np.lexsort((-apart, -(count[first] + count[second])))
+    _, place = np.unique(owner[first[order]], return_index=True)
+    best = order[np.sort(place)]
+    first, second = first[best], second[best]
+    one = np.full(len(best), reference)
+    return Candidates(
+        np.stack([one, centroid[first], centroid[second]], axis=-1),
+        np.stack([stars[owner[first]], star[first], star[second]], axis=-1),
+    )
+
+
+def _agreeing_pairs(
+    owner: Rows, star: Rows, centroid: Rows, observation: Observation, database: Database
+) -> tuple[Rows, Rows]:
+    """Return the pairs of names of the same owner, which ascend, that agree."""
+    after = np.arange(len(owner)) + 1
+    first, second = rows_between(after, np.searchsorted(owner, owner, side="right"))
+    low, high = _squared_chords(observation)
+    u, v = database.directions[star[first]], database.directions[star[second]]
+    square = 2.0 - 2.0 * np.einsum("ij,ij->i", u, v)
+    ends = centroid[first], centroid[second]
+    agree = (square >= low[ends]) & (square <= high[ends]) & (star[first] != star[second])
+    return first[agree], second[agree]
+
+
+def _squared_chords(observation: Observation) -> tuple[Array, Array]:
+    """Return the bounds on the squared chord of centroids' stars; none fit one centroid."""
+    apart, tolerance_rad = observation.separation_rad, side_tolerance_rad(observation)
+    low = 4.0 * np.sin(0.5 * np.maximum(apart - tolerance_rad, 0.0)) ** 2
+    high = 4.0 * np.sin(0.5 * np.minimum(apart + tolerance_rad, np.pi)) ** 2
+    np.fill_diagonal(low, np.inf)
+    return low, high
+
+
+def _named_by_neighbours(
+    reference: int,
+    stars: Rows,
+    product: ProductArrays,
+    observation: Observation,
+    database: Database,
+) -> tuple[Rows, Rows, Rows]:
+    """Return whose neighbours are as far from it as which centroids from the reference star."""
+    offsets = product["star_offsets"]
+    owner, row = rows_between(offsets[stars], offsets[stars + 1])
+    star = product["neighbour"][row].astype(np.intp)
+    apart = separation(database.directions[stars[owner]], database.directions[star])
+    observed = observation.separation_rad[reference]
+    nearest = np.argsort(observed, kind="stable")
+    nearest = nearest[nearest != reference]
+    tolerance_rad = side_tolerance_rad(observation)
+    low = np.searchsorted(observed[nearest], apart - tolerance_rad, side="left")
+    high = np.searchsorted(observed[nearest], apart + tolerance_rad, side="right")
+    name, place = rows_between(low, high)
+    return owner[name], star[name], nearest[place]

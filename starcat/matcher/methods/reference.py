@@ -1,0 +1,163 @@
+"""Reference stars: what lies around one centroid, and in what order centroids are tried.
+
+Several methods compare the neighbourhood of one centroid, the reference star, with that of
+every star. A centroid near the middle of the frame has its neighbours in the frame, so the
+nearest to the centre comes first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.matcher.methods.candidates import Candidates
+from starcat.matcher.observation import Observation
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
+
+RANKS = (1, 5, 20)
+"""How many of each reference star's candidates have been tried after each round."""
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """The centroids around one of them, the nearest first.
+
+    Attributes
+    ----------
+    centroids : ndarray of int, shape (n,)
+        Rows of the observation.
+    separation_rad : ndarray of float64, shape (n,)
+        From the reference star, radians.
+    position_angle_rad : ndarray of float64, shape (n,)
+        At the reference star, radians, -pi to pi, counter-clockwise on the sky as seen from an
+        axis of no meaning.
+    """
+
+    centroids: Rows
+    separation_rad: Array
+    position_angle_rad: Array
+
+    def __len__(self) -> int:
+        """Return the number of centroids around."""
+        return len(self.centroids)
+
+
+def references(observation: Observation) -> Rows:
+    """Return the centroids in the order in which they serve as reference stars.
+
+    Parameters
+    ----------
+    observation : Observation
+        The frame.
+
+    Returns
+    -------
+    ndarray of int, shape (N,)
+        Rows of the observation, the nearest to the centre of the frame first.
+    """
+    camera = observation.camera
+    x, y = (observation.centroids_px - [0.5 * camera.width_px, 0.5 * camera.height_px]).T
+    return np.lexsort((y, x, x * x + y * y))
+
+
+def surroundings(observation: Observation, reference: int, radius_rad: float) -> Surroundings:
+    """Return the centroids around one of them.
+
+    Parameters
+    ----------
+    observation : Observation
+        The frame.
+    reference : int
+        Row of the observation.
+    radius_rad : float
+        Largest separation, radians, itself included.
+
+    Returns
+    -------
+    Surroundings
+        Without the reference star; of equally near ones the first in position angle.
+    """
+    apart, u = observation.separation_rad[reference], observation.body[reference]
+    inside = apart <= radius_rad
+    inside[reference] = False
+    rows = np.flatnonzero(inside)
+    # East is y x u, north u x east: as on the sky their product points outwards, so that angles
+    # run the same way. No direction that a camera sees is along y.
+    x, _, z = u / np.hypot(u[0], u[2])
+    offset = observation.body[rows] - u
+    to_east = offset @ np.array([z, 0.0, -x])
+    to_north = offset @ np.array([-x * u[1], x * u[0] + z * u[2], -z * u[1]])
+    angle = np.arctan2(to_east, to_north)
+    order = np.lexsort((angle, apart[rows]))
+    return Surroundings(rows[order], apart[rows][order], angle[order])
+
+
+def by_reference(
+    observation: Observation, *proposals: Callable[[int], Candidates]
+) -> Iterator[Candidates]:
+    """Propose the best of every reference star, then more of all.
+
+    Parameters
+    ----------
+    observation : Observation
+        The frame.
+    *proposals : callable
+        Each returns the candidates of a reference star, given its row, the best first; the
+        second is asked when all reference stars have been asked the first.
+
+    Yields
+    ------
+    Candidates
+        The best one of a reference star at a time, then those of the next ranks of all
+        reference stars together.
+
+    Notes
+    -----
+    Papers stop at the best star of the reference star nearest to the centre. Where that one
+    is a false star, or lost its neighbours, another reference star decides.
+    """
+    found: list[Candidates] = []
+    for propose in proposals:
+        for reference in references(observation):
+            found.append(propose(int(reference)))
+            if len(found[-1]):
+                yield found[-1][:1]
+    for first, last in pairwise(RANKS):
+        batch = [ranked[first:last] for ranked in found]
+        if any(len(part) for part in batch):
+            yield Candidates(
+                np.concatenate([part.centroids for part in batch]),
+                np.concatenate([part.stars for part in batch]),
+            )
+
+
+def rows_between(
+    start: NDArray[np.integer[Any]], stop: NDArray[np.integer[Any]]
+) -> tuple[Rows, Rows]:
+    """Return all rows of several runs of rows.
+
+    Parameters
+    ----------
+    start, stop : ndarray of int, shape (K,)
+        Where each run begins and where it has ended.
+
+    Returns
+    -------
+    run, row : ndarray of int, shape (M,)
+        Which run it is and which row, run after run.
+
+    Examples
+    --------
+    >>> rows_between(np.array([5, 2, 9]), np.array([7, 2, 10]))
+    (array([0, 0, 2]), array([5, 6, 9]))
+    """
+    count = stop - start
+    run = np.repeat(np.arange(len(count)), count)
+    return run, np.arange(len(run)) + np.repeat(start - np.cumsum(count) + count, count)

@@ -1,0 +1,167 @@
+"""Identification by triangles (S4): area in the K-vector, circumradius as the filter.
+
+Needs the product ``triangles``. Observed triangles are looked up a few at a time, then more
+at a time: most frames are decided by the first few.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from itertools import permutations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.geometry.kvector import KVector
+from starcat.matcher.database import Database, ProductArrays
+from starcat.matcher.methods.candidates import Candidates
+from starcat.matcher.methods.triangle_order import DEFAULT, Selection, select_triangles
+from starcat.matcher.observation import Observation
+
+Array = NDArray[np.float64]
+
+PRODUCTS = ("triangles",)
+
+BATCHES = (2, 8, 32)
+"""Triangles looked up together: the first batches, then the last size again and again."""
+
+MANY = 200
+"""Triangles of stars from which on one side is compared before all three are."""
+
+SIDE_TOLERANCE = 1.5
+"""Largest error of a side, in units of the largest error of a centroid."""
+
+_ORDERS = np.array(list(permutations(range(3))), dtype=np.intp)
+
+
+def candidates(
+    observation: Observation, database: Database, selection: Selection = DEFAULT
+) -> Iterator[Candidates]:
+    """Propose the triangles of stars that observed triangles may be.
+
+    Parameters
+    ----------
+    observation : Observation
+        The frame.
+    database : Database
+        With the product ``triangles``.
+    selection : Selection
+        Which observed triangles, and in what order.
+
+    Yields
+    ------
+    Candidates
+        Three stars each, of the same handedness as the centroids.
+
+    References
+    ----------
+    Liao and Zhang 2024 (S4), sections 2 and 3.
+    """
+    triangles = select_triangles(observation, selection)
+    product = database.products["triangles"]
+    done = step = 0
+    while done < len(triangles):
+        size = BATCHES[min(step, len(BATCHES) - 1)]
+        found = _look_up(triangles[done : done + size], observation, database, product)
+        if len(found):
+            yield found
+        done, step = done + size, step + 1
+
+
+def _look_up(
+    triangles: NDArray[np.intp],
+    observation: Observation,
+    database: Database,
+    product: ProductArrays,
+) -> Candidates:
+    """Return the triangles of stars with the area and circumradius of observed ones."""
+    i, j, k = triangles.T
+    apart = observation.separation_rad
+    sides = np.stack([apart[j, k], apart[i, k], apart[i, j]], axis=-1)
+    tolerance_rad = SIDE_TOLERANCE * observation.tolerance_rad
+    by_area = KVector(
+        product["area_rad2"],
+        product["kvector_counts"],
+        product.numbers["kvector_intercept"],
+        product.numbers["kvector_slope"],
+    )
+    radii, found = product["circumradius_rad"], []
+    for a, b, c in sides.tolist():
+        area, area_error, radius, radius_error = features(a, b, c, tolerance_rad)
+        near = by_area.range(area - area_error, area + area_error)
+        fits = np.abs(radii[near] - radius) <= radius_error
+        found.append(fits.nonzero()[0] + near.start)
+    observed = np.repeat(np.arange(len(triangles)), [len(rows) for rows in found])
+    rows = np.concatenate(found)
+    if len(rows) > MANY:
+        close = _has_a_side(rows, sides[observed], tolerance_rad, database, product)
+        rows, observed = rows[close], observed[close]
+    stars = np.stack([product["i"][rows], product["j"][rows], product["k"][rows]], axis=-1)
+    return _in_order(
+        triangles[observed], stars, sides[observed], tolerance_rad, observation, database
+    )
+
+
+def _has_a_side(
+    rows: NDArray[np.intp],
+    sides: Array,
+    tolerance_rad: float,
+    database: Database,
+    product: ProductArrays,
+) -> NDArray[np.bool_]:
+    """Return where the first two stars are as far apart as one of the observed sides is long."""
+    chord = database.directions[product["i"][rows]] - database.directions[product["j"][rows]]
+    apart = 2.0 * np.arcsin(0.5 * np.sqrt(np.einsum("ij,ij->i", chord, chord)))
+    near = np.abs(sides - apart[:, None]) <= tolerance_rad
+    return np.asarray(near[:, 0] | near[:, 1] | near[:, 2])
+
+
+def features(
+    a: float, b: float, c: float, tolerance_rad: float
+) -> tuple[float, float, float, float]:
+    """Return area and circumradius of a plane triangle and how far sides in error move them.
+
+    Parameters
+    ----------
+    a, b, c : float
+        Sides, radians, of a triangle that is not flat.
+    tolerance_rad : float
+        Error of each side.
+
+    Returns
+    -------
+    area_rad2, area_error_rad2, circumradius_rad, circumradius_error_rad : float
+        The errors to first order, those of the sides as if independent.
+    """
+    a2, b2, c2 = a * a, b * b, c * c
+    u, v, w = b2 + c2 - a2, a2 + c2 - b2, a2 + b2 - c2
+    area = 0.25 * math.sqrt(max(a2 * u + b2 * v + c2 * w, 1e-300))
+    radius = a * b * c / (4.0 * area)
+    slopes = a * u / (8.0 * area), b * v / (8.0 * area), c * w / (8.0 * area)
+    area_error = tolerance_rad * math.hypot(*slopes)
+    turns = (1.0 / side - slope / area for side, slope in zip((a, b, c), slopes, strict=True))
+    return area, area_error, radius, tolerance_rad * radius * math.hypot(*turns)
+
+
+def _in_order(
+    centroids: NDArray[np.intp],
+    stars: NDArray[np.integer[Any]],
+    sides: Array,
+    tolerance_rad: float,
+    observation: Observation,
+    database: Database,
+) -> Candidates:
+    """Return the stars in the order of the centroids, where sides and handedness agree."""
+    u = database.directions[stars]
+    chord = u[:, [1, 0, 0]] - u[:, [2, 2, 1]]
+    apart = 2.0 * np.arcsin(0.5 * np.sqrt(np.einsum("ijk,ijk->ij", chord, chord)))
+    fits = np.abs(apart[:, :, None] - sides[:, None, :]) <= tolerance_rad
+    first, second, third = _ORDERS.T
+    row, order = np.nonzero(fits[:, first, 0] & fits[:, second, 1] & fits[:, third, 2])
+    centroids, stars = centroids[row], stars[row[:, None], _ORDERS[order]]
+    # The determinant of the product is the product of the two triangles' handedness.
+    turned = database.directions[stars] @ np.swapaxes(observation.body[centroids], 1, 2)
+    handed = np.linalg.det(turned) > 0.0
+    return Candidates(centroids[handed], stars[handed])

@@ -1,0 +1,383 @@
+"""The stages of a build, in order: from a spec and archive files to an artifact.
+
+Each stage is a plain function of the results before it; the last ones write into a partial
+folder, read it back, identify simulated fields with it and only then give it its name.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from starcat.artifact.verify import check_artifact
+from starcat.artifact.writer import (
+    Outcome,
+    Product,
+    partial_folder,
+    publish,
+    write_manifest,
+    write_products,
+)
+from starcat.catalog.fetching.locate import locate
+from starcat.catalog.ingest import Ingested, ingest
+from starcat.catalog.selection import Selected
+from starcat.catalog.stars import directions_of, sort_rows
+from starcat.catalog.variability import AmplitudeTable, join_amplitudes, read_amplitudes
+from starcat.errors import BuildError, ConfigError
+from starcat.matcher.matcher import Matcher
+from starcat.pipeline.counterparts import match_catalogs
+from starcat.pipeline.facts import (
+    FilterCoverage,
+    Results,
+    build_facts,
+    filter_coverage,
+    source_facts,
+)
+from starcat.pipeline.guide_stars import select_stars
+from starcat.pipeline.log import Stopwatch, write_build_log
+from starcat.pipeline.recipes import RECIPES, Sky, boresight_product, cook
+from starcat.products.boresights import FieldStars
+from starcat.progress import Progress, no_progress
+from starcat.report.coverage import CoverageReport, holes_warning
+from starcat.report.report import write_report
+from starcat.simulation.selftest import Rates, self_test
+from starcat.specs.build_spec import BuildSpec
+from starcat.tables.schema import product_schema
+
+Inputs = Mapping[str, Sequence[Path]]
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Built:
+    """A finished build.
+
+    Attributes
+    ----------
+    folder : Path
+        The artifact.
+    outcome : {"written", "unchanged", "replaced"}
+        What happened to the folder.
+    manifest : dict
+        Of the artifact.
+    filters : tuple of FilterCoverage
+        What each filter left.
+    coverage : CoverageReport
+        Of the guide stars.
+    rates : tuple of Rates
+        Of the self-test: clean and hard frames.
+    problems : tuple of str
+        The first malformed records.
+    warnings : tuple of str
+        What is worth a second look, such as holes of the tiling.
+    times_s : dict of str to float
+        Seconds by stage.
+    """
+
+    folder: Path
+    outcome: Outcome
+    manifest: dict[str, Any]
+    filters: tuple[FilterCoverage, ...]
+    coverage: CoverageReport
+    rates: tuple[Rates, Rates]
+    problems: tuple[str, ...]
+    warnings: tuple[str, ...]
+    times_s: dict[str, float]
+
+
+def build(
+    spec: BuildSpec,
+    inputs: Inputs,
+    output: Path,
+    *,
+    replace: bool = False,
+    workers: int = 2,
+    progress: Progress = no_progress,
+) -> Built:
+    """Build an artifact.
+
+    Parameters
+    ----------
+    spec : BuildSpec
+        Everything that the database depends on.
+    inputs : mapping of str to sequence of Path
+        Input files or folders by source; others are looked for (`locate`).
+    output : Path
+        Folder that the artifact's own folder is made in.
+    replace : bool, default False
+        Whether a different artifact of the same name and version may be replaced.
+    workers : int, default 2
+        Threads; the artifact is the same for any number.
+    progress : Progress
+        Called with (stage, done, total).
+
+    Returns
+    -------
+    Built
+        The artifact and what is worth telling about it.
+
+    Raises
+    ------
+    ConfigError, SourceError
+        If the spec or an input cannot be used.
+    BuildError
+        If too few stars are left, or the database cannot identify its own fields.
+    OutputError
+        If the output cannot be written, or another artifact is there.
+    """
+    final = output / f"{spec.name}-{spec.version}"
+    clock = Stopwatch()
+    with partial_folder(final) as partial:
+        catalog, amplitudes = read_sources(spec, inputs, workers, progress)
+        stars, joined = _join_all(catalog.stars, amplitudes)
+        clock.lap("read")
+        selected, fields = select_stars(stars, spec)
+        clock.lap("select")
+        products = make_products(spec, catalog, selected, fields, progress)
+        matched = match_catalogs(selected, spec, inputs, workers, progress)
+        products += matched.products
+        clock.lap("products")
+        facts = write_products(partial, products, database_facts(spec))
+        clock.lap("write")
+        rates = run_self_test(partial, spec, progress)
+        clock.lap("self-test")
+        progress("report", 0, None)
+        sources = [*source_facts(catalog, selected, amplitudes, joined), *matched.sources]
+        filters = tuple(filter_coverage(step, spec) for step in selected.steps)
+        results = Results(spec, sources, products, facts, fields, filters, rates)
+        report = report_build(partial, results)
+        clock.lap("report")
+        manifest = write_manifest(partial, spec.model_dump(mode="json"), sources, facts)
+        progress("verify", 0, None)
+        check_artifact(partial)
+        check_rates(rates, spec)
+        outcome = publish(partial, final, replace=replace)
+        clock.lap("verify")
+    write_build_log(final, outcome, clock.times_s)
+    notes = (*catalog.notes, *matched.notes)
+    warnings = (*dict.fromkeys(notes), *filter(None, [holes_warning(report.gap)]))
+    return Built(
+        final, outcome, manifest, filters, report, rates, catalog.problems, warnings, clock.times_s
+    )
+
+
+def read_sources(
+    spec: BuildSpec, inputs: Inputs, workers: int, progress: Progress
+) -> tuple[Ingested, list[AmplitudeTable]]:
+    """Read the star catalog and the sources of amplitudes.
+
+    Parameters
+    ----------
+    spec : BuildSpec
+        Which sources, and the epoch.
+    inputs : mapping of str to sequence of Path
+        As for `build`.
+    workers : int
+        Threads.
+    progress : Progress
+        Passed on.
+
+    Returns
+    -------
+    catalog : Ingested
+        The star table, at the epoch of the spec.
+    amplitudes : list of AmplitudeTable
+        In the order of the spec.
+    """
+    joins = spec.selection.variables.join
+    check_inputs(spec, inputs)
+    # All inputs are found before any is read: a missing one is known at once.
+    paths = {name: locate(name, inputs) for name in spec.sources}
+    catalog = ingest(
+        spec.catalog.source,
+        paths[spec.catalog.source],
+        band=spec.catalog.band,
+        epoch_jyear=spec.epoch_jyear,
+        read_limit_mag=spec.catalog.read_limit_mag,
+        workers=workers,
+        progress=progress,
+    )
+    return catalog, [read_amplitudes(name, paths[name], progress) for name in joins]
+
+
+def check_inputs(spec: BuildSpec, inputs: Inputs) -> None:
+    """Check that the spec uses every source that an input is given for.
+
+    Parameters
+    ----------
+    spec : BuildSpec
+        Which sources.
+    inputs : mapping of str to sequence of Path
+        As for `build`.
+
+    Raises
+    ------
+    ConfigError
+        Naming the source that would be ignored.
+    """
+    for name in inputs:
+        if name not in spec.sources:
+            raise ConfigError(
+                f"--input {name}=...: {spec.name} does not read {name} but "
+                f"{', '.join(spec.sources)}; choose another preset or spec, or leave the input out",
+                key="input",
+                value=name,
+            )
+
+
+def _join_all(
+    stars: pa.Table, amplitudes: Sequence[AmplitudeTable]
+) -> tuple[pa.Table, dict[str, int]]:
+    joined: dict[str, int] = {}
+    for table in amplitudes:
+        stars, joined[table.source] = join_amplitudes(stars, table)
+    return stars, joined
+
+
+def report_build(folder: Path, results: Results) -> CoverageReport:
+    """Write the report of a build.
+
+    Parameters
+    ----------
+    folder : Path
+        With the products written; gets a folder ``report``.
+    results : Results
+        Of the stages before.
+
+    Returns
+    -------
+    CoverageReport
+        What it says about coverage.
+    """
+    facts = build_facts(folder, results)
+    (folder / "report").mkdir()
+    write_report(folder / "report", facts)
+    warning = holes_warning(facts.coverage.gap)
+    if warning is not None:
+        _logger.warning("%s: %s", facts.title, warning)
+    return facts.coverage
+
+
+def make_products(
+    spec: BuildSpec,
+    catalog: Ingested,
+    selected: Selected,
+    fields: FieldStars,
+    progress: Progress = no_progress,
+) -> list[Product]:
+    """Compute the products of an artifact.
+
+    Parameters
+    ----------
+    spec : BuildSpec
+        Which products, and their parameters.
+    catalog : Ingested
+        Records rejected while reading.
+    selected : Selected
+        Guide stars, and stars rejected by the selection.
+    fields : FieldStars
+        The tiling of the guide stars.
+    progress : Progress
+        Called with ("product <name>", 0, None).
+
+    Returns
+    -------
+    list of Product
+        In the order of the database.
+    """
+    rejected = pa.concat_tables([catalog.rejected, selected.rejected]).combine_chunks()
+    order = product_schema("rejected").order
+    products = [
+        Product("stars", selected.guide_stars),
+        Product("rejected", sort_rows(rejected, order), in_database=False),
+        boresight_product(fields, spec.boresights.brightest),
+    ]
+    sky = Sky(directions_of(selected.guide_stars), fields, spec)
+    for name in RECIPES:
+        if getattr(spec.products, name).enabled:
+            progress(f"product {name}", 0, None)
+            products.append(cook(name, sky))
+    return products
+
+
+def database_facts(spec: BuildSpec) -> dict[str, str | float]:
+    """Return the attributes of the database as a whole.
+
+    Parameters
+    ----------
+    spec : BuildSpec
+        The build.
+
+    Returns
+    -------
+    dict of str to str or float
+        Name, version, frame, epoch, camera and the whole spec as JSON.
+    """
+    camera = spec.camera.camera()
+    size = {"width_px": camera.width_px, "height_px": camera.height_px}
+    content = spec.model_dump(mode="json")
+    return {
+        "name": spec.name,
+        "version": spec.version,
+        "frame": "ICRS",
+        "epoch_jyear": spec.epoch_jyear,
+        "camera": json.dumps({**size, "focal_length_px": camera.focal_length_px}, sort_keys=True),
+        "spec": json.dumps(content, sort_keys=True),
+    }
+
+
+def run_self_test(folder: Path, spec: BuildSpec, progress: Progress) -> tuple[Rates, Rates]:
+    """Identify simulated fields with a database.
+
+    Parameters
+    ----------
+    folder : Path
+        With ``database.h5``.
+    spec : BuildSpec
+        How many fields, their noise and seed.
+    progress : Progress
+        Passed on.
+
+    Returns
+    -------
+    clean, hard : Rates
+        How they fared.
+    """
+    test = spec.self_test
+    matcher = Matcher.open(folder, None, tolerance_px=max(0.5, 4.0 * test.noise_px))
+    return self_test(matcher, test.frames, test.noise_px, test.seed, progress)
+
+
+def check_rates(rates: tuple[Rates, Rates], spec: BuildSpec) -> None:
+    """Check that a database identifies its own fields.
+
+    Parameters
+    ----------
+    rates : tuple of Rates
+        Of the self-test.
+    spec : BuildSpec
+        ``self_test.min_identified``.
+
+    Raises
+    ------
+    BuildError
+        If the clean frames fall short, or any answer was wrong.
+    """
+    clean = rates[0]
+    if clean.identified_share < spec.self_test.min_identified:
+        raise BuildError(
+            f"{spec.name}: the database identifies {clean.identified} of {clean.identifiable} "
+            f"simulated fields with at least 4 stars ({clean.frames} in all); "
+            f"self_test.min_identified asks for {spec.self_test.min_identified:.1%}. A fainter "
+            "faint_limit_mag or a wider camera gives more stars a field"
+        )
+    wrong = sum(rate.wrong for rate in rates)
+    if wrong:
+        raise BuildError(f"{spec.name}: {wrong} simulated fields got a wrong answer")

@@ -1,0 +1,380 @@
+"""Cross-identification of star tables: of a build's guide stars, and of two files.
+
+Counterparts are read at their own epochs, where their catalog knows them best, one catalog at
+a time; only rows that some star may be stay in memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from starcat.artifact.counterparts import (
+    NEEDED,
+    counterparts_of,
+    matched_stars,
+    moving_stars,
+    table_from_matches,
+)
+from starcat.artifact.manifest import SourceFacts
+from starcat.artifact.writer import Product
+from starcat.catalog.fetching.locate import locate
+from starcat.catalog.ingest import ingest
+from starcat.catalog.selection import Selected
+from starcat.catalog.stars import sort_rows
+from starcat.catalog.verdict import Reason
+from starcat.errors import ParseError, SchemaError, SourceMissing, reason
+from starcat.products.crossmatch import VERDICTS, Matches, candidate_pairs, crossmatch
+from starcat.products.match_odds import ARCSEC, MatchModel
+from starcat.progress import Progress, no_progress
+from starcat.specs.build_spec import BuildSpec, Crossmatch
+from starcat.tables.parquet import write_table
+from starcat.tables.schema import product_schema
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a cross-identification of two catalogs found.
+
+    Attributes
+    ----------
+    stars, counterparts : int
+        Rows of the two.
+    radius_arcsec : float
+        Largest separation of a candidate.
+    matched, unmatched : int
+        Stars with a counterpart, be it ambiguous, and all others.
+    verdicts : dict of str to int
+        Stars by the verdict on their likeliest candidate.
+    no_candidate : int
+        Stars with none within the radius.
+    mutual : int
+        Stars that are their likeliest candidate's likeliest star.
+    median_separation_arcsec, median_delta_mag : float or None
+        Over the matched stars; None where there is none.
+    position_error_arcsec, expected_delta_mag, completeness : float
+        The figures behind the odds, given or measured.
+    """
+
+    stars: int
+    counterparts: int
+    radius_arcsec: float
+    matched: int
+    unmatched: int
+    verdicts: dict[str, int]
+    no_candidate: int
+    mutual: int
+    median_separation_arcsec: float | None
+    median_delta_mag: float | None
+    position_error_arcsec: float
+    expected_delta_mag: float
+    completeness: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the summary as plain values.
+
+        Returns
+        -------
+        dict
+            For JSON.
+        """
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Counterparts:
+    """The counterparts of a build's guide stars.
+
+    Attributes
+    ----------
+    products : tuple of Product
+        The crossmatch product; none where the spec does not ask for it.
+    sources : tuple of SourceFacts
+        The catalogs they are of, as the manifest has them.
+    notes : tuple of str
+        What a user should know of the inputs.
+    """
+
+    products: tuple[Product, ...] = ()
+    sources: tuple[SourceFacts, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def model_from_spec(wanted: Crossmatch) -> MatchModel:
+    """Return the model of errors that a spec asks for.
+
+    Parameters
+    ----------
+    wanted : Crossmatch
+        The section of the spec.
+
+    Returns
+    -------
+    MatchModel
+        In radians.
+    """
+    error = wanted.position_error_arcsec
+    return MatchModel(
+        position_error_rad=None if error is None else error * ARCSEC,
+        unknown_motion_rad_yr=wanted.unknown_motion_mas_yr * 1e-3 * ARCSEC,
+        outlier_share=wanted.outlier_share,
+        expected_delta_mag=wanted.expected_delta_mag,
+        colour_spread_mag=wanted.colour_spread_mag,
+        completeness=wanted.completeness,
+        ambiguous_odds=wanted.ambiguous_odds,
+        min_probability=wanted.min_probability,
+    )
+
+
+def match_tables(
+    stars: pa.Table, counterparts: pa.Table, wanted: Crossmatch
+) -> tuple[pa.Table, Summary]:
+    """Find the counterparts of one star table in another.
+
+    Parameters
+    ----------
+    stars, counterparts : pyarrow.Table
+        With the columns of the stars schema that `NEEDED` lists.
+    wanted : Crossmatch
+        Radius and model.
+
+    Returns
+    -------
+    table : pyarrow.Table
+        Of the crossmatch schema.
+    summary : Summary
+        Counts and medians.
+    """
+    radius = wanted.radius_arcsec * ARCSEC
+    model = model_from_spec(wanted)
+    found = crossmatch(moving_stars(stars), moving_stars(counterparts), radius, model)
+    table = table_from_matches(found, counterparts)
+    return table, _summary(found, table, len(stars), len(counterparts), wanted.radius_arcsec)
+
+
+def _summary(found: Matches, table: pa.Table, stars: int, others: int, radius: float) -> Summary:
+    first = found.rank == 1
+    rows = matched_stars(table)
+    delta = found.delta_mag[rows]
+    delta = delta[~np.isnan(delta)]
+    angle = found.separation_rad[rows] / ARCSEC
+    return Summary(
+        stars,
+        others,
+        radius,
+        len(rows),
+        stars - len(rows),
+        {name: found.count(name) for name in VERDICTS if name != "other"},
+        stars - int(first.sum()),
+        int((first & (found.star_rank == 1)).sum()),
+        round(float(np.median(angle)), 6) if len(angle) else None,
+        round(float(np.median(delta)), 6) if len(delta) else None,
+        round(found.odds.position_error_rad / ARCSEC, 6),
+        round(found.odds.delta_mag, 6),
+        round(found.odds.completeness, 6),
+    )
+
+
+def with_rivals(selected: Selected, radius_rad: float) -> pa.Table:
+    """Return guide stars, followed by the rejected stars that may be their counterparts' own.
+
+    Parameters
+    ----------
+    selected : Selected
+        Guide stars, and the others of their catalog.
+    radius_rad : float
+        Largest separation of a candidate.
+
+    Returns
+    -------
+    pyarrow.Table
+        The guide stars in their order, then every rejected star within two radii of one.
+
+    Notes
+    -----
+    A component of a double star that is no guide star still is the better match of its own
+    entry elsewhere. Stars that were merged into a guide star are part of it.
+    """
+    guide_stars = selected.guide_stars.select(NEEDED)
+    apart = pc.not_equal(selected.rejected["reason"], Reason.merged.name)
+    others = selected.rejected.filter(apart).select(NEEDED)
+    near = candidate_pairs(moving_stars(guide_stars), moving_stars(others), 2.0 * radius_rad)
+    rivals = others.take(pa.array(np.unique(near.counterpart))).cast(guide_stars.schema)
+    return pa.concat_tables([guide_stars, rivals])
+
+
+def match_catalogs(
+    selected: Selected,
+    spec: BuildSpec,
+    inputs: Mapping[str, Sequence[Path]],
+    workers: int = 2,
+    progress: Progress = no_progress,
+) -> Counterparts:
+    """Find the counterparts of a build's guide stars in the catalogs of its spec.
+
+    Parameters
+    ----------
+    selected : Selected
+        Guide stars, in the order of the artifact, and the others of their catalog.
+    spec : BuildSpec
+        Its section ``products.crossmatch``.
+    inputs : mapping of str to sequence of Path
+        Input files or folders by source; others are looked for (`locate`).
+    workers : int, default 2
+        Threads; the result is the same for any number.
+    progress : Progress
+        Called with (stage, done, total).
+
+    Returns
+    -------
+    Counterparts
+        Nothing where the product is not enabled.
+
+    Raises
+    ------
+    SourceError
+        If a catalog is missing or damaged.
+    """
+    wanted = spec.products.crossmatch
+    if not wanted.enabled:
+        return Counterparts()
+    stars = with_rivals(selected, wanted.radius_arcsec * ARCSEC)
+    count = len(selected.guide_stars)
+    tables: list[pa.Table] = []
+    sources: list[SourceFacts] = []
+    notes: list[str] = []
+    for name in wanted.catalogs:
+        read = ingest(
+            name,
+            locate(name, inputs),
+            read_limit_mag=wanted.read_limit_mag,
+            neighbours=False,
+            workers=workers,
+            progress=progress,
+        )
+        progress("product crossmatch", 0, None)
+        table, _ = match_tables(stars, read.stars, wanted)
+        table = table.filter(pc.less(table["star"], count))
+        kept, rejected = len(read.stars), read.rejected_by_reason
+        joined = counterparts_of(table, name)
+        facts = (name, "crossmatch", read.files, read.rows_read, kept, rejected, joined)
+        tables.append(table)
+        sources.append(SourceFacts(*facts))
+        notes += read.notes
+        del read  # a whole catalog: two of them need not fit into memory
+    table = sort_rows(pa.concat_tables(tables), product_schema("crossmatch").order)
+    product = Product("crossmatch", table.combine_chunks(), in_database=False)
+    return Counterparts((product,), tuple(sources), tuple(notes))
+
+
+def match_files(a: Path, b: Path, output: Path, wanted: Crossmatch) -> Summary:
+    """Find the counterparts of the stars of one file in another.
+
+    Parameters
+    ----------
+    a, b : Path
+        Parquet files of star tables: the stars, and where their counterparts are looked for.
+    output : Path
+        Parquet file: the columns of the crossmatch schema with ``star_id`` and
+        ``star_designation`` of A in front; replaced when the new one is whole.
+    wanted : Crossmatch
+        Radius and model.
+
+    Returns
+    -------
+    Summary
+        Counts and medians.
+
+    Raises
+    ------
+    SourceError
+        If a file cannot be read.
+    SchemaError
+        If a file is no star table.
+    OutputError
+        If the output cannot be written.
+    """
+    stars, counterparts = read_star_table(a), read_star_table(b)
+    table, summary = match_tables(stars, counterparts, wanted)
+    own = stars.select(["star_id", "designation"]).take(table["star"].combine_chunks())
+    schema = table.schema.remove_metadata()
+    known = product_schema("stars").arrow_schema
+    names = {"star_id": "star_id", "designation": "star_designation"}
+    for place, (column, name) in enumerate(names.items()):
+        field = known.field(column).with_name(name)
+        table = table.add_column(place, field, own[column].combine_chunks())
+        schema = schema.insert(place, field)
+    write_table(table.cast(schema), output)
+    return summary
+
+
+def read_star_table(path: Path) -> pa.Table:
+    """Read the columns of a star table that a cross-identification needs.
+
+    Parameters
+    ----------
+    path : Path
+        A Parquet file as ``starcat ingest`` or a build writes it.
+
+    Returns
+    -------
+    pyarrow.Table
+        With the columns that `NEEDED` lists.
+
+    Raises
+    ------
+    SourceMissing
+        If there is no such file.
+    ParseError
+        If it is no Parquet file.
+    SchemaError
+        If it is no star table, or a star has no number, position or epoch.
+    """
+    hint = "give a star table, as 'starcat ingest' writes it"
+    try:
+        with pq.ParquetFile(path) as file:
+            lacking = [name for name in NEEDED if name not in file.schema_arrow.names]
+            if lacking:
+                raise SchemaError(
+                    f"{path}: no column {', '.join(lacking)}; {hint}",
+                    product="stars",
+                    field=lacking[0],
+                    found=file.schema_arrow.names,
+                    expected=NEEDED,
+                )
+            table = file.read(list(NEEDED))
+    except FileNotFoundError:
+        raise SourceMissing(f"{path}: no such file; {hint}", path=path) from None
+    except (OSError, pa.ArrowException) as error:
+        why = reason(error) if isinstance(error, OSError) else str(error)
+        raise ParseError(f"{path}: cannot be read as Parquet ({why}); {hint}", path=path) from error
+    _check_columns(table, path)
+    return table
+
+
+def _check_columns(table: pa.Table, path: Path) -> None:
+    """Check types, and that every star has what places it."""
+    for column in product_schema("stars").columns:
+        if column.name not in NEEDED:
+            continue
+        values, kind = table[column.name], column.arrow_field.type
+        blank = values.null_count
+        if column.dtype == "float64" and values.type == kind and not column.nullable:
+            blank += pc.sum(pc.invert(pc.is_finite(values))).as_py() or 0
+        if values.type != kind or (blank and not column.nullable):
+            found = f"{values.type}" if values.type != kind else f"{blank} rows without a value"
+            raise SchemaError(
+                f"{path}: {column.name}: found {found}; a star table has {kind} in every row. "
+                "Make it with 'starcat ingest'",
+                product="stars",
+                field=column.name,
+                found=found,
+                expected=str(kind),
+            )

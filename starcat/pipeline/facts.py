@@ -1,0 +1,253 @@
+"""What a build hands to its report: the results of its stages as plain data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from starcat.artifact.manifest import (
+    DATABASE_NAME,
+    ProductFacts,
+    SourceFacts,
+    software_versions,
+)
+from starcat.artifact.reader import Artifact
+from starcat.artifact.writer import Product
+from starcat.catalog.ingest import Ingested, count_by_reason
+from starcat.catalog.selection import Selected, Step
+from starcat.catalog.stars import floats_of
+from starcat.catalog.variability import AmplitudeTable
+from starcat.catalog.verdict import Reason
+from starcat.pipeline.guide_stars import MIN_GUIDE_STARS
+from starcat.pipeline.recipes import field_size
+from starcat.products.boresights import FieldStars, tile_sphere
+from starcat.products.coverage import Coverage, field_coverage
+from starcat.report.coverage import CoverageReport, report_coverage
+from starcat.report.report import BuildFacts
+from starcat.simulation.selftest import Rates
+from starcat.specs.build_spec import BuildSpec
+
+
+@dataclass(frozen=True)
+class FilterCoverage:
+    """What one filter leaves in the fields of the tiling.
+
+    Attributes
+    ----------
+    step : str
+        The filter.
+    stars : int
+        Stars left.
+    median_per_field : float
+        Stars in the field of a boresight.
+    min_per_field : int
+        The same.
+    share_below_4 : float
+        Share of the fields with fewer than 4 stars.
+    """
+
+    step: str
+    stars: int
+    median_per_field: float
+    min_per_field: int
+    share_below_4: float
+
+
+def filter_coverage(step: Step, spec: BuildSpec) -> FilterCoverage:
+    """Count what a filter leaves in the fields of the tiling.
+
+    Parameters
+    ----------
+    step : Step
+        The stars left.
+    spec : BuildSpec
+        The tiling.
+
+    Returns
+    -------
+    FilterCoverage
+        For the table of filters.
+    """
+    fields = tile_sphere(
+        spec.boresights.count,
+        step.directions,
+        np.zeros(len(step.directions)),
+        field_size(spec),
+        spec.boresights.field,
+    )
+    count = fields.count
+    return FilterCoverage(
+        step.name,
+        len(step.directions),
+        float(np.median(count)),
+        int(count.min()),
+        round(float((count < MIN_GUIDE_STARS).mean()), 9),
+    )
+
+
+def coverage_report(coverage: Coverage, spec: BuildSpec) -> CoverageReport:
+    """Return what a report says about coverage.
+
+    Parameters
+    ----------
+    coverage : Coverage
+        By boresight.
+    spec : BuildSpec
+        Says how far a field reaches at any roll: half of its narrower angle.
+
+    Returns
+    -------
+    CoverageReport
+        With the gaps of the tiling.
+    """
+    size = field_size(spec)
+    return report_coverage(coverage, 0.5 * float(np.radians(min(size.fov_x_deg, size.fov_y_deg))))
+
+
+def source_facts(
+    catalog: Ingested,
+    selected: Selected,
+    amplitudes: Sequence[AmplitudeTable],
+    joined: Mapping[str, int],
+) -> list[SourceFacts]:
+    """Return what went into a build as the manifest has it.
+
+    Parameters
+    ----------
+    catalog : Ingested
+        The star catalog.
+    selected : Selected
+        What became of its stars.
+    amplitudes : sequence of AmplitudeTable
+        The sources joined to it.
+    joined : mapping of str to int
+        Stars whose amplitude came from each.
+
+    Returns
+    -------
+    list of SourceFacts
+        The star catalog first.
+    """
+    rejected = {**catalog.rejected_by_reason, **count_by_reason(selected.rejected)}
+    for reason in catalog.rejected_by_reason.keys() & count_by_reason(selected.rejected).keys():
+        rejected[reason] += catalog.rejected_by_reason[reason]
+    facts = [
+        SourceFacts(
+            catalog.source,
+            "stars",
+            catalog.files,
+            catalog.rows_read,
+            len(selected.guide_stars),
+            rejected,
+        )
+    ]
+    for table in amplitudes:
+        read = sum(file.rows for file in table.files)
+        facts.append(
+            SourceFacts(
+                table.source,
+                "variability",
+                table.files,
+                read,
+                table.kept,
+                table.rejected,
+                joined[table.source],
+            )
+        )
+    return facts
+
+
+@dataclass(frozen=True)
+class Results:
+    """The results of a build's stages.
+
+    Attributes
+    ----------
+    spec : BuildSpec
+        The build.
+    sources : sequence of SourceFacts
+        What went in.
+    products : sequence of Product
+        What came out.
+    facts : mapping of str to ProductFacts
+        The same as the manifest has it.
+    fields : FieldStars
+        The tiling of the guide stars.
+    filters : sequence of FilterCoverage
+        What each filter left.
+    rates : sequence of Rates
+        Of the self-test.
+    """
+
+    spec: BuildSpec
+    sources: Sequence[SourceFacts]
+    products: Sequence[Product]
+    facts: Mapping[str, ProductFacts]
+    fields: FieldStars
+    filters: Sequence[FilterCoverage]
+    rates: Sequence[Rates]
+
+
+def build_facts(folder: Path, results: Results) -> BuildFacts:
+    """Return what the report of a build is made of.
+
+    Parameters
+    ----------
+    folder : Path
+        With the products written.
+    results : Results
+        Of the stages before.
+
+    Returns
+    -------
+    BuildFacts
+        Plain data.
+    """
+    spec, tables = results.spec, {product.name: product.table for product in results.products}
+    products = {name: facts.as_dict() for name, facts in results.facts.items()}
+    for facts in products.values():
+        facts["bytes"] = (folder / facts["parquet"]).stat().st_size
+    sources = [source.as_dict() for source in results.sources]
+    found = {name for source in sources for name in source["rejected"]}
+    return BuildFacts(
+        spec=spec.model_dump(mode="json"),
+        sources=sources,
+        reasons={reason.name: reason.value for reason in Reason if reason.name in found},
+        products=products,
+        database_bytes=(folder / DATABASE_NAME).stat().st_size,
+        filters=[asdict(step) for step in results.filters],
+        coverage=coverage_report(field_coverage(results.fields, spec.boresights.brightest), spec),
+        self_test=[rates.as_dict() for rates in results.rates],
+        software=software_versions(),
+        band=str(tables["stars"]["band"][0]),
+        guide_star_mag=floats_of(tables["stars"], "mag"),
+        rejected_mag=floats_of(tables["rejected"], "mag"),
+    )
+
+
+def artifact_coverage(artifact: Artifact) -> CoverageReport:
+    """Return the coverage of an artifact, from its own boresights.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        Open.
+
+    Returns
+    -------
+    CoverageReport
+        The same as the report of its build has.
+    """
+    from starcat.pipeline.facts import coverage_report
+    from starcat.products.coverage import coverage_from_counts
+    from starcat.specs.build_spec import spec_from_dict
+
+    table = artifact.table("boresights")
+    boresights = np.stack([table[name].to_numpy() for name in ("x", "y", "z")], axis=-1)
+    spec = spec_from_dict(artifact.manifest["spec"], "manifest.json")
+    counts = table["star_count"].to_numpy()
+    coverage = coverage_from_counts(boresights, counts, spec.boresights.brightest)
+    return coverage_report(coverage, spec)

@@ -1,0 +1,101 @@
+"""The build log: seconds and memory of one run, in a file beside the artifact.
+
+They differ from run to run, so they are no part of the artifact and nothing digests them.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from starcat.artifact.manifest import software_versions
+from starcat.storage.digests import json_bytes
+
+
+class Stopwatch:
+    """Seconds that each stage of a build has taken."""
+
+    def __init__(self) -> None:
+        self._began = self._last = time.perf_counter()
+        self._seconds: dict[str, float] = {}
+
+    def lap(self, stage: str) -> None:
+        """Say that a stage has ended.
+
+        Parameters
+        ----------
+        stage : str
+            Its name; the next stage begins now.
+        """
+        now = time.perf_counter()
+        self._seconds[stage] = self._seconds.get(stage, 0.0) + now - self._last
+        self._last = now
+
+    @property
+    def times_s(self) -> dict[str, float]:
+        """Seconds by stage, in order, and in all up to the last stage."""
+        total = {"total": self._last - self._began}
+        return {stage: round(taken, 4) for stage, taken in (self._seconds | total).items()}
+
+
+def peak_memory_bytes() -> int | None:
+    """Return the most memory that this process has held.
+
+    Returns
+    -------
+    int or None
+        Resident bytes; None where the system does not say.
+    """
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak
+
+
+def write_build_log(artifact: Path, outcome: str, times_s: Mapping[str, float]) -> Path:
+    """Write the log of a build beside its artifact.
+
+    Parameters
+    ----------
+    artifact : Path
+        The folder ``<name>-<version>``.
+    outcome : str
+        What happened to it.
+    times_s : mapping of str to float
+        Seconds by stage.
+
+    Returns
+    -------
+    Path
+        The file ``<name>-<version>.build.json``; that of an earlier build is replaced whole.
+    """
+    content: dict[str, Any] = {
+        "artifact": artifact.name,
+        "outcome": outcome,
+        "times_s": dict(times_s),
+        "peak_memory_bytes": peak_memory_bytes(),
+        "processors": os.cpu_count(),
+        "platform": platform.platform(),
+        "software": software_versions(),
+    }
+    final = artifact.with_name(f"{artifact.name}.build.json")
+    handle, name = tempfile.mkstemp(
+        prefix=f".{final.name}.", suffix=".partial", dir=artifact.parent
+    )
+    partial = Path(name)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(json_bytes(content))
+        partial.chmod(0o644)
+        partial.replace(final)
+    finally:
+        partial.unlink(missing_ok=True)
+    return final

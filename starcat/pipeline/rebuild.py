@@ -1,0 +1,194 @@
+"""Building an artifact again from its own manifest, and comparing the bytes."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from starcat.artifact.diff import Change, changes_between
+from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
+from starcat.artifact.reader import Artifact, open_artifact
+from starcat.catalog.fetching.locate import locate
+from starcat.catalog.readers.files import find_files
+from starcat.catalog.source import data_source
+from starcat.errors import ChecksumMismatch
+from starcat.pipeline.build import Inputs, build, check_inputs
+from starcat.progress import Progress, no_progress
+from starcat.specs.build_spec import spec_from_dict
+from starcat.storage.digests import file_sha256
+
+
+@dataclass(frozen=True)
+class FileChange:
+    """A file of an artifact that the rebuild did not reproduce.
+
+    Attributes
+    ----------
+    file : str
+        Path within the artifact.
+    what : str
+        How it differs, and whether its product does.
+    """
+
+    file: str
+    what: str
+
+
+@dataclass(frozen=True)
+class Rebuilt:
+    """The outcome of a rebuild.
+
+    Attributes
+    ----------
+    name : str
+        ``<name>-<version>``.
+    files : int
+        Files that were compared.
+    changes : tuple of FileChange
+        Those that differ; none where every byte is the same.
+    software : tuple of Change
+        Versions then (``a``) and now (``b``) that differ.
+    """
+
+    name: str
+    files: int
+    changes: tuple[FileChange, ...]
+    software: tuple[Change, ...]
+
+    @property
+    def is_identical(self) -> bool:
+        """Whether every file has the same bytes."""
+        return not self.changes
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the outcome as plain values.
+
+        Returns
+        -------
+        dict
+            For JSON.
+        """
+        return {"is_identical": self.is_identical, **asdict(self)}
+
+
+def rebuild(
+    artifact: Path,
+    inputs: Inputs,
+    output: Path | None = None,
+    progress: Progress = no_progress,
+) -> Rebuilt:
+    """Build an artifact again from its manifest, and compare every file.
+
+    Parameters
+    ----------
+    artifact : Path
+        The folder ``<name>-<version>``.
+    inputs : mapping of str to sequence of Path
+        Input files or folders by source; others are looked for (`locate`).
+    output : Path, optional
+        Folder to keep the new artifact in; without it, it is built in a temporary folder and
+        removed.
+    progress : Progress
+        Called with (stage, done, total).
+
+    Returns
+    -------
+    Rebuilt
+        Whether the bytes are the same, and what differs.
+
+    Raises
+    ------
+    ProductError
+        If the artifact has no readable manifest.
+    SourceMissing
+        If an input is not found.
+    ChecksumMismatch
+        If an input is not the file that the artifact was made from.
+    """
+    old = open_artifact(artifact)
+    spec = spec_from_dict(old.manifest["spec"], f"{artifact.name}/{MANIFEST_NAME}")
+    check_inputs(spec, inputs)
+    found = _same_inputs(old, inputs, progress)
+    if output is not None:
+        return _compare(old, build(spec, found, output, progress=progress).folder)
+    with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
+        return _compare(old, build(spec, found, Path(folder), progress=progress).folder)
+
+
+def _same_inputs(old: Artifact, given: Inputs, progress: Progress) -> Inputs:
+    """Return the inputs of a build, found to be the files that the manifest lists."""
+    found = {}
+    progress("check inputs", 0, None)
+    for facts in old.manifest["sources"]:
+        name = facts["source"]
+        found[name] = locate(name, given)
+        paths = [file.path for file in find_files(data_source(name), found[name])]
+        expected = [(file["name"], file["sha256"]) for file in facts["files"]]
+        if len(paths) != len(expected):
+            raise ChecksumMismatch(
+                f"{name}: {len(paths)} input files; {old.folder.name} was made from "
+                f"{len(expected)}: {', '.join(file for file, _ in expected)}",
+                source=name,
+            )
+        for path, (file, sha256) in zip(paths, expected, strict=True):
+            digest = file_sha256(path)
+            if digest != sha256:
+                raise ChecksumMismatch(
+                    f"{path}: sha256 {digest}; {old.folder.name} was made from {file} with "
+                    f"{sha256}. Name that file with --input {name}=PATH",
+                    source=name,
+                    path=path,
+                )
+    return found
+
+
+def _compare(old: Artifact, folder: Path) -> Rebuilt:
+    new = Artifact(folder, read_manifest(folder))
+    names = {
+        path.relative_to(place).as_posix()
+        for place in (old.folder, folder)
+        for path in place.rglob("*")
+        if path.is_file()
+    }
+    changes = [
+        FileChange(name, what) for name in sorted(names) if (what := _what_differs(name, old, new))
+    ]
+    return Rebuilt(
+        f"{new.manifest['name']}-{new.manifest['version']}",
+        len(names),
+        tuple(changes),
+        changes_between(old.manifest["software"], new.manifest["software"]),
+    )
+
+
+def _what_differs(name: str, old: Artifact, new: Artifact) -> str:
+    """Return how a file differs; empty where it has the same bytes."""
+    before, after = old.folder / name, new.folder / name
+    if not before.is_file():
+        return "missing in the artifact"
+    if not after.is_file():
+        return "not made by the rebuild"
+    digest = file_sha256(before)
+    if digest == file_sha256(after):
+        return ""
+    if name == MANIFEST_NAME:
+        keys = [change.name for change in changes_between(old.manifest, new.manifest)]
+        return f"differs in {', '.join(k for k in keys if k != 'manifest_sha256') or 'form'}"
+    if digest != old.manifest["files"].get(name, {}).get("sha256"):
+        return "changed since it was built"
+    return "built differently" + _columns_that_differ(name, old, new)
+
+
+def _columns_that_differ(name: str, old: Artifact, new: Artifact) -> str:
+    product = name.removesuffix(".parquet")
+    if product not in old.products or product not in new.products:
+        return ""
+    a, b = old.table(product), new.table(product)
+    if len(a) != len(b):
+        return f": {len(a)} rows before, {len(b)} now"
+    shared = [column for column in a.column_names if column in b.column_names]
+    differ = [column for column in shared if not a[column].equals(b[column])]
+    differ += sorted(set(a.column_names) ^ set(b.column_names))
+    return f": {', '.join(differ)}" if differ else ": the same values in other bytes"

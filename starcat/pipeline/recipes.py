@@ -1,0 +1,258 @@
+"""The product table: how each product is made from guide stars and a spec.
+
+A new product is a pure function in ``products``, a schema, a section of the spec and one line
+in `RECIPES`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from starcat.artifact.writer import Product
+from starcat.catalog.stars import directions_of, floats_of
+from starcat.geometry.sphere import radec_from_directions
+from starcat.products.boresights import FieldSize, FieldStars, NominalField, tile_sphere
+from starcat.products.grid import grid_patterns
+from starcat.products.hausdorff_angular import angular_reference_sets
+from starcat.products.hausdorff_l2 import planar_reference_sets
+from starcat.products.index import Index, Ragged
+from starcat.products.neighbours import find_neighbours
+from starcat.products.pairs import find_pairs
+from starcat.products.radial import radial_patterns
+from starcat.products.triangles import find_triangles
+from starcat.specs.build_spec import BuildSpec
+from starcat.tables.schema import ProductSchema, product_schema
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sky:
+    """What every recipe starts from.
+
+    Attributes
+    ----------
+    directions : ndarray of float64, shape (N, 3)
+        Guide stars, ICRS.
+    fields : FieldStars
+        The tiling of the sphere and the stars in each field.
+    spec : BuildSpec
+        Which products, and their parameters.
+    """
+
+    directions: Array
+    fields: FieldStars
+    spec: BuildSpec
+
+    def radius_rad(self, radius_deg: float | None, factor: float = 1.0) -> float:
+        """Return a product's radius.
+
+        Parameters
+        ----------
+        radius_deg : float, optional
+            As the spec has it.
+        factor : float
+            Times half of the camera's narrower field, where the spec has none.
+
+        Returns
+        -------
+        float
+            Radians.
+        """
+        if radius_deg is not None:
+            return float(np.radians(radius_deg))
+        camera = self.spec.camera.camera()
+        return factor * 0.5 * float(np.radians(min(camera.fov_x_deg, camera.fov_y_deg)))
+
+
+def _pairs(sky: Sky) -> Any:
+    wanted = sky.spec.products.pairs
+    most = sky.spec.camera.camera().diagonal_rad
+    if wanted.max_separation_deg is not None:
+        most = float(np.radians(wanted.max_separation_deg))
+    return find_pairs(sky.directions, float(np.radians(wanted.min_separation_deg)), most)
+
+
+def _triangles(sky: Sky) -> Any:
+    return find_triangles(sky.fields, sky.directions, sky.spec.boresights.brightest)
+
+
+def _neighbours(sky: Sky) -> Any:
+    wanted = sky.spec.products.neighbours
+    return find_neighbours(
+        sky.directions,
+        sky.radius_rad(wanted.radius_deg),
+        angle_bin_rad=float(np.radians(wanted.angle_bin_deg)),
+        separation_bin_rad=float(np.radians(wanted.separation_bin_deg)),
+    )
+
+
+def _hausdorff_angular(sky: Sky) -> Any:
+    radius_deg = sky.spec.products.hausdorff_angular.radius_deg
+    # S5: 4/3 of the field's radius.
+    return angular_reference_sets(sky.directions, sky.radius_rad(radius_deg, 4.0 / 3.0))
+
+
+def _hausdorff_l2(sky: Sky) -> Any:
+    radius_deg = sky.spec.products.hausdorff_l2.radius_deg
+    return planar_reference_sets(sky.directions, sky.radius_rad(radius_deg))
+
+
+def _grid(sky: Sky) -> Any:
+    wanted = sky.spec.products.grid
+    return grid_patterns(
+        sky.directions,
+        sky.radius_rad(wanted.radius_deg),
+        buffer_rad=float(np.radians(wanted.buffer_deg)),
+        cells_per_side=wanted.cells_per_side,
+    )
+
+
+def _radial(sky: Sky) -> Any:
+    wanted = sky.spec.products.radial
+    radius = sky.radius_rad(wanted.radius_deg)
+    return radial_patterns(sky.directions, radius, rings=wanted.rings, sectors=wanted.sectors)
+
+
+RECIPES: dict[str, Callable[[Sky], Any]] = {
+    "pairs": _pairs,
+    "triangles": _triangles,
+    "neighbours": _neighbours,
+    "hausdorff_angular": _hausdorff_angular,
+    "hausdorff_l2": _hausdorff_l2,
+    "grid": _grid,
+    "radial": _radial,
+}
+"""Every product that is made from guide stars alone, in the order of the database."""
+
+
+def field_size(spec: BuildSpec) -> FieldSize:
+    """Return the size of the tiling's fields.
+
+    Parameters
+    ----------
+    spec : BuildSpec
+        Its ``boresights`` section; the camera where that says nothing.
+
+    Returns
+    -------
+    FieldSize
+        Full angles across width and height.
+    """
+    camera, wanted = spec.camera.camera(), spec.boresights
+    return NominalField(
+        camera.fov_x_deg if wanted.fov_x_deg is None else wanted.fov_x_deg,
+        camera.fov_y_deg if wanted.fov_y_deg is None else wanted.fov_y_deg,
+    )
+
+
+def tile_guide_stars(guide_stars: pa.Table, spec: BuildSpec) -> FieldStars:
+    """Tile the sphere and find the guide stars in each field.
+
+    Parameters
+    ----------
+    guide_stars : pyarrow.Table
+        Of the stars schema.
+    spec : BuildSpec
+        Number, size and shape of the fields.
+
+    Returns
+    -------
+    FieldStars
+        In spiral order.
+    """
+    return tile_sphere(
+        spec.boresights.count,
+        directions_of(guide_stars),
+        floats_of(guide_stars, "mag"),
+        field_size(spec),
+        spec.boresights.field,
+    )
+
+
+def cook(name: str, sky: Sky) -> Product:
+    """Make one product.
+
+    Parameters
+    ----------
+    name : str
+        A key of `RECIPES`.
+    sky : Sky
+        Guide stars, tiling and spec.
+
+    Returns
+    -------
+    Product
+        Ready to be written.
+    """
+    made = RECIPES[name](sky)
+    return Product(name, table_from_result(made, product_schema(name)), made.index)
+
+
+def table_from_result(result: Any, schema: ProductSchema) -> pa.Table:
+    """Return the columns of a product's result as a table.
+
+    Parameters
+    ----------
+    result : object
+        Its attributes carry the names of the schema's columns.
+    schema : ProductSchema
+        The contract.
+
+    Returns
+    -------
+    pyarrow.Table
+        With every column of the schema, in its order.
+    """
+    arrays = []
+    for column in schema.columns:
+        values, kind = getattr(result, column.name), column.arrow_field.type
+        if isinstance(values, Ragged):
+            offsets, items = pa.array(values.offsets, pa.int32()), pa.array(values.values)
+            arrays.append(pa.ListArray.from_arrays(offsets, items).cast(kind))
+        else:
+            arrays.append(pa.array(values, kind))
+    return pa.Table.from_arrays(arrays, schema=schema.arrow_schema)
+
+
+def boresight_product(fields: FieldStars, brightest: int) -> Product:
+    """Return the boresights as a product.
+
+    Parameters
+    ----------
+    fields : FieldStars
+        The tiling.
+    brightest : int
+        Length of each field's list of stars.
+
+    Returns
+    -------
+    Product
+        One row a boresight.
+    """
+    ra_deg, dec_deg = radec_from_directions(fields.boresights)
+    u = np.ascontiguousarray(fields.boresights.T)
+    rows = np.arange(len(ra_deg), dtype=np.int32)
+    count = fields.count.astype(np.int32)
+    result = _Boresights(
+        rows, ra_deg, dec_deg, u[0], u[1], u[2], count, Ragged(*fields.brightest(brightest))
+    )
+    return Product("boresights", table_from_result(result, product_schema("boresights")), Index())
+
+
+@dataclass(frozen=True)
+class _Boresights:
+    boresight: NDArray[np.int32]
+    ra_deg: Array
+    dec_deg: Array
+    x: Array
+    y: Array
+    z: Array
+    star_count: NDArray[np.int32]
+    brightest: Ragged

@@ -1,0 +1,1 @@
+"""Simulation: skies, the frames that a camera makes of them, and the self-test of a build."""

@@ -1,0 +1,167 @@
+"""Simulated frames: what a camera at a known attitude would measure of a sky."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.geometry.attitude import random_attitudes
+from starcat.geometry.camera import Camera
+from starcat.simulation.sky import Sky
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One simulated frame.
+
+    Attributes
+    ----------
+    matrix : ndarray of float64, shape (3, 3)
+        True attitude, ``body = matrix @ icrs``.
+    centroids_px : ndarray of float64, shape (N, 2)
+        Measured centroids, in random order.
+    star_index : ndarray of int64, shape (N,)
+        Row of each centroid's guide star; -1 for another star and for a false one.
+    mag : ndarray of float64, shape (N,)
+        Measured magnitudes.
+    is_false : ndarray of bool, shape (N,)
+        Which centroids are no stars at all.
+    """
+
+    matrix: Array
+    centroids_px: Array
+    star_index: NDArray[np.int64]
+    mag: Array
+    is_false: NDArray[np.bool_]
+
+    @property
+    def n_stars(self) -> int:
+        """Centroids that are guide stars."""
+        return int((self.star_index >= 0).sum())
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What a frame suffers.
+
+    Attributes
+    ----------
+    noise_px : float
+        Standard deviation of a centroid, each axis.
+    drop_probability : float
+        Chance of a star to be missing.
+    false_stars : int
+        Spots at random places, with the magnitudes of stars drawn from the sky.
+    false_share : float
+        Further such spots, so many that they are this share of all centroids; below 1.
+    noise_mag : float
+        Standard deviation of a magnitude, before the limit decides what is seen.
+    limit_mag : float
+        Fainter ones are not seen.
+    """
+
+    noise_px: float = 0.0
+    drop_probability: float = 0.0
+    false_stars: int = 0
+    false_share: float = 0.0
+    noise_mag: float = 0.0
+    limit_mag: float = float("inf")
+
+
+def simulate_frames(
+    directions: Array,
+    camera: Camera,
+    count: int,
+    noise: Noise,
+    seed: int,
+    mag: Array | None = None,
+) -> Iterator[Frame]:
+    """Simulate frames of guide stars at attitudes uniform over all rotations.
+
+    Parameters
+    ----------
+    directions : ndarray of float64, shape (N, 3)
+        ICRS directions of the stars that the camera can see.
+    camera : Camera
+        The camera.
+    count : int
+        Number of frames.
+    noise : Noise
+        What they suffer.
+    seed : int
+        Of all that is random; the same seed gives the same frames.
+    mag : ndarray of float64, shape (N,), optional
+        Their magnitudes; 0 each by default.
+
+    Yields
+    ------
+    Frame
+        As `simulate_frame` makes them.
+    """
+    generator = np.random.default_rng(seed)
+    stars = np.arange(len(directions), dtype=np.int32)
+    sky = Sky(directions, np.zeros(len(directions)) if mag is None else mag, stars)
+    for matrix in random_attitudes(count, generator):
+        yield simulate_frame(sky, camera, matrix, noise, generator)
+
+
+def simulate_frame(
+    sky: Sky, camera: Camera, matrix: Array, noise: Noise, generator: np.random.Generator
+) -> Frame:
+    """Simulate one frame.
+
+    Parameters
+    ----------
+    sky : Sky
+        All that shines.
+    camera : Camera
+        The camera as it is, which may differ from what a matcher is told.
+    matrix : ndarray of float64, shape (3, 3)
+        Attitude, ``body = matrix @ icrs``.
+    noise : Noise
+        What the frame suffers.
+    generator : numpy.random.Generator
+        Source of randomness.
+
+    Returns
+    -------
+    Frame
+        Centroids that noise moves off the detector are lost, as they would be.
+    """
+    near = np.flatnonzero(sky.directions @ matrix[2] >= np.cos(1.05 * camera.radius_rad))
+    centroids = camera.pixels_from_directions(sky.directions[near] @ matrix.T)
+    inside = camera.contains(centroids)
+    centroids, star = centroids[inside], near[inside]
+    seen = generator.random(len(star)) >= noise.drop_probability
+    mag = sky.mag[star]
+    if noise.noise_mag > 0.0:
+        mag = mag + generator.normal(scale=noise.noise_mag, size=len(mag))
+    seen &= mag <= noise.limit_mag
+    centroids, star, mag = centroids[seen], star[seen], mag[seen]
+    centroids = centroids + generator.normal(scale=noise.noise_px, size=centroids.shape)
+    count = noise.false_stars + round(len(star) * noise.false_share / (1.0 - noise.false_share))
+    false = generator.random((count, 2)) * [camera.width_px, camera.height_px]
+    order = generator.permutation(len(star) + count)
+    centroids = np.concatenate([centroids, false])
+    order = order[camera.contains(centroids[order])]
+    borrowed = sky.mag[_visible(sky, noise.limit_mag, count, generator)]
+    return Frame(
+        matrix,
+        centroids[order],
+        np.concatenate([sky.star_index[star], np.full(count, -1)]).astype(np.int64)[order],
+        np.concatenate([mag, borrowed])[order],
+        (np.arange(len(star) + count) >= len(star))[order],
+    )
+
+
+def _visible(
+    sky: Sky, limit_mag: float, count: int, generator: np.random.Generator
+) -> NDArray[np.int64]:
+    """Draw stars up to a magnitude."""
+    bright = np.flatnonzero(sky.mag <= limit_mag)
+    return bright[generator.integers(0, max(1, len(bright)), count)] if len(bright) else bright

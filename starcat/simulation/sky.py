@@ -1,0 +1,49 @@
+"""The sky of a simulation: points of light, guide stars and others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sky:
+    """Points of light.
+
+    Attributes
+    ----------
+    directions : ndarray of float64, shape (N, 3)
+        ICRS unit vectors.
+    mag : ndarray of float64, shape (N,)
+        Magnitudes.
+    star_index : ndarray of int32, shape (N,)
+        Row of the guide star in the database, -1 for what is none.
+    """
+
+    directions: Array
+    mag: Array
+    star_index: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.mag)
+
+    def brighter(self, limit_mag: float) -> Sky:
+        """Return the points up to a magnitude.
+
+        Parameters
+        ----------
+        limit_mag : float
+            Itself included.
+
+        Returns
+        -------
+        Sky
+            In the same order.
+        """
+        seen = self.mag <= limit_mag
+        return Sky(self.directions[seen], self.mag[seen], self.star_index[seen])

@@ -1,0 +1,1 @@
+"""Specs: what a build is asked for, checked key by key."""

@@ -1,0 +1,151 @@
+"""Camera files: a camera as TOML, read and written.
+
+A camera file has the keys of `KEYS` at its top or in a table ``[camera]``, so that a build
+spec is a camera file too. What a value may be is up to `Camera`; what is wrong with it is
+said here with the file and the key.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import asdict, fields
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from starcat.errors import ConfigError, reason
+from starcat.geometry.camera import Camera
+from starcat.geometry.distortion import Distortion, checked_number
+
+SCALES = (
+    ("focal_length_px",),
+    ("fov_x_deg",),
+    ("fov_y_deg",),
+    ("fov_x_deg", "fov_y_deg"),
+    ("focal_length_mm", "pixel_um"),
+)
+"""What may be said together of how much sky a pixel sees."""
+
+SIZES = ("width_px", "height_px")
+SCALE_KEYS = tuple(dict.fromkeys(key for keys in SCALES for key in keys))
+KEYS = (*SIZES, *SCALE_KEYS, "principal_point_px", "distortion")
+COEFFICIENTS = tuple(field.name for field in fields(Distortion))
+
+
+def read_camera(path: Path) -> Camera:
+    """Read a camera from a TOML file.
+
+    Parameters
+    ----------
+    path : Path
+        A camera file, or a build spec, of which the table ``[camera]`` is read.
+
+    Returns
+    -------
+    Camera
+        Checked.
+
+    Raises
+    ------
+    ConfigError
+        If the file is missing or not TOML, or a key is unknown, missing, contradicted by
+        another or out of range.
+    """
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such camera file") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: not a readable TOML file: {reason(error)}") from error
+    except ValueError as error:
+        raise ConfigError(f"{path}: not a readable TOML file: {error}") from error
+    if "camera" not in content:
+        return _camera(content, path, "")
+    for key in KEYS:
+        if key in content:
+            raise _error(path, key, content[key], "found outside [camera]; expected in it")
+    return _camera(_table(content["camera"], path, "camera"), path, "camera.")
+
+
+def camera_toml(camera: Camera) -> str:
+    """Return the TOML text that `read_camera` reads the same camera from.
+
+    Parameters
+    ----------
+    camera : Camera
+        To be written.
+
+    Returns
+    -------
+    str
+        With all digits of the numbers.
+
+    Examples
+    --------
+    >>> print(camera_toml(Camera(1024, 768, 2000.0)), end="")
+    width_px = 1024
+    height_px = 768
+    focal_length_px = 2000.0
+    principal_point_px = [512.0, 384.0]
+    """
+    lines = [
+        f"width_px = {camera.width_px}",
+        f"height_px = {camera.height_px}",
+        f"focal_length_px = {camera.focal_length_px!r}",
+        f"principal_point_px = {list(camera.principal_point_px)!r}",
+    ]
+    if not camera.distortion.is_none:
+        lines += ["", "[distortion]"]
+        lines += [f"{name} = {value!r}" for name, value in asdict(camera.distortion).items()]
+    return "\n".join(lines) + "\n"
+
+
+def _camera(table: dict[str, Any], path: Path, prefix: str) -> Camera:
+    """Return the camera of a table whose keys stand behind a prefix."""
+    _refuse_unknown(table, KEYS, path, prefix)
+    for key in SIZES:
+        if key not in table:
+            raise _error(path, prefix + key, None, "missing; every camera needs it")
+    scale = tuple(key for key in SCALE_KEYS if key in table)
+    if scale not in SCALES:
+        raise ConfigError(
+            f"{path}: found {' and '.join(scale) or 'no scale'}; expected one of "
+            + ", ".join(" with ".join(keys) for keys in SCALES)
+        )
+    arguments = dict(table)
+    inside = _table(arguments.pop("distortion", {}), path, f"{prefix}distortion")
+    _refuse_unknown(inside, COEFFICIENTS, path, f"{prefix}distortion.")
+    where = f"{prefix}distortion."
+    try:
+        distortion = Distortion(**inside)
+        where = prefix
+        if "pixel_um" in arguments:
+            pixel_um = checked_number("pixel_um", arguments.pop("pixel_um"), 0.0)
+            length_mm = checked_number("focal_length_mm", arguments.pop("focal_length_mm"), 0.0)
+            arguments["focal_length_px"] = length_mm * 1000.0 / pixel_um
+        return Camera(**arguments, distortion=distortion)
+    except ValueError as error:
+        # The message opens with the name of what is wrong.
+        name = str(error).split()[0]
+        value = inside.get(name, table.get(name))
+        raise ConfigError(f"{path}: {where}{error}", key=where + name, value=value) from error
+
+
+def _refuse_unknown(table: dict[str, Any], known: tuple[str, ...], path: Path, prefix: str) -> None:
+    for key, value in table.items():
+        if key not in known:
+            near = get_close_matches(key, known, 1, cutoff=0.5)
+            hint = f"did you mean {near[0]!r}? " if near else ""
+            shown = key if key.isprintable() else repr(key)
+            text = f"unknown key; {hint}known keys here: {', '.join(known)}"
+            raise _error(path, prefix + shown, value, text)
+
+
+def _table(value: object, path: Path, key: str) -> dict[str, Any]:
+    if isinstance(value, dict):
+        return value
+    raise _error(path, key, value, f"found {value!r}; expected a table")
+
+
+def _error(path: Path, key: str, value: object, text: str) -> ConfigError:
+    return ConfigError(f"{path}: {key}: {text}", key=key, value=value)

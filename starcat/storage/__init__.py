@@ -1,0 +1,1 @@
+"""Storage: files that are whole or absent, their digests, and downloads."""

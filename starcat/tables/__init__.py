@@ -1,0 +1,1 @@
+"""Tables: released schemas, and Parquet files that follow them."""

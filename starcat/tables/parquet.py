@@ -1,0 +1,82 @@
+"""Parquet files: for SQL, analysis and archives; one a product."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from starcat.storage.atomic import whole_file
+from starcat.tables.votable import astropy_metadata, votable_metadata
+
+ROW_GROUP_ROWS = 1 << 17
+"""Fixed, as the size of row groups is part of the bytes."""
+
+
+def write_parquet(table: pa.Table, path: Path) -> None:
+    """Write a table, the same bytes for the same table and library.
+
+    Parameters
+    ----------
+    table : pyarrow.Table
+        The product; units and meanings are in its field metadata.
+    path : Path
+        Overwritten if it exists.
+    """
+    floating = [field.name for field in table.schema if pa.types.is_floating(field.type)]
+    # Names differ in every row: a dictionary of them would be the column again.
+    dictionary = [
+        field.name
+        for field in table.schema
+        if pa.types.is_string(field.type) and field.name != "designation"
+    ]
+    known = {**(table.schema.metadata or {}), **astropy_metadata(table)}
+    table = table.replace_schema_metadata(known)
+    with pq.ParquetWriter(
+        path,
+        table.schema,
+        compression="zstd",
+        compression_level=1,
+        use_dictionary=dictionary or False,
+        column_encoding=dict.fromkeys(floating, "BYTE_STREAM_SPLIT") or None,
+        write_statistics=True,
+    ) as writer:
+        writer.write_table(table, row_group_size=ROW_GROUP_ROWS)
+        writer.add_key_value_metadata(votable_metadata(table))
+
+
+def read_parquet(path: Path) -> pa.Table:
+    """Read a whole Parquet file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    pyarrow.Table
+        With its field metadata.
+    """
+    with pq.ParquetFile(path) as file:
+        return file.read()
+
+
+def write_table(table: pa.Table, path: Path) -> None:
+    """Write a table as a Parquet file.
+
+    Parameters
+    ----------
+    table : pyarrow.Table
+        Units and meanings are in its field metadata.
+    path : Path
+        Replaced when the new file is whole.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
+    with whole_file(path) as partial:
+        write_parquet(table, partial)
