@@ -7,6 +7,8 @@ expected and what to do next. ``exit_code`` is what the command line returns for
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
+from difflib import get_close_matches
 from pathlib import Path
 
 
@@ -29,6 +31,30 @@ def reason(error: OSError) -> str:
     'No space left on device'
     """
     return os.strerror(error.errno) if error.errno else str(error)
+
+
+def suggest(word: str, known: Iterable[str]) -> str:
+    """Return the start of a hint where a word is nearly one of those that are known.
+
+    Parameters
+    ----------
+    word : str
+        As somebody wrote it.
+    known : iterable of str
+        What it may be.
+
+    Returns
+    -------
+    str
+        ``did you mean '...'? `` with a space behind it; empty where nothing is near.
+
+    Examples
+    --------
+    >>> suggest("soa", ["sao", "gaia"])
+    "did you mean 'sao'? "
+    """
+    near = get_close_matches(word, list(known), 1, cutoff=0.5)
+    return f"did you mean {near[0]!r}? " if near else ""
 
 
 class StarcatError(Exception):

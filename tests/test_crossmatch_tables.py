@@ -17,7 +17,7 @@ import pytest
 from jsonschema import Draft202012Validator
 
 from starcat.artifact.content import content_sha256
-from starcat.artifact.counterparts import counterpart_problems, matched_stars, moving_stars
+from starcat.artifact.crossmatch_table import counterpart_problems, matched_stars, moving_stars
 from starcat.artifact.diff import diff_artifacts
 from starcat.artifact.manifest import manifest_digest
 from starcat.artifact.reader import open_artifact

@@ -23,12 +23,13 @@ import pytest
 from astropy.stats import binom_conf_interval
 
 from starcat.errors import ConfigError, ProductError
-from starcat.evaluation import registry, trial
 from starcat.evaluation import run as evaluate
+from starcat.evaluation import trial
 from starcat.evaluation.axes import AXES, axis_label
-from starcat.evaluation.campaign import Measured, Outcome, _measured, is_goal_reached, run_paper
+from starcat.evaluation.campaign import MeasuredRow, Outcome, _measured, is_goal_reached, run_paper
 from starcat.evaluation.judge import FIELDS
 from starcat.evaluation.paper import Paper, Row, Statistic
+from starcat.evaluation.papers import table as registry
 from starcat.evaluation.rates import (
     CAUSES,
     MEANINGS,
@@ -317,12 +318,12 @@ def test_two_trials_of_one_name_are_refused(small_artifact: Path, tmp_path: Path
         run_paper(paper, {"small": small_artifact}, tmp_path, workers=1)
 
 
-def measured(hits: int, hits_enough: int, mean_ms: float, **row: Any) -> Measured:
+def measured(hits: int, hits_enough: int, mean_ms: float, **row: Any) -> MeasuredRow:
     enough = Share(hits_enough, 5)
     rates = TrialRates(
         Share(5, 10), Share(hits, 10), enough, Share(0, 10), Share(0, 5), 0, mean_ms, 1.0, 1.0
     )
-    return Measured(Row("g", "l", "small", trial_of("t"), "starcat", **row), rates)
+    return MeasuredRow(Row("g", "l", "small", trial_of("t"), "starcat", **row), rates)
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ from starcat.matcher.methods.reference_sets import (
     smallest_differences,
     within_reach,
 )
-from starcat.matcher.methods.triangle_order import Selection
+from starcat.matcher.methods.triangle_order import TriangleOrder
 from starcat.matcher.observation import Observation, observe
 from starcat.products.hausdorff_angular import angular_reference_sets
 from starcat.products.hausdorff_l2 import planar_reference_sets
@@ -277,17 +277,17 @@ def test_names_outside_the_field_and_names_given_twice_are_outliers(sky, monkeyp
 def test_the_angular_method_begins_with_consensus_and_goes_on_without(sky, monkeypatch):
     frame = frames(sky, 1)[0]
     seen = observed(frame.centroids_px)
-    first = next(hausdorff_angular.candidates(seen, sky, Selection()))
+    first = next(hausdorff_angular.candidates(seen, sky, TriangleOrder()))
     assert first.stars.shape[1] > 6
     monkeypatch.setattr(hausdorff_angular, "consistent_candidates", lambda *_: iter(()))
-    first = next(hausdorff_angular.candidates(seen, sky, Selection()))
+    first = next(hausdorff_angular.candidates(seen, sky, TriangleOrder()))
     assert first.stars.shape == (1, 3)
     assert Matcher(sky, "hausdorff_angular").identify(frame.centroids_px).status == "identified"
 
 
 def test_crowded_frames_are_thinned_out(sky):
     px = np.random.default_rng(17).uniform(0.0, 1024.0, (70, 2))
-    assert list(hausdorff_angular.candidates(observed(px), sky, Selection()))
+    assert list(hausdorff_angular.candidates(observed(px), sky, TriangleOrder()))
 
 
 # Planar reference sets
@@ -790,7 +790,7 @@ def test_without_magnitudes_nothing_depends_on_brightness(matcher):
         for database in (matcher.database, fainter):
             module = {"hausdorff_angular": hausdorff_angular, "hausdorff_l2": hausdorff_l2}
             method = module.get(matcher.method, hausdorff_l1)
-            batches = list(method.candidates(seen, database, Selection()))[:20]
+            batches = list(method.candidates(seen, database, TriangleOrder()))[:20]
             proposed.append([(b.centroids.tolist(), b.stars.tolist()) for b in batches])
         assert proposed[0]
         assert proposed[0] == proposed[1]
@@ -824,7 +824,7 @@ def test_few_centroids_and_empty_sets_are_no_match(matcher, random_directions):
         px = generator.uniform(0.0, 1024.0, (count, 2))
         module = {"hausdorff_angular": hausdorff_angular, "hausdorff_l2": hausdorff_l2}
         method = module.get(matcher.method, hausdorff_l1)
-        for batch in method.candidates(observed(px), matcher.database, Selection()):
+        for batch in method.candidates(observed(px), matcher.database, TriangleOrder()):
             assert batch.stars.shape == batch.centroids.shape
 
 

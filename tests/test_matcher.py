@@ -29,7 +29,7 @@ from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods import pairs, pyramid, triangle
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.table import METHODS, best_method
-from starcat.matcher.methods.triangle_order import DEFAULT, Selection
+from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder
 from starcat.matcher.observation import Observation, observe
 from starcat.matcher.verification import REACH, agree, agreeing_centroids, verify
 from starcat.products.boresights import tile_sphere
@@ -344,7 +344,7 @@ def test_verification_of_nothing(sky):
 # --- Methods
 
 
-def proposals(matcher: Matcher, seen: Observation, selection: Selection = DEFAULT) -> Iterator:
+def proposals(matcher: Matcher, seen: Observation, selection: TriangleOrder = DEFAULT) -> Iterator:
     propose = METHODS[matcher.method].propose
     for batch in propose(seen, matcher.database, selection):
         yield from zip(batch.centroids.tolist(), batch.stars.tolist(), strict=True)
@@ -868,7 +868,7 @@ def test_only_what_the_method_needs_is_opened(small_artifact):
 
 
 def test_the_limits_of_open_reach_the_matcher(small_artifact):
-    selection = Selection("inradius")
+    selection = TriangleOrder("inradius")
     found = Matcher.open(
         small_artifact, "pairs", tolerance_px=1.5, max_false_match_probability=1e-6,
         selection=selection,

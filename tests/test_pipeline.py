@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 
 from starcat.artifact.verify import check_artifact
-from starcat.artifact.writer import publish
+from starcat.artifact.writer import move_into_place
 from starcat.errors import BuildError, OutputError, ProductError, StarcatError
 from starcat.pipeline.build import Built, build
 from starcat.specs.build_spec import preset, spec_from_dict
@@ -354,7 +354,7 @@ def test_replacing_is_undone_if_it_is_interrupted(
 
     monkeypatch.setattr(Path, "rename", stop_before_the_new)
     with pytest.raises(SystemExit):
-        publish(partial, final, replace=True)
+        move_into_place(partial, final, replace=True)
     assert (final / "manifest.json").read_text() == "small-1.0.0"
 
 

@@ -26,13 +26,13 @@ from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars
 from starcat.pipeline.build import build
 from starcat.pipeline.facts import artifact_coverage
 from starcat.products.coverage import coverage_from_counts
-from starcat.report.coverage import report_coverage
+from starcat.report.coverage_report import report_coverage
 from starcat.report.page import table
 from starcat.report.plots import draw_histogram, draw_magnitudes, save_plot
 from starcat.report.report import count_magnitudes
 from starcat.report.sky_map import HALF_HEIGHT, HALF_WIDTH, nearest_raster, project
 from starcat.specs.build_spec import BuildSpec, spec_from_dict
-from starcat.terminal.coverage import histogram_rows
+from starcat.terminal.coverage_tables import histogram_rows
 
 FILES = {
     "coverage.csv",

@@ -214,7 +214,7 @@ def test_the_values_of_a_named_query_have_its_types():
         query.with_values({"radius_arcsec": "x"})
     with pytest.raises(QueryError, match="no value 'radius'; it has: radius_arcsec"):
         query.with_values({"radius": "1"})
-    with pytest.raises(QueryError, match="did you mean crossmatch"):
+    with pytest.raises(QueryError, match="did you mean 'crossmatch'"):
         named_query("crosmatch")
 
 

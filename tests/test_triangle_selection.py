@@ -1,4 +1,4 @@
-"""Selection of triangles: S3's flow chart step by step, thresholds at both ends, three orders."""
+"""Triangles in order: S3's flow chart step by step, thresholds at both ends, three orders."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from starcat.geometry.camera import Camera
 from starcat.matcher.methods.triangle_order import (
-    Selection,
+    TriangleOrder,
     is_well_shaped,
     optimised_triangle,
     select_triangles,
@@ -168,7 +168,7 @@ def pixels_apart(observation: Observation, triangle: tuple[int, int, int]) -> li
 @pytest.mark.parametrize("order", ["auto", "brightness", "inradius", "compact"])
 def test_every_well_shaped_triangle_once(order, magnitudes):
     observation = frame(12, 22, magnitudes)
-    selection = Selection(order, min_side_px=150.0, min_angle_deg=25.0, few_centroids=0)
+    selection = TriangleOrder(order, min_side_px=150.0, min_angle_deg=25.0, few_centroids=0)
     found = select_triangles(observation, selection).tolist()
     expected = [
         list(triangle)
@@ -183,8 +183,8 @@ def test_every_well_shaped_triangle_once(order, magnitudes):
 def test_few_centroids_try_the_poor_triangles_last():
     observation = frame(10, 22)
     strict = {"order": "brightness", "min_side_px": 150.0, "min_angle_deg": 25.0}
-    good = select_triangles(observation, Selection(**strict, few_centroids=9)).tolist()
-    both = select_triangles(observation, Selection(**strict, few_centroids=10)).tolist()
+    good = select_triangles(observation, TriangleOrder(**strict, few_centroids=9)).tolist()
+    both = select_triangles(observation, TriangleOrder(**strict, few_centroids=10)).tolist()
     assert both[: len(good)] == good
     poor = [
         list(triangle)
@@ -199,7 +199,9 @@ def test_few_centroids_try_the_poor_triangles_last():
 
 @pytest.mark.parametrize(("order", "magnitudes"), [("brightness", False), ("auto", True)])
 def test_order_of_brightness_is_that_of_the_faintest(order, magnitudes):
-    found = select_triangles(frame(9, 23, magnitudes), Selection(order, few_centroids=0)).tolist()
+    found = select_triangles(
+        frame(9, 23, magnitudes), TriangleOrder(order, few_centroids=0)
+    ).tolist()
     assert found == sorted(found, key=lambda triangle: triangle[::-1])
     assert len(found) > 20
 
@@ -207,7 +209,7 @@ def test_order_of_brightness_is_that_of_the_faintest(order, magnitudes):
 @pytest.mark.parametrize(("order", "magnitudes"), [("compact", True), ("auto", False)])
 def test_compact_is_by_the_longest_side(order, magnitudes):
     observation = frame(9, 24, magnitudes)
-    found = select_triangles(observation, Selection(order, few_centroids=0))
+    found = select_triangles(observation, TriangleOrder(order, few_centroids=0))
     longest = [max(pixels_apart(observation, tuple(triangle))) for triangle in found]
     assert (np.diff(longest) >= 0.0).all()
 
@@ -216,7 +218,7 @@ def test_compact_is_by_the_longest_side(order, magnitudes):
 def test_inradius_is_largest_first(magnitudes):
     observation = frame(9, 25, magnitudes)
     inradius = []
-    for triangle in select_triangles(observation, Selection("inradius", few_centroids=0)):
+    for triangle in select_triangles(observation, TriangleOrder("inradius", few_centroids=0)):
         a, b, c = pixels_apart(observation, tuple(triangle))
         area = 0.5 * b * c * math.sin(angles_of(a, b, c)[0])
         inradius.append(2.0 * area / (a + b + c))
@@ -227,13 +229,13 @@ def test_inradius_is_largest_first(magnitudes):
 def test_equal_keys_keep_the_order_of_the_centroids():
     square = [[300.0, 300.0], [300.0, 700.0], [700.0, 300.0], [700.0, 700.0]]
     observation = observe(square, CAMERA, 2.0)
-    found = select_triangles(observation, Selection("brightness", few_centroids=0)).tolist()
+    found = select_triangles(observation, TriangleOrder("brightness", few_centroids=0)).tolist()
     assert found == [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]
 
 
 @pytest.mark.parametrize("most", [4, 7, 40])
 def test_only_the_first_centroids_take_part(most):
-    found = select_triangles(frame(40, 26), Selection(min_angle_deg=1.0, most_centroids=most))
+    found = select_triangles(frame(40, 26), TriangleOrder(min_angle_deg=1.0, most_centroids=most))
     assert found.max() == most - 1
     assert (np.diff(found, axis=1) > 0).all()
 

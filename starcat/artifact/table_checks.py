@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from starcat.artifact.content import content_sha256
-from starcat.artifact.counterparts import counterpart_problems
+from starcat.artifact.crossmatch_table import counterpart_problems
 from starcat.errors import SchemaError
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.tables.schema import ProductSchema

@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from starcat.artifact.counterparts import counterparts_of
+from starcat.artifact.crossmatch_table import counterparts_of
 from starcat.artifact.database_checks import (
     group_problems,
     index_problems,

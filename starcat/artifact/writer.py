@@ -192,7 +192,7 @@ def write_manifest(
     return manifest
 
 
-def publish(partial: Path, final: Path, *, replace: bool) -> Outcome:
+def move_into_place(partial: Path, final: Path, *, replace: bool) -> Outcome:
     """Give a complete folder its final name.
 
     Parameters

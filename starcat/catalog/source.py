@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import re
 import tomllib
-from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from starcat.errors import ConfigError
+from starcat.errors import ConfigError, suggest
 from starcat.resources import resource_folder
 
 UNITS = frozenset(
@@ -332,8 +331,7 @@ def data_source(name: str) -> DataSource:
     258997
     """
     if name not in source_names():
-        near = get_close_matches(name, source_names(), 1)
-        hint = f"did you mean {near[0]!r}? " if near else ""
+        hint = suggest(name, source_names())
         raise ConfigError(
             f"unknown source {name!r}; {hint}known sources: {', '.join(source_names())}",
             key="source",

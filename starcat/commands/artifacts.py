@@ -84,7 +84,7 @@ def coverage(
     Example: starcat coverage dist/gaia-12deg-1.0.0 -o coverage
     """
     from starcat.artifact.reader import open_artifact
-    from starcat.terminal.coverage import print_coverage
+    from starcat.terminal.coverage_tables import print_coverage
 
     print_coverage(open_artifact(artifact), output, as_json=json)
 

@@ -80,9 +80,9 @@ def ingest(
 
     Example: starcat ingest sao --input sao.dat.gz -o sao.parquet --epoch 2026.0
     """
-    from starcat.catalog.export import write_star_tables
     from starcat.catalog.fetching.locate import locate
     from starcat.catalog.ingest import ingest as read_catalog
+    from starcat.catalog.star_files import write_star_tables
     from starcat.terminal.builds import print_ingested
     from starcat.terminal.console import progress_bars
 

@@ -28,7 +28,7 @@ from starcat.progress import Progress, no_progress
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredRow:
     """A row of a paper and what was measured.
 
     Attributes
@@ -86,7 +86,7 @@ class Outcome:
         What it prints.
     is_quick : bool
         Whether fewer frames were tried than the paper's.
-    rows : tuple of Measured
+    rows : tuple of MeasuredRow
         In the paper's order.
     statistics : tuple of Statistic
         Numbers that need no trial.
@@ -94,7 +94,7 @@ class Outcome:
 
     paper: Paper
     is_quick: bool
-    rows: tuple[Measured, ...]
+    rows: tuple[MeasuredRow, ...]
     statistics: tuple[Statistic, ...]
 
     def as_dict(self) -> dict[str, Any]:
@@ -209,9 +209,9 @@ def _tasks(rows: list[Row], artifacts: Mapping[str, Path]) -> list[tuple[Trial, 
     return sorted(tasks.values(), key=lambda task: -frame_count(task[0]))
 
 
-def _measured(row: Row, records: Path) -> Measured:
+def _measured(row: Row, records: Path) -> MeasuredRow:
     rates = rates_of(records, row.rule, row.trial.attitude_limit_px)
-    return Measured(row, rates, failures_of(records, row.rule, row.trial.attitude_limit_px))
+    return MeasuredRow(row, rates, failures_of(records, row.rule, row.trial.attitude_limit_px))
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from typing import Any
 from starcat import __version__
 from starcat.errors import ConfigError
 from starcat.evaluation.campaign import Outcome, run_paper
-from starcat.evaluation.registry import papers_named
+from starcat.evaluation.papers.table import papers_named
 from starcat.evaluation.report.files import RESULTS, write_evaluation
 from starcat.evaluation.report.files import write_reproduction as write_page
 from starcat.evaluation.sweep import Sweep, sweep_paper

@@ -27,7 +27,7 @@ from starcat.evaluation.judge import Verdict, judge
 from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.methods.triangle_order import Selection
+from starcat.matcher.methods.triangle_order import TriangleOrder
 from starcat.matcher.verification import REACH
 from starcat.progress import Progress, no_progress
 from starcat.simulation.simulate import Noise, simulate_frame
@@ -92,7 +92,7 @@ class Trial:
         Whether the matcher is given magnitudes.
     answer : str
         Key of `ANSWERS`: the matcher as it is, or a paper's method without verification.
-    selection : Selection
+    selection : TriangleOrder
         Of triangles.
     guide_stars_only : bool
         Whether nothing but guide stars shines.
@@ -110,7 +110,7 @@ class Trial:
     max_false_match_probability: float = 1e-9
     with_magnitudes: bool = True
     answer: str = "matcher"
-    selection: Selection = field(default_factory=Selection)
+    selection: TriangleOrder = field(default_factory=TriangleOrder)
     guide_stars_only: bool = False
     seed: int = 1
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 
 import pyarrow as pa
 
 from starcat.artifact.reader import open_artifact
-from starcat.errors import ConfigError, SourceError, SourceMissing
+from starcat.errors import ConfigError, SourceError, SourceMissing, suggest
 from starcat.tables.parquet import read_parquet
 
 
@@ -50,8 +49,7 @@ class NamedTables:
         """
         for product in products or ():
             if product not in self.readers:
-                near = get_close_matches(product, self.readers, 1)
-                hint = f"did you mean {near[0]!r}? " if near else ""
+                hint = suggest(product, self.readers)
                 raise ConfigError(
                     f"{self.name} has no product {product!r}; {hint}it has "
                     f"{', '.join(self.readers)}",

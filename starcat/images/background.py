@@ -1,6 +1,6 @@
 """What stands above the background of a star image, and the noise that it stands in.
 
-Input is a grey image, output is a `Sky`. Background and noise vary slowly over the image, and
+Input is a grey image, output is a `Levels`. Background and noise vary slowly over the image, and
 single hot pixels can be taken out. What is a star is not decided here.
 """
 
@@ -29,7 +29,7 @@ _HOT_PART = 0.25
 
 
 @dataclass(frozen=True)
-class Sky:
+class Levels:
     """An image and its background.
 
     Attributes
@@ -72,7 +72,7 @@ def load_sep() -> Any:
         ) from error
 
 
-def subtract_background(image: ArrayLike) -> Sky:
+def subtract_background(image: ArrayLike) -> Levels:
     """Take the background off an image.
 
     Parameters
@@ -82,7 +82,7 @@ def subtract_background(image: ArrayLike) -> Sky:
 
     Returns
     -------
-    Sky
+    Levels
         The background is the mode of boxes of 64 px, smoothed over three by three boxes and
         joined by splines.
 
@@ -110,7 +110,7 @@ def subtract_background(image: ArrayLike) -> Sky:
     above = raw - background.back(dtype=np.float32)
     above[mask] = 0.0
     noise = np.maximum(background.rms(dtype=np.float32), _least_noise(raw[~mask]))
-    return Sky(raw, above, noise, mask)
+    return Levels(raw, above, noise, mask)
 
 
 def _least_noise(values: Grey) -> np.float32:
@@ -121,12 +121,12 @@ def _least_noise(values: Grey) -> np.float32:
     return np.float32(max(rounded * PIXEL_VARIANCE**0.5, 1e-5 * (highest - lowest), digits))
 
 
-def repair_hot_pixels(sky: Sky, psf_sigma_px: float) -> Sky:
+def repair_hot_pixels(levels: Levels, psf_sigma_px: float) -> Levels:
     """Replace single bright pixels by the mean of their neighbours.
 
     Parameters
     ----------
-    sky : Sky
+    levels : Levels
         An image above its background.
     psf_sigma_px : float
         Standard deviation of a star's spot: a pixel is hot if its neighbours have less than a
@@ -134,18 +134,18 @@ def repair_hot_pixels(sky: Sky, psf_sigma_px: float) -> Sky:
 
     Returns
     -------
-    Sky
+    Levels
         With another ``above``; ``raw`` stays.
     """
     centre, square = (erf(half / (np.sqrt(2.0) * psf_sigma_px)) ** 2 for half in (0.5, 1.5))
-    y, x = np.nonzero(sky.above > _HOT_NOISE * sky.noise)
-    around = pixels_around(sky.above, x, y).astype(np.float64)
+    y, x = np.nonzero(levels.above > _HOT_NOISE * levels.noise)
+    around = pixels_around(levels.above, x, y).astype(np.float64)
     pixel = around[:, 1, 1]
     neighbours = around.sum(axis=(1, 2)) - pixel
     hot = neighbours < _HOT_PART * (square / centre - 1.0) * pixel
-    above = sky.above.copy()
+    above = levels.above.copy()
     above[y[hot], x[hot]] = neighbours[hot] / 8.0
-    return replace(sky, above=above)
+    return replace(levels, above=above)
 
 
 def pixels_around(image: Grey, x: NDArray[np.int64], y: NDArray[np.int64]) -> Grey:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from starcat.errors import ConfigError
 from starcat.images.background import (
     PIXEL_VARIANCE,
-    Sky,
+    Levels,
     load_sep,
     pixels_around,
     repair_hot_pixels,
@@ -109,7 +109,7 @@ def find_spots(
     ------
     ConfigError
         If sep is not installed; if the image is not 2-D, too small, without a finite value, or
-        has too much in it to be a sky; if a parameter is not positive.
+        has too much in it to be a levels; if a parameter is not positive.
 
     References
     ----------
@@ -121,14 +121,14 @@ def find_spots(
         saturation=saturation,
         gain_e_per_adu=gain_e_per_adu,
     )
-    sky = subtract_background(image)
+    levels = subtract_background(image)
     sigma = psf_sigma_px
     if sigma is None:
-        sky = repair_hot_pixels(sky, _SIGMA_RANGE_PX[0])
-        sigma = _measured_sigma(sky, _detect(sky, 1.0, threshold_sigma))
-    sky = repair_hot_pixels(sky, sigma)
-    found = _detect(sky, float(sigma), threshold_sigma)
-    return _measured(sky, found, float(sigma), saturation, gain_e_per_adu)
+        levels = repair_hot_pixels(levels, _SIGMA_RANGE_PX[0])
+        sigma = _measured_sigma(levels, _detect(levels, 1.0, threshold_sigma))
+    levels = repair_hot_pixels(levels, sigma)
+    found = _detect(levels, float(sigma), threshold_sigma)
+    return _measured(levels, found, float(sigma), saturation, gain_e_per_adu)
 
 
 def _check_positive(**values: float | None) -> None:
@@ -139,7 +139,7 @@ def _check_positive(**values: float | None) -> None:
             )
 
 
-def _detect(sky: Sky, sigma: float, threshold: float) -> NDArray[Any]:
+def _detect(levels: Levels, sigma: float, threshold: float) -> NDArray[Any]:
     """Return sep's table of what stands out after smoothing with a star's shape.
 
     Filter "conv" with the threshold in units of the smoothed noise, and no cleaning: sep's
@@ -151,55 +151,66 @@ def _detect(sky: Sky, sigma: float, threshold: float) -> NDArray[Any]:
     smoothed = threshold * float(np.sqrt((kernel**2).sum()))
     try:
         found = load_sep().extract(
-            sky.above, smoothed, err=sky.noise, mask=sky.mask, minarea=1, clean=False,
+            levels.above, smoothed, err=levels.noise, mask=levels.mask, minarea=1, clean=False,
             filter_kernel=kernel, filter_type="conv",
         )  # fmt: skip
     except Exception as error:  # sep raises nothing more special when a buffer is full
         raise ConfigError(
-            f"the image has too much in it to be a sky ({error}); raise the threshold "
+            f"the image has too much in it to be a levels ({error}); raise the threshold "
             f"({threshold:g} sigma) or check that it is a star image"
         ) from error
     return np.asarray(found)
 
 
-def _measured_sigma(sky: Sky, found: NDArray[Any]) -> float:
+def _measured_sigma(levels: Levels, found: NDArray[Any]) -> float:
     """Return sigma of the spots that stand out well, from the radius with half of their light.
 
     Of these the middle by brightness: the brightest may be saturated, which makes them wide.
     """
     order = np.argsort(-found["flux"], kind="stable")
-    clear = int((found["flux"] > _CLEAR_NOISE * sky.noise[found["ypeak"], found["xpeak"]]).sum())
+    clear = int((found["flux"] > _CLEAR_NOISE * levels.noise[found["ypeak"], found["xpeak"]]).sum())
     first = max(clear - _SIGMA_SPOTS, 0) // 2
     chosen = found[order[first : first + min(max(clear, 3), _SIGMA_SPOTS)]]
     if not len(chosen):
         return 1.0
     widest = np.full(len(chosen), _WIDEST_RADIUS_PX)
     radius, _ = load_sep().flux_radius(
-        sky.above, chosen["x"], chosen["y"], widest, 0.5, mask=sky.mask, subpix=5
+        levels.above, chosen["x"], chosen["y"], widest, 0.5, mask=levels.mask, subpix=5
     )
     variance = np.median(radius) ** 2 / (2.0 * np.log(2.0)) - PIXEL_VARIANCE
     return float(np.clip(np.sqrt(max(variance, 0.0)), *_SIGMA_RANGE_PX))
 
 
 def _measured(
-    sky: Sky, found: NDArray[Any], sigma: float, saturation: float | None, gain: float | None
+    levels: Levels,
+    found: NDArray[Any],
+    sigma: float,
+    saturation: float | None,
+    gain: float | None,
 ) -> Spots:
     """Measure place and light of what was found, and put it into order."""
     seen = float(np.sqrt(sigma**2 + PIXEL_VARIANCE))
-    centroids = _windowed(sky, found, max(seen, _NARROWEST_WINDOW_PX))
+    centroids = _windowed(levels, found, max(seen, _NARROWEST_WINDOW_PX))
     x, y = (centroids - 0.5).T
     part, error, _ = load_sep().sum_circle(
-        sky.above, x, y, _APERTURE_SIGMA * seen, err=sky.noise, mask=sky.mask, gain=gain, subpix=0
+        levels.above,
+        x,
+        y,
+        _APERTURE_SIGMA * seen,
+        err=levels.noise,
+        mask=levels.mask,
+        gain=gain,
+        subpix=0,
     )
     flux = part / (1.0 - np.exp(-0.5 * _APERTURE_SIGMA**2))
-    to_edge = np.minimum(centroids, sky.raw.shape[::-1] - centroids).min(axis=1)
+    to_edge = np.minimum(centroids, levels.raw.shape[::-1] - centroids).min(axis=1)
     order = brightest_first(flux, centroids)[: np.count_nonzero(flux > 0.0)]
     return Spots(
         centroids[order],
         flux[order],
         -2.5 * np.log10(flux[order]),
         part[order] / error[order],
-        _is_saturated(sky, found, saturation)[order],
+        _is_saturated(levels, found, saturation)[order],
         _is_blended(found)[order],
         to_edge[order] < _EDGE_SIGMA * seen,
         sigma,
@@ -224,21 +235,23 @@ def brightest_first(flux: Array, centroids_px: Array) -> NDArray[np.int64]:
     return np.lexsort((centroids_px[:, 1], centroids_px[:, 0], -flux))
 
 
-def _is_saturated(sky: Sky, found: NDArray[Any], saturation: float | None) -> NDArray[np.bool_]:
+def _is_saturated(
+    levels: Levels, found: NDArray[Any], saturation: float | None
+) -> NDArray[np.bool_]:
     """Return which spots reach the limit, given or seen as a plateau at the image's maximum."""
-    around = pixels_around(sky.raw, found["xpeak"], found["ypeak"])
+    around = pixels_around(levels.raw, found["xpeak"], found["ypeak"])
     if saturation is not None:
         return np.asarray((around >= saturation).any(axis=(1, 2)))
-    read_noise = _PLATEAU_NOISE * float(np.median(sky.noise))
-    depth = min(read_noise, _PLATEAU_DEPTH * float(sky.above.max()))
-    at_limit = around >= float(sky.raw[~sky.mask].max()) - depth
+    read_noise = _PLATEAU_NOISE * float(np.median(levels.noise))
+    depth = min(read_noise, _PLATEAU_DEPTH * float(levels.above.max()))
+    at_limit = around >= float(levels.raw[~levels.mask].max()) - depth
     return np.asarray(at_limit.sum(axis=(1, 2)) >= _PLATEAU_PIXELS)
 
 
-def _windowed(sky: Sky, found: NDArray[Any], window: float) -> Array:
+def _windowed(levels: Levels, found: NDArray[Any], window: float) -> Array:
     """Return windowed centroids; barycentres where a window drifts to the spot beside it."""
     start = np.stack([found["x"], found["y"]], axis=1)
-    x, y, _ = load_sep().winpos(sky.above, *start.T, window, mask=sky.mask, subpix=0)
+    x, y, _ = load_sep().winpos(levels.above, *start.T, window, mask=levels.mask, subpix=0)
     centroids = np.stack([x, y], axis=1)
     drifts = _is_blended(found) & (np.hypot(*(centroids - start).T) > 0.5 * window)
     # sep counts from the centre of the first pixel.

@@ -23,7 +23,7 @@ IMAGE_SUFFIXES = (".fits", ".fit", ".fts", ".gz", ".fz", ".png", ".tif", ".tiff"
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredFile:
     """What a file holds.
 
     Attributes
@@ -38,7 +38,7 @@ class Measured:
     image: NDArray[Any] | None = None
 
 
-def measure(path: Path, *, flip: bool | None = None) -> Measured:
+def measure(path: Path, *, flip: bool | None = None) -> MeasuredFile:
     """Read centroids, or find them in an image.
 
     Parameters
@@ -50,7 +50,7 @@ def measure(path: Path, *, flip: bool | None = None) -> Measured:
 
     Returns
     -------
-    Measured
+    MeasuredFile
         One frame for CSV and images.
 
     Raises
@@ -59,23 +59,23 @@ def measure(path: Path, *, flip: bool | None = None) -> Measured:
         If the file cannot be read, or images cannot be for lack of a package.
     """
     if path.suffix.lower() not in IMAGE_SUFFIXES:
-        return Measured(read_frames(path))
+        return MeasuredFile(read_frames(path))
     from starcat.images.centroiding import find_spots
     from starcat.images.image_file import read_image
 
     image = read_image(path, flip=flip)
     spots = find_spots(image)
-    return Measured([MeasuredFrame(path.stem, spots.centroids_px, spots.mag)], image)
+    return MeasuredFile([MeasuredFrame(path.stem, spots.centroids_px, spots.mag)], image)
 
 
-def identify_frames(matcher: Matcher, measured: Measured, camera: Camera) -> list[MatchResult]:
+def identify_frames(matcher: Matcher, measured: MeasuredFile, camera: Camera) -> list[MatchResult]:
     """Identify the frames of a file.
 
     Parameters
     ----------
     matcher : Matcher
         With a database open.
-    measured : Measured
+    measured : MeasuredFile
         The frames.
     camera : Camera
         That took them.
@@ -133,7 +133,7 @@ def write_simulated(path: Path, frame: Frame, camera: Camera, seed: int) -> None
 
 
 def draw(
-    path: Path, measured: Measured, result: MatchResult, database: Database, camera: Camera
+    path: Path, measured: MeasuredFile, result: MatchResult, database: Database, camera: Camera
 ) -> None:
     """Draw the first frame of a file with its stars circled and named.
 
@@ -141,7 +141,7 @@ def draw(
     ----------
     path : Path
         PNG or SVG file to write.
-    measured : Measured
+    measured : MeasuredFile
         The frames.
     result : MatchResult
         The answer to the first one.

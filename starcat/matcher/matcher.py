@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database, open_database, products_in
 from starcat.matcher.methods.table import METHODS, best_method, method_named
-from starcat.matcher.methods.triangle_order import DEFAULT, Selection
+from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder
 from starcat.matcher.observation import Observation, observe
 from starcat.matcher.result import MatchResult, identified, unidentified
 from starcat.matcher.verification import MIN_STARS, Agreement, verify
@@ -41,7 +41,7 @@ class Matcher:
         Largest error of a centroid, as a radius.
     max_false_match_probability : float
         Answers that chance would give more often than this are withheld.
-    selection : Selection
+    selection : TriangleOrder
         Which triangles of centroids are tried, for the methods that choose some.
     max_batches : int
         Batches of candidates tried before giving up.
@@ -51,7 +51,7 @@ class Matcher:
     method: str = "triangle"
     tolerance_px: float = 2.0
     max_false_match_probability: float = CERTAIN
-    selection: Selection = DEFAULT
+    selection: TriangleOrder = DEFAULT
     max_batches: int = 200
 
     @classmethod
@@ -62,7 +62,7 @@ class Matcher:
         *,
         tolerance_px: float = 2.0,
         max_false_match_probability: float = CERTAIN,
-        selection: Selection = DEFAULT,
+        selection: TriangleOrder = DEFAULT,
     ) -> Matcher:
         """Open the database of an artifact.
 

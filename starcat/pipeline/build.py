@@ -19,8 +19,8 @@ from starcat.artifact.verify import check_artifact
 from starcat.artifact.writer import (
     Outcome,
     Product,
+    move_into_place,
     partial_folder,
-    publish,
     write_manifest,
     write_products,
 )
@@ -41,10 +41,10 @@ from starcat.pipeline.facts import (
 )
 from starcat.pipeline.guide_stars import select_stars
 from starcat.pipeline.log import Stopwatch, write_build_log
-from starcat.pipeline.recipes import RECIPES, Sky, boresight_product, cook
+from starcat.pipeline.recipes import RECIPES, Ingredients, boresight_product, cook
 from starcat.products.boresights import FieldStars
 from starcat.progress import Progress, no_progress
-from starcat.report.coverage import CoverageReport, holes_warning
+from starcat.report.coverage_report import CoverageReport, holes_warning
 from starcat.report.report import write_report
 from starcat.simulation.selftest import Rates, self_test
 from starcat.specs.build_spec import BuildSpec
@@ -158,7 +158,7 @@ def build(
         progress("verify", 0, None)
         check_artifact(partial)
         check_rates(rates, spec)
-        outcome = publish(partial, final, replace=replace)
+        outcome = move_into_place(partial, final, replace=replace)
         clock.lap("verify")
     write_build_log(final, outcome, clock.times_s)
     notes = (*catalog.notes, *matched.notes)
@@ -299,11 +299,11 @@ def make_products(
         Product("rejected", sort_rows(rejected, order), in_database=False),
         boresight_product(fields, spec.boresights.brightest),
     ]
-    sky = Sky(directions_of(selected.guide_stars), fields, spec)
+    given = Ingredients(directions_of(selected.guide_stars), fields, spec)
     for name in RECIPES:
         if getattr(spec.products, name).enabled:
             progress(f"product {name}", 0, None)
-            products.append(cook(name, sky))
+            products.append(cook(name, given))
     return products
 
 

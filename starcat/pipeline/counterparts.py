@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from starcat.artifact.counterparts import (
+from starcat.artifact.crossmatch_table import (
     NEEDED,
     counterparts_of,
     matched_stars,

@@ -25,7 +25,7 @@ from starcat.pipeline.guide_stars import MIN_GUIDE_STARS
 from starcat.pipeline.recipes import field_size
 from starcat.products.boresights import FieldStars, tile_sphere
 from starcat.products.coverage import Coverage, field_coverage
-from starcat.report.coverage import CoverageReport, report_coverage
+from starcat.report.coverage_report import CoverageReport, report_coverage
 from starcat.report.report import BuildFacts
 from starcat.simulation.selftest import Rates
 from starcat.specs.build_spec import BuildSpec

@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Sky:
+class Ingredients:
     """What every recipe starts from.
 
     Attributes
@@ -71,56 +71,56 @@ class Sky:
         return factor * 0.5 * float(np.radians(min(camera.fov_x_deg, camera.fov_y_deg)))
 
 
-def _pairs(sky: Sky) -> Any:
-    wanted = sky.spec.products.pairs
-    most = sky.spec.camera.camera().diagonal_rad
+def _pairs(given: Ingredients) -> Any:
+    wanted = given.spec.products.pairs
+    most = given.spec.camera.camera().diagonal_rad
     if wanted.max_separation_deg is not None:
         most = float(np.radians(wanted.max_separation_deg))
-    return find_pairs(sky.directions, float(np.radians(wanted.min_separation_deg)), most)
+    return find_pairs(given.directions, float(np.radians(wanted.min_separation_deg)), most)
 
 
-def _triangles(sky: Sky) -> Any:
-    return find_triangles(sky.fields, sky.directions, sky.spec.boresights.brightest)
+def _triangles(given: Ingredients) -> Any:
+    return find_triangles(given.fields, given.directions, given.spec.boresights.brightest)
 
 
-def _neighbours(sky: Sky) -> Any:
-    wanted = sky.spec.products.neighbours
+def _neighbours(given: Ingredients) -> Any:
+    wanted = given.spec.products.neighbours
     return find_neighbours(
-        sky.directions,
-        sky.radius_rad(wanted.radius_deg),
+        given.directions,
+        given.radius_rad(wanted.radius_deg),
         angle_bin_rad=float(np.radians(wanted.angle_bin_deg)),
         separation_bin_rad=float(np.radians(wanted.separation_bin_deg)),
     )
 
 
-def _hausdorff_angular(sky: Sky) -> Any:
-    radius_deg = sky.spec.products.hausdorff_angular.radius_deg
+def _hausdorff_angular(given: Ingredients) -> Any:
+    radius_deg = given.spec.products.hausdorff_angular.radius_deg
     # S5: 4/3 of the field's radius.
-    return angular_reference_sets(sky.directions, sky.radius_rad(radius_deg, 4.0 / 3.0))
+    return angular_reference_sets(given.directions, given.radius_rad(radius_deg, 4.0 / 3.0))
 
 
-def _hausdorff_l2(sky: Sky) -> Any:
-    radius_deg = sky.spec.products.hausdorff_l2.radius_deg
-    return planar_reference_sets(sky.directions, sky.radius_rad(radius_deg))
+def _hausdorff_l2(given: Ingredients) -> Any:
+    radius_deg = given.spec.products.hausdorff_l2.radius_deg
+    return planar_reference_sets(given.directions, given.radius_rad(radius_deg))
 
 
-def _grid(sky: Sky) -> Any:
-    wanted = sky.spec.products.grid
+def _grid(given: Ingredients) -> Any:
+    wanted = given.spec.products.grid
     return grid_patterns(
-        sky.directions,
-        sky.radius_rad(wanted.radius_deg),
+        given.directions,
+        given.radius_rad(wanted.radius_deg),
         buffer_rad=float(np.radians(wanted.buffer_deg)),
         cells_per_side=wanted.cells_per_side,
     )
 
 
-def _radial(sky: Sky) -> Any:
-    wanted = sky.spec.products.radial
-    radius = sky.radius_rad(wanted.radius_deg)
-    return radial_patterns(sky.directions, radius, rings=wanted.rings, sectors=wanted.sectors)
+def _radial(given: Ingredients) -> Any:
+    wanted = given.spec.products.radial
+    radius = given.radius_rad(wanted.radius_deg)
+    return radial_patterns(given.directions, radius, rings=wanted.rings, sectors=wanted.sectors)
 
 
-RECIPES: dict[str, Callable[[Sky], Any]] = {
+RECIPES: dict[str, Callable[[Ingredients], Any]] = {
     "pairs": _pairs,
     "triangles": _triangles,
     "neighbours": _neighbours,
@@ -176,14 +176,14 @@ def tile_guide_stars(guide_stars: pa.Table, spec: BuildSpec) -> FieldStars:
     )
 
 
-def cook(name: str, sky: Sky) -> Product:
+def cook(name: str, given: Ingredients) -> Product:
     """Make one product.
 
     Parameters
     ----------
     name : str
         A key of `RECIPES`.
-    sky : Sky
+    given : Ingredients
         Guide stars, tiling and spec.
 
     Returns
@@ -191,7 +191,7 @@ def cook(name: str, sky: Sky) -> Product:
     Product
         Ready to be written.
     """
-    made = RECIPES[name](sky)
+    made = RECIPES[name](given)
     return Product(name, table_from_result(made, product_schema(name)), made.index)
 
 

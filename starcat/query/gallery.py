@@ -6,7 +6,6 @@ The comments above a query say what it finds, how many targets it needs where th
 
 from __future__ import annotations
 
-import difflib
 import json
 import re
 from collections.abc import Mapping
@@ -14,7 +13,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from starcat.errors import QueryError
+from starcat.errors import QueryError, suggest
 
 FOLDER = Path(__file__).parent / "sql" / "gallery"
 
@@ -139,9 +138,8 @@ def named_query(name: str) -> NamedQuery:
     """
     known = gallery()
     if name not in known:
-        near = difflib.get_close_matches(name, known, 1)
-        hint = f"; did you mean {near[0]}?" if near else ""
-        raise QueryError(f"no query named {name!r}{hint} 'starcat sql --list' shows all")
+        hint = suggest(name, known)
+        raise QueryError(f"no query named {name!r}; {hint}'starcat sql --list' shows all")
     return known[name]
 
 

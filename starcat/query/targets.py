@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
-from starcat.catalog.export import rejected_path
+from starcat.catalog.star_files import rejected_path
 from starcat.errors import ProductError, QueryError
 from starcat.progress import Progress, no_progress
 from starcat.tables.schema import ProductSchema, product_schema

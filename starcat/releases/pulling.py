@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
 from starcat.artifact.verify import check_artifact, verify_artifact
-from starcat.artifact.writer import publish
+from starcat.artifact.writer import move_into_place
 from starcat.errors import OutputError, ProductError, SchemaError
 from starcat.progress import Progress, no_progress
 from starcat.releases.files import locked, sync_folder, writing
@@ -109,7 +109,7 @@ def pull_release(
         if _is_there(final, release):  # another pull was faster, or killed after the last step
             return Pulled(release, registry.address, final, "unchanged")
         whole = _assemble(registry, release, place, progress)
-        publish(whole, final, replace=False)
+        move_into_place(whole, final, replace=False)
         sync_folder(output)
     return Pulled(release, registry.address, final, "pulled")
 

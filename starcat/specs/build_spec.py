@@ -7,7 +7,6 @@ and an unknown key is refused with the nearest known name. It travels whole in t
 from __future__ import annotations
 
 import tomllib
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,7 +20,7 @@ from pydantic import (
     model_validator,
 )
 
-from starcat.errors import ConfigError
+from starcat.errors import ConfigError, suggest
 from starcat.geometry.camera import Camera
 from starcat.resources import resource_folder
 
@@ -413,8 +412,7 @@ def _explain(error: dict[str, Any]) -> str:
     kind, context = error["type"], error.get("ctx", {})
     if kind == "extra_forbidden":
         known = _known_keys(error["loc"][:-1])
-        near = get_close_matches(str(error["loc"][-1]), known, 1, cutoff=0.5)
-        hint = f"did you mean {near[0]!r}? " if near else ""
+        hint = suggest(str(error["loc"][-1]), known)
         return f"unknown key; {hint}known keys here: {', '.join(known)}"
     if kind == "missing":
         return "missing; every spec needs it"
@@ -467,8 +465,7 @@ def preset(name: str) -> BuildSpec:
         If there is none of that name, with the nearest that there is.
     """
     if name not in preset_names():
-        near = get_close_matches(name, preset_names(), 1)
-        hint = f"did you mean {near[0]!r}? " if near else ""
+        hint = suggest(name, preset_names())
         raise ConfigError(
             f"unknown preset {name!r}; {hint}known presets: {', '.join(preset_names())}",
             key="preset",

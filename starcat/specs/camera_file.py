@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import asdict, fields
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from starcat.errors import ConfigError, reason
+from starcat.errors import ConfigError, reason, suggest
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion, checked_number
 
@@ -134,8 +133,7 @@ def _camera(table: dict[str, Any], path: Path, prefix: str) -> Camera:
 def _refuse_unknown(table: dict[str, Any], known: tuple[str, ...], path: Path, prefix: str) -> None:
     for key, value in table.items():
         if key not in known:
-            near = get_close_matches(key, known, 1, cutoff=0.5)
-            hint = f"did you mean {near[0]!r}? " if near else ""
+            hint = suggest(key, known)
             shown = key if key.isprintable() else repr(key)
             text = f"unknown key; {hint}known keys here: {', '.join(known)}"
             raise _error(path, prefix + shown, value, text)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from starcat.errors import SourceError
 from starcat.terminal.console import print_json, print_table, say
-from starcat.terminal.coverage import print_coverage_table
+from starcat.terminal.coverage_tables import print_coverage_table
 
 if TYPE_CHECKING:
     from starcat.artifact.reader import Artifact
@@ -127,7 +127,7 @@ def print_ingested(read: Ingested, output: Path, *, as_json: bool) -> None:
     as_json : bool
         Whether to print JSON.
     """
-    from starcat.catalog.export import rejected_path
+    from starcat.catalog.star_files import rejected_path
 
     facts = {
         "source": read.source,

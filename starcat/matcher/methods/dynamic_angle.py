@@ -17,7 +17,7 @@ from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.pairs import side_tolerance_rad
 from starcat.matcher.methods.reference import Surroundings, by_reference, rows_between, surroundings
-from starcat.matcher.methods.triangle_order import Selection
+from starcat.matcher.methods.triangle_order import TriangleOrder
 from starcat.matcher.observation import Observation
 
 Array = NDArray[np.float64]
@@ -57,7 +57,7 @@ class Tolerance:
 
 
 def candidates(
-    observation: Observation, database: Database, selection: Selection
+    observation: Observation, database: Database, selection: TriangleOrder
 ) -> Iterator[Candidates]:
     """Propose what a reference star and the farthest neighbour that agrees are.
 
@@ -67,7 +67,7 @@ def candidates(
         The frame.
     database : Database
         With the product ``neighbours``.
-    selection : Selection
+    selection : TriangleOrder
         Without effect: no triangles are chosen.
 
     Yields

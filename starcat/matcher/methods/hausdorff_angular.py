@@ -25,7 +25,7 @@ from starcat.matcher.methods.reference_sets import (
     smallest_differences,
     within_reach,
 )
-from starcat.matcher.methods.triangle_order import Selection
+from starcat.matcher.methods.triangle_order import TriangleOrder
 from starcat.matcher.observation import Observation
 
 Array = NDArray[np.float64]
@@ -44,7 +44,7 @@ _AT_ONCE = 1 << 22
 
 
 def candidates(
-    observation: Observation, database: Database, selection: Selection
+    observation: Observation, database: Database, selection: TriangleOrder
 ) -> Iterator[Candidates]:
     """Propose names of centroids that agree with each other.
 
@@ -54,7 +54,7 @@ def candidates(
         The frame.
     database : Database
         With the product ``hausdorff_angular``.
-    selection : Selection
+    selection : TriangleOrder
         Without effect: no triangles are chosen.
 
     Yields

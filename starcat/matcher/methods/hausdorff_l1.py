@@ -19,7 +19,7 @@ from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.consensus import neighbour_candidates
 from starcat.matcher.methods.reference import by_reference, references, surroundings
 from starcat.matcher.methods.reference_sets import lowest, means_of_minima
-from starcat.matcher.methods.triangle_order import Selection
+from starcat.matcher.methods.triangle_order import TriangleOrder
 from starcat.matcher.observation import Observation
 
 Array = NDArray[np.float64]
@@ -37,7 +37,7 @@ _UP = np.array([0.0, -1.0, 0.0])
 
 
 def candidates(
-    observation: Observation, database: Database, selection: Selection
+    observation: Observation, database: Database, selection: TriangleOrder
 ) -> Iterator[Candidates]:
     """Propose what a reference star and two of its neighbours are, if the roll is 0.
 
@@ -47,7 +47,7 @@ def candidates(
         The frame.
     database : Database
         With the product ``hausdorff_l2``.
-    selection : Selection
+    selection : TriangleOrder
         Without effect: no triangles are chosen.
 
     Yields

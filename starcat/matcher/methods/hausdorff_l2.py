@@ -25,7 +25,7 @@ from starcat.matcher.methods.reference_sets import (
     reference_sets,
     within_reach,
 )
-from starcat.matcher.methods.triangle_order import Selection
+from starcat.matcher.methods.triangle_order import TriangleOrder
 from starcat.matcher.observation import Observation
 
 Array = NDArray[np.float64]
@@ -39,7 +39,7 @@ the best stars of each pair of divisors become candidates, one round after the o
 
 
 def candidates(
-    observation: Observation, database: Database, selection: Selection
+    observation: Observation, database: Database, selection: TriangleOrder
 ) -> Iterator[Candidates]:
     """Propose what a reference star and two of its neighbours are.
 
@@ -49,7 +49,7 @@ def candidates(
         The frame.
     database : Database
         With the product ``hausdorff_l2``.
-    selection : Selection
+    selection : TriangleOrder
         Without effect: no triangles are chosen.
 
     Yields

@@ -16,7 +16,7 @@ from starcat.geometry.kvector import KVector
 from starcat.geometry.sphere import separation
 from starcat.matcher.database import Database
 from starcat.matcher.methods.candidates import Candidates
-from starcat.matcher.methods.triangle_order import Selection, select_triangles
+from starcat.matcher.methods.triangle_order import TriangleOrder, select_triangles
 from starcat.matcher.observation import Observation
 
 Rows = NDArray[np.intp]
@@ -25,7 +25,7 @@ PRODUCTS = ("pairs",)
 
 
 def candidates(
-    observation: Observation, database: Database, selection: Selection
+    observation: Observation, database: Database, selection: TriangleOrder
 ) -> Iterator[Candidates]:
     """Propose the triangles of stars that observed triangles may be.
 
@@ -35,7 +35,7 @@ def candidates(
         The frame.
     database : Database
         With the product ``pairs``.
-    selection : Selection
+    selection : TriangleOrder
         Which observed triangles, and in what order.
 
     Yields

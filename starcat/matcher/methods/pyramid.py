@@ -15,7 +15,7 @@ from starcat.geometry.sphere import separation
 from starcat.matcher.database import Database
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.pairs import directed_pairs, side_tolerance_rad, triangles_of_stars
-from starcat.matcher.methods.triangle_order import Selection, select_triangles
+from starcat.matcher.methods.triangle_order import TriangleOrder, select_triangles
 from starcat.matcher.observation import Observation
 
 Rows = NDArray[np.intp]
@@ -24,7 +24,7 @@ PRODUCTS = ("pairs",)
 
 
 def candidates(
-    observation: Observation, database: Database, selection: Selection
+    observation: Observation, database: Database, selection: TriangleOrder
 ) -> Iterator[Candidates]:
     """Propose the pyramids of stars that observed pyramids may be.
 
@@ -34,7 +34,7 @@ def candidates(
         The frame.
     database : Database
         With the product ``pairs``.
-    selection : Selection
+    selection : TriangleOrder
         Which observed triangles, and in what order.
 
     Yields

@@ -16,7 +16,7 @@ from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.consensus import consistent_candidates
 from starcat.matcher.methods.reference import Surroundings, references, rows_between, surroundings
-from starcat.matcher.methods.triangle_order import Selection
+from starcat.matcher.methods.triangle_order import TriangleOrder
 from starcat.matcher.observation import Observation
 
 Array = NDArray[np.float64]
@@ -41,7 +41,7 @@ SECTORS = 0.2
 
 
 def candidates(
-    observation: Observation, database: Database, selection: Selection
+    observation: Observation, database: Database, selection: TriangleOrder
 ) -> Iterator[Candidates]:
     """Propose names of centroids that agree with each other.
 
@@ -51,7 +51,7 @@ def candidates(
         The frame.
     database : Database
         With the product ``radial``.
-    selection : Selection
+    selection : TriangleOrder
         Without effect: no triangles are chosen.
 
     Yields

@@ -22,10 +22,10 @@ from starcat.matcher.methods import (
     triangle,
 )
 from starcat.matcher.methods.candidates import Candidates
-from starcat.matcher.methods.triangle_order import Selection
+from starcat.matcher.methods.triangle_order import TriangleOrder
 from starcat.matcher.observation import Observation
 
-Propose = Callable[[Observation, Database, Selection], Iterator[Candidates]]
+Propose = Callable[[Observation, Database, TriangleOrder], Iterator[Candidates]]
 
 
 @dataclass(frozen=True)

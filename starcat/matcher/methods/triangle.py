@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from starcat.geometry.kvector import KVector
 from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.methods.candidates import Candidates
-from starcat.matcher.methods.triangle_order import DEFAULT, Selection, select_triangles
+from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder, select_triangles
 from starcat.matcher.observation import Observation
 
 Array = NDArray[np.float64]
@@ -37,7 +37,7 @@ _ORDERS = np.array(list(permutations(range(3))), dtype=np.intp)
 
 
 def candidates(
-    observation: Observation, database: Database, selection: Selection = DEFAULT
+    observation: Observation, database: Database, selection: TriangleOrder = DEFAULT
 ) -> Iterator[Candidates]:
     """Propose the triangles of stars that observed triangles may be.
 
@@ -47,7 +47,7 @@ def candidates(
         The frame.
     database : Database
         With the product ``triangles``.
-    selection : Selection
+    selection : TriangleOrder
         Which observed triangles, and in what order.
 
     Yields

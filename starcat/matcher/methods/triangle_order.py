@@ -23,7 +23,7 @@ Triple = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
-class Selection:
+class TriangleOrder:
     """How triangles are chosen.
 
     Attributes
@@ -54,20 +54,22 @@ class Selection:
     few_centroids: int = 12
 
 
-DEFAULT = Selection()
+DEFAULT = TriangleOrder()
 
 LEAST_ANGLE_DEG = 4.0
 """Narrower triangles are never tried."""
 
 
-def select_triangles(observation: Observation, selection: Selection = DEFAULT) -> NDArray[np.intp]:
+def select_triangles(
+    observation: Observation, selection: TriangleOrder = DEFAULT
+) -> NDArray[np.intp]:
     """Return the triangles of a frame in the order in which they are to be looked up.
 
     Parameters
     ----------
     observation : Observation
         The frame.
-    selection : Selection
+    selection : TriangleOrder
         Thresholds and order.
 
     Returns

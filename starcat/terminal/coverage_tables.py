@@ -11,7 +11,7 @@ from starcat.terminal.console import print_json, print_table, say
 
 if TYPE_CHECKING:
     from starcat.artifact.reader import Artifact
-    from starcat.report.coverage import CoverageReport
+    from starcat.report.coverage_report import CoverageReport
 
 _BARS, _BAR_WIDTH = 20, 50
 
@@ -29,7 +29,7 @@ def print_coverage(artifact: Artifact, folder: Path | None, *, as_json: bool) ->
         Whether to print JSON.
     """
     from starcat.pipeline.facts import artifact_coverage
-    from starcat.report.coverage import holes_warning, write_coverage
+    from starcat.report.coverage_report import holes_warning, write_coverage
 
     report = artifact_coverage(artifact)
     if as_json:
