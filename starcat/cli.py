@@ -22,6 +22,7 @@ from starcat.commands import (
     matching,
     querying,
     releasing,
+    specs,
 )
 from starcat.errors import StarcatError, reason
 
@@ -33,7 +34,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-PARTS = (catalogs, artifacts, querying, exchanging, releasing, matching, evaluating)
+PARTS = (catalogs, specs, artifacts, querying, exchanging, releasing, matching, evaluating)
 """In the order of --help."""
 
 for part in PARTS:

@@ -123,7 +123,7 @@ def starcat(
 def small_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> Path:
     """The artifact of `small_spec`; to be copied by who changes it."""
     from starcat.pipeline.build import build
-    from starcat.specs.build_spec import spec_from_dict
+    from starcat.specs.reading import spec_from_dict
 
     folder = tmp_path_factory.mktemp("small")
     (folder / "sao.dat").write_bytes(b"".join(sao_lines))

@@ -20,7 +20,7 @@ from starcat.artifact.content import content_sha256
 from starcat.catalog.source import source_names
 from starcat.cli import app
 from starcat.matcher.methods.table import METHODS
-from starcat.specs.build_spec import preset_names
+from starcat.specs.reading import preset_names
 from starcat.tables.schema import product_schema
 
 COMMANDS = tuple(sorted(typer.main.get_command(app).commands))  # type: ignore[attr-defined]

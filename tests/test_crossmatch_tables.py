@@ -38,7 +38,9 @@ from starcat.pipeline.rebuild import rebuild
 from starcat.products.crossmatch import VERDICTS
 from starcat.products.match_odds import ARCSEC
 from starcat.resources import resource_folder
-from starcat.specs.build_spec import BuildSpec, Crossmatch, spec_from_dict
+from starcat.specs.build_spec import BuildSpec
+from starcat.specs.product_sections import Crossmatch
+from starcat.specs.reading import spec_from_dict
 from starcat.storage.digests import file_sha256, json_bytes
 from starcat.tables.parquet import read_parquet, write_parquet
 from starcat.tables.schema import product_schema

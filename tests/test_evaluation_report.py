@@ -61,7 +61,7 @@ from starcat.evaluation.trial import Attitudes, Trial
 from starcat.geometry.camera import Camera
 from starcat.matcher.methods.table import METHODS, Method
 from starcat.simulation.simulate import Noise
-from starcat.specs.build_spec import spec_from_dict
+from starcat.specs.reading import spec_from_dict
 from starcat.terminal.evaluations import print_evaluation
 
 FRAMES = Attitudes("random", 8)

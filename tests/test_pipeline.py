@@ -23,7 +23,7 @@ from starcat.artifact.verify import check_artifact
 from starcat.artifact.writer import move_into_place
 from starcat.errors import BuildError, OutputError, ProductError, StarcatError
 from starcat.pipeline.build import Built, build
-from starcat.specs.build_spec import preset, spec_from_dict
+from starcat.specs.reading import preset, spec_from_dict
 
 FILES = {
     "database.h5",

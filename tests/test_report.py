@@ -31,7 +31,8 @@ from starcat.report.page import table
 from starcat.report.plots import draw_histogram, draw_magnitudes, save_plot
 from starcat.report.report import count_magnitudes
 from starcat.report.sky_map import HALF_HEIGHT, HALF_WIDTH, nearest_raster, project
-from starcat.specs.build_spec import BuildSpec, spec_from_dict
+from starcat.specs.build_spec import BuildSpec
+from starcat.specs.reading import spec_from_dict
 from starcat.terminal.coverage_tables import histogram_rows
 
 FILES = {

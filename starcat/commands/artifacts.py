@@ -14,20 +14,17 @@ app = typer.Typer()
 
 
 @app.command()
-def presets(json: Json = False) -> None:
-    """List the build specs that ship with starcat.
-
-    Example: starcat presets
-    """
-    from starcat.terminal.builds import print_presets
-
-    print_presets(as_json=json)
-
-
-@app.command()
 def build(
     spec: Annotated[Path | None, typer.Argument(help="A build spec (TOML).")] = None,
     preset: Annotated[str | None, typer.Option(help="A spec that ships with starcat.")] = None,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="A key of the spec, such as camera.fov_x_deg=16. Repeatable.",
+        ),
+    ] = None,
     inputs: Input = None,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder to put <name>-<version>/ into.")
@@ -48,7 +45,7 @@ def build(
     from starcat.terminal.builds import print_built
     from starcat.terminal.console import progress_bars
 
-    chosen, given = chosen_spec(spec, preset), inputs_by_source(inputs)
+    chosen, given = chosen_spec(spec, preset, changes), inputs_by_source(inputs)
     with progress_bars() as progress:
         built = run_build(
             chosen, given, output, replace=replace, workers=workers, progress=progress

@@ -118,7 +118,7 @@ def crossmatch(
     Example: starcat crossmatch sao.parquet hipparcos.parquet -o found.parquet
     """
     from starcat.pipeline.counterparts import match_files
-    from starcat.specs.build_spec import Crossmatch
+    from starcat.specs.product_sections import Crossmatch
     from starcat.terminal.crossmatches import print_crossmatch
 
     found = match_files(a, b, output, Crossmatch(radius_arcsec=radius))

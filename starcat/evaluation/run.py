@@ -22,7 +22,7 @@ from starcat.evaluation.report.files import write_reproduction as write_page
 from starcat.evaluation.sweep import Sweep, sweep_paper
 from starcat.pipeline.build import Inputs, build
 from starcat.progress import Progress, no_progress
-from starcat.specs.build_spec import preset
+from starcat.specs.reading import preset
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,8 @@ from starcat.errors import ParseError, SchemaError, SourceMissing, reason
 from starcat.products.crossmatch import VERDICTS, Matches, candidate_pairs, crossmatch
 from starcat.products.match_odds import ARCSEC, MatchModel
 from starcat.progress import Progress, no_progress
-from starcat.specs.build_spec import BuildSpec, Crossmatch
+from starcat.specs.build_spec import BuildSpec
+from starcat.specs.product_sections import Crossmatch
 from starcat.tables.parquet import write_table
 from starcat.tables.schema import product_schema
 

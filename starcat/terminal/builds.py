@@ -69,24 +69,6 @@ def print_sources(*, as_json: bool) -> None:
     )
 
 
-def print_presets(*, as_json: bool) -> None:
-    """Print the presets.
-
-    Parameters
-    ----------
-    as_json : bool
-        Whether to print JSON, with every key of every spec.
-    """
-    from starcat.specs.build_spec import preset, preset_names
-
-    specs = [preset(name) for name in preset_names()]
-    if as_json:
-        print_json([spec.model_dump(mode="json") for spec in specs])
-        return
-    rows = [(spec.name, spec.version, spec.catalog.source, spec.description) for spec in specs]
-    print_table("", ("preset", "version", "source", "what it is"), rows)
-
-
 def print_fetched(report: FetchReport, *, as_json: bool) -> None:
     """Print what was fetched.
 

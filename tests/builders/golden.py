@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 
 from starcat.artifact.reader import open_artifact
 from starcat.pipeline.build import build
-from starcat.specs.build_spec import preset
+from starcat.specs.reading import preset
 
 PRESETS = ("gaia-12deg", "sao-12deg")
 GOLDEN = Path(__file__).parents[1] / "golden"
