@@ -48,10 +48,7 @@ def print_preset(spec: BuildSpec, *, as_json: bool) -> None:
     rows = [
         ("what it is", spec.description),
         ("sources", ", ".join(spec.sources)),
-        (
-            "limits",
-            f"{spec.selection.bright_limit_mag:g} to {spec.selection.faint_limit_mag:g} mag",
-        ),
+        ("limits", f"{limits.bright_limit_mag:g} to {limits.faint_limit_mag:g} mag"),
         ("camera", f"{camera.width_px} x {camera.height_px} px"),
         ("field", f"{camera.fov_x_deg:.4g} x {camera.fov_y_deg:.4g} deg"),
         ("boresights", f"{spec.boresights.count:,}"),
@@ -99,15 +96,12 @@ def print_starter(starter: Starter, path: Path, *, as_json: bool) -> None:
         for row in starter.limits
     ]
     heads = ("faint limit, G", "guide stars", "fewest", "1 %", "median", "most")
-    title = (
-        f"Stars in a field of {camera.fov_x_deg:.4g} x {camera.fov_y_deg:.4g} deg (* the spec's)"
-    )
-    print_table(
-        f"Stars in a field of {field} (* the spec's limit)", heads, rows, numbers=(0, 1, 2, 3, 4, 5)
-    )
+    field = f"{camera.fov_x_deg:.4g} x {camera.fov_y_deg:.4g} deg"
+    title = f"Stars in a field of {field} (* the spec's limit)"
+    print_table(title, heads, rows, numbers=(0, 1, 2, 3, 4, 5))
     out().print(
-        f"\nA frame needs 4 stars. A limit is good when 1 % of the fields have about {ENOUGH_STARS}:\n"
-        "some are left where spots are missing, and the database stays small."
+        "\nA frame needs 4 stars. A limit is good when 1 % of the fields have about "
+        f"{ENOUGH_STARS}:\nsome are left where spots are missing, and the database stays small."
     )
     for text in told:
         say(f"warning: {text}")
