@@ -7,13 +7,13 @@ stderr. Exit codes: 0 done, 1 failed, 2 usage or spec, 3 source missing or damag
 
 from __future__ import annotations
 
+import logging
 import signal
 import sys
 from typing import Annotated, Any
 
 import typer
 
-from starcat import __version__
 from starcat.commands import (
     artifacts,
     catalogs,
@@ -25,6 +25,7 @@ from starcat.commands import (
     specs,
 )
 from starcat.errors import StarcatError, reason
+from starcat.version import __version__
 
 app = typer.Typer(
     name="starcat",
@@ -68,6 +69,7 @@ def main() -> None:
     What the operating system refuses at a place that nobody foresaw exits with 1.
     """
     signal.signal(signal.SIGTERM, _stop)
+    logging.getLogger("starcat").addHandler(logging.NullHandler())  # the commands print their own
     try:
         app(prog_name="starcat")
     except StarcatError as error:

@@ -15,8 +15,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starcat import __version__
 from starcat.errors import ProductError, SchemaVersionError
+from starcat.version import __version__
 
 if TYPE_CHECKING:  # reading a manifest needs none of these
     from starcat.catalog.ingest import FileFacts

@@ -91,6 +91,10 @@ class Verification:
     checks: int
     findings: tuple[Finding, ...]
 
+    def __repr__(self) -> str:
+        """Return the outcome in one line."""
+        return f"<Verification {self.folder.name}: {self.checks:,} checks, {len(self.findings)} findings>"
+
     def as_dict(self) -> dict[str, Any]:
         """Return the result as plain values.
 

@@ -120,6 +120,13 @@ class Ingested:
     problems: tuple[str, ...]
     notes: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        """Return source and counts in one line."""
+        return (
+            f"<Ingested {self.source} ({self.band}): {self.rows_read:,} records read, "
+            f"{len(self.stars):,} kept, {len(self.rejected):,} rejected>"
+        )
+
     @property
     def rows_read(self) -> int:
         """Records in all files."""

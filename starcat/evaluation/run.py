@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from starcat import __version__
 from starcat.errors import ConfigError
 from starcat.evaluation.campaign import Outcome, run_paper
 from starcat.evaluation.papers.table import papers_named
@@ -23,6 +22,7 @@ from starcat.evaluation.sweep import Sweep, sweep_paper
 from starcat.pipeline.build import Inputs, build
 from starcat.progress import Progress, no_progress
 from starcat.specs.reading import preset
+from starcat.version import __version__
 
 
 @dataclass(frozen=True)

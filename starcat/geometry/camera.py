@@ -85,6 +85,14 @@ class Camera:
         )
         self._refuse_fold()
 
+    def __repr__(self) -> str:
+        """Return size, scale and what is not plain in one line."""
+        lens = "" if self.distortion.is_none else ", distorted"
+        return (
+            f"<Camera {self.width_px} x {self.height_px} px, {self.fov_x_deg:.4g} x "
+            f"{self.fov_y_deg:.4g} deg, f = {self.focal_length_px:.6g} px{lens}>"
+        )
+
     def _refuse_fold(self) -> None:
         """Raise ValueError unless all of the detector lies inside the fold."""
         reach_px = float(np.hypot(*(self._corners - self.principal_point_px).T).max())

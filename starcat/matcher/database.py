@@ -84,6 +84,11 @@ class Database:
     products: Mapping[str, ProductArrays] = field(default_factory=dict)
     _derived: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
+    def __repr__(self) -> str:
+        """Return name, stars and products in one line."""
+        opened = ", ".join(self.products) or "no product"
+        return f"<Database {self.name}: {len(self.mag):,} stars at J{self.epoch_jyear:g}, {opened}>"
+
     def derived(self, make: Callable[..., Made], *arguments: float) -> Made:
         """Return what a method makes of the database before it can use it, made once.
 

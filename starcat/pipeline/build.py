@@ -91,6 +91,15 @@ class Built:
     warnings: tuple[str, ...]
     times_s: dict[str, float]
 
+    def __repr__(self) -> str:
+        """Return the artifact and how it identifies in one line."""
+        clean, hard = self.rates
+        stars = self.manifest["products"]["stars"]["rows"]
+        return (
+            f"<Built {self.folder} ({self.outcome}): {stars:,} guide stars, identified {clean.identified_share:.1%} "
+            f"of clean and {hard.identified_share:.1%} of hard fields>"
+        )
+
 
 def build(
     spec: BuildSpec,
