@@ -1,5 +1,5 @@
 # Every target runs in .venv, which the first of them makes. What a user needs (RUNS) and what a
-# developer needs besides (READY) are installed apart: the demo takes half the disk.
+# developer needs besides (READY) are installed apart: the demo needs no development tool.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -15,13 +15,13 @@ help: ## list the targets
 
 $(RUNS): pyproject.toml
 	@$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "starcat needs Python 3.11 or newer"'
-	@echo "making $(VENV) and installing starcat with its libraries (500 MB; a minute or two)"
+	@echo "making $(VENV) and installing starcat with its libraries (700 MB; a minute or two)"
 	@$(PYTHON) -m venv $(VENV)
 	@$(PIP) --editable '.[images]'
 	@touch $(RUNS)
 
 $(READY): $(RUNS)
-	@echo "installing the tools of the tests into $(VENV) (another 500 MB; a minute)"
+	@echo "installing the tools of the tests into $(VENV) (another 300 MB; a minute)"
 	@$(PIP) --editable '.[dev]'
 	@touch $(READY)
 

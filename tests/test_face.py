@@ -189,3 +189,13 @@ def test_a_star_name_is_no_html():
     shown = AnswerTable(pa.table({"<b>": ["<script>"]}))._repr_html_()
     assert "<script>" not in shown
     assert "<b>" not in shown
+
+
+def test_pip_installs_it_by_one_name():
+    from starcat.version import DISTRIBUTION
+
+    assert f'\nname = "{DISTRIBUTION}"' in (ROOT / "pyproject.toml").read_text()
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "starcat").rglob("*.py")]
+    for page in pages:
+        for wrong in re.findall(r"install[^\n]*'?\bstarcat\[", page.read_text()):
+            pytest.fail(f"{page.name}: {wrong} is another project's")

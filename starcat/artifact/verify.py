@@ -93,7 +93,8 @@ class Verification:
 
     def __repr__(self) -> str:
         """Return the outcome in one line."""
-        return f"<Verification {self.folder.name}: {self.checks:,} checks, {len(self.findings)} findings>"
+        found = len(self.findings)
+        return f"<Verification {self.folder.name}: {self.checks:,} checks, {found} findings>"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the result as plain values.

@@ -96,8 +96,8 @@ class Built:
         clean, hard = self.rates
         stars = self.manifest["products"]["stars"]["rows"]
         return (
-            f"<Built {self.folder} ({self.outcome}): {stars:,} guide stars, identified {clean.identified_share:.1%} "
-            f"of clean and {hard.identified_share:.1%} of hard fields>"
+            f"<Built {self.folder} ({self.outcome}): {stars:,} guide stars, identified "
+            f"{clean.identified_share:.1%} of clean and {hard.identified_share:.1%} of hard fields>"
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,7 +93,7 @@ def starter_spec(
     Parameters
     ----------
     name : str
-        Of the artifact.
+        Of the artifact; what no artifact's name may have becomes a hyphen.
     camera : CameraSpec
         The camera.
     faint_limit_mag : float, optional
@@ -111,6 +112,7 @@ def starter_spec(
     ConfigError
         If the camera or the limit is out of range.
     """
+    name = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:64] or "camera"
     sky = ingest(SOURCE, locate(SOURCE, {}), progress=progress).stars
     mag = np.sort(floats_of(sky, "mag"))
     shape = _spec(name, camera, float(mag[-1]))

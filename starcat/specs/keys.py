@@ -170,10 +170,14 @@ def _range(value: dict[str, Any]) -> str:
     if choices:
         return ", ".join(choices)
     if "pattern" in value:
-        return str(value["pattern"])
+        return f"`{value['pattern']}`"
     low = value.get("minimum", value.get("exclusiveMinimum"))
     high = value.get("maximum", value.get("exclusiveMaximum"))
-    if low is None and high is None:
+    if low is None or high is None:
         return f"at most {value['maxLength']:,} characters" if "maxLength" in value else ""
     below = "below " if "exclusiveMaximum" in value else ""
-    return f"{low:,} to {below}{high:,}"
+    return f"{_plain(low)} to {below}{_plain(high)}"
+
+
+def _plain(number: float) -> str:
+    return f"{int(number):,}" if number == int(number) else f"{number:g}"
