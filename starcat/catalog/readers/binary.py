@@ -44,10 +44,11 @@ def parse_binary(
     count, rest = divmod(len(data), size)
     table = np.frombuffer(data, dtype=packed, count=count)
     line = np.arange(first_line, first_line + count, dtype=np.int64)
-    values = {
-        name: table[name].astype(np.int64 if packed[name].kind == "i" else np.float64)
-        for name in names
-    }
+    with np.errstate(invalid="ignore"):  # a signalling NaN is a NaN like any other
+        values = {
+            name: table[name].astype(np.int64 if packed[name].kind == "i" else np.float64)
+            for name in names
+        }
     problems = []
     if rest:
         problems.append(
