@@ -14,7 +14,6 @@ import pytest
 
 from starcat.catalog.ingest import Ingested, ingest
 from starcat.catalog.plausible import PLAUSIBLE, without_impossible
-from starcat.catalog.proper_motion import Motion, propagate
 from starcat.catalog.source import Column, data_source
 from starcat.catalog.star_files import write_star_tables
 from starcat.catalog.stars import StarBlock
@@ -193,20 +192,3 @@ def test_progress_counts_bytes_within_a_file(tmp_path: Path) -> None:
     assert done == sorted(done)
     assert done[-1] == size
     assert any(0 < each < size for each in done), "nothing was reported within the file"
-
-
-@pytest.mark.parametrize("ra_deg", [0.0, 123.0])
-@pytest.mark.parametrize("dec_deg", [90.0, -90.0, 45.0, np.nan])
-def test_motion_at_a_pole_has_no_memory_of_others(ra_deg: float, dec_deg: float) -> None:
-    # A star that ends exactly at a pole takes its east from its right ascension.
-    def moved() -> Motion:
-        ones = np.ones(3)
-        start = Motion(ra_deg * ones, dec_deg * ones, 0.0 * ones, np.array([0.0, 5.0, np.nan]))
-        return propagate(start, 10.0)
-
-    first = moved()
-    for _ in range(20):
-        np.full(3, 7.7)  # fills the memory that an array without initial values would get
-        again = moved()
-        np.testing.assert_array_equal(first.pm_ra_cosdec_mas_yr, again.pm_ra_cosdec_mas_yr)
-        np.testing.assert_array_equal(first.pm_dec_mas_yr, again.pm_dec_mas_yr)
