@@ -9,6 +9,7 @@ import signal
 import sys
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,17 +25,62 @@ settings.register_profile(
 settings.load_profile("starcat")
 
 
-@pytest.fixture(scope="session")
-def catalogs() -> Path:
-    """The folder of catalog excerpts, which are not part of the repository."""
+# Builders and tests share modules, which are found by path.
+sys.path.insert(0, str(Path(__file__).parent / "builders"))
+
+
+def excerpts_folder() -> Path:
+    """Where the catalog excerpts are, which are not part of the repository."""
     beside = Path(__file__).resolve().parents[2] / "shared" / "catalogs"
-    folder = Path(os.environ.get("STARCAT_CATALOGS") or beside)
-    if not folder.is_dir():
+    return Path(os.environ.get("STARCAT_CATALOGS") or beside)
+
+
+@pytest.fixture(scope="session")
+def has_excerpts() -> bool:
+    """Whether `catalogs` are the genuine excerpts, whose figures are known."""
+    return excerpts_folder().is_dir()
+
+
+@pytest.fixture(scope="session")
+def excerpts(has_excerpts: bool) -> Path:
+    """The folder of catalog excerpts, for what only genuine records can show."""
+    if not has_excerpts:
         pytest.skip(
-            "the folder of catalog excerpts is absent: set STARCAT_CATALOGS to it, "
-            f"or put it at {beside}"
+            "genuine records are wanted and the folder of catalog excerpts is absent: set "
+            f"STARCAT_CATALOGS to it, or put it at {excerpts_folder()}"
         )
+    return excerpts_folder()
+
+
+@pytest.fixture(scope="session")
+def made_catalogs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the names of the excerpts, of stars that are made up; one for all workers."""
+    from catalog_folder import write_catalog_folder
+
+    common = tmp_path_factory.getbasetemp()
+    common = common.parent if os.environ.get("PYTEST_XDIST_WORKER") else common
+    folder = common / "made-catalogs"
+    if not folder.is_dir():
+        own = tmp_path_factory.mktemp("catalogs")
+        write_catalog_folder(own)
+        # Another worker may have been faster: then its files, which are the same, are used.
+        with suppress(OSError):
+            own.rename(folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def catalogs(request: pytest.FixtureRequest, has_excerpts: bool) -> Path:
+    """The catalog excerpts where they are there, else files of the same names and layouts."""
+    return Path(request.getfixturevalue("excerpts" if has_excerpts else "made_catalogs"))
+
+
+@pytest.fixture(scope="session")
+def solve_wahba_quest() -> Callable[..., NDArray[np.float64]]:
+    """QUEST, which checks the attitudes of the singular-value decomposition by other means."""
+    from quest import solve_wahba_quest
+
+    return solve_wahba_quest
 
 
 @pytest.fixture(scope="session")

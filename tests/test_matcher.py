@@ -20,7 +20,6 @@ from starcat.geometry.attitude import (
     matrix_from_quaternion,
     matrix_from_radec_roll,
     quaternion_from_matrix,
-    solve_wahba_quest,
 )
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
@@ -215,7 +214,7 @@ def test_agreement_from_an_attitude_nearby_is_that_of_all_stars(sky):
         assert found.false_match_probability < 1e-50
 
 
-def test_the_residual_is_that_of_the_attitude_that_is_returned(sky):
+def test_the_residual_is_that_of_the_attitude_that_is_returned(sky, solve_wahba_quest):
     for frame in frames(sky, 20, Noise(0.5)):
         seen = observed(frame)
         found = agree(frame.matrix, seen, sky)

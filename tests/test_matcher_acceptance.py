@@ -13,7 +13,6 @@ import pytest
 from starcat.geometry.attitude import (
     matrix_from_quaternion,
     matrix_from_radec_roll,
-    solve_wahba_quest,
     solve_wahba_svd,
 )
 from starcat.geometry.camera import Camera
@@ -230,7 +229,7 @@ def test_with_noise_the_attitude_errs_as_the_number_of_stars_says(ground, answer
 
 
 @pytest.mark.parametrize("noise", [Noise(), CLEAN, HARD], ids=["exact", "clean", "hard"])
-def test_svd_and_quest_agree(answers, matcher, noise):
+def test_svd_and_quest_agree(answers, matcher, noise, solve_wahba_quest):
     for frame, found in answers(noise):
         if found.status == "identified":
             body, icrs = named(frame, found, matcher)

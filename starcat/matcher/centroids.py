@@ -1,7 +1,7 @@
 """Centroid files: CSV for one frame (``x_px,y_px[,mag]``), JSON for one or many.
 
 JSON is a frame, a list of frames, or an object with the key ``frames``; a frame is an object
-with ``centroids_px`` (pairs of numbers) and, as it likes, ``mag`` (a number or null each) and
+with ``centroids_px`` (pairs of numbers) and, optionally, ``mag`` (a number or null for each) and
 ``name``.
 """
 
@@ -30,7 +30,7 @@ class MeasuredFrame:
     Attributes
     ----------
     name : str
-        Of the frame; that of the file where it has none of its own.
+        Name of the frame; that of the file where the frame has none of its own.
     centroids_px : ndarray of float64, shape (N, 2)
         Pixels, in the order of the file.
     mag : ndarray of float64, shape (N,), or None

@@ -1,8 +1,8 @@
-"""Whether chance alone would agree as well with a frame as an attitude does.
+"""The probability that chance alone agrees with a frame as well as an attitude does.
 
-If the centroids lay anywhere on the detector, how many attitudes, over the whole sky, would
-put as many stars as near to them? The expected number bounds the probability of a false match,
-and it needs no count of what a method tried.
+It is bounded by an expected number: that of the attitudes, over the whole sky, which put as many
+stars as near to centroids that lie anywhere on the detector. This number does not depend on how
+many candidates a method has tried.
 """
 
 from __future__ import annotations
@@ -38,23 +38,23 @@ def false_match_probability(
     stars_in_frame : int
         Stars of the database that the attitude puts on the detector or within reach of it.
     camera : Camera
-        Its detector and focal length.
+        The camera, whose detector size and focal length are used.
 
     Returns
     -------
     float
-        0 to 1.
+        Upper bound, 0 to 1.
 
     Notes
     -----
-    n of N centroids and n of M stars can be assigned in ``C(N, n) M! / (M - n)!`` ways. For
-    one of them, the frames that some attitude explains with squared residuals below Q fill
-    ``8 pi^2 f^3 sqrt(det H)`` (all attitudes, in pixels; H sums, over the n places, the
-    squared derivatives by the three angles) times a ball of radius sqrt(Q) in the 2n - 3
-    dimensions that the fit leaves, out of all frames, A^n. The product is the expected number;
-    the sum over the N - 3 values that n may have bounds the probability. M is the local
-    density, so that an agreement in a crowded field, or one that leaves most of the field
-    unexplained, weighs less.
+    There are ``C(N, n) M! / (M - n)!`` ways to assign n of N centroids to n of M stars. In each
+    of them, the frames whose squared residuals sum to less than Q in some attitude fill the
+    volume ``8 pi^2 f^3 sqrt(det H)`` times that of a ball of radius sqrt(Q) in the 2n - 3
+    dimensions that the fit leaves free, out of A^n for all frames. The first factor is that of
+    all attitudes, in pixels; H is the sum, over the n places, of the squared derivatives by the
+    three angles. The product is the expected number. Its sum over the N - 3 possible values of
+    n bounds the probability. M is counted around the field, so the bound is higher in a crowded
+    field, and where most of the field is left unexplained.
 
     Examples
     --------
@@ -73,12 +73,17 @@ def false_match_probability(
     if not information > 0.0:
         return 1.0
     left = 2 * n - 3
-    ways = (
-        math.lgamma(n_centroids + 1) - math.lgamma(n + 1) - math.lgamma(n_centroids - n + 1)
-    ) + (math.lgamma(stars + 1) - math.lgamma(stars - n + 1))
     attitudes = math.log(_ALL_ATTITUDES * camera.focal_length_px**3 * math.sqrt(information))
     unit_ball = 0.5 * left * math.log(math.pi) - math.lgamma(0.5 * left + 1.0)
     ball = unit_ball + 0.5 * left * math.log(max(square_px, 1e-30))
     frames = n * math.log(camera.width_px * camera.height_px)
+    ways = _log_ways(n, n_centroids, stars)
     expected = ways + attitudes + ball - frames + math.log(max(1, n_centroids - 3))
     return math.exp(min(0.0, expected))
+
+
+def _log_ways(n: int, n_centroids: int, stars: int) -> float:
+    """Return the logarithm of the number of ways to assign n centroids to n stars."""
+    return (
+        math.lgamma(n_centroids + 1) - math.lgamma(n + 1) - math.lgamma(n_centroids - n + 1)
+    ) + (math.lgamma(stars + 1) - math.lgamma(stars - n + 1))

@@ -61,7 +61,7 @@ class Database:
     camera : Camera
         The camera that the database was built for.
     epoch_jyear : float
-        Of the directions.
+        Epoch of the directions, Julian year.
     star_id : ndarray of int64, shape (N,)
         Permanent star numbers.
     directions : ndarray of float64, shape (N, 3)
@@ -71,7 +71,7 @@ class Database:
     designation : ndarray of bytes, shape (N,)
         Names.
     products : mapping of str to ProductArrays
-        Those that were opened.
+        The products that were opened.
     """
 
     name: str

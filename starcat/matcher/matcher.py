@@ -43,7 +43,7 @@ class Matcher:
     max_false_match_probability : float
         Answers that chance would give more often than this are withheld.
     selection : TriangleOrder
-        Which triangles of centroids are tried, for the methods that choose some.
+        Order and limits of the triangles of centroids, for the methods that use triangles.
     max_batches : int
         Batches of candidates tried before giving up.
     """
@@ -117,7 +117,8 @@ class Matcher:
         camera : Camera, optional
             The database's own by default.
         magnitudes : array_like of float64, shape (N,), optional
-            Of any zero point; they decide what is tried first, never what is accepted.
+            Magnitudes with any zero point; they decide what is tried first, never what is
+            accepted.
 
         Returns
         -------

@@ -1,4 +1,4 @@
-"""One frame as the methods see it: usable centroids, their directions, an order of their own."""
+"""One frame as the methods see it: its usable centroids, their directions and their order."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Observation:
     Attributes
     ----------
     rows : ndarray of int64, shape (N,)
-        Where each centroid stood in the frame as given.
+        Row of each centroid in the frame as it was given.
     centroids_px : ndarray of float64, shape (N, 2)
         Pixels. Brightest first where magnitudes are known, else nearest to the centre first,
         so that nothing depends on the order in which they were given.
@@ -59,7 +59,7 @@ class Observation:
         """Separations between all centroids, radians, shape (N, N)."""
         x, y, z = self.body.T
         dx, dy, dz = x[:, None] - x, y[:, None] - y, z[:, None] - z
-        # By the chord, which is exact for the angles within a frame.
+        # The chord loses no digits at small angles, where the cosine would.
         return np.asarray(2.0 * np.arcsin(0.5 * np.sqrt(dx * dx + dy * dy + dz * dz)))
 
 
@@ -80,13 +80,13 @@ def observe(
     tolerance_px : float
         Largest error of a centroid, as a radius.
     magnitudes : array_like of float64, shape (N,), optional
-        Of any zero point, larger is fainter; NaN where unknown.
+        Magnitudes with any zero point, larger is fainter; NaN where unknown.
 
     Returns
     -------
     Observation
-        Of the centroids that can be used. Of several at the very same place one is kept, the
-        brightest where magnitudes are known.
+        The frame with the centroids that can be used. Where several lie at exactly the same
+        place, one is kept: the brightest, if magnitudes are known.
 
     Raises
     ------

@@ -86,7 +86,7 @@ def unidentified(status: Status, observation: Observation) -> MatchResult:
     Returns
     -------
     MatchResult
-        Without stars.
+        An answer without stars and attitude.
     """
     none = np.full(len(observation) + len(observation.dropped), -1)
     nan = float("nan")
@@ -122,7 +122,7 @@ def identified(
     Returns
     -------
     MatchResult
-        With quaternion and angles of one and the same attitude.
+        An answer whose quaternion and angles are the same attitude.
     """
     count = len(observation) + len(observation.dropped)
     index = np.full(count, -1, dtype=np.int32)

@@ -1,8 +1,9 @@
-"""Spread: whether the matched stars hold an attitude, and the scale, over the whole frame.
+"""Spread: whether the matched stars determine the attitude and the scale of the whole frame.
 
-Ten stars within 100 px hardly say how the camera is turned about them. An attitude that only
-they agree with is no chance, and yet it may be far off at the edge of the frame. What the
-matched stars tell of the attitude is compared with what the whole frame could tell.
+Ten stars within 100 px hardly determine how the camera is turned about their middle. An attitude
+that only they agree with is not due to chance, and yet it may be wrong at the edge of the frame.
+So the accuracy that the matched stars give is compared with the one that all stars of the frame
+would give.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from starcat.matcher.observation import Observation
 Array = NDArray[np.float64]
 
 SCALE_DEVIATIONS = 3.0
-"""Standard deviations from which on a difference of scale is none of chance."""
+"""Standard deviations above which a difference of scale is not taken for chance."""
 
 _UNIT = np.eye(3)
 
@@ -42,10 +43,11 @@ def share_of_frame(
     Returns
     -------
     float
-        `explained_share` of the stars or of the centroids, whichever is more: a camera may see
-        fewer stars than the database holds, or more. That of the stars where the matched do
-        not hold the corners of the frame to the tolerance: that a camera saw nothing else
-        tells no more about the attitude. 0 if they fix no attitude at all.
+        `explained_share` of the stars or of the centroids, whichever is larger, because a camera
+        may see fewer stars than the database holds, or more. Where the matched stars do not
+        determine the corners of the frame to within the tolerance it is the share of the stars:
+        that the camera saw no others adds nothing to the attitude. 0 if the matched stars
+        determine no attitude at all.
     """
     try:
         covariance = np.asarray(np.linalg.inv(information(matched)), dtype=np.float64)
@@ -62,7 +64,7 @@ def share_of_frame(
 
 
 def information(directions: Array) -> Array:
-    """Return what the centroids of stars tell of an attitude.
+    """Return the information matrix of an attitude that the centroids of stars determine.
 
     Parameters
     ----------
@@ -95,15 +97,15 @@ def explained_share(covariance: Array, directions: Array) -> float:
     Returns
     -------
     float
-        1 if all are matched; about n / N if n matched ones are spread as all are; far less if
-        they stand together.
+        1 if all stars are matched; about n / N if the n matched ones are spread like the N
+        stars; much less if the matched ones are close together.
 
     Notes
     -----
-    A star's weight is the variance that the matched stars leave to its place. Those of the
-    matched themselves add up to three, the number of angles, wherever they are. Outside of
-    them it grows with the square of the distance: ten stars 50 px around their middle leave
-    one at 500 px a weight of ten.
+    The weight of a star is the variance of its position, given the matched stars. The weights
+    of the matched stars themselves add up to three, the number of angles, wherever they are.
+    Outside of them the weight grows with the square of the distance: with ten matched stars
+    at 50 px from their middle, a star at 500 px has a weight of ten.
 
     Examples
     --------
@@ -121,7 +123,7 @@ def explained_share(covariance: Array, directions: Array) -> float:
 
 
 def corner_deviation(covariance: Array, camera: Camera) -> float:
-    """Return how far an attitude may put a corner of the frame from its place.
+    """Return the error of the worst corner of a frame under an attitude.
 
     Parameters
     ----------
@@ -139,12 +141,12 @@ def corner_deviation(covariance: Array, camera: Camera) -> float:
     w, h = float(camera.width_px), float(camera.height_px)
     corners = camera.directions_from_pixels(np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]]))
     along = np.einsum("ni,ij,nj->n", corners, covariance, corners)
-    # Rounding may leave less than nothing where the stars all but coincide.
+    # Rounding may make the difference negative where the stars nearly coincide.
     return math.sqrt(max(0.0, float(np.trace(covariance) - along.min())))
 
 
 def is_scaled(predicted_px: Array, centroids_px: Array, observation: Observation) -> bool:
-    """Return whether a frame is plainly larger or smaller than the stars that it matches.
+    """Return whether a frame differs in scale from the stars that it matches.
 
     Parameters
     ----------
@@ -156,13 +158,13 @@ def is_scaled(predicted_px: Array, centroids_px: Array, observation: Observation
     Returns
     -------
     bool
-        True if it is so by more than `SCALE_DEVIATIONS`, and so much that the corner of the
-        frame is off by more than the largest error of a centroid.
+        True if the scale differs by more than `SCALE_DEVIATIONS` and by so much that the corner
+        of the frame is displaced by more than the largest error of a centroid.
 
     Notes
     -----
-    Then the camera's focal length is wrong: the attitude may be right, but towards the edge
-    stars are taken for their neighbours.
+    A frame of another scale means that the camera's focal length is wrong. The attitude may be
+    right, but towards the edge of the frame stars are taken for their neighbours.
     """
     camera = observation.camera
     inner = predicted_px - predicted_px.sum(axis=0) / len(predicted_px)

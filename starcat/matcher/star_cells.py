@@ -1,7 +1,7 @@
-"""Which directions have a star near them: the stars of a sky in small cells.
+"""Cells of the sky that list the stars in them, to find out which directions have a star nearby.
 
-Candidates are many and most are wrong; this tells quickly how many centroids each would
-explain. Made when it is first needed.
+Most of the many candidates of a frame are wrong. The cells tell quickly how many centroids each
+candidate explains. They are made when a database first needs them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class StarCells:
     directions : ndarray of float64, shape (N, 3)
         Unit vectors of the stars.
     side : float
-        Of a cell.
+        Side of a cell, in units of the sphere's radius.
     margin : float
         A star is listed in every cell that it is this near to.
     keys : ndarray of int64, shape (C,)
@@ -95,7 +95,7 @@ def star_cells(directions: Array, reach_rad: float) -> StarCells:
     Returns
     -------
     StarCells
-        With cells that are several times as wide.
+        The stars, in cells that are four times as wide as the reach, or wider.
     """
     side = max(MIN_SIDE, 4.0 * reach_rad)
     margin = 0.25 * side

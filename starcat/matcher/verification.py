@@ -25,29 +25,34 @@ from starcat.matcher.star_cells import StarCells, star_cells
 Array = NDArray[np.float64]
 
 MIN_STARS = 4
-"""Three stars make an attitude; at least one more has to agree with it."""
+"""Smallest number of matched stars: three determine an attitude, a fourth confirms it."""
 
 MIN_SHARE = 1.0 / 3.0
-"""An attitude has to explain this share of the centroids, or of the stars if that is more.
+"""Smallest share of a frame that the attitude of an answer explains.
 
-Each counts by how little the matched ones say of its place (`explained_share`): stars crowd in
-clusters, and those of a cluster may agree with an attitude that is off.
+The share is that of the centroids or that of the stars, whichever is larger. Every one of them
+is weighted by the uncertainty that the matched stars leave in its position (`explained_share`).
+Without weights, the many stars of one cluster would accept an attitude that is right in the
+cluster and wrong in the rest of the frame.
 """
 
 SURE_SHARE = 2.0 / 3.0
-"""If it explains less than this, the frame is searched for more, within wider reaches."""
+"""An attitude that explains a smaller share is refined again, with the reaches of `WIDER`."""
 
 WIDER = (4.0, 2.0)
-"""These reaches, in units of the final one."""
+"""Reaches of that second refinement, one after the other, in units of the final reach."""
 
 REACH = 1.5
-"""Stars and centroids agree within this many tolerances: an attitude from few stars errs too."""
+"""Largest distance between a centroid and its star, in units of the tolerance.
+
+It is larger than 1 because an attitude that was computed from a few stars has an error too.
+"""
 
 MAX_REFINEMENTS = 4
-"""The matched stars rarely change after the first."""
+"""Largest number of refinements; after the first one the matched stars rarely change."""
 
 AT_ONCE = 256
-"""Candidates whose agreement is counted together."""
+"""Number of candidates whose agreeing centroids are counted together."""
 
 
 @dataclass(frozen=True)
@@ -61,9 +66,11 @@ class Agreement:
     star_index : ndarray of int32, shape (N,)
         Row of each centroid's star, -1 where none.
     residual_rad : float
-        Root mean square separation of the matched; NaN for too few.
+        Root mean square separation of the matched centroids from their stars; NaN where fewer
+        than `MIN_STARS` match.
     false_match_probability : float
-        That chance agrees as well; 1 for too few.
+        Bound on the probability that chance agrees as well; 1 where fewer than `MIN_STARS`
+        match.
     """
 
     matrix: Array
@@ -171,15 +178,16 @@ def agree(matrix: Array, observation: Observation, database: Database) -> Agreem
     Returns
     -------
     Agreement
-        After refinement on all stars that matched, until they no longer change. Each star has
-        one centroid at most. Its false-match probability is 1 if it leaves too much of the frame
-        unexplained (`MIN_SHARE`) or if the frame is scaled.
+        The agreement after the attitude was refined on all matched stars until these no longer
+        changed. Each star has one centroid at most. The false-match probability is 1 if too
+        much of the frame is unexplained (`MIN_SHARE`) or if the frame is scaled.
     """
     fit = _refined(matrix, observation, database)
     found, share = _judged(fit, observation)
     if share < SURE_SHARE:
-        # No chance, and yet much is unexplained: the attitude may be the right one but for a
-        # wrong star or two at the edge of a cluster.
+        # This agreement is not due to chance, although much of the frame is unexplained. One or
+        # two wrong stars at the edge of a cluster may have spoilt an attitude that is nearly
+        # right, and a search within wider reaches replaces them.
         wider, _ = _judged(_refined(fit.matrix, observation, database, WIDER), observation)
         if wider.false_match_probability < found.false_match_probability:
             return wider
@@ -223,7 +231,10 @@ def _refined(
 
 
 def _judged(fit: _Fit, observation: Observation) -> tuple[Agreement, float]:
-    """Return the agreement of a fit and the share of the frame that it explains, 1 if chance."""
+    """Return the agreement of a fit and the share of the frame that it explains.
+
+    The share is 1 where chance explains the agreement, as it is of no use there.
+    """
     camera, matched, star = observation.camera, fit.matched, fit.star[fit.matched]
     index = np.full(len(observation), -1, dtype=np.int32)
     index[matched] = fit.near[star]
@@ -258,13 +269,16 @@ def _within_reach_of_frame(predicted_px: Array, observation: Observation) -> NDA
 def _mutually_nearest(
     predicted_px: Array, observation: Observation, reach_px: float
 ) -> tuple[NDArray[np.int64], Array]:
-    """Return each centroid's star and its squared distance; -1 unless neither has a nearer one."""
+    """Return the star of each centroid, -1 where it has none, and the squared distances.
+
+    A centroid has a star if each of the two is the nearest to the other, within reach.
+    """
     count = len(observation)
     if not len(predicted_px):
         return np.full(count, -1), np.full(count, np.inf)
     x, y = observation.centroids_px.T
     dx, dy = x[:, None] - predicted_px[:, 0], y[:, None] - predicted_px[:, 1]
-    # Where the lens shows no star at all the distance is NaN, which is no minimum.
+    # The distance is NaN where the lens forms no image of a star; it must not be the minimum.
     square = np.fmin(dx * dx + dy * dy, np.inf)
     star, rows = square.argmin(axis=1), np.arange(count)
     nearest = square[rows, star]

@@ -1,4 +1,4 @@
-"""What a method proposes: that these centroids are those stars."""
+"""Candidates: correspondences between centroids and stars that a method proposes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Candidates:
-    """Correspondences to be verified, the most promising first; a row is one of them.
+    """Correspondences to be verified, one a row, the most promising first.
 
     Attributes
     ----------

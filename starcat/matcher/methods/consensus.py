@@ -1,8 +1,8 @@
-"""Consensus: which stars named for single centroids agree with each other.
+"""Consensus: which names of single centroids agree with each other.
 
-A method that ranks stars for every centroid on its own ends here: two of its names can both
-be right only if the two stars are as far apart as the two centroids. The names with the most
-such partners come first.
+Some methods rank stars for every centroid on its own; a name is one such star for one centroid.
+Two names can both be right only if the two stars are as far apart as the two centroids. The
+names that agree with the most others in this way come first.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ Rows = NDArray[np.intp]
 Flags = NDArray[np.bool_]
 
 BATCHES = (4, 16, 64)
-"""Pairs yielded together: the first batches, then the last size again and again."""
+"""Sizes of the first batches of pairs; all later batches have the last size."""
 
 MOST_NAMES = 2048
-"""Names compared with each other; of more the lower ranks are left out."""
+"""Largest number of names that are compared; where there are more, low ranks are left out."""
 
 
 def consistent_candidates(
@@ -45,20 +45,20 @@ def consistent_candidates(
     database : Database
         The stars.
     most : int, default 1000
-        Pairs proposed at the most.
+        Largest number of pairs proposed.
 
     Yields
     ------
     Candidates
-        First the pair of the highest support together with all names that agree with both
-        and with each other, in one correspondence; then every pair by falling support, of
-        equal ones the farthest apart.
+        The first is one correspondence: the pair with the highest support and all names that
+        agree with both and with each other. Then every pair follows by falling support, and
+        among equal ones by falling separation.
 
     Notes
     -----
-    The support of a name is the number of other centroids with a name that agrees with it:
-    true names support each other, false ones hardly, however many there are. The support of
-    a pair is the sum of both.
+    The support of a name is the number of other centroids with a name that agrees with it. True
+    names agree with each other and false ones rarely do, however many there are. The support
+    of a pair is the sum of the support of both names.
     """
     centroid, star = _names(ranked)
     fits = consistent(centroid, star, observation, database)
@@ -88,7 +88,7 @@ def consistent(centroid: Rows, star: Rows, observation: Observation, database: D
     centroid : ndarray of int, shape (L,)
         Rows of the observation.
     star : ndarray of int, shape (L,)
-        Rows of the database's stars: the name of each.
+        Row of the database's star that each name stands for.
     observation : Observation
         The frame.
     database : Database
@@ -119,7 +119,7 @@ def support(fits: Flags, centroid: Rows, count: int) -> NDArray[np.int64]:
     Parameters
     ----------
     fits : ndarray of bool, shape (L, L)
-        Which names agree.
+        True where two names agree.
     centroid : ndarray of int, shape (L,)
         Row of each name's centroid.
     count : int
@@ -171,7 +171,7 @@ def neighbour_candidates(
     stars : ndarray of int, shape (K,)
         Rows of the database's stars, none twice: what the reference star may be.
     product : ProductArrays
-        With the rows of every star's neighbours: ``star_offsets`` and ``neighbour``.
+        A product that lists the neighbours of every star in ``star_offsets`` and ``neighbour``.
     observation : Observation
         The frame.
     database : Database
@@ -180,9 +180,9 @@ def neighbour_candidates(
     Returns
     -------
     Candidates
-        At most one of each star, in three correspondences, the best supported first: the
-        reference star, and two centroids with neighbours of the star that are as far apart
-        and as far from it.
+        At most one candidate for each star, the best supported first. It names three centroids:
+        the reference star, and two whose stars are neighbours of the star at the same
+        separations from it and from each other.
     """
     owner, star, centroid = _named_by_neighbours(reference, stars, product, observation, database)
     first, second = _agreeing_pairs(owner, star, centroid, observation, database)

@@ -1,8 +1,9 @@
 """Identification by angular reference sets (S5): separations under a Hausdorff distance.
 
 A centroid's feature is the set of its separations from the others, a star's the set of its
-separations from its neighbours, product ``hausdorff_angular``. Every centroid is named by the
-star whose set is nearest in the mean; which names agree with each other, consensus says.
+separations from its neighbours, product ``hausdorff_angular``. Every centroid is named after the
+stars whose sets are nearest in the mean. `consensus` then finds the names that agree with each
+other.
 """
 
 from __future__ import annotations
@@ -34,13 +35,13 @@ Rows = NDArray[np.intp]
 PRODUCTS = ("hausdorff_angular",)
 
 FIRST_ROUND = (16, 5)
-"""How many of the first centroids take part, and how many names each of them gets."""
+"""Number of the first centroids that take part, and number of names that each of them gets."""
 
 SECOND_ROUND = (64, 100)
-"""The same, where the first round's names do not agree."""
+"""The same two numbers of a second round, where the names of the first one do not agree."""
 
 _AT_ONCE = 1 << 22
-"""Numbers held at the same time where every observed separation meets every star."""
+"""Numbers held at the same time while observed separations are compared with all stars."""
 
 
 def candidates(
@@ -60,13 +61,13 @@ def candidates(
     Yields
     ------
     Candidates
-        First names of several centroids that agree with each other; then, of each centroid
-        and many more names, those whose neighbours agree.
+        The first ones are names of several centroids that agree with each other. Then follow,
+        for each centroid and many more names, those whose neighbours agree.
 
     Notes
     -----
-    The bare method lets every difference count in full, so that one false or missing star
-    outweighs all that agree; here a difference counts as `side_tolerance_rad` at the most.
+    The bare method counts every difference in full, so that one false or missing star outweighs
+    all that agree. Here a difference counts as `side_tolerance_rad` at the most.
 
     References
     ----------
@@ -104,19 +105,19 @@ def rank_stars(
     database : Database
         With the product ``hausdorff_angular``.
     cap_rad : float or None
-        What a difference counts at the most, radians; None for no limit, as in the paper.
+        Largest value that a difference counts as, radians; None for no limit, as in the paper.
     count : int
-        How many stars for each centroid.
+        Number of stars to return for each centroid.
     first : int, optional
-        Use only so many of the first centroids; all by default.
+        Number of the first centroids to use; all by default.
 
     Returns
     -------
     stars : ndarray of int, shape (N, count)
         Rows of the database's stars, the nearest set first; -1 where there are no more.
     scores : ndarray of float64, shape (N, count)
-        Mean over a centroid's separations from the others, as far as they lie within the
-        reference sets' radius, of the smallest difference from a member; radians, ``inf``
+        Mean of the smallest differences from a member of the set, over those separations of the
+        centroid from others that lie within the radius of the reference sets; radians, ``inf``
         where there are no more. A centroid without such separations has no stars.
 
     References
@@ -167,7 +168,7 @@ def identify_bare(
     database : Database
         With the product ``hausdorff_angular``.
     cap_rad : float, optional
-        As in `rank_stars`; no limit by default.
+        Largest value that a difference counts as, radians; no limit by default.
 
     Returns
     -------
@@ -176,10 +177,10 @@ def identify_bare(
 
     Notes
     -----
-    A star that two centroids are named by is neither's. Of the other names a set is kept that
-    fits into one field of view: no two farther apart than its diagonal. It grows from
-    the name with most others that near, which finds the largest set wherever most names are
-    right. No attitude is checked.
+    Where two centroids are named after the same star, neither keeps the name. Among the other
+    names, those are kept that fit into one field of view, with no two stars farther apart than
+    its diagonal. This set grows from the name that has the most others within that distance,
+    which finds the largest set wherever most names are right. No attitude is checked.
 
     References
     ----------

@@ -2,8 +2,8 @@
 
 The centroids around a reference star are compared, as points of its tangent plane, with the
 neighbours of every star, product ``hausdorff_l2``. Points turn and stretch with the image, so
-the camera has to be upright, its roll 0, and of the nominal scale. The ratios of
-`hausdorff_l2` are there to do without.
+the camera has to be upright, with a roll of 0, and of the nominal scale. The ratios of
+`hausdorff_l2` do not have these two limits.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Rows = NDArray[np.intp]
 PRODUCTS = ("hausdorff_l2",)
 
 STARS = 30
-"""How many of the best stars of a reference star become candidates."""
+"""Number of the best stars of a reference star that become candidates."""
 
 LIMIT_PX = 12.0
 """Mean L1 distance up to which the bare method accepts its best star, pixels."""
@@ -82,7 +82,7 @@ def rank_stars(
     reference : int, optional
         Row of the observation; the nearest to the centre of the frame by default.
     count : int
-        How many stars.
+        Number of stars to return.
 
     Returns
     -------
@@ -96,8 +96,8 @@ def rank_stars(
     Notes
     -----
     The image's up is taken for north at the reference star. That is exact in its centre;
-    elsewhere the meridians converge, the more the nearer to a pole. Every centroid meets the
-    neighbours of all stars: the time is that of their product.
+    elsewhere the meridians converge, the more the nearer to a pole. Every centroid is compared
+    with the neighbours of all stars, so the time grows with the product of the two numbers.
 
     References
     ----------

@@ -2,7 +2,7 @@
 
 For an observed triangle the pairs that fit two of its sides, found by the K-vector over the
 separations, are joined at their common star; the third side and the handedness leave few
-triangles of stars, each of which is a candidate. Needs the product ``pairs``.
+triangles of stars, each of which is a candidate. The method needs the product ``pairs``.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def candidates(
     database : Database
         With the product ``pairs``.
     selection : TriangleOrder
-        Which observed triangles, and in what order.
+        Order and limits of the observed triangles.
 
     Yields
     ------
@@ -101,7 +101,8 @@ def side_tolerance_rad(observation: Observation) -> float:
     Returns
     -------
     float
-        Radians: both ends err, but rarely both by the most and apart.
+        Radians. It is less than twice the error of a centroid, because both ends rarely err by
+        the most and in opposite directions.
     """
     return 1.5 * observation.tolerance_rad
 

@@ -1,7 +1,8 @@
 """Identification by pyramids (Mortari et al. 2004): a triangle confirmed by a fourth star.
 
 The triangles of stars that an observed triangle may be are found by star pairs; a further
-centroid has to be a star whose separations from all three agree. Needs the product ``pairs``.
+centroid has to be a star whose separations from all three agree. The method needs the product
+``pairs``.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def candidates(
     database : Database
         With the product ``pairs``.
     selection : TriangleOrder
-        Which observed triangles, and in what order.
+        Order and limits of the observed triangles.
 
     Yields
     ------

@@ -1,8 +1,8 @@
-"""Reference stars: what lies around one centroid, and in what order centroids are tried.
+"""Reference stars: the centroids around one of them, and the order in which they are tried.
 
 Several methods compare the neighbourhood of one centroid, the reference star, with that of
-every star. A centroid near the middle of the frame has its neighbours in the frame, so the
-nearest to the centre comes first.
+every star. The centroid nearest to the centre of the frame is tried first, because most of its
+neighbours are in the frame.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 RANKS = (1, 5, 20)
-"""How many of each reference star's candidates have been tried after each round."""
+"""Number of candidates of each reference star that have been tried after each round."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,10 @@ class Surroundings:
     centroids : ndarray of int, shape (n,)
         Rows of the observation.
     separation_rad : ndarray of float64, shape (n,)
-        From the reference star, radians.
+        Separation from the reference star, radians.
     position_angle_rad : ndarray of float64, shape (n,)
-        At the reference star, radians, -pi to pi, counter-clockwise on the sky as seen from an
-        axis of no meaning.
+        Position angle at the reference star, radians, -pi to pi. It runs counter-clockwise on
+        the sky as seen, from an arbitrary axis: only differences have a meaning.
     """
 
     centroids: Rows
@@ -82,7 +82,7 @@ def surroundings(observation: Observation, reference: int, radius_rad: float) ->
     Returns
     -------
     Surroundings
-        Without the reference star; of equally near ones the first in position angle.
+        The other centroids, the nearest first; equally near ones by position angle.
     """
     apart, u = observation.separation_rad[reference], observation.body[reference]
     inside = apart <= radius_rad
@@ -120,8 +120,8 @@ def by_reference(
 
     Notes
     -----
-    Papers stop at the best star of the reference star nearest to the centre. Where that one
-    is a false star, or lost its neighbours, another reference star decides.
+    The papers stop at the best star of the reference star nearest to the centre. Here another
+    reference star decides where that one is a false star, or has lost its neighbours.
     """
     found: list[Candidates] = []
     for propose in proposals:
@@ -146,12 +146,12 @@ def rows_between(
     Parameters
     ----------
     start, stop : ndarray of int, shape (K,)
-        Where each run begins and where it has ended.
+        First row of each run, and the row after its last.
 
     Returns
     -------
     run, row : ndarray of int, shape (M,)
-        Which run it is and which row, run after run.
+        Run and row of each entry, run after run.
 
     Examples
     --------

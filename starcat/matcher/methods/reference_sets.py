@@ -1,8 +1,8 @@
-"""Sets of numbers, one for every star, and how near observed numbers come to their members.
+"""Reference sets: one set of numbers for every star, and distances of observed numbers from it.
 
 The directed, averaged Hausdorff distance from observed numbers to a star's set is the mean of
-their smallest differences from its members. Two ways lead there: all differences of all stars,
-and only those within a reach, where a number meets few of the stars.
+their smallest differences from its members. `smallest_differences` computes the differences for
+all stars; `within_reach` computes only the small ones, which few stars have.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ class ReferenceSets:
     Attributes
     ----------
     offsets : ndarray of int64, shape (S + 1,)
-        By star, the members of star n are ``offsets[n]:offsets[n + 1]``.
+        The members of star n are ``offsets[n]:offsets[n + 1]``, when they are sorted by star.
     fenced : ndarray of float64, shape (M + S + 1,)
-        The members by star, ascending, with an ``inf`` before, between and after the stars:
-        it is infinitely far from any number.
+        The members by star, ascending, with an ``inf`` before the first star, between two stars
+        and after the last one; no number is near to it.
     value : ndarray of float64, shape (M,)
-        The members, ascending.
+        The members of all stars, ascending.
     star : ndarray of int, shape (M,)
-        Whose they are.
+        The star that each member of ``value`` belongs to.
     low, high : ndarray of float64, shape (M,)
-        Each is the nearest of its star's members to numbers from ``low`` up to ``high``, the
-        latter excluded.
+        Each member of ``value`` is the nearest of its star's members to all numbers from
+        ``low`` up to ``high``, the latter excluded.
     """
 
     offsets: NDArray[np.int64]
@@ -52,7 +52,7 @@ class ReferenceSets:
 
 
 def reference_sets(values: Array, offsets: NDArray[np.int64]) -> ReferenceSets:
-    """Arrange sets for both ways.
+    """Arrange the members of sets by star and by value.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def reference_sets(values: Array, offsets: NDArray[np.int64]) -> ReferenceSets:
     Returns
     -------
     ReferenceSets
-        40 bytes a member.
+        The arranged sets, which take 40 bytes a member.
     """
     star = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
     fenced = np.full(len(values) + len(offsets), np.inf)
@@ -83,9 +83,9 @@ def smallest_differences(sets: ReferenceSets, numbers: Array) -> Array:
     Parameters
     ----------
     sets : ReferenceSets
-        Of S stars.
+        The sets of S stars.
     numbers : ndarray of float64, shape (Q,)
-        In any order.
+        Observed numbers, in any order.
 
     Returns
     -------
@@ -94,8 +94,8 @@ def smallest_differences(sets: ReferenceSets, numbers: Array) -> Array:
 
     Notes
     -----
-    With the numbers in order, the members between one and the next are counted by star; the
-    running sum of these counts is where each number stands among each star's members.
+    The numbers are sorted, and the members between one number and the next are counted by star.
+    The running sum of these counts is the place of each number among the members of each star.
     """
     count = len(sets)
     order = np.argsort(numbers, kind="stable")
@@ -112,12 +112,15 @@ def smallest_differences(sets: ReferenceSets, numbers: Array) -> Array:
 
 
 def means_of_minima(differences: Iterable[Array], offsets: NDArray[np.int64]) -> Array:
-    """Return each star's mean of the smallest differences, of whatever kind they are.
+    """Return, for every star, the mean of the observed elements' smallest differences from it.
+
+    The differences are the caller's, so elements need not be numbers: they may be points, for
+    example, with distances as the differences.
 
     Parameters
     ----------
     differences : iterable of ndarray of float64, shape (M,)
-        For one observed element after the other, its difference from every member, by star.
+        One array for every observed element: its difference from each member, sorted by star.
     offsets : ndarray of int64, shape (S + 1,)
         The members of star n are ``offsets[n]:offsets[n + 1]``.
 
@@ -126,7 +129,7 @@ def means_of_minima(differences: Iterable[Array], offsets: NDArray[np.int64]) ->
     ndarray of float64, shape (S,)
         ``inf`` where the star has no members, and where nothing was observed.
     """
-    # An interval of no members would yield the member that follows it.
+    # For an empty interval, reduceat would return the member that follows it.
     filled = np.flatnonzero(np.diff(offsets))
     total, count = np.zeros(len(filled)), 0
     for difference in differences:
@@ -145,9 +148,9 @@ def within_reach(sets: ReferenceSets, numbers: Array, reach: Array) -> tuple[Row
     Parameters
     ----------
     sets : ReferenceSets
-        Of S stars.
+        The sets of S stars.
     numbers, reach : ndarray of float64, shape (Q,)
-        In any order; and how far each of them reaches.
+        Observed numbers, in any order, and the largest difference that counts for each.
 
     Returns
     -------
@@ -175,7 +178,7 @@ def lowest(scores: Array, count: int) -> tuple[Rows, Array]:
         A row for each centroid, a column for each star; ``inf`` or NaN where the star is out
         of the question.
     count : int
-        How many of each row.
+        Number of stars to return for each row.
 
     Returns
     -------

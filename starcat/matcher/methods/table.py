@@ -1,4 +1,4 @@
-"""The methods: which module proposes, and which products it needs.
+"""The table of methods: the function that proposes candidates, and the products it needs.
 
 A new method is a module with a function that yields candidates, and one line in `METHODS`.
 """
@@ -37,9 +37,9 @@ class Method:
     propose : callable
         Yields batches of candidates for an observation, the most promising first.
     products : tuple of str
-        What it needs beside the stars.
+        Names of the products that it needs beside the stars.
     description : str
-        In a few words.
+        Description in a few words.
     """
 
     propose: Propose
@@ -77,7 +77,7 @@ def method_named(name: str) -> Method:
     Parameters
     ----------
     name : str
-        Its name.
+        Name of the method, a key of `METHODS`.
 
     Returns
     -------
@@ -103,7 +103,7 @@ def best_method(products: Iterable[str]) -> str:
     Parameters
     ----------
     products : iterable of str
-        Those that a database holds.
+        Names of the products that a database holds.
 
     Returns
     -------

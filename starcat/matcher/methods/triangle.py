@@ -1,7 +1,7 @@
 """Identification by triangles (S4): area in the K-vector, circumradius as the filter.
 
-Needs the product ``triangles``. Observed triangles are looked up a few at a time, then more
-at a time: most frames are decided by the first few.
+The method needs the product ``triangles``. The first batches of observed triangles are small,
+because the first few triangles decide most frames; later batches are larger.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ Array = NDArray[np.float64]
 PRODUCTS = ("triangles",)
 
 BATCHES = (2, 8, 32)
-"""Triangles looked up together: the first batches, then the last size again and again."""
+"""Sizes of the first batches of observed triangles; all later batches have the last size."""
 
 MANY = 200
-"""Triangles of stars from which on one side is compared before all three are."""
+"""With more triangles of stars than this, one side is compared before all three are."""
 
 SIDE_TOLERANCE = 1.5
 """Largest error of a side, in units of the largest error of a centroid."""
@@ -48,7 +48,7 @@ def candidates(
     database : Database
         With the product ``triangles``.
     selection : TriangleOrder
-        Which observed triangles, and in what order.
+        Order and limits of the observed triangles.
 
     Yields
     ------
@@ -121,7 +121,7 @@ def _has_a_side(
 def features(
     a: float, b: float, c: float, tolerance_rad: float
 ) -> tuple[float, float, float, float]:
-    """Return area and circumradius of a plane triangle and how far sides in error move them.
+    """Return area and circumradius of a plane triangle and the errors that its sides cause.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def features(
     Returns
     -------
     area_rad2, area_error_rad2, circumradius_rad, circumradius_error_rad : float
-        The errors to first order, those of the sides as if independent.
+        The errors are of first order and treat those of the three sides as independent.
     """
     a2, b2, c2 = a * a, b * b, c * c
     u, v, w = b2 + c2 - a2, a2 + c2 - b2, a2 + b2 - c2

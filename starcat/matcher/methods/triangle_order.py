@@ -1,9 +1,9 @@
-"""Which triangles of centroids are looked up, and in what order.
+"""The order in which triangles of centroids are looked up, and the ones that are left out.
 
-Three methods share this stage. With magnitudes the brightest go first, as in S3; without
-them the most compact. S4's order, the largest inscribed circle first, can be had. Triangles
-with a short side or a narrow angle are left out: two centroids of a double star and three
-centroids in a line say little.
+Three methods share this stage. Triangles of the brightest stars are first where magnitudes are
+known, as in S3; otherwise the most compact ones are. The order of S4, by the radius of the
+inscribed circle, can be chosen. Triangles with a short side or a narrow angle are left out,
+because the two centroids of a double star, or three centroids in a line, identify little.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Triple = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class TriangleOrder:
-    """How triangles are chosen.
+    """Order and limits of the triangles of a frame.
 
     Attributes
     ----------
@@ -33,13 +33,14 @@ class TriangleOrder:
         triangles with the shortest long side first, which the most fields hold whole. ``auto``
         is ``brightness`` where magnitudes are known, else ``compact``.
     min_side_px : float
-        Shorter sides are a double star's (d_min of S3).
+        Triangles with a shorter side are left out, as those of double stars (d_min of S3).
     min_angle_deg : float
-        Narrower angles are a line's (theta_min of S3).
+        Triangles with a narrower angle are left out, as three stars in a line (theta_min of S3).
     most_centroids : int
-        Only the first of the observation's order take part.
+        Number of centroids that take part: the first ones in the observation's order.
     few_centroids : int
-        Frames with no more than these also try, at the end, the triangles that are left out.
+        In frames with at most this many centroids, the triangles that are left out are tried
+        at the end.
 
     References
     ----------
@@ -57,7 +58,7 @@ class TriangleOrder:
 DEFAULT = TriangleOrder()
 
 LEAST_ANGLE_DEG = 4.0
-"""Narrower triangles are never tried."""
+"""Smallest angle of a triangle that is tried at all."""
 
 
 def select_triangles(

@@ -1,0 +1,176 @@
+"""Cameras and attitudes against astropy's WCS, which shares no code with them.
+
+A tangent-plane WCS is written down from a boresight and a roll as the manual describes them:
+with no roll the image's up is north and its left is east; a positive roll turns north from up
+towards left. FITS counts pixels so that the centre of the first one is at 1.0; here it is 0.5.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.wcs import WCS, Sip
+from hypothesis import example, given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from starcat.geometry.attitude import matrix_from_radec_roll
+from starcat.geometry.camera import Camera
+from starcat.geometry.distortion import Distortion
+from starcat.geometry.sphere import directions_from_radec, radec_from_directions
+from starcat.matcher.matcher import Matcher
+
+Array = NDArray[np.float64]
+
+FITS_FROM_CAMERA_PX = 0.5
+
+POINTINGS = [
+    (83.8, -5.4, 0.0),
+    (0.0, 0.0, 90.0),
+    (359.9999, 10.0, 181.0),
+    (266.4, -29.0, 270.0),
+    (12.3, 90.0, 33.0),
+    (200.0, -90.0, 300.0),
+    (45.0, 89.9, 123.4),
+]
+"""Right ascension, declination and roll, degrees; the poles and RA 0 among them."""
+
+pointings = st.tuples(st.floats(0.0, 360.0), st.floats(-90.0, 90.0), st.floats(0.0, 360.0))
+
+
+def wcs_of(camera: Camera, ra_deg: float, dec_deg: float, roll_deg: float) -> WCS:
+    """The WCS of a camera that points there."""
+    roll, scale = np.radians(roll_deg), np.degrees(1.0 / camera.focal_length_px)
+    # Where north and east lie in the image, x right and y down.
+    north = np.array([-np.sin(roll), -np.cos(roll)])
+    east = np.array([-np.cos(roll), np.sin(roll)])
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+    wcs.wcs.crval = [ra_deg, dec_deg]
+    wcs.wcs.crpix = np.array(camera.principal_point_px) + FITS_FROM_CAMERA_PX
+    wcs.wcs.cd = scale * np.array([east, north])
+    # The default is another one at the north pole.
+    wcs.wcs.lonpole = 180.0
+    return wcs
+
+
+def pixels_of(wcs: WCS, ra_deg: Array, dec_deg: Array) -> Array:
+    """The centroids of stars, by WCS."""
+    return np.stack(wcs.wcs_world2pix(ra_deg, dec_deg, 1), axis=1) - FITS_FROM_CAMERA_PX
+
+
+def stars_around(ra_deg: float, dec_deg: float, radius_deg: float, count: int) -> Array:
+    """Directions within a cap, drawn without any attitude."""
+    centre = directions_from_radec(np.array([ra_deg]), np.array([dec_deg]))[0]
+    drawn = np.random.default_rng(count).normal(size=(count, 3))
+    across = drawn - np.outer(drawn @ centre, centre)
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    angle = np.radians(np.linspace(0.0, radius_deg, count))[:, None]
+    return np.asarray(np.cos(angle) * centre + np.sin(angle) * across)
+
+
+CAMERAS = [
+    Camera(1024, 1024, 4871.0),
+    Camera(2592, 1944, 2500.0, principal_point_px=(1301.7, 950.2)),
+]
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=["narrow", "wide"])
+@given(pointing=pointings)
+@example(pointing=POINTINGS[1])
+@example(pointing=POINTINGS[4])
+@example(pointing=POINTINGS[5])
+def test_stars_fall_on_the_pixels_of_the_wcs(
+    camera: Camera, pointing: tuple[float, float, float]
+) -> None:
+    stars = stars_around(*pointing[:2], np.degrees(camera.radius_rad), 60)
+    found = camera.pixels_from_directions(stars @ matrix_from_radec_roll(*pointing).T)
+    expected = pixels_of(wcs_of(camera, *pointing), *radec_from_directions(stars))
+    assert np.abs(found - expected).max() < 1e-6
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=["narrow", "wide"])
+@pytest.mark.parametrize("pointing", POINTINGS)
+def test_pixels_point_where_the_wcs_says(
+    camera: Camera, pointing: tuple[float, float, float]
+) -> None:
+    x, y = np.meshgrid(np.linspace(0.0, camera.width_px, 9), np.linspace(0.0, camera.height_px, 7))
+    grid = np.stack([x.ravel(), y.ravel()], axis=1)
+    found = camera.directions_from_pixels(grid) @ matrix_from_radec_roll(*pointing)
+    ra_deg, dec_deg = wcs_of(camera, *pointing).wcs_pix2world(*(grid + FITS_FROM_CAMERA_PX).T, 1)
+    assert np.abs(found - directions_from_radec(ra_deg, dec_deg)).max() < 1e-13
+
+
+def sip_coefficients(camera: Camera) -> tuple[Array, Array]:
+    """Brown's and Conrady's polynomial as the AP and BP of SIP, in pixels.
+
+    ``ap[i, j]`` belongs to ``x**i * y**j``; a term of degree n has ``f**(1 - n)`` in it.
+    """
+    lens, f = camera.distortion, camera.focal_length_px
+    ap, bp = np.zeros((8, 8)), np.zeros((8, 8))
+    # The binomials of (x^2 + y^2)^n, once times x and once times y.
+    for n, k in ((1, lens.k1), (2, lens.k2), (3, lens.k3)):
+        for m, ways in enumerate(np.poly1d([1, 1]) ** n):
+            ap[2 * m + 1, 2 * (n - m)] += k * ways / f ** (2 * n)
+            bp[2 * m, 2 * (n - m) + 1] += k * ways / f ** (2 * n)
+    ap[1, 1] += 2.0 * lens.p1 / f
+    ap[2, 0] += 3.0 * lens.p2 / f
+    ap[0, 2] += lens.p2 / f
+    bp[1, 1] += 2.0 * lens.p2 / f
+    bp[0, 2] += 3.0 * lens.p1 / f
+    bp[2, 0] += lens.p1 / f
+    return ap, bp
+
+
+@pytest.mark.parametrize(
+    "distortion",
+    [Distortion(k1=-0.12), Distortion(-0.2, 0.08, -0.01), Distortion(-0.1, 0.02, 0.0, 3e-4, -5e-4)],
+)
+def test_a_lens_distorts_as_the_polynomials_of_sip(distortion: Distortion) -> None:
+    camera = Camera(2592, 1944, 2500.0, principal_point_px=(1301.7, 950.2), distortion=distortion)
+    pinhole = Camera(2592, 1944, 2500.0, principal_point_px=(1301.7, 950.2))
+    wcs = wcs_of(pinhole, *POINTINGS[0])
+    ap, bp = sip_coefficients(camera)
+    wcs.sip = Sip(None, None, ap, bp, wcs.wcs.crpix)
+    stars = stars_around(*POINTINGS[0][:2], np.degrees(camera.radius_rad), 200)
+    found = camera.pixels_from_directions(stars @ matrix_from_radec_roll(*POINTINGS[0]).T)
+    straight = pixels_of(wcs, *radec_from_directions(stars))
+    from_axis = straight - np.array(camera.principal_point_px)
+    expected = wcs.sip_foc2pix(from_axis, 1) - FITS_FROM_CAMERA_PX
+    assert np.abs(found - straight).max() > 1.0
+    assert np.abs(found - expected).max() < 1e-6
+
+
+@pytest.mark.parametrize("pointing", POINTINGS)
+def test_an_identified_frame_has_the_pointing_and_the_roll_of_the_wcs(
+    small_artifact: Path, pointing: tuple[float, float, float]
+) -> None:
+    matcher = Matcher.open(small_artifact)
+    database = matcher.database
+    camera, wcs = database.camera, wcs_of(database.camera, *pointing)
+    ra_deg, dec_deg = radec_from_directions(database.directions)
+    # The tangent plane has no place for the other half of the sky.
+    centre = directions_from_radec(np.array(pointing[:1]), np.array(pointing[1:2]))[0]
+    ahead = np.flatnonzero(database.directions @ centre > 0.5)
+    places = pixels_of(wcs, ra_deg[ahead], dec_deg[ahead])
+    seen = camera.contains(places)
+    found = matcher.identify(places[seen])
+    assert found.status == "identified"
+    np.testing.assert_array_equal(found.star_index, ahead[seen])
+    matrix = matrix_from_radec_roll(found.boresight_ra_deg, found.boresight_dec_deg, found.roll_deg)
+    # At a pole right ascension and roll are one angle, so points are compared: the axis and
+    # one that is 100 px above it in the image.
+    points = np.add(camera.principal_point_px, [[0.0, 0.0], [0.0, -100.0]]) + FITS_FROM_CAMERA_PX
+    body = directions_from_radec(*wcs.wcs_pix2world(points, 1).T) @ matrix.T
+    assert np.abs(np.cross(body[0], [0.0, 0.0, 1.0])).max() < 1e-11
+    assert abs(body[1, 0]) < 1e-11
+    assert body[1, 1] < 0.0 < body[1, 2]
+    if abs(pointing[1]) < 89.0:
+        given, angles = (
+            np.array([pointing[0], pointing[2]]),
+            [found.boresight_ra_deg, found.roll_deg],
+        )
+        assert np.abs((angles - given + 180.0) % 360.0 - 180.0).max() < 1e-8
+        assert found.boresight_dec_deg == pytest.approx(pointing[1], abs=1e-8)
