@@ -255,7 +255,7 @@ def test_newer_versions_are_named_with_the_known_ones(copy: Path) -> None:
 
 def test_a_newer_manifest_is_named_with_the_known_version(copy: Path) -> None:
     seal(copy, lambda manifest: manifest.update(manifest_version="2.0.0"))
-    expect(copy, MANIFEST_NAME, "", "manifest version 2.0.0; this starcat reads 1.0.0")
+    expect(copy, MANIFEST_NAME, "", "manifest version 2.0.0; this starcat reads 1.1.0")
 
 
 def manifest_case(words: str, change: Change) -> Any:

@@ -23,9 +23,7 @@ if TYPE_CHECKING:  # reading a manifest needs none of these
     from starcat.tables.schema import ProductSchema
 
 MANIFEST_NAME = "manifest.json"
-MANIFEST_VERSION = "1.0.0"
-COUNTERPARTS_VERSION = "1.1.0"
-"""Of a manifest that lists catalogs of counterparts: the others stay as they were before."""
+MANIFEST_VERSION = "1.1.0"
 
 DATABASE_NAME = "database.h5"
 PARTS = ("name", "version", "frame", "epoch_jyear", "spec", "sources", "products", "files")
@@ -121,23 +119,6 @@ class ProductFacts:
         if self.records is not None:
             facts["records"] = self.records
         return facts
-
-
-def manifest_version(sources: Sequence[SourceFacts]) -> str:
-    """Return the version of the manifest of a build.
-
-    Parameters
-    ----------
-    sources : sequence of SourceFacts
-        What went in.
-
-    Returns
-    -------
-    str
-        The lowest that knows all of their roles.
-    """
-    roles = {source.role for source in sources}
-    return COUNTERPARTS_VERSION if "crossmatch" in roles else MANIFEST_VERSION
 
 
 def software_versions() -> dict[str, str]:

@@ -19,10 +19,10 @@ from starcat.artifact.database import open_for_writing, write_product, write_roo
 from starcat.artifact.manifest import (
     DATABASE_NAME,
     MANIFEST_NAME,
+    MANIFEST_VERSION,
     ProductFacts,
     SourceFacts,
     manifest_digest,
-    manifest_version,
     software_versions,
 )
 from starcat.errors import OutputError, reason
@@ -170,7 +170,7 @@ def write_manifest(
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     manifest: dict[str, Any] = {
         "format": "starcat-artifact",
-        "manifest_version": manifest_version(sources),
+        "manifest_version": MANIFEST_VERSION,
         "name": spec["name"],
         "version": spec["version"],
         "frame": "ICRS",

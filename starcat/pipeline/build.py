@@ -141,7 +141,7 @@ def build(
         selected, fields = select_stars(stars, spec)
         clock.lap("select")
         products = make_products(spec, catalog, selected, fields, progress)
-        matched = match_catalogs(selected, spec, inputs, workers, progress)
+        matched = match_catalogs(stars, selected, spec, inputs, workers, progress)
         products += matched.products
         clock.lap("products")
         facts = write_products(partial, products, database_facts(spec))

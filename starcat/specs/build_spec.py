@@ -14,9 +14,7 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
-    SerializerFunctionWrapHandler,
     ValidationError,
-    model_serializer,
     model_validator,
 )
 
@@ -291,17 +289,6 @@ class Products(_Section):
     grid: Grid = Grid()
     radial: Radial = Radial()
     crossmatch: Crossmatch = Crossmatch()
-
-    @model_serializer(mode="wrap")
-    def _without_an_unused_section(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out a section that came after the first artifacts, so that they stay as they are.
-
-        Specs that do not speak of it read the same before and after.
-        """
-        content: dict[str, Any] = dump(self)
-        if self.crossmatch == Crossmatch():
-            del content["crossmatch"]
-        return content
 
 
 class SelfTest(_Section):
