@@ -81,7 +81,7 @@ def artifact(files: Path, small_spec: str) -> Path:
 
 @pytest.fixture
 def copy(artifact: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(artifact, tmp_path / artifact.name))
+    return Path(shutil.copytree(artifact, tmp_path / artifact.name, copy_function=shutil.copyfile))
 
 
 # In an artifact ------------------------------------------------------------------------------
