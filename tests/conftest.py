@@ -197,7 +197,7 @@ def artifact_version(
         artifact = folder / f"small-{version}"
         if artifact.exists():
             return artifact
-        shutil.copytree(small_artifact, artifact)
+        shutil.copytree(small_artifact, artifact, copy_function=shutil.copyfile)
         manifest = json.loads((artifact / "manifest.json").read_bytes())
         manifest["version"] = manifest["spec"]["version"] = version
         with h5py.File(artifact / "database.h5", "r+") as file:

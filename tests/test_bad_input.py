@@ -78,7 +78,11 @@ class Place:
 
     def copy(self) -> Path:
         """A copy of a good artifact, to be damaged."""
-        return Path(shutil.copytree(self.artifact, self.folder / self.artifact.name))
+        return Path(
+            shutil.copytree(
+                self.artifact, self.folder / self.artifact.name, copy_function=shutil.copyfile
+            )
+        )
 
     def manifest(self, change: Callable[[dict[str, Any]], object]) -> Path:
         """A copy of a good artifact with a changed manifest."""
@@ -489,7 +493,7 @@ def _(place: Place) -> Call:
 
 @case("another artifact of that name", 1)
 def _(place: Place) -> Call:
-    shutil.copytree(place.artifact, place.out / place.artifact.name)
+    shutil.copytree(place.artifact, place.out / place.artifact.name, copy_function=shutil.copyfile)
     return place.build("faint_limit_mag = 6.0", "faint_limit_mag = 5.9")
 
 

@@ -152,7 +152,7 @@ def test_identifiers_need_no_quotes(text):
 
 def damaged(small_artifact: Path, folder: Path, damage: str) -> Path:
     copied = folder / "artifact"
-    shutil.copytree(small_artifact, copied)
+    shutil.copytree(small_artifact, copied, copy_function=shutil.copyfile)
     manifest = json.loads((copied / "manifest.json").read_text())
     if damage == "cut":
         data = (copied / "pairs.parquet").read_bytes()
