@@ -145,7 +145,7 @@ def test_presets_as_json(starcat: Run) -> None:
 
 def test_ingest_writes_a_star_table(starcat: Run, stars: Path, tmp_path: Path) -> None:
     out = tmp_path / "made" / "out.parquet"
-    run = starcat(["ingest", "sao", "--input", stars, "-o", out, "--epoch", "2026"])
+    run = starcat(["ingest", "sao", "--input", stars, "-o", out, "--epoch-jyear", "2026"])
     assert run.code == 0
     assert run.err == f"wrote {out}\n"
     assert re.search(r"^kept +600$", run.out, re.MULTILINE)
@@ -204,7 +204,9 @@ def test_ingest_of_several_files(starcat: Run, sao_lines: list[bytes], tmp_path:
 def test_ingest_of_the_excerpt(starcat: Run, catalogs: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.parquet"
     archive = catalogs / "sao.dat.gz"
-    run = starcat(["ingest", "sao", "--input", archive, "-o", out, "--epoch", "2026", "--json"])
+    run = starcat(
+        ["ingest", "sao", "--input", archive, "-o", out, "--epoch-jyear", "2026", "--json"]
+    )
     assert json.loads(run.out)["rows_read"] == 15_935
     product_schema("stars").check(pq.read_table(out))
 
