@@ -245,10 +245,22 @@ class ProductError(StarcatError):
         self.path = path
 
 
+class ArtifactMissing(ProductError):  # noqa: N818 - the name reads as the fact
+    """No artifact, or no database, at the place that was named."""
+
+    exit_code = 3
+
+
 class QueryError(StarcatError):
     """A query that is no SQL, asks for what is not there, or for what is not allowed."""
 
     exit_code = 2
+
+
+class TargetMissing(QueryError):  # noqa: N818
+    """A query about an artifact or a file that is not there."""
+
+    exit_code = 3
 
 
 class QueryLimitError(QueryError):

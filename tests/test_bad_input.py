@@ -944,7 +944,7 @@ def _(place: Place) -> Call:
 
 @case("export of nothing", 2)
 def _(place: Place) -> Call:
-    return ["export", "--to", "fits", "-o", place.out]
+    return ["export", "--format", "fits", "-o", place.out]
 
 
 @case("export of what is not there", 3)
@@ -954,12 +954,12 @@ def _(place: Place) -> Call:
 
 @case("export of a file that is not Parquet", 3)
 def _(place: Place) -> Call:
-    return ["export", place.write("stars.csv", "star_id\n1\n"), "--to", "fits", "-o", place.out]
+    return ["export", place.write("stars.csv", "star_id\n1\n"), "--format", "fits", "-o", place.out]
 
 
 @case("format unknown", 2)
 def _(place: Place) -> Call:
-    return ["export", place.artifact, "--to", "xlsx", "-o", place.out]
+    return ["export", place.artifact, "--format", "xlsx", "-o", place.out]
 
 
 @case("format that the name of a file does not say", 2)
@@ -974,7 +974,7 @@ def _(place: Place) -> Call:
 
 @case("HATS of what are no stars", 2)
 def _(place: Place) -> Call:
-    return ["export", place.artifact, "--to", "hats", "--product", "pairs", "-o", place.out]
+    return ["export", place.artifact, "--format", "hats", "--product", "pairs", "-o", place.out]
 
 
 @case("another file of that name", 1)
@@ -992,14 +992,14 @@ def _(place: Place) -> Call:
 def _(place: Place) -> Call:
     path = place.folder / "stars.parquet"
     pq.write_table(pa.table({"designation": ["α Centauri"]}), path)
-    return ["export", path, "--to", "fits", "-o", place.out]
+    return ["export", path, "--format", "fits", "-o", place.out]
 
 
 @case("type that no format can hold", 4)
 def _(place: Place) -> Call:
     path = place.folder / "stars.parquet"
     pq.write_table(pa.table({"code": [b"x"]}), path)
-    return ["export", path, "--to", "csv", "-o", place.out]
+    return ["export", path, "--format", "csv", "-o", place.out]
 
 
 @case("peer unknown", 2)

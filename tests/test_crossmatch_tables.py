@@ -356,7 +356,7 @@ def test_the_command_prints_a_summary(
         assert word in ran.out
     assert max(len(line) for line in ran.out.splitlines()) <= 100
     assert f"wrote {output}" in ran.err
-    ran = starcat(["crossmatch", *tables, "-o", output, "--radius", 0.001, "--json"])
+    ran = starcat(["crossmatch", *tables, "-o", output, "--radius-arcsec", 0.001, "--json"])
     content = json.loads(ran.out)
     assert (content["a"], content["b"], content["radius_arcsec"]) == ("sao", "gaia", 0.001)
     assert content["matched"] + content["unmatched"] == 600

@@ -135,7 +135,7 @@ def test_parquet_files_of_others_are_tables_of_their_name(tmp_path):
 
 
 def test_hats_catalogs_are_one_table(starcat, small_artifact, session, tmp_path):
-    exported = ["export", small_artifact, "--to", "hats", "--product", "stars", "-o", tmp_path]
+    exported = ["export", small_artifact, "--format", "hats", "--product", "stars", "-o", tmp_path]
     assert starcat(exported).code == 0
     count = "SELECT count(*), min(ra_deg), sum(mag) FROM stars"
     with open_session([str(tmp_path / "stars")]) as opened:

@@ -15,7 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starcat.errors import ProductError, SchemaVersionError
+from starcat.errors import ArtifactMissing, ProductError, SchemaVersionError
 from starcat.version import __version__
 
 if TYPE_CHECKING:  # reading a manifest needs none of these
@@ -197,8 +197,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
     Raises
     ------
+    ArtifactMissing
+        If there is no folder, or no manifest in it.
     ProductError
-        If the folder is not an artifact, or its manifest cannot be read.
+        If the manifest cannot be read.
     SchemaVersionError
         If the manifest is of a version that this starcat does not know.
     """
@@ -206,7 +208,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise ProductError(
+        is_missing = isinstance(error, FileNotFoundError | NotADirectoryError)
+        raise (ArtifactMissing if is_missing else ProductError)(
             f"{folder}: not an artifact, {MANIFEST_NAME} cannot be read ({error.strerror}); give "
             "the folder <name>-<version> that 'starcat build' made",
             path=folder,

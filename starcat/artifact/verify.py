@@ -33,7 +33,7 @@ from starcat.artifact.table_checks import (
     columns_follow_the_schema,
 )
 from starcat.catalog.stars import directions_of
-from starcat.errors import ProductError, StarcatError
+from starcat.errors import ArtifactMissing, ProductError, StarcatError
 from starcat.storage.digests import file_sha256, json_bytes
 
 T = TypeVar("T")
@@ -118,11 +118,11 @@ def verify_artifact(folder: Path) -> Verification:
 
     Raises
     ------
-    ProductError
+    ArtifactMissing
         If there is no such folder.
     """
     if not folder.is_dir():
-        raise ProductError(
+        raise ArtifactMissing(
             f"{folder}: no such artifact; give the folder <name>-<version> that 'starcat build' "
             "made",
             path=folder,

@@ -26,7 +26,7 @@ NoisePx = Annotated[float, typer.Option(min=0, max=50, help="Of a centroid, each
 
 
 def chosen_spec(path: Path | None, name: str | None, changes: list[str] | None = None) -> BuildSpec:
-    """Return the spec of a file or of a preset; the first preset without either.
+    """Return the spec of a file or of a preset.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def chosen_spec(path: Path | None, name: str | None, changes: list[str] | None =
     Raises
     ------
     ConfigError
-        If both are given, or the spec is wrong.
+        If both are given or neither is, or the spec is wrong.
     """
     from starcat.specs.reading import preset as named_preset
     from starcat.specs.reading import preset_names, read_spec
@@ -54,7 +54,11 @@ def chosen_spec(path: Path | None, name: str | None, changes: list[str] | None =
         raise ConfigError("give either a spec file or --preset, not both")
     if path is not None:
         return read_spec(path, changed_keys(changes))
-    return named_preset(name or preset_names()[0], changed_keys(changes))
+    if name is None:
+        raise ConfigError(
+            "say what to build: a spec (TOML), or --preset with one of " + ", ".join(preset_names())
+        )
+    return named_preset(name, changed_keys(changes))
 
 
 def changed_keys(given: list[str] | None) -> dict[str, str]:
@@ -131,13 +135,15 @@ def camera_of_options(
         raise what_is_wrong(error, "camera") from error
 
 
-def inputs_by_source(given: list[str] | None) -> Mapping[str, list[Path]]:
+def inputs_by_source(given: list[str] | None, only: str | None = None) -> Mapping[str, list[Path]]:
     """Return the paths of ``SOURCE=PATH`` texts by source.
 
     Parameters
     ----------
     given : list of str, optional
         Texts of ``--input``.
+    only : str, optional
+        The source that a text without one is about, where a command is about one source.
 
     Returns
     -------
@@ -154,6 +160,8 @@ def inputs_by_source(given: list[str] | None) -> Mapping[str, list[Path]]:
     inputs: dict[str, list[Path]] = {}
     for text in given or []:
         name, separator, path = text.partition("=")
+        if only is not None and (name != only or not separator):
+            name, separator, path = only, "=", text
         if not separator or not path:
             raise ConfigError(f"--input {text!r} is not SOURCE=PATH, such as sao=sao.dat.gz")
         inputs.setdefault(data_source(name).name, []).append(Path(path))

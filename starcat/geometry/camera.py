@@ -119,6 +119,12 @@ class Camera:
         body = self.directions_from_pixels(centroids_px)
         return float(separation(body[:, None], body[None]).max())
 
+    @property
+    def in_words(self) -> str:
+        """Pixels and field of view, as reports say them."""
+        size, field = (self.width_px, self.height_px), (self.fov_x_deg, self.fov_y_deg)
+        return f"{size[0]} x {size[1]} px, {field[0]:.4g} x {field[1]:.4g} deg"
+
     @cached_property
     def fov_x_deg(self) -> float:
         """Separation of the middles of the left and the right edge, degrees."""

@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.errors import ProductError, SchemaVersionError
+from starcat.errors import ArtifactMissing, ProductError, SchemaVersionError
 from starcat.geometry.camera import Camera
 
 Made = TypeVar("Made")
@@ -164,7 +164,9 @@ def products_in(artifact: Path) -> tuple[str, ...]:
 def _database_file(artifact: Path) -> Path:
     path = artifact / "database.h5" if artifact.is_dir() else artifact
     if not path.is_file():
-        raise ProductError(f"{path}: no such database; give the folder of an artifact", path=path)
+        raise ArtifactMissing(
+            f"{path}: no such database; give the folder of an artifact", path=path
+        )
     return path
 
 
