@@ -18,8 +18,9 @@ if TYPE_CHECKING:
     from typing import Any
 
     from starcat.errors import StarcatError
-    from starcat.face import build, connect, ingest, verify
-    from starcat.face import open_artifact as open  # noqa: A004 - as numpy, gzip and PIL have it
+    from starcat.face.artifact import open_artifact as open  # noqa: A004 - as numpy, gzip and PIL have it
+    from starcat.face.connection import connect
+    from starcat.face.functions import build, ingest, verify
     from starcat.geometry.camera import Camera
     from starcat.matcher.matcher import Matcher
     from starcat.specs.reading import preset, read_spec
@@ -42,13 +43,13 @@ _HOMES = {
     "Camera": ("starcat.geometry.camera", "Camera"),
     "Matcher": ("starcat.matcher.matcher", "Matcher"),
     "StarcatError": ("starcat.errors", "StarcatError"),
-    "build": ("starcat.face", "build"),
-    "connect": ("starcat.face", "connect"),
-    "ingest": ("starcat.face", "ingest"),
-    "open": ("starcat.face", "open_artifact"),
+    "build": ("starcat.face.functions", "build"),
+    "connect": ("starcat.face.connection", "connect"),
+    "ingest": ("starcat.face.functions", "ingest"),
+    "open": ("starcat.face.artifact", "open_artifact"),
     "preset": ("starcat.specs.reading", "preset"),
     "read_spec": ("starcat.specs.reading", "read_spec"),
-    "verify": ("starcat.face", "verify"),
+    "verify": ("starcat.face.functions", "verify"),
 }
 """Module and name of what each public name is."""
 

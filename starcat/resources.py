@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
+
+PathLike = str | os.PathLike[str]
+"""What public functions take for a path."""
 
 _PACKAGE = Path(__file__).resolve().parent
 

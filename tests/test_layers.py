@@ -27,7 +27,7 @@ ROOMS = rooms_of_the_house()
 
 SINGLE_MODULES = {
     "ground": ["errors", "progress", "resources", "version"],
-    "faces": ["", "cli", "__main__", "face"],  # "" is starcat itself,
+    "entry": ["", "cli", "__main__"],  # "" is starcat itself,
 }
 
 GEOMETRY = ("attitude", "camera", "distortion", "kvector", "sphere")

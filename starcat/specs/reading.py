@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,10 +12,9 @@ from pydantic import (
 )
 
 from starcat.errors import ConfigError, suggest
-from starcat.resources import resource_folder
+from starcat.resources import PathLike, resource_folder
 from starcat.specs.build_spec import BuildSpec
 
-PathLike = str | os.PathLike[str]
 Changes = Mapping[str, str]
 """Values by dotted key, as somebody types them: ``{"camera.fov_x_deg": "16"}``."""
 
