@@ -10,6 +10,7 @@ import json
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from dataclasses import replace as changed
 from pathlib import Path
 from typing import Any
 
@@ -128,47 +129,63 @@ def build(
 
     Raises
     ------
-    ConfigError, SourceError
-        If the spec or an input cannot be used.
-    BuildError
-        If too few stars are left, or the database cannot identify its own fields.
-    OutputError
-        If the output cannot be written, or another artifact is there.
+    ConfigError, SourceError, BuildError, OutputError
+        If the spec or an input cannot be used, too few stars are left, the database cannot
+        identify its own fields, or the output cannot be written.
     """
     final = output / f"{spec.name}-{spec.version}"
     clock = Stopwatch()
     with whole_folder(final) as partial:
-        catalog, amplitudes = read_sources(spec, inputs, workers, progress)
-        stars, joined = _join_all(catalog.stars, amplitudes)
-        clock.lap("read")
-        selected, fields = select_stars(stars, spec)
-        clock.lap("select")
-        products = make_products(spec, catalog, selected, fields, progress)
-        matched = match_catalogs(stars, selected, spec, inputs, workers, progress)
-        products += matched.products
-        clock.lap("products")
-        facts = write_products(partial, products, database_facts(spec))
-        clock.lap("write")
-        rates = run_self_test(partial, spec, progress)
-        clock.lap("self-test")
-        progress("report", 0, None)
-        sources = [*source_facts(catalog, selected, amplitudes, joined), *matched.sources]
-        filters = tuple(filter_coverage(step, spec) for step in selected.steps)
-        results = Results(spec, sources, products, facts, fields, filters, rates)
-        report = report_build(partial, results)
-        clock.lap("report")
-        manifest = write_manifest(partial, spec.model_dump(mode="json"), sources, facts)
+        made = _make(partial, spec, inputs, workers, clock, progress)
         progress("verify", 0, None)
-        check_artifact(partial)
-        check_rates(rates, spec)
-        outcome = move_into_place(partial, final, replace=replace)
+        outcome = _release(partial, final, spec, made.rates, replace=replace)
         clock.lap("verify")
     write_build_log(final, outcome, clock.times_s)
-    notes = (*catalog.notes, *matched.notes)
-    warnings = (*dict.fromkeys(notes), *filter(None, [holes_warning(report.gap)]))
-    return Built(
-        final, outcome, manifest, filters, report, rates, catalog.problems, warnings, clock.times_s
-    )
+    return changed(made, folder=final, outcome=outcome, times_s=clock.times_s)
+
+
+def _make(
+    partial: Path,
+    spec: BuildSpec,
+    inputs: Inputs,
+    workers: int,
+    clock: Stopwatch,
+    progress: Progress,
+) -> Built:
+    """Go through all stages up to the manifest, in a folder that has no name yet."""
+    catalog, amplitudes = read_sources(spec, inputs, workers, progress)
+    stars, joined = _join_all(catalog.stars, amplitudes)
+    clock.lap("read")
+    selected, fields = select_stars(stars, spec)
+    clock.lap("select")
+    products = make_products(spec, catalog, selected, fields, progress)
+    matched = match_catalogs(stars, selected, spec, inputs, workers, progress)
+    products += matched.products
+    clock.lap("products")
+    facts = write_products(partial, products, database_facts(spec))
+    clock.lap("write")
+    rates = run_self_test(partial, spec, progress)
+    clock.lap("self-test")
+    progress("report", 0, None)
+    sources = [*source_facts(catalog, selected, amplitudes, joined), *matched.sources]
+    filters = tuple(filter_coverage(step, spec) for step in selected.steps)
+    results = Results(spec, sources, products, facts, fields, filters, rates)
+    report = report_build(partial, results)
+    clock.lap("report")
+    manifest = write_manifest(partial, spec.model_dump(mode="json"), sources, facts)
+    told = dict.fromkeys((*catalog.notes, *matched.notes, holes_warning(report.gap)))
+    warnings = tuple(filter(None, told))
+    problems = catalog.problems
+    return Built(partial, "written", manifest, filters, report, rates, problems, warnings, {})
+
+
+def _release(
+    partial: Path, final: Path, spec: BuildSpec, rates: tuple[Rates, Rates], *, replace: bool
+) -> Outcome:
+    """Read a finished artifact back, hold it against its spec and give it its name."""
+    check_artifact(partial)
+    check_rates(rates, spec)
+    return move_into_place(partial, final, replace=replace)
 
 
 def read_sources(
