@@ -69,7 +69,7 @@ def bright_sky(faint_limit_mag: float = FAINT_LIMIT_MAG, seed: int = 1) -> Sky:
         hip=hip,
         hd=1 + generator.permutation(359_083)[:count],
         sao=generator.choice(others, count, replace=False),
-        gaia_id=np.where(known, 0, gaia["source_id"]),
+        gaia_id=np.where(known, 10**17 + hip, gaia["source_id"]),
     )
     number, ra_deg, dec_deg = POLARIS
     polaris = np.argmin(np.hypot(sky.ra_deg - ra_deg, sky.dec_deg - dec_deg))
