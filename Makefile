@@ -1,8 +1,11 @@
-# Every target runs in .venv, which the first of them makes.
+# Every target runs in .venv, which the first of them makes. What a user needs (RUNS) and what a
+# developer needs besides (READY) are installed apart: the demo needs no development tool.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+RUNS := $(VENV)/.runs
 READY := $(VENV)/.ready
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .PHONY: help install check format test test-all demo bench reproduction docs pictures golden release clean
@@ -10,10 +13,16 @@ READY := $(VENV)/.ready
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
 
-$(READY): pyproject.toml
-	$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "starcat needs Python 3.11 or newer"'
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+$(RUNS): pyproject.toml
+	@$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "starcat needs Python 3.11 or newer"'
+	@echo "making $(VENV) and installing starcat with its libraries (700 MB; a minute or two)"
+	@$(PYTHON) -m venv $(VENV)
+	@$(PIP) --editable '.[images]'
+	@touch $(RUNS)
+
+$(READY): $(RUNS)
+	@echo "installing the tools of the tests into $(VENV) (another 300 MB; a minute)"
+	@$(PIP) --editable '.[dev]'
 	@touch $(READY)
 
 install: $(READY) ## install starcat and its tools into .venv
@@ -33,7 +42,7 @@ test: $(READY) ## the fast tests and the docstrings' examples
 test-all: $(READY) ## the fast tests and the sky-scale ones
 	$(BIN)/python -m pytest -q -n 2
 
-demo: $(READY) ## build a database from the embedded sky, check it, identify simulated fields
+demo: $(RUNS) ## build a database from the embedded sky, check it, identify simulated fields
 	$(BIN)/starcat build --preset gaia-12deg --output dist --replace
 	$(BIN)/starcat verify dist/gaia-12deg-1.0.0
 	$(BIN)/starcat sql dist/gaia-12deg-1.0.0 --named emptiest-fields --set count=3

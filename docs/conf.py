@@ -1,6 +1,6 @@
 """The documentation site: Markdown pages of this folder, built by ``make docs``."""
 
-from starcat import __version__
+from starcat.version import __version__
 
 project = "starcat"
 author = "the starcat developers"

@@ -1,13 +1,72 @@
 """starcat: guide-star databases for star trackers, built from star catalogs.
 
-The rooms follow the data: ``catalog`` reads archives and selects guide stars, ``products``
-computes what a tracker looks up, ``artifact`` writes and reads the released directory,
-``matcher`` identifies stars with it and ``evaluation`` measures how well.
+>>> import starcat
+>>> starcat.preset("gaia-12deg")
+<BuildSpec gaia-12deg-1.0.0: gaia to 6 mag, 1024 x 1024 px, 12 x 12 deg>
+
+The names of ``__all__`` are the public ones; each is imported when it is first used, so that
+``import starcat`` costs nothing and a program that only matches needs numpy and h5py alone. The
+rooms behind them are described in ``docs/house.md`` and may change.
 """
 
-import logging
+from __future__ import annotations
 
-# A program that wants to see the library's messages sets up logging; the CLI prints its own.
-logging.getLogger(__name__).addHandler(logging.NullHandler())
+from starcat.version import __version__
 
-__version__ = "0.1.0"
+TYPE_CHECKING = False  # as a type checker knows it, without importing typing for it
+if TYPE_CHECKING:
+    from typing import Any
+
+    from starcat.errors import StarcatError
+    from starcat.face import build, connect, ingest, verify
+    from starcat.face import open_artifact as open  # noqa: A004 - as numpy, gzip and PIL have it
+    from starcat.geometry.camera import Camera
+    from starcat.matcher.matcher import Matcher
+    from starcat.specs.reading import preset, read_spec
+
+__all__ = [
+    "Camera",
+    "Matcher",
+    "StarcatError",
+    "__version__",
+    "build",
+    "connect",
+    "ingest",
+    "open",
+    "preset",
+    "read_spec",
+    "verify",
+]
+
+_HOMES = {
+    "Camera": ("starcat.geometry.camera", "Camera"),
+    "Matcher": ("starcat.matcher.matcher", "Matcher"),
+    "StarcatError": ("starcat.errors", "StarcatError"),
+    "build": ("starcat.face", "build"),
+    "connect": ("starcat.face", "connect"),
+    "ingest": ("starcat.face", "ingest"),
+    "open": ("starcat.face", "open_artifact"),
+    "preset": ("starcat.specs.reading", "preset"),
+    "read_spec": ("starcat.specs.reading", "read_spec"),
+    "verify": ("starcat.face", "verify"),
+}
+"""Module and name of what each public name is."""
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used (PEP 562)."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'starcat' has no attribute {name!r}")
+    import logging
+    from importlib import import_module
+
+    # A program that wants to see the library's messages sets up logging itself.
+    logging.getLogger(__name__).addHandler(logging.NullHandler())
+    module, attribute = _HOMES[name]
+    found = globals()[name] = getattr(import_module(module), attribute)
+    return found
+
+
+def __dir__() -> list[str]:
+    """List the public names."""
+    return sorted(__all__)

@@ -1,19 +1,23 @@
 """The command line: parse, call one function, print, exit code.
 
 Results go to stdout as tables or, with ``--json``, as JSON; messages and progress bars go to
-stderr. Exit codes: 0 done, 1 failed, 2 usage or spec, 3 source missing or damaged, 4 schema,
-5 artifact damaged. The commands themselves are in ``starcat.commands``.
+stderr, and so does the one object that an error is under ``--json``. The exit codes are in
+``docs/errors.md``, the commands themselves in ``starcat.commands``.
 """
 
 from __future__ import annotations
 
+import logging
+import os
 import signal
 import sys
+import traceback
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
-from starcat import __version__
 from starcat.commands import (
     artifacts,
     catalogs,
@@ -22,18 +26,43 @@ from starcat.commands import (
     matching,
     querying,
     releasing,
+    specs,
 )
-from starcat.errors import StarcatError, reason
+from starcat.terminal.failures import failure_of
+from starcat.version import __version__
+
+INTERRUPTED = 128 + signal.SIGINT
+"""Exit code after Ctrl-C, as the shells have it."""
+
+
+class WholeSummaries(TyperGroup):
+    """The commands in the help, each with its first sentence and no dots for the rest."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write a line or more a command.
+
+        Parameters
+        ----------
+        ctx : click.Context
+            Of the help.
+        formatter : click.HelpFormatter
+            Wraps the lines.
+        """
+        rows = [(name, one.get_short_help_str(limit=1000)) for name, one in self.commands.items()]
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
+
 
 app = typer.Typer(
+    cls=WholeSummaries,
     name="starcat",
     help="Guide-star databases for star trackers, built from star catalogs.",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["--help", "-h"]},
 )
-PARTS = (catalogs, artifacts, querying, exchanging, releasing, matching, evaluating)
+PARTS = (catalogs, specs, artifacts, querying, exchanging, releasing, matching, evaluating)
 """In the order of --help."""
 
 for part in PARTS:
@@ -51,7 +80,9 @@ def _options(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of errors.")] = False,
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show the traceback of errors; anywhere on the line.")
+    ] = False,
 ) -> None:
     """Guide-star databases for star trackers, built from star catalogs."""
 
@@ -62,21 +93,54 @@ def _stop(number: int, frame: Any) -> None:
 
 
 def main() -> None:
-    """Run the command line, and turn errors into a message and an exit code.
+    """Run the command line, and turn every exception into a message and an exit code.
 
-    What the operating system refuses at a place that nobody foresaw exits with 1.
+    ``--debug`` shows the traceback before the message, wherever on the line it stands; the exit
+    code stays the same.
     """
     signal.signal(signal.SIGTERM, _stop)
+    logging.getLogger("starcat").addHandler(logging.NullHandler())  # the commands print their own
+    arguments, behind = _parted(sys.argv[1:])
+    is_debug = "--debug" in arguments
+    arguments = [argument for argument in arguments if argument != "--debug"]
     try:
-        app(prog_name="starcat")
-    except StarcatError as error:
-        if "--debug" in sys.argv:
-            raise
-        sys.stderr.write(f"starcat: error: {error}\n")
-        sys.exit(error.exit_code)
-    except OSError as error:
-        if "--debug" in sys.argv:
-            raise
-        where = f"{error.filename}: " if error.filename else ""
-        sys.stderr.write(f"starcat: error: {where}{reason(error)}\n")
-        sys.exit(1)
+        code = _run([*arguments, *behind])
+    except Exception as error:
+        if is_debug:
+            traceback.print_exc()
+        code = _tell(error, arguments)
+    except KeyboardInterrupt:
+        code = INTERRUPTED
+    sys.exit(code)
+
+
+def _parted(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return what stands before ``--``, where options are, and the rest."""
+    end = list(arguments).index("--") if "--" in arguments else len(arguments)
+    return list(arguments[:end]), list(arguments[end:])
+
+
+def _run(arguments: Sequence[str]) -> int:
+    """Run a command, and see that all that it printed has arrived."""
+    try:
+        command = typer.main.get_command(app)
+        code = command.main(list(arguments), "starcat", standalone_mode=False)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Whoever read the output has had enough; what is left goes nowhere, without a word.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    return code if isinstance(code, int) else 0
+
+
+def _tell(error: Exception, arguments: Sequence[str]) -> int:
+    """Say what went wrong on stderr and return the exit code."""
+    named = [argument for argument in arguments if not argument.startswith("-")]
+    failure = failure_of(error, " ".join(["starcat", *named[:1]]))
+    if "--json" in arguments:
+        sys.stderr.write(failure.as_json())
+    elif hasattr(error, "show"):  # a usage error, with the usage above the message
+        error.show()
+    else:
+        sys.stderr.write(failure.as_text())
+    return failure.code

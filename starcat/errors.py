@@ -57,6 +57,35 @@ def suggest(word: str, known: Iterable[str]) -> str:
     return f"did you mean {near[0]!r}? " if near else ""
 
 
+def quoted(text: bytes | str, most: int = 60) -> str:
+    """Return a text of an input as a message quotes it: what is too long is cut.
+
+    Parameters
+    ----------
+    text : bytes or str
+        Any length, with any characters.
+    most : int, default 60
+        Characters to quote at most.
+
+    Returns
+    -------
+    str
+        In quotation marks, with escapes for what cannot be printed, and the length of the whole
+        where only its beginning is there.
+
+    Examples
+    --------
+    >>> quoted(b" x.2")
+    "' x.2'"
+    >>> quoted("7" * 20_000, most=5)
+    "'77777' (the first 5 of 20,000 characters)"
+    """
+    words = text.decode("latin-1") if isinstance(text, bytes) else text
+    if len(words) <= most:
+        return repr(words)
+    return f"{words[:most]!r} (the first {most} of {len(words):,} characters)"
+
+
 class StarcatError(Exception):
     """Base of all errors that starcat raises on purpose."""
 
@@ -216,10 +245,22 @@ class ProductError(StarcatError):
         self.path = path
 
 
+class ArtifactMissing(ProductError):  # noqa: N818 - the name reads as the fact
+    """No artifact, or no database, at the place that was named."""
+
+    exit_code = 3
+
+
 class QueryError(StarcatError):
     """A query that is no SQL, asks for what is not there, or for what is not allowed."""
 
     exit_code = 2
+
+
+class TargetMissing(QueryError):  # noqa: N818
+    """A query about an artifact or a file that is not there."""
+
+    exit_code = 3
 
 
 class QueryLimitError(QueryError):

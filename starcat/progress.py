@@ -9,7 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 Progress = Callable[[str, int, int | None], None]
-"""Called with (stage, done, total); ``total`` is None where it is not known."""
+"""Called with (stage, done, total); ``total`` is None where it is not known.
+
+A stage whose name begins with one of `BYTE_STAGES` and that knows its total counts bytes; others
+count what they work on.
+"""
+
+BYTE_STAGES = ("fetch", "publish", "pull", "read")
 
 
 def no_progress(stage: str, done: int, total: int | None) -> None:

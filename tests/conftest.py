@@ -169,7 +169,7 @@ def starcat(
 def small_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> Path:
     """The artifact of `small_spec`; to be copied by who changes it."""
     from starcat.pipeline.build import build
-    from starcat.specs.build_spec import spec_from_dict
+    from starcat.specs.reading import spec_from_dict
 
     folder = tmp_path_factory.mktemp("small")
     (folder / "sao.dat").write_bytes(b"".join(sao_lines))
@@ -197,7 +197,7 @@ def artifact_version(
         artifact = folder / f"small-{version}"
         if artifact.exists():
             return artifact
-        shutil.copytree(small_artifact, artifact)
+        shutil.copytree(small_artifact, artifact, copy_function=shutil.copyfile)
         manifest = json.loads((artifact / "manifest.json").read_bytes())
         manifest["version"] = manifest["spec"]["version"] = version
         with h5py.File(artifact / "database.h5", "r+") as file:

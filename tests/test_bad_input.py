@@ -78,7 +78,11 @@ class Place:
 
     def copy(self) -> Path:
         """A copy of a good artifact, to be damaged."""
-        return Path(shutil.copytree(self.artifact, self.folder / self.artifact.name))
+        return Path(
+            shutil.copytree(
+                self.artifact, self.folder / self.artifact.name, copy_function=shutil.copyfile
+            )
+        )
 
     def manifest(self, change: Callable[[dict[str, Any]], object]) -> Path:
         """A copy of a good artifact with a changed manifest."""
@@ -489,7 +493,7 @@ def _(place: Place) -> Call:
 
 @case("another artifact of that name", 1)
 def _(place: Place) -> Call:
-    shutil.copytree(place.artifact, place.out / place.artifact.name)
+    shutil.copytree(place.artifact, place.out / place.artifact.name, copy_function=shutil.copyfile)
     return place.build("faint_limit_mag = 6.0", "faint_limit_mag = 5.9")
 
 
@@ -940,7 +944,7 @@ def _(place: Place) -> Call:
 
 @case("export of nothing", 2)
 def _(place: Place) -> Call:
-    return ["export", "--to", "fits", "-o", place.out]
+    return ["export", "--format", "fits", "-o", place.out]
 
 
 @case("export of what is not there", 3)
@@ -950,12 +954,12 @@ def _(place: Place) -> Call:
 
 @case("export of a file that is not Parquet", 3)
 def _(place: Place) -> Call:
-    return ["export", place.write("stars.csv", "star_id\n1\n"), "--to", "fits", "-o", place.out]
+    return ["export", place.write("stars.csv", "star_id\n1\n"), "--format", "fits", "-o", place.out]
 
 
 @case("format unknown", 2)
 def _(place: Place) -> Call:
-    return ["export", place.artifact, "--to", "xlsx", "-o", place.out]
+    return ["export", place.artifact, "--format", "xlsx", "-o", place.out]
 
 
 @case("format that the name of a file does not say", 2)
@@ -970,7 +974,7 @@ def _(place: Place) -> Call:
 
 @case("HATS of what are no stars", 2)
 def _(place: Place) -> Call:
-    return ["export", place.artifact, "--to", "hats", "--product", "pairs", "-o", place.out]
+    return ["export", place.artifact, "--format", "hats", "--product", "pairs", "-o", place.out]
 
 
 @case("another file of that name", 1)
@@ -988,14 +992,14 @@ def _(place: Place) -> Call:
 def _(place: Place) -> Call:
     path = place.folder / "stars.parquet"
     pq.write_table(pa.table({"designation": ["α Centauri"]}), path)
-    return ["export", path, "--to", "fits", "-o", place.out]
+    return ["export", path, "--format", "fits", "-o", place.out]
 
 
 @case("type that no format can hold", 4)
 def _(place: Place) -> Call:
     path = place.folder / "stars.parquet"
     pq.write_table(pa.table({"code": [b"x"]}), path)
-    return ["export", path, "--to", "csv", "-o", place.out]
+    return ["export", path, "--format", "csv", "-o", place.out]
 
 
 @case("peer unknown", 2)

@@ -20,8 +20,8 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import HORIZON, NO_DISTORTION, Distortion
 from starcat.geometry.sphere import separation
 from starcat.resources import resource_folder
-from starcat.specs.build_spec import preset, preset_names
 from starcat.specs.camera_file import camera_toml, read_camera
+from starcat.specs.reading import preset, preset_names
 
 WIDE = Camera(1024, 768, 2000.0)
 BARREL = Distortion(-0.3)

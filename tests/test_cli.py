@@ -21,7 +21,7 @@ from starcat.artifact.content import content_sha256
 from starcat.catalog.source import source_names
 from starcat.cli import app
 from starcat.matcher.methods.table import METHODS
-from starcat.specs.build_spec import preset_names
+from starcat.specs.reading import preset_names
 from starcat.tables.schema import product_schema
 
 COMMANDS = tuple(sorted(typer.main.get_command(app).commands))  # type: ignore[attr-defined]
@@ -146,7 +146,7 @@ def test_presets_as_json(starcat: Run) -> None:
 
 def test_ingest_writes_a_star_table(starcat: Run, stars: Path, tmp_path: Path) -> None:
     out = tmp_path / "made" / "out.parquet"
-    run = starcat(["ingest", "sao", "--input", stars, "-o", out, "--epoch", "2026"])
+    run = starcat(["ingest", "sao", "--input", stars, "-o", out, "--epoch-jyear", "2026"])
     assert run.code == 0
     assert run.err == f"wrote {out}\n"
     assert re.search(r"^kept +600$", run.out, re.MULTILINE)
@@ -205,7 +205,9 @@ def test_ingest_of_several_files(starcat: Run, sao_lines: list[bytes], tmp_path:
 def test_ingest_of_the_excerpt(starcat: Run, catalogs: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.parquet"
     archive = catalogs / "sao.dat.gz"
-    run = starcat(["ingest", "sao", "--input", archive, "-o", out, "--epoch", "2026", "--json"])
+    run = starcat(
+        ["ingest", "sao", "--input", archive, "-o", out, "--epoch-jyear", "2026", "--json"]
+    )
     assert json.loads(run.out)["rows_read"] == gzip.decompress(archive.read_bytes()).count(b"\n")
     product_schema("stars").check(pq.read_table(out))
 
@@ -221,7 +223,9 @@ def test_build_prints_what_it_made(
     arguments = ["build", spec, "--input", f"sao={stars}", "-o", tmp_path / "dist"]
     run = starcat(arguments)
     assert run.code == 0
-    assert run.err == f"written: {tmp_path / 'dist' / 'small-1.0.0'}\n"
+    artifact = tmp_path / "dist" / "small-1.0.0"
+    assert run.err == f"written: {artifact}\nreport: {artifact / 'report' / 'index.html'}\n"
+    assert (artifact / "report" / "index.html").is_file()
     assert fits(run.out)
     for words in ("read", "kept", "rejected: too_faint", "fields below 4", "pairs-1.0.0", "clean"):
         assert words in run.out
@@ -230,7 +234,7 @@ def test_build_prints_what_it_made(
     assert again.err == ""
     assert made["outcome"] == "unchanged"
     assert list(made) == [
-        "artifact", "outcome", "filters", "coverage", "self_test", "warnings", "times_s",
+        "artifact", "report", "outcome", "filters", "coverage", "self_test", "warnings", "times_s",
         "sources", "products", "files",
     ]  # fmt: skip
     assert made["artifact"] == str(tmp_path / "dist" / "small-1.0.0")
@@ -242,7 +246,13 @@ def test_inspect(starcat: Run, small_artifact: Path) -> None:
     run = starcat(["inspect", small_artifact])
     assert run.code == 0
     assert fits(run.out)
-    for words in ("small-1.0.0", "ICRS, J2026", "512 x 512 px", "sao from sao.dat", "pairs-1.0.0"):
+    for words in (
+        "small-1.0.0",
+        "ICRS, J2026",
+        "512 x 512 px, 40 x 40 deg",
+        "sao from sao.dat",
+        "pairs-1.0.0",
+    ):
         assert words in run.out
 
 

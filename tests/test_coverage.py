@@ -32,7 +32,8 @@ from starcat.products.coverage import (
     summarise_coverage,
     tiling_gap,
 )
-from starcat.specs.build_spec import BuildSpec, preset, spec_from_dict
+from starcat.specs.build_spec import BuildSpec
+from starcat.specs.reading import preset, spec_from_dict
 
 Array = NDArray[np.float64]
 Draw = Callable[[int, int], Array]

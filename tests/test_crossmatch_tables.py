@@ -19,7 +19,7 @@ from jsonschema import Draft202012Validator
 from starcat.artifact.content import content_sha256
 from starcat.artifact.crossmatch_table import counterpart_problems, matched_stars, moving_stars
 from starcat.artifact.diff import diff_artifacts
-from starcat.artifact.manifest import manifest_digest
+from starcat.artifact.manifest import MANIFEST_VERSION, manifest_digest
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import verify_artifact
 from starcat.catalog.ingest import ingest
@@ -38,7 +38,9 @@ from starcat.pipeline.rebuild import rebuild
 from starcat.products.crossmatch import VERDICTS
 from starcat.products.match_odds import ARCSEC
 from starcat.resources import resource_folder
-from starcat.specs.build_spec import BuildSpec, Crossmatch, spec_from_dict
+from starcat.specs.build_spec import BuildSpec
+from starcat.specs.product_sections import Crossmatch, Products
+from starcat.specs.reading import spec_from_dict
 from starcat.storage.digests import file_sha256, json_bytes
 from starcat.tables.parquet import read_parquet, write_parquet
 from starcat.tables.schema import product_schema
@@ -81,7 +83,7 @@ def artifact(files: Path, small_spec: str) -> Path:
 
 @pytest.fixture
 def copy(artifact: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(artifact, tmp_path / artifact.name))
+    return Path(shutil.copytree(artifact, tmp_path / artifact.name, copy_function=shutil.copyfile))
 
 
 # In an artifact ------------------------------------------------------------------------------
@@ -103,11 +105,11 @@ def test_an_artifact_names_the_counterparts(artifact: Path):
     assert best["designation"][0].as_py() == f"Gaia DR3 {star_id[0] + FIRST_ID - 1}"
 
 
-def test_its_manifest_is_of_the_version_that_knows_counterparts(
-    artifact: Path, small_artifact: Path
-):
+def test_every_manifest_is_of_one_version(artifact: Path, small_artifact: Path):
     manifest = json.loads((artifact / "manifest.json").read_bytes())
-    schema = json.loads((resource_folder("schemas") / "manifest-1.1.0.json").read_text())
+    schema = json.loads(
+        (resource_folder("schemas") / f"manifest-{MANIFEST_VERSION}.json").read_text()
+    )
     Draft202012Validator(schema).validate(manifest)
     roles = [(source["source"], source["role"]) for source in manifest["sources"]]
     assert roles == [("sao", "stars"), ("gaia", "crossmatch")]
@@ -115,15 +117,18 @@ def test_its_manifest_is_of_the_version_that_knows_counterparts(
     assert manifest["products"]["crossmatch"]["in_database"] is False
     with h5py.File(artifact / "database.h5") as file:
         assert "crossmatch" not in file
-    # One that asks for none is what it was before there were any.
-    before = json.loads((small_artifact / "manifest.json").read_bytes())
-    assert before["manifest_version"] == "1.0.0"
-    assert "crossmatch" not in before["spec"]["products"]
+    # One that asks for none is of the same version, and says so.
+    plain = json.loads((small_artifact / "manifest.json").read_bytes())
+    assert plain["manifest_version"] == manifest["manifest_version"] == MANIFEST_VERSION
+    assert plain["spec"]["products"]["crossmatch"]["enabled"] is False
 
 
-def test_an_unused_section_is_not_dumped(small_spec: str):
+def test_the_spec_of_a_manifest_is_whole(small_artifact: Path, small_spec: str):
     plain = spec_of(small_spec)
-    assert "crossmatch" not in plain.model_dump(mode="json")["products"]
+    dumped = json.loads((small_artifact / "manifest.json").read_bytes())["spec"]
+    assert dumped == plain.model_dump(mode="json")
+    assert dumped.keys() == BuildSpec.model_fields.keys()
+    assert dumped["products"].keys() == Products.model_fields.keys()
     named = spec_of(small_spec, catalogs=["gaia"], radius_arcsec=5.0)
     assert named.sources == ("sao",)
     again = spec_from_dict(named.model_dump(mode="json"), "manifest.json")
@@ -233,9 +238,9 @@ def test_a_rejected_companion_is_a_rival(
     spec = spec_of(small_spec, enabled=True, catalogs=["gaia"])
     selected = select_guide_stars(stars, spec.selection)
     assert 601 not in selected.guide_stars["star_id"].to_pylist()
-    both = with_rivals(selected, 10.0 * ARCSEC)
+    both = with_rivals(stars, selected, 10.0 * ARCSEC)
     assert both["star_id"].to_pylist() == [*selected.guide_stars["star_id"].to_pylist(), 601]
-    found = match_catalogs(selected, spec, {"gaia": [files]})
+    found = match_catalogs(stars, selected, spec, {"gaia": [files]})
     table = found.products[0].table
     row = table["counterpart_id"].to_pylist().index(FIRST_ID + 9)
     assert table["star"][row].as_py() == 9
@@ -351,7 +356,7 @@ def test_the_command_prints_a_summary(
         assert word in ran.out
     assert max(len(line) for line in ran.out.splitlines()) <= 100
     assert f"wrote {output}" in ran.err
-    ran = starcat(["crossmatch", *tables, "-o", output, "--radius", 0.001, "--json"])
+    ran = starcat(["crossmatch", *tables, "-o", output, "--radius-arcsec", 0.001, "--json"])
     content = json.loads(ran.out)
     assert (content["a"], content["b"], content["radius_arcsec"]) == ("sao", "gaia", 0.001)
     assert content["matched"] + content["unmatched"] == 600

@@ -28,7 +28,8 @@ from starcat.pipeline.counterparts import match_tables
 from starcat.pipeline.rebuild import rebuild
 from starcat.products.crossmatch import VERDICTS, crossmatch
 from starcat.products.match_odds import ARCSEC, MatchModel
-from starcat.specs.build_spec import Crossmatch, spec_from_dict
+from starcat.specs.product_sections import Crossmatch
+from starcat.specs.reading import spec_from_dict
 
 FILES = {"sao": "sao.dat.gz", "hipparcos": "hip_main.dat.gz", "tycho2": "tyc2.dat.gz"}
 

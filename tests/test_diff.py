@@ -14,7 +14,7 @@ from starcat.artifact.diff import MOVED_ARCSEC, NOT_READ, Change, Difference, di
 from starcat.artifact.reader import Artifact, open_artifact
 from starcat.artifact.verify import check_artifact
 from starcat.pipeline.build import build
-from starcat.specs.build_spec import spec_from_dict
+from starcat.specs.reading import spec_from_dict
 
 Make = Callable[..., Artifact]
 

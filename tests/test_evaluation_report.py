@@ -27,6 +27,7 @@ from starcat.evaluation import run as evaluate
 from starcat.evaluation import trial
 from starcat.evaluation.axes import AXES, axis_label
 from starcat.evaluation.campaign import MeasuredRow, Outcome, _measured, is_goal_reached, run_paper
+from starcat.evaluation.earlier import with_earlier
 from starcat.evaluation.judge import FIELDS
 from starcat.evaluation.paper import Paper, Row, Statistic
 from starcat.evaluation.papers import table as registry
@@ -55,13 +56,13 @@ from starcat.evaluation.report.plots import (
     series_order,
 )
 from starcat.evaluation.report.tables import failure_table, rate_tables, summary_table
-from starcat.evaluation.run import Evaluation, evaluate_artifact, evaluate_papers, noise_values
-from starcat.evaluation.sweep import plan_sweep, sweep_paper
+from starcat.evaluation.run import Evaluation, evaluate_artifact, evaluate_papers
+from starcat.evaluation.sweep import plan_sweep, sweep_paper, sweep_values
 from starcat.evaluation.trial import Attitudes, Trial
 from starcat.geometry.camera import Camera
 from starcat.matcher.methods.table import METHODS, Method
 from starcat.simulation.simulate import Noise
-from starcat.specs.build_spec import spec_from_dict
+from starcat.specs.reading import spec_from_dict
 from starcat.terminal.evaluations import print_evaluation
 
 FRAMES = Attitudes("random", 8)
@@ -437,12 +438,12 @@ def test_a_sweep_needs_an_artifact(tmp_path: Path) -> None:
         plan_sweep(tmp_path, {})
 
 
-def test_noise_values() -> None:
-    read = noise_values(["noise_px=0,0.5,1", "k1=-0.1"])
+def test_values_of_a_sweep() -> None:
+    read = sweep_values(noise_px="0,0.5,1", k1="-0.1", scale=None)
     assert read == {"noise_px": (0.0, 0.5, 1.0), "k1": (-0.1,)}
-    for wrong in (["noise_px"], ["noise_px="], ["noise_px=1,x"], ["k1=1", "k1=2"]):
-        with pytest.raises(ConfigError, match="NAME=VALUE"):
-            noise_values(wrong)
+    for wrong in ("", "1,", "1,x", "1;2"):
+        with pytest.raises(ConfigError, match=r"--false-stars .*commas"):
+            sweep_values(false_stars=wrong)
 
 
 # Tables, files, pages -----------------------------------------------------------------------
@@ -777,3 +778,61 @@ def test_an_artifact_is_evaluated_end_to_end(small_artifact: Path, tmp_path: Pat
     assert content["rows"][0]["by_rule"]["hits"] == 3
     assert (done.page.parent / "small-1.0.0_01_position_noise_px.svg").is_file()
     assert "At a glance" not in done.page.read_text(encoding="utf-8")
+
+
+def test_sweeps_into_one_folder_stand_beside_each_other(
+    small_artifact: Path, tmp_path: Path
+) -> None:
+    """As the how-to's recipe makes them: two commands, one folder."""
+
+    def sweep(frames: int = 3, **values: tuple[float, ...]) -> Evaluation:
+        planned = plan_sweep(small_artifact, values, frames=frames)
+        return evaluate_artifact(planned, tmp_path, workers=1)
+
+    sweep(noise_px=(0.0, 1.0))
+    done = sweep(false_stars=(0.0, 2.0))
+    assert [row["group"] for row in done.contents[0]["rows"]] == ["false stars"] * 2
+    sweep(4, noise_px=(1.0, 2.0))
+    sweep(noise_px=(0.0, 1.0), false_stars=(3.0,))  # under other conditions: a group of its own
+    (content,) = json.loads((done.page.parent / RESULTS).read_bytes())["evaluations"]
+    points = [(row["group"], row["x"], row["frames"]) for row in content["rows"]]
+    assert points == [
+        ("position noise, px", 0.0, 3),
+        ("position noise, px", 1.0, 4),
+        ("position noise, px", 2.0, 4),
+        ("false stars", 0.0, 3),
+        ("false stars", 2.0, 3),
+        ("position noise, px (false stars 3)", 0.0, 3),
+        ("position noise, px (false stars 3)", 1.0, 3),
+    ]
+    page = done.page.read_text(encoding="utf-8")
+    assert page.count("<figure>") == 3
+    assert "0: 3 frames, seed 1<br>1, 2: 4 frames, seed 1" in page
+    assert "the paper" not in page
+    with (done.page.parent / "small-1.0.0.csv").open(newline="") as file:
+        assert len(list(csv.DictReader(file))) == 7
+
+
+def test_a_sweep_with_another_camera_has_a_section_of_its_own(
+    small_artifact: Path, tmp_path: Path
+) -> None:
+    for camera in (None, replace(LENS, focal_length_px=700.0), LENS):
+        sweep = plan_sweep(small_artifact, {"noise_px": (0.5,)}, camera=camera, frames=2)
+        done = evaluate_artifact(sweep, tmp_path, workers=1)
+    stored = json.loads((done.page.parent / RESULTS).read_bytes())["evaluations"]
+    assert [content["name"] for content in stored] == ["small-1.0.0", "small-1.0.0-camera-2"]
+    assert [len(content["rows"]) for content in stored] == [1, 1]
+    assert (done.page.parent / "small-1.0.0-camera-2.csv").is_file()
+
+
+def test_sweeps_of_another_artifact_or_code_are_left_out(
+    small_artifact: Path, tmp_path: Path
+) -> None:
+    sweep = plan_sweep(small_artifact, {"noise_px": (0.5,)}, frames=2)
+    results = evaluate_artifact(sweep, tmp_path, workers=1).page.parent / RESULTS
+    (stored,) = json.loads(results.read_bytes())["evaluations"]
+    other = {**stored, "measured_with": {**stored["measured_with"], "code_sha256": "0" * 64}}
+    for kept in ({"evaluations": [other]}, {"evaluations": [{}]}, []):
+        results.write_text(json.dumps(kept))
+        (content,) = with_earlier(results, stored, small_artifact)
+        assert content == stored

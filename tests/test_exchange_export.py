@@ -37,7 +37,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 @pytest.mark.parametrize("to", EXPORT_FORMATS)
 def test_one_file_a_product(starcat: Run, small_artifact: Path, tmp_path: Path, to: str) -> None:
     out = tmp_path / "out"
-    ran = starcat(["export", small_artifact, "--to", to, "-o", out, "--json"])
+    ran = starcat(["export", small_artifact, "--format", to, "-o", out, "--json"])
     assert ran.code == 0, ran.err
     told = json.loads(ran.out)
     artifact = open_artifact(small_artifact)
@@ -58,7 +58,7 @@ def test_one_file_a_product(starcat: Run, small_artifact: Path, tmp_path: Path, 
 def test_columns_say_units_where_the_format_does_not(
     starcat: Run, small_artifact: Path, tmp_path: Path, to: str
 ) -> None:
-    assert starcat(["export", small_artifact, "--to", to, "-o", tmp_path]).code == 0
+    assert starcat(["export", small_artifact, "--format", to, "-o", tmp_path]).code == 0
     with (tmp_path / "columns.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     artifact = open_artifact(small_artifact)
@@ -96,7 +96,7 @@ def test_a_second_export_adds_to_the_columns(
 def test_what_is_there_stays_unless_it_may_be_replaced(
     starcat: Run, small_artifact: Path, tmp_path: Path
 ) -> None:
-    command = ["export", small_artifact, "--to", "fits", "--product", "stars", "-o", tmp_path]
+    command = ["export", small_artifact, "--format", "fits", "--product", "stars", "-o", tmp_path]
     (tmp_path / "notes.txt").write_text("mine")
     assert starcat(command).code == 0
     assert starcat(command).code == 0  # the same again is no conflict
@@ -120,7 +120,7 @@ def test_hats_replaces_a_hats_catalog_and_nothing_else(
     starcat: Run, small_artifact: Path, tmp_path: Path
 ) -> None:
     pytest.importorskip("cdshealpix")
-    command = ["export", small_artifact, "--to", "hats", "--product", "stars", "-o", tmp_path]
+    command = ["export", small_artifact, "--format", "hats", "--product", "stars", "-o", tmp_path]
     assert starcat(command).code == 0
     before = contents(tmp_path)
     smaller = [*command, "--max-partition-rows", "20"]
@@ -143,7 +143,7 @@ def test_a_file_in_place_of_the_folder(starcat: Run, small_artifact: Path, tmp_p
 
 def test_a_parquet_file(starcat: Run, small_artifact: Path, tmp_path: Path) -> None:
     file = small_artifact / "stars.parquet"
-    assert starcat(["export", file, "--to", "ecsv", "-o", tmp_path]).code == 0
+    assert starcat(["export", file, "--format", "ecsv", "-o", tmp_path]).code == 0
     wanted = pq.read_table(file)
     assert Table.read(tmp_path / "stars.ecsv")["star_id"].tolist() == wanted["star_id"].to_pylist()
 
@@ -155,7 +155,7 @@ def test_a_peer_s_stars(starcat: Run, tmp_path: Path) -> None:
     np.savez(tmp_path / "tetra.npz", star_table=table)
     out = tmp_path / "out"
     peer = ["export", tmp_path / "tetra.npz", "--from-peer", "cedar-solve", "-o", out]
-    assert starcat([*peer, "--to", "parquet"]).code == 0
+    assert starcat([*peer, "--format", "parquet"]).code == 0
     product_schema("stars").check(pq.read_table(out / "stars.parquet"))
     wrong = starcat(["export", tmp_path / "tetra.npz", "-o", out])
     assert wrong.code == 3
@@ -165,9 +165,13 @@ def test_a_peer_s_stars(starcat: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        (["--to", "xlsx"], 2, "format 'xlsx' is unknown; choose one of csv,"),
+        (["--format", "xlsx"], 2, "format 'xlsx' is unknown; choose one of csv,"),
         (["--product", "star"], 2, "has no product 'star'; did you mean 'stars'?"),
-        (["--to", "hats", "--product", "pairs"], 2, "not a star table, it has no column star_id"),
+        (
+            ["--format", "hats", "--product", "pairs"],
+            2,
+            "not a star table, it has no column star_id",
+        ),
         (["--from-peer", "lost"], 2, "peer 'lost' is unknown"),
     ],
 )
@@ -196,7 +200,9 @@ def test_rows_without_a_position_are_told(starcat: Run, tmp_path: Path) -> None:
     pytest.importorskip("cdshealpix")
     table = pa.table({"star_id": [1, 2], "ra_deg": [5.0, None], "dec_deg": [5.0, None]})
     pq.write_table(table, tmp_path / "stars.parquet")
-    ran = starcat(["export", tmp_path / "stars.parquet", "--to", "hats", "-o", tmp_path / "out"])
+    ran = starcat(
+        ["export", tmp_path / "stars.parquet", "--format", "hats", "-o", tmp_path / "out"]
+    )
     assert "stars: 1 rows without a position are left out" in ran.err
     assert ran.code == 0
 

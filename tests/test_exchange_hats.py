@@ -201,7 +201,7 @@ def test_tables_that_are_no_star_tables(tmp_path: Path) -> None:
 
 def test_without_cdshealpix(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(__import__("sys").modules, "cdshealpix.nested", None)
-    with pytest.raises(ConfigError, match=r"pip install 'starcat\[hats\]'"):
+    with pytest.raises(ConfigError, match=r"pip install 'starcat-guide-stars\[hats\]'"):
         hats.write_hats(star_table([1.0], [1.0]), tmp_path / "sky", "sky")
 
 

@@ -480,7 +480,7 @@ def test_options_are_positive(option):
 
 def test_without_the_extra_it_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "sep", None)
-    with pytest.raises(ConfigError, match=r"pip install 'starcat\[images\]'"):
+    with pytest.raises(ConfigError, match=r"pip install 'starcat-guide-stars\[images\]'"):
         find_spots(np.zeros((40, 40)))
 
 

@@ -26,8 +26,8 @@ def rooms_of_the_house() -> list[str]:
 ROOMS = rooms_of_the_house()
 
 SINGLE_MODULES = {
-    "ground": ["", "errors", "progress", "resources"],  # "" is starcat itself, for its version
-    "faces": ["cli", "__main__"],
+    "ground": ["errors", "progress", "resources", "version"],
+    "faces": ["", "cli", "__main__", "face"],  # "" is starcat itself,
 }
 
 GEOMETRY = ("attitude", "camera", "distortion", "kvector", "sphere")

@@ -769,7 +769,7 @@ def test_the_database_says_what_it_is(small_artifact):
 @pytest.fixture
 def copy(small_artifact, tmp_path) -> Path:
     """A copy of the small artifact that a test may spoil."""
-    return Path(shutil.copytree(small_artifact, tmp_path / "copy"))
+    return Path(shutil.copytree(small_artifact, tmp_path / "copy", copy_function=shutil.copyfile))
 
 
 def test_a_dataset_that_is_not_contiguous_is_read(copy):

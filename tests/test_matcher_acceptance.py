@@ -22,7 +22,7 @@ from starcat.matcher.result import MatchResult
 from starcat.pipeline.build import build
 from starcat.simulation.simulate import Frame, Noise, simulate_frame, simulate_frames
 from starcat.simulation.sky import Sky
-from starcat.specs.build_spec import preset
+from starcat.specs.reading import preset
 
 pytestmark = pytest.mark.timeout(600)
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from starcat.catalog.proper_motion import Motion, propagate, propagate_directions
+from starcat.catalog.proper_motion import MAS, Motion, propagate, propagate_directions
 from starcat.geometry.sphere import directions_from_radec, separation
 
 ARCSEC = np.pi / (180.0 * 3600.0)
@@ -134,3 +134,15 @@ def test_no_stars():
     moved, u = propagate_directions(Motion(*(np.empty(0) for _ in range(4))), 10.0)
     assert moved.ra_deg.shape == (0,)
     assert u.shape == (0, 3)
+
+
+def test_a_star_that_ends_exactly_at_the_pole() -> None:
+    # cos(90 deg) is 6e-17 in float64; this proper motion takes away just that in a year.
+    # A division that leaves such stars out must say what it leaves in their place.
+    left = np.cos(np.radians(90.0)) / MAS
+    start = Motion(np.zeros(1), np.full(1, 90.0), np.zeros(1), np.full(1, left))
+    end, u = propagate_directions(start, 1.0)
+    assert u.tolist() == [[0.0, 0.0, 1.0]]
+    assert end.dec_deg.tolist() == [90.0]
+    assert end.pm_ra_cosdec_mas_yr.tolist() == [0.0]
+    np.testing.assert_allclose(end.pm_dec_mas_yr, left, rtol=1e-12)

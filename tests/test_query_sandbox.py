@@ -19,7 +19,7 @@ OUTSIDE = "/etc/passwd"
 def folder(small_artifact: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the artifact, with a file beside it that nobody named."""
     copied = tmp_path_factory.mktemp("sandbox") / "artifact"
-    shutil.copytree(small_artifact, copied)
+    shutil.copytree(small_artifact, copied, copy_function=shutil.copyfile)
     shutil.copy(copied / "stars.parquet", copied.parent / "secret.parquet")
     (copied.parent / "secret.csv").write_text("a,b\n1,2\n", encoding="utf-8")
     return copied

@@ -28,7 +28,13 @@ def stars(tmp_path: Path, sao_lines: list[bytes]) -> Path:
 
 @pytest.fixture
 def copy(small_artifact: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(small_artifact, tmp_path / "artifacts" / small_artifact.name))
+    return Path(
+        shutil.copytree(
+            small_artifact,
+            tmp_path / "artifacts" / small_artifact.name,
+            copy_function=shutil.copyfile,
+        )
+    )
 
 
 def edit_manifest(folder: Path, change: Any) -> None:

@@ -31,7 +31,8 @@ from starcat.report.page import table
 from starcat.report.plots import draw_histogram, draw_magnitudes, save_plot
 from starcat.report.report import count_magnitudes
 from starcat.report.sky_map import HALF_HEIGHT, HALF_WIDTH, nearest_raster, project
-from starcat.specs.build_spec import BuildSpec, spec_from_dict
+from starcat.specs.build_spec import BuildSpec
+from starcat.specs.reading import spec_from_dict
 from starcat.terminal.coverage_tables import histogram_rows
 
 FILES = {
@@ -286,6 +287,34 @@ def test_the_page_says_what_the_json_says(page: Page, report: dict[str, Any]) ->
         assert rates[rate["name"]][-1] == f"{rate['identified_share']:.2%}"
     assert report["description"] in page.text
     assert '"max_stars_per_field": 12' in page.text
+
+
+def test_the_page_says_what_the_camera_sees_and_rounds_means(
+    page: Page, report: dict[str, Any]
+) -> None:
+    assert ["camera", "512 x 512 px, 20 x 20 deg"] in page.tables[0]
+    means = next(t for t in page.tables if t[0][0] == "in a field")
+    assert [row[4] for row in means[1:]] == [
+        f"{report['coverage'][kind]['mean']:,.1f}" for kind in ("stars", "pairs", "triangles")
+    ]
+
+
+def test_the_page_and_its_plots_turn_dark(artifact: Artifact) -> None:
+    """Every colour of a light drawing's paper, ink and grid has another one in the dark."""
+    folder, dark = artifact.folder / "report", "@media (prefers-color-scheme: dark)"
+    assert dark in (folder / "index.html").read_text(encoding="utf-8")
+    for name in PLOTS:
+        text = (folder / f"{name}.svg").read_text(encoding="utf-8")
+        style, drawn = text.split("</style>", 1)
+        assert dark in style
+        for colour in ("fill: #ffffff", "stroke: #000000", "stroke: #e3e7ea", "fill: #2c6e9e"):
+            assert colour not in drawn or f'[style*="{colour}"]' in style, (name, colour)
+
+
+def test_digests_are_broken_into_lines() -> None:
+    digest = "0123456789abcdef" * 4
+    assert f'<td class="digest">{digest}</td>' in table("", ("x",), [(digest,)])
+    assert "<thead>" not in table("", ("", ""), [("a", "b")])
 
 
 def test_a_table_escapes_what_it_is_given() -> None:

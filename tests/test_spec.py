@@ -17,14 +17,8 @@ from pydantic import BaseModel, ValidationError
 from starcat.catalog.ingest import check_band
 from starcat.catalog.source import data_source, source_names
 from starcat.errors import ConfigError
-from starcat.specs.build_spec import (
-    BuildSpec,
-    CameraSpec,
-    preset,
-    preset_names,
-    read_spec,
-    spec_from_dict,
-)
+from starcat.specs.build_spec import BuildSpec, CameraSpec
+from starcat.specs.reading import preset, preset_names, read_spec, spec_from_dict
 
 JSON_SCHEMA = BuildSpec.model_json_schema()
 

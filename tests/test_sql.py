@@ -135,7 +135,7 @@ def test_parquet_files_of_others_are_tables_of_their_name(tmp_path):
 
 
 def test_hats_catalogs_are_one_table(starcat, small_artifact, session, tmp_path):
-    exported = ["export", small_artifact, "--to", "hats", "--product", "stars", "-o", tmp_path]
+    exported = ["export", small_artifact, "--format", "hats", "--product", "stars", "-o", tmp_path]
     assert starcat(exported).code == 0
     count = "SELECT count(*), min(ra_deg), sum(mag) FROM stars"
     with open_session([str(tmp_path / "stars")]) as opened:
@@ -152,7 +152,7 @@ def test_identifiers_need_no_quotes(text):
 
 def damaged(small_artifact: Path, folder: Path, damage: str) -> Path:
     copied = folder / "artifact"
-    shutil.copytree(small_artifact, copied)
+    shutil.copytree(small_artifact, copied, copy_function=shutil.copyfile)
     manifest = json.loads((copied / "manifest.json").read_text())
     if damage == "cut":
         data = (copied / "pairs.parquet").read_bytes()

@@ -215,12 +215,28 @@ def test_amplitudes_of_gcvs(
 
 
 def test_numbers_of_gcvs(gcvs: Callable[..., Gcvs]) -> None:
-    found = gcvs("118218 M 1 0 2", "4313918654563864193 - 1 0 2", "none SR 1 0 2")
-    assert found.hip_number.tolist() == [118218, 0, 0]
-    assert found.gaia_id.tolist() == [0, 4313918654563864193, 0]
-    assert found.var_type.tolist() == ["M", None, "SR"]
-    assert found.files[0].rows == 3
+    found = gcvs("118218 M 1 0 2", "4313918654563864193 - 1 0 2")
+    assert found.hip_number.tolist() == [118218, 0]
+    assert found.gaia_id.tolist() == [0, 4313918654563864193]
+    assert found.var_type.tolist() == ["M", None]
+    assert found.files[0].rows == 2
     assert found.rejected == {}
+
+
+@pytest.mark.parametrize("ref", ["none", "0", "\u00b2\u00b3", "9" * 19, "\u0661", "-5", "1_0"])
+def test_a_record_of_gcvs_without_a_number_is_rejected(gcvs: Callable[..., Gcvs], ref: str) -> None:
+    found = gcvs("118218 M 1 0 2", f"{ref} SR 1 0 2")
+    assert found.hip_number.tolist() == [118218]
+    assert found.rejected == {"no_identity": 1}
+    assert found.files[0].rows == 2
+
+
+@pytest.mark.parametrize("mag", ["nan", "inf", "1e308", "\u0665", "1_0"])
+def test_a_magnitude_of_gcvs_that_is_none_gives_no_amplitude(
+    gcvs: Callable[..., Gcvs], mag: str
+) -> None:
+    found = gcvs(f"118218 M 8.0 0 {mag}")
+    assert np.isnan(found.amplitude_mag).all()
 
 
 def test_a_malformed_record_of_gcvs(gcvs: Callable[..., Gcvs]) -> None:

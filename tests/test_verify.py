@@ -17,19 +17,27 @@ import pyarrow.compute as pc
 import pytest
 
 from starcat.artifact.content import content_sha256
+from starcat.artifact.database import INDICES
 from starcat.artifact.manifest import DATABASE_NAME, MANIFEST_NAME, manifest_digest
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import Finding, check_artifact, verify_artifact
 from starcat.errors import ProductError
+from starcat.resources import resource_folder
 from starcat.storage.digests import file_sha256, json_bytes
 from starcat.tables.parquet import read_parquet, write_parquet
+
+SCHEMAS = resource_folder("schemas")
 
 Change = Callable[[dict[str, Any]], object]
 
 
 @pytest.fixture
 def copy(small_artifact: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(small_artifact, tmp_path / small_artifact.name))
+    return Path(
+        shutil.copytree(
+            small_artifact, tmp_path / small_artifact.name, copy_function=shutil.copyfile
+        )
+    )
 
 
 @pytest.fixture(scope="module")
@@ -95,6 +103,19 @@ def expect(folder: Path, file: str, product: str, words: str) -> tuple[Finding, 
     return found
 
 
+def test_every_index_that_is_written_is_named(small_artifact: Path) -> None:
+    """The table of indices is that of the file, and no column is among them."""
+    artifact = open_artifact(small_artifact)
+    with h5py.File(small_artifact / DATABASE_NAME, "r") as file:
+        for name in file:
+            columns = set()
+            for column in artifact.schema(name).columns:
+                parts = ("_offsets", "_values") if column.is_list else ("",)
+                columns |= {f"{column.name}{part}" for part in parts}
+            assert set(file[name]) - columns == set(INDICES.get(name, ()))
+    assert set(INDICES) <= {path.stem.partition("-")[0] for path in SCHEMAS.glob("*.json")}
+
+
 # Whole and damaged files --------------------------------------------------------------------
 
 
@@ -152,15 +173,15 @@ def test_every_missing_file_is_found(copy: Path, files: Sequence[str]) -> None:
         assert finding.problem.startswith("missing")
 
 
-def test_a_damaged_database_names_the_products_that_lost_values(copy: Path) -> None:
+def test_a_damaged_database_is_one_finding_and_is_not_opened(copy: Path) -> None:
     with h5py.File(copy / DATABASE_NAME, "r") as file:
         place = file["pairs/separation_rad"].id.get_offset() + 801
     path = copy / DATABASE_NAME
     data = bytearray(path.read_bytes())
     data[place] ^= 4
     path.write_bytes(data)
-    found = expect(copy, DATABASE_NAME, "pairs", "does not hold separation_rad")
-    assert {f.product for f in found} == {"database", "pairs"}
+    (finding,) = expect(copy, DATABASE_NAME, "database", "changed since it was built")
+    assert finding.file == DATABASE_NAME
 
 
 def test_all_damaged_files_are_found_at_once(copy: Path) -> None:
@@ -245,6 +266,29 @@ def test_a_senseless_manifest_with_a_right_digest_is_found(
     assert verify_artifact(copy).findings
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda m: m.update(manifest_version=1), "manifest_version is '1'"),
+        (lambda m: m.pop("spec"), "no spec"),
+        (lambda m: m["products"]["pairs"].pop("rows"), "no products.pairs.rows"),
+        (lambda m: m["products"]["pairs"].update(rows=True), "products.pairs.rows is 'True'"),
+        (lambda m: m["products"].update(pairs=[]), "products.pairs is no object"),
+        (lambda m: m["sources"][0]["rejected"].update(x="1"), "sources[0].rejected.x is '1'"),
+        (lambda m: m.update(sources={}), "sources is no list"),
+        (lambda m: m["products"]["pairs"].update(parquet="../a"), "parquet is '../a'"),
+        (lambda m: m["products"].update({"../a": m["products"]["pairs"]}), "products.../a.parquet"),
+    ],
+)
+def test_a_manifest_of_another_shape_is_refused(change: Change, words: str, copy: Path) -> None:
+    """Whoever opens the artifact hears it, before anything relies on it."""
+    seal(copy, change)
+    with pytest.raises(ProductError) as caught:
+        open_artifact(copy)
+    assert words in str(caught.value)
+    assert f"{MANIFEST_NAME}: not a starcat manifest (" in str(caught.value)
+
+
 def test_newer_versions_are_named_with_the_known_ones(copy: Path) -> None:
     def newer(manifest: dict[str, Any]) -> None:
         manifest["products"]["pairs"]["schema"] = "pairs-2.0.0"
@@ -255,7 +299,7 @@ def test_newer_versions_are_named_with_the_known_ones(copy: Path) -> None:
 
 def test_a_newer_manifest_is_named_with_the_known_version(copy: Path) -> None:
     seal(copy, lambda manifest: manifest.update(manifest_version="2.0.0"))
-    expect(copy, MANIFEST_NAME, "", "manifest version 2.0.0; this starcat reads 1.0.0")
+    expect(copy, MANIFEST_NAME, "", "manifest version 2.0.0; this starcat reads 1.1.0")
 
 
 def manifest_case(words: str, change: Change) -> Any:

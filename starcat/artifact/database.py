@@ -19,11 +19,23 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from starcat.errors import SchemaError
 from starcat.products.index import Index
 from starcat.tables.schema import ProductSchema, SchemaColumn
 
 LAYOUT_VERSION = "1.0.0"
-"""Of the arrangement of groups, datasets and attributes described above."""
+"""The version of the arrangement of groups, datasets and attributes described above."""
+
+INDICES: dict[str, tuple[str, ...]] = {
+    "pairs": ("kvector_counts",),
+    "triangles": ("kvector_counts",),
+    "neighbours": ("star_offsets", "lookup_offsets", "lookup_rows"),
+    "hausdorff_angular": ("star_offsets",),
+    "hausdorff_l2": ("star_offsets", "smallest_distance"),
+    "grid": ("cell_offsets", "cell_rows"),
+    "radial": ("ring_offsets", "ring_rows"),
+}
+"""The datasets that stand beside the columns of a product; a product that is not here has none."""
 
 
 def write_root(file: h5py.File, facts: Mapping[str, str | float]) -> None:
@@ -62,7 +74,21 @@ def write_product(
         Arrays and numbers beside the columns.
     star_count : int
         Stars of the artifact; says how wide their row numbers have to be.
+
+    Raises
+    ------
+    SchemaError
+        If the indices are not those that `INDICES` names.
     """
+    expected = INDICES.get(schema.product, ())
+    if set(index.datasets) != set(expected):
+        raise SchemaError(
+            f"{schema.product}: indices {', '.join(index.datasets) or 'none'} found; expected "
+            f"{', '.join(expected) or 'none'}",
+            product=schema.product,
+            found=sorted(index.datasets),
+            expected=sorted(expected),
+        )
     group = file.create_group(schema.product)
     group.attrs["schema"] = schema.name
     group.attrs["description"] = schema.description

@@ -5,7 +5,6 @@ Each check is a generator of problems: it yields nothing for a sound file.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from starcat.artifact.database import LAYOUT_VERSION, column_datasets, dataset_attributes
+from starcat.artifact.database import INDICES, LAYOUT_VERSION, column_datasets, dataset_attributes
 from starcat.products.index import row_offsets
 from starcat.tables.schema import ProductSchema
 
@@ -91,37 +90,6 @@ def _plain(value: object) -> object:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def lost_columns(data: bytes, table: pa.Table, schema: ProductSchema, star_count: int) -> list[str]:
-    """Return the columns of a product that a damaged database no longer holds whole.
-
-    Parameters
-    ----------
-    data : bytes
-        The file. It is searched as bytes, since a damaged one is not to be trusted to an
-        HDF5 library.
-    table : pyarrow.Table
-        The product, from its Parquet file.
-    schema : ProductSchema
-        Its contract.
-    star_count : int
-        Stars of the artifact.
-
-    Returns
-    -------
-    list of str
-        Names of datasets.
-    """
-    return [
-        name
-        for column in schema.columns
-        if column.in_database
-        for name, expected in column_datasets(
-            column, table[column.name].combine_chunks(), star_count
-        ).items()
-        if expected.tobytes() not in data
-    ]
-
-
 def index_problems(
     group: h5py.Group, table: pa.Table, schema: ProductSchema, star_count: int
 ) -> Iterator[str]:
@@ -134,7 +102,7 @@ def index_problems(
     table : pyarrow.Table
         The product.
     schema : ProductSchema
-        Its contract; the text names the indices.
+        Its contract.
     star_count : int
         Stars of the artifact.
 
@@ -143,8 +111,7 @@ def index_problems(
     str
         The problem.
     """
-    named = re.findall(r"\b[a-z_]+_(?:counts|offsets|rows)\b", schema.description)
-    for name in dict.fromkeys(named):
+    for name in INDICES.get(schema.product, ()):
         if name not in group:
             yield f"{group.name}/{name} is missing"
         elif name == "kvector_counts":

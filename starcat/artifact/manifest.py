@@ -15,20 +15,48 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starcat import __version__
-from starcat.errors import ProductError, SchemaVersionError
+from starcat.errors import ArtifactMissing, ProductError, SchemaVersionError
+from starcat.version import __version__
 
 if TYPE_CHECKING:  # reading a manifest needs none of these
     from starcat.catalog.ingest import FileFacts
     from starcat.tables.schema import ProductSchema
 
 MANIFEST_NAME = "manifest.json"
-MANIFEST_VERSION = "1.0.0"
-COUNTERPARTS_VERSION = "1.1.0"
-"""Of a manifest that lists catalogs of counterparts: the others stay as they were before."""
+MANIFEST_VERSION = "1.1.0"
 
 DATABASE_NAME = "database.h5"
-PARTS = ("name", "version", "frame", "epoch_jyear", "spec", "sources", "products", "files")
+
+SHAPE: dict[Any, Any] = {
+    "name": str,
+    "version": str,
+    "frame": str,
+    "epoch_jyear": (int, float),
+    "spec": {"catalog": {"source": str}},
+    "sources": [
+        {
+            "source": str,
+            "role": str,
+            "files": [{"name": str, "sha256": str, "bytes": int, "rows": int}],
+            "rows_read": int,
+            "kept": int,
+            "rejected": {...: int},
+        }
+    ],
+    "products": {
+        ...: {
+            "schema": str,
+            "rows": int,
+            "content_sha256": str,
+            "parquet": str,
+            "in_database": bool,
+        }
+    },
+    "files": {...: {"bytes": int, "sha256": str}},
+    "software": {...: str},
+}
+"""What is read of a manifest, whatever else it holds (`_shape_problem` says how to read this)."""
+
 LIBRARIES = ("numpy", "scipy", "pyerfa", "pyarrow", "h5py", "pydantic", "matplotlib", "pillow")
 
 
@@ -123,23 +151,6 @@ class ProductFacts:
         return facts
 
 
-def manifest_version(sources: Sequence[SourceFacts]) -> str:
-    """Return the version of the manifest of a build.
-
-    Parameters
-    ----------
-    sources : sequence of SourceFacts
-        What went in.
-
-    Returns
-    -------
-    str
-        The lowest that knows all of their roles.
-    """
-    roles = {source.role for source in sources}
-    return COUNTERPARTS_VERSION if "crossmatch" in roles else MANIFEST_VERSION
-
-
 def software_versions() -> dict[str, str]:
     """Return the versions of what computes and writes the products.
 
@@ -171,10 +182,6 @@ def manifest_digest(manifest: Mapping[str, Any]) -> str:
     return hashlib.sha256(json_bytes(others)).hexdigest()
 
 
-def _lacks(error: Exception) -> str:
-    return f"no {error.args[0]}" if isinstance(error, KeyError) else str(error)
-
-
 def read_manifest(folder: Path) -> dict[str, Any]:
     """Read the manifest of an artifact.
 
@@ -190,40 +197,108 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
     Raises
     ------
+    ArtifactMissing
+        If there is no folder, or no manifest in it.
     ProductError
-        If the folder is not an artifact, or its manifest cannot be read.
+        If the manifest cannot be read.
     SchemaVersionError
         If the manifest is of a version that this starcat does not know.
     """
     path = folder / MANIFEST_NAME
     try:
-        manifest = json.loads(path.read_bytes())
-        found = str(manifest["manifest_version"])
+        data = path.read_bytes()
     except OSError as error:
-        raise ProductError(
+        is_missing = isinstance(error, FileNotFoundError | NotADirectoryError)
+        raise (ArtifactMissing if is_missing else ProductError)(
             f"{folder}: not an artifact, {MANIFEST_NAME} cannot be read ({error.strerror}); give "
             "the folder <name>-<version> that 'starcat build' made",
             path=folder,
         ) from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise ProductError(
-            f"{path}: not a starcat manifest ({_lacks(error)}); rebuild the artifact",
-            path=path,
-        ) from error
+    return parse_manifest(data, str(path), "rebuild the artifact", path)
+
+
+def parse_manifest(
+    data: bytes, where: str, advice: str, path: Path | None = None
+) -> dict[str, Any]:
+    """Return a manifest from the bytes of its file, with every part that starcat relies on.
+
+    Parameters
+    ----------
+    data : bytes
+        The file.
+    where, advice : str
+        Where it is from and what to do if it is damaged, for messages.
+    path : Path, optional
+        The file, where it is on disk.
+
+    Returns
+    -------
+    dict
+        Plain values.
+
+    Raises
+    ------
+    ProductError
+        If it is no manifest, or a part is missing or of another type.
+    SchemaVersionError
+        If it is of a version that this starcat does not know.
+    """
+    try:
+        manifest = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise _no_manifest(where, str(error), advice, path) from error
+    problem = _shape_problem(manifest, {"manifest_version": str}, "")
+    if problem:
+        raise _no_manifest(where, problem, advice, path)
+    found = manifest["manifest_version"]
     if found.split(".")[0] != MANIFEST_VERSION.split(".")[0]:
         software = manifest.get("software")
         made_by = software.get("starcat") if isinstance(software, dict) else None
         raise SchemaVersionError(
-            f"{path}: manifest version {found}; this starcat reads {MANIFEST_VERSION}. Install "
+            f"{where}: manifest version {found}; this starcat reads {MANIFEST_VERSION}. Install "
             f"starcat {made_by or 'of the release that wrote it'}",
             product="manifest",
             found=found,
             expected=MANIFEST_VERSION,
         )
-    lacking = [part for part in PARTS if part not in manifest]
-    if lacking:
-        raise ProductError(
-            f"{path}: not a starcat manifest (no {', '.join(lacking)}); rebuild the artifact",
-            path=path,
-        )
+    problem = _shape_problem(manifest, SHAPE, "") or _name_problem(manifest["products"])
+    if problem:
+        raise _no_manifest(where, problem, advice, path)
     return dict(manifest)
+
+
+def _no_manifest(where: str, problem: str, advice: str, path: Path | None) -> ProductError:
+    return ProductError(f"{where}: not a starcat manifest ({problem}); {advice}", path=path)
+
+
+def _shape_problem(value: object, shape: Any, place: str) -> str:
+    """Return where a value does not have a shape, or an empty text.
+
+    A shape is a type, or a tuple of types; a list of one shape, for a list of any length; a dict
+    of shapes by the keys that have to be there; or a dict with the one key ``...`` for any keys.
+    """
+    if isinstance(shape, list):
+        if not isinstance(value, list):
+            return f"{place} is no list"
+        items = ((f"{place}[{n}]", item, shape[0]) for n, item in enumerate(value))
+    elif isinstance(shape, dict):
+        if not isinstance(value, dict):
+            return f"{place or 'it'} is no object"
+        dot = f"{place}." if place else ""
+        lacking = [name for name in shape if name is not ... and name not in value]
+        if lacking:
+            return f"no {', '.join(dot + name for name in lacking)}"
+        names = value if ... in shape else shape
+        items = ((f"{dot}{n}", value[n], shape.get(..., shape.get(n))) for n in names)
+    else:
+        is_right = isinstance(value, shape) and (shape is bool or not isinstance(value, bool))
+        return "" if is_right else f"{place} is {str(value)[:40]!r}"
+    return next(filter(None, (_shape_problem(v, s, p) for p, v, s in items)), "")
+
+
+def _name_problem(products: Mapping[str, Any]) -> str:
+    """Return the product whose file is not the one of its name, or an empty text."""
+    for name, facts in products.items():
+        if facts["parquet"] != f"{name}.parquet" or "/" in name or "\\" in name:
+            return f"products.{name}.parquet is {facts['parquet'][:40]!r}"
+    return ""

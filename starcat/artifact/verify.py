@@ -7,7 +7,7 @@ manifest, since a damaged file is not to be trusted to the libraries that would 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,12 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from starcat.artifact.crossmatch_table import counterparts_of
-from starcat.artifact.database_checks import (
-    group_problems,
-    index_problems,
-    lost_columns,
-    root_problems,
-)
+from starcat.artifact.database_checks import group_problems, index_problems, root_problems
 from starcat.artifact.manifest import (
     DATABASE_NAME,
     MANIFEST_NAME,
@@ -38,7 +33,7 @@ from starcat.artifact.table_checks import (
     columns_follow_the_schema,
 )
 from starcat.catalog.stars import directions_of
-from starcat.errors import ProductError, StarcatError
+from starcat.errors import ArtifactMissing, ProductError, StarcatError
 from starcat.storage.digests import file_sha256, json_bytes
 
 T = TypeVar("T")
@@ -91,6 +86,11 @@ class Verification:
     checks: int
     findings: tuple[Finding, ...]
 
+    def __repr__(self) -> str:
+        """Return the outcome in one line."""
+        found = len(self.findings)
+        return f"<Verification {self.folder.name}: {self.checks:,} checks, {found} findings>"
+
     def as_dict(self) -> dict[str, Any]:
         """Return the result as plain values.
 
@@ -118,11 +118,11 @@ def verify_artifact(folder: Path) -> Verification:
 
     Raises
     ------
-    ProductError
+    ArtifactMissing
         If there is no such folder.
     """
     if not folder.is_dir():
-        raise ProductError(
+        raise ArtifactMissing(
             f"{folder}: no such artifact; give the folder <name>-<version> that 'starcat build' "
             "made",
             path=folder,
@@ -156,14 +156,29 @@ def check_artifact(folder: Path) -> Artifact:
     """
     found = verify_artifact(folder).findings
     if found:
-        more = f"; and {len(found) - MAX_NAMED} more" if len(found) > MAX_NAMED else ""
         raise ProductError(
-            f"{folder}: {'; '.join(str(finding) for finding in found[:MAX_NAMED])}{more}. "
-            "Build the artifact again, or fetch it again",
+            f"{folder}: {first_of(found)}. Build the artifact again, or fetch it again",
             product=found[0].product or None,
             path=folder / found[0].file,
         )
     return Artifact(folder, read_manifest(folder))
+
+
+def first_of(findings: Sequence[Finding]) -> str:
+    """Return the first findings as one line, and how many more there are.
+
+    Parameters
+    ----------
+    findings : sequence of Finding
+        What a verification found; at least one.
+
+    Returns
+    -------
+    str
+        At most `MAX_NAMED` findings.
+    """
+    more = f"; and {len(findings) - MAX_NAMED} more" if len(findings) > MAX_NAMED else ""
+    return "; ".join(str(finding) for finding in findings[:MAX_NAMED]) + more
 
 
 @dataclass
@@ -211,9 +226,8 @@ def _check_all(artifact: Artifact, log: _Log) -> None:
     damaged = _check_files(artifact, log)
     held = _check_products(artifact, damaged, log)
     log.run(MANIFEST_NAME, "", _count_problems, artifact.manifest, held)
-    if (artifact.folder / DATABASE_NAME).is_file():
-        check = _find_lost_columns if DATABASE_NAME in damaged else _check_database
-        log.get(DATABASE_NAME, "database", check, artifact, held, log)
+    if DATABASE_NAME not in damaged:
+        log.get(DATABASE_NAME, "database", _check_database, artifact, held, log)
 
 
 def _check_files(artifact: Artifact, log: _Log) -> set[str]:
@@ -335,15 +349,3 @@ def _check_database(artifact: Artifact, held: dict[str, HeldProduct], log: _Log)
                 for check in (group_problems, index_problems):
                     parts = (file[name], product.table, product.schema, stars)
                     log.run(DATABASE_NAME, name, check, *parts)
-
-
-def _find_lost_columns(artifact: Artifact, held: dict[str, HeldProduct], log: _Log) -> None:
-    """Say which products a damaged database has lost columns of."""
-    stars = artifact.manifest["products"]["stars"]["rows"]
-    data = (artifact.folder / DATABASE_NAME).read_bytes()
-    for name, product in held.items():
-        if product.facts["in_database"]:
-            lost = lost_columns(data, product.table, product.schema, stars)
-            if lost:
-                problem = f"does not hold {', '.join(lost)} as the Parquet file does"
-                log.findings.append(Finding(DATABASE_NAME, name, problem))

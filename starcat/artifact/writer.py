@@ -1,16 +1,11 @@
-"""Writing an artifact: into a hidden folder, read back, and only then given its name."""
+"""Writing the files of an artifact: its database, its tables, and the manifest last."""
 
 from __future__ import annotations
 
-import errno
-import os
-import shutil
-import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import pyarrow as pa
 
@@ -19,19 +14,16 @@ from starcat.artifact.database import open_for_writing, write_product, write_roo
 from starcat.artifact.manifest import (
     DATABASE_NAME,
     MANIFEST_NAME,
+    MANIFEST_VERSION,
     ProductFacts,
     SourceFacts,
     manifest_digest,
-    manifest_version,
     software_versions,
 )
-from starcat.errors import OutputError, reason
 from starcat.products.index import Index
 from starcat.storage.digests import file_sha256, json_bytes
 from starcat.tables.parquet import write_parquet
 from starcat.tables.schema import product_schema
-
-Outcome = Literal["written", "unchanged", "replaced"]
 
 
 @dataclass(frozen=True)
@@ -54,48 +46,6 @@ class Product:
     table: pa.Table
     index: Index = field(default_factory=Index)
     in_database: bool = True
-
-
-@contextmanager
-def partial_folder(final: Path) -> Iterator[Path]:
-    """Give a folder to write into, beside the final one, and remove it afterwards.
-
-    Parameters
-    ----------
-    final : Path
-        Where the artifact will be.
-
-    Yields
-    ------
-    Path
-        An empty folder ``.<name>.*.partial`` on the same file system.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be made, or the disk is full.
-    """
-    try:
-        final.parent.mkdir(parents=True, exist_ok=True)
-        made = Path(tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".partial", dir=final.parent))
-    except OSError as error:
-        raise OutputError(
-            f"{final.parent}: cannot write there ({reason(error)}); choose another folder "
-            "with --output",
-            path=final.parent,
-        ) from error
-    try:
-        made.chmod(0o755)
-        yield made
-    except OSError as error:
-        if error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES}:
-            raise OutputError(
-                f"{final.parent}: writing failed ({reason(error)}); nothing was left there",
-                path=final.parent,
-            ) from error
-        raise
-    finally:
-        shutil.rmtree(made, ignore_errors=True)
 
 
 def write_products(
@@ -170,7 +120,7 @@ def write_manifest(
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     manifest: dict[str, Any] = {
         "format": "starcat-artifact",
-        "manifest_version": manifest_version(sources),
+        "manifest_version": MANIFEST_VERSION,
         "name": spec["name"],
         "version": spec["version"],
         "frame": "ICRS",
@@ -190,73 +140,3 @@ def write_manifest(
     manifest["manifest_sha256"] = manifest_digest(manifest)
     (folder / MANIFEST_NAME).write_bytes(json_bytes(manifest))
     return manifest
-
-
-def move_into_place(partial: Path, final: Path, *, replace: bool) -> Outcome:
-    """Give a complete folder its final name.
-
-    Parameters
-    ----------
-    partial : Path
-        Complete and checked.
-    final : Path
-        The name to give it.
-    replace : bool
-        Whether a different artifact of that name may be replaced.
-
-    Returns
-    -------
-    {"written", "unchanged", "replaced"}
-        ``unchanged`` where the final folder already held the same manifest.
-
-    Raises
-    ------
-    OutputError
-        If something else is there and ``replace`` is false.
-    """
-    for path in sorted(partial.rglob("*")):
-        if path.is_file():
-            with path.open("rb") as file:
-                os.fsync(file.fileno())
-    if not final.exists() and _rename(partial, final):
-        return "written"
-    new = (partial / MANIFEST_NAME).read_bytes()
-    old = final / MANIFEST_NAME
-    if old.is_file() and old.read_bytes() == new and _is_whole(final, partial):
-        return "unchanged"
-    if not replace:
-        raise OutputError(
-            f"{final} already exists and differs; raise the version in the spec, choose another "
-            "--output, or pass --replace",
-            path=final,
-        )
-    aside = partial.with_name(f"{partial.name}.old.partial")
-    try:
-        final.rename(aside)
-        partial.rename(final)
-    except BaseException:  # a signal between the two must not leave the name empty
-        if aside.exists() and not final.exists():
-            aside.rename(final)
-        raise
-    shutil.rmtree(aside, ignore_errors=True)
-    return "replaced"
-
-
-def _rename(partial: Path, final: Path) -> bool:
-    """Rename, and return False where another build has just taken the name."""
-    try:
-        partial.rename(final)
-    except OSError:
-        if final.exists():
-            return False
-        raise
-    return True
-
-
-def _is_whole(final: Path, partial: Path) -> bool:
-    """Return whether every file of the new artifact is in the old one with the same bytes."""
-    names = [path.relative_to(partial) for path in partial.rglob("*") if path.is_file()]
-    return all(
-        (final / name).is_file() and file_sha256(final / name) == file_sha256(partial / name)
-        for name in names
-    )

@@ -7,19 +7,16 @@ or in the rejected table, with one reason.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from starcat.catalog.archives import gaia, hipparcos, sao, twomass, tycho1, tycho2
+from starcat.catalog.blocks import CATALOGS, Part, Reading, join_parts, parse_block
 from starcat.catalog.nearest import add_nearest_neighbours
 from starcat.catalog.photometry import blend_weights
-from starcat.catalog.readers.binary import parse_binary
-from starcat.catalog.readers.delimited import parse_delimited
 from starcat.catalog.readers.files import (
     Block,
     DigestReader,
@@ -28,46 +25,14 @@ from starcat.catalog.readers.files import (
     map_in_order,
     read_blocks,
 )
-from starcat.catalog.readers.fixed_width import parse_fixed_width
-from starcat.catalog.readers.malformed import check_malformed, malformed_rows, not_this_archive
-from starcat.catalog.readers.records import Problem, Records
+from starcat.catalog.readers.malformed import check_malformed, not_this_archive
+from starcat.catalog.readers.records import Problem
 from starcat.catalog.source import DataSource, data_source
-from starcat.catalog.stars import (
-    StarBlock,
-    floats_of,
-    move_to_epoch,
-    sort_rows,
-    table_from_columns,
-)
+from starcat.catalog.stars import floats_of
 from starcat.catalog.verdict import Reason
 from starcat.errors import ConfigError, SourceMissing
 from starcat.progress import Progress, no_progress
 from starcat.tables.schema import product_schema
-
-_PARSERS = {
-    "fixed_width": parse_fixed_width,
-    "delimited": parse_delimited,
-    "binary": parse_binary,
-}
-
-
-@dataclass(frozen=True)
-class CatalogModule:
-    """What ingest needs of a catalog: the columns to parse and what they mean."""
-
-    columns: Mapping[str, Sequence[str]]
-    stars: Callable[[Records, str], StarBlock]
-
-
-CATALOGS = {
-    "sao": CatalogModule(sao.COLUMNS, sao.stars),
-    "hipparcos": CatalogModule(hipparcos.COLUMNS, hipparcos.stars),
-    "tycho1": CatalogModule(tycho1.COLUMNS, tycho1.stars),
-    "tycho2": CatalogModule(tycho2.COLUMNS, tycho2.stars),
-    "2mass": CatalogModule(twomass.COLUMNS, twomass.stars),
-    "gaia": CatalogModule(gaia.COLUMNS, gaia.stars),
-}
-"""The star catalogs, by the name of their data source."""
 
 
 @dataclass(frozen=True)
@@ -120,6 +85,13 @@ class Ingested:
     problems: tuple[str, ...]
     notes: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        """Return source and counts in one line."""
+        return (
+            f"<Ingested {self.source} ({self.band}): {self.rows_read:,} records read, "
+            f"{len(self.stars):,} kept, {len(self.rejected):,} rejected>"
+        )
+
     @property
     def rows_read(self) -> int:
         """Records in all files."""
@@ -149,17 +121,6 @@ def count_by_reason(rejected: pa.Table) -> dict[str, int]:
         for entry in pc.value_counts(rejected["reason"]).to_pylist()
     }
     return {reason.name: counted[reason.name] for reason in Reason if reason.name in counted}
-
-
-@dataclass(frozen=True)
-class _Part:
-    """One block after parsing."""
-
-    file_number: int
-    rows: int
-    stars: pa.Table
-    rejected: pa.Table
-    problems: list[Problem]
 
 
 def ingest(
@@ -193,22 +154,33 @@ def ingest(
     workers : int, default 2
         Threads; the result is the same for any number.
     progress : Progress
-        Called with ("read <source>", bytes done, bytes in all).
+        Called with ("read <source>", bytes done, bytes in all) after every block.
 
     Returns
     -------
     Ingested
-        The tables and what was read.
+        The tables, which follow their schemas, and what was read.
 
     Raises
     ------
     ConfigError
         If the source is not a star catalog or has no such band.
-    SourceMissing
-        If a file is missing.
-    ParseError
-        If a file is damaged, or not of this archive.
+    SourceError
+        If a file is missing, damaged, or not of this archive.
     """
+    source = _star_catalog(source_name)
+    how = Reading(source_name, check_band(source, band), epoch_jyear, read_limit_mag)
+    files = _given_files(source, paths)
+    facts, parts, problems = _read_parts(files, source, how, workers, progress)
+    stars, rejected = join_parts(parts)
+    stars = add_nearest_neighbours(stars, workers) if neighbours else stars
+    product_schema("stars").check(stars)
+    product_schema("rejected").check(rejected)
+    notes = (*missing_files(source, files), *unmoved_stars(source_name, stars, epoch_jyear))
+    return Ingested(source_name, how.band, stars, rejected, facts, problems, notes)
+
+
+def _star_catalog(source_name: str) -> DataSource:
     source = data_source(source_name)
     if source_name not in CATALOGS:
         raise ConfigError(
@@ -216,27 +188,14 @@ def ingest(
             key="source",
             value=source_name,
         )
-    chosen = check_band(source, band)
+    return source
+
+
+def _given_files(source: DataSource, paths: Sequence[Path]) -> list[InputFile]:
     files = find_files(source, paths)
     if not files:
-        raise SourceMissing(f"{source_name}: no input files given", source=source_name)
-
-    def parse(item: tuple[int, Block]) -> _Part:
-        return _parse_block(*item, source_name, chosen, epoch_jyear, read_limit_mag)
-
-    facts, parts, problems = _read_parts(files, source, parse, workers, progress)
-    stars, rejected = _join(parts, source_name, chosen)
-    if neighbours:
-        stars = add_nearest_neighbours(stars, workers)
-    return Ingested(
-        source=source_name,
-        band=chosen,
-        stars=stars,
-        rejected=rejected,
-        files=facts,
-        problems=tuple(f"{files[n].path.name} {problem}" for n, problem in problems[:20]),
-        notes=(*missing_files(source, files), *unmoved_stars(source_name, stars, epoch_jyear)),
-    )
+        raise SourceMissing(f"{source.name}: no input files given", source=source.name)
+    return files
 
 
 def unmoved_stars(source_name: str, stars: pa.Table, epoch_jyear: float | None) -> tuple[str, ...]:
@@ -293,16 +252,20 @@ def missing_files(source: DataSource, files: Sequence[InputFile]) -> tuple[str, 
 def _read_parts(
     files: Sequence[InputFile],
     source: DataSource,
-    parse: Callable[[tuple[int, Block]], _Part],
+    how: Reading,
     workers: int,
     progress: Progress,
-) -> tuple[tuple[FileFacts, ...], list[_Part], list[tuple[int, Problem]]]:
+) -> tuple[tuple[FileFacts, ...], list[Part], tuple[str, ...]]:
     """Read all files; return their facts, their parsed blocks and what is malformed in them."""
     facts: list[FileFacts] = []
-    parts: list[_Part] = []
+    parts: list[Part] = []
     rows = [0] * len(files)
     problems: list[tuple[int, Problem]] = []
-    for part in map_in_order(parse, _numbered_blocks(files, source, facts, progress), workers):
+
+    def parse(numbered: tuple[int, Block]) -> Part:
+        return parse_block(*numbered, how)
+
+    for part in map_in_order(parse, numbered_blocks(files, source, facts, progress), workers):
         if part.problems and not rows[part.file_number] and part.rows == len(part.problems):
             raise not_this_archive(files[part.file_number], source, part.problems)
         rows[part.file_number] += part.rows
@@ -310,7 +273,8 @@ def _read_parts(
         parts.append(part)
     check_malformed(files, rows, problems, source)
     counted = (replace(fact, rows=count) for fact, count in zip(facts, rows, strict=True))
-    return tuple(counted), parts, problems
+    first = tuple(f"{files[n].path.name} {problem}" for n, problem in problems[:20])
+    return tuple(counted), parts, first
 
 
 def check_band(source: DataSource, band: str | None) -> str:
@@ -346,93 +310,38 @@ def check_band(source: DataSource, band: str | None) -> str:
     return band
 
 
-def _numbered_blocks(
+def numbered_blocks(
     files: Sequence[InputFile], source: DataSource, facts: list[FileFacts], progress: Progress
 ) -> Iterator[tuple[int, Block]]:
-    total = sum(file.path.stat().st_size for file in files)
-    done = 0
+    """Read the blocks of all files of a source, and report how far that is.
+
+    Parameters
+    ----------
+    files : sequence of InputFile
+        In reading order.
+    source : DataSource
+        What they are.
+    facts : list of FileFacts
+        Each file is appended when it has been read to its end, with 0 for its rows.
+    progress : Progress
+        Called with ("read <source>", bytes done, bytes in all): bytes as they lie on disk.
+
+    Yields
+    ------
+    file_number : int
+        Number of the file.
+    block : Block
+        Its next records.
+    """
+    stage = f"read {source.name}"
+    sizes = [file.path.stat().st_size for file in files]
     for number, file in enumerate(files):
+        before = sum(sizes[:number])
 
         def note(raw: DigestReader, name: str = file.path.name) -> None:
             facts.append(FileFacts(name, raw.sha256, raw.bytes_read, 0))
 
         for block in read_blocks(file, source.name, note):
+            progress(stage, before + block.bytes_read, sum(sizes))
             yield number, block
-            progress(f"read {source.name}", done, total)
-        done += file.path.stat().st_size
-        progress(f"read {source.name}", done, total)
-
-
-def _parse_block(
-    number: int,
-    block: Block,
-    source_name: str,
-    band: str,
-    epoch_jyear: float | None,
-    read_limit_mag: float | None,
-) -> _Part:
-    layout = block.file.layout
-    module = CATALOGS[source_name]
-    names = list(module.columns[layout.name])
-    records = _PARSERS[layout.layout](block.data, layout, names, block.first_line)
-    made = module.stars(records, band)
-    if read_limit_mag is not None:
-        mag = np.asarray(made.columns["mag"], dtype=np.float64)
-        made.verdicts.reject(mag > read_limit_mag, Reason.too_faint)
-    columns = move_to_epoch(made.columns, epoch_jyear)
-    columns |= {"catalog": source_name, "source_file": number, "source_line": records.line}
-    table = table_from_columns("stars", columns, len(records))
-    kept = made.verdicts.is_kept
-    if kept.all():
-        stars, rejected = table, []
-    else:
-        out = table.filter(pa.array(~kept))
-        stars, rejected = table.filter(pa.array(kept)), [reject_rows(out, made.verdicts.reasons)]
-    if records.problems:
-        rejected.append(malformed_rows(records.problems, number, source_name, band))
-    empty = product_schema("rejected").arrow_schema.empty_table()
-    return _Part(
-        number,
-        len(records) + len(records.problems),
-        stars,
-        pa.concat_tables(rejected) if rejected else empty,
-        records.problems,
-    )
-
-
-def reject_rows(stars: pa.Table, reasons: pa.Array) -> pa.Table:
-    """Return rows of a star table as rows of a rejected table.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        Of the stars schema.
-    reasons : pyarrow.Array
-        Of strings, one a row.
-
-    Returns
-    -------
-    pyarrow.Table
-        Of the rejected schema.
-    """
-    schema = product_schema("rejected").arrow_schema
-    verdict = {"reason": reasons, "detail": pa.nulls(len(stars), pa.string())}
-    columns = [verdict[name] if name in verdict else stars[name] for name in schema.names]
-    return pa.Table.from_arrays(columns, schema=schema)
-
-
-def _join(parts: Sequence[_Part], source_name: str, band: str) -> tuple[pa.Table, pa.Table]:
-    """Join the blocks, sorted, and reject the records whose star was read before."""
-    # Chunks stay as they are: joining them would hold the whole catalog in memory twice.
-    stars = pa.concat_tables([part.stars for part in parts])
-    keys = ["star_id", "source_file", "source_line"]
-    stars = sort_rows(stars, keys)
-    rejected = [part.rejected for part in parts]
-    number = stars["star_id"].to_numpy()
-    repeated = np.concatenate([[False], number[1:] == number[:-1]])[: len(number)]
-    if repeated.any():
-        again = stars.filter(pa.array(repeated))
-        reasons = pa.repeat(Reason.duplicate_record.name, len(again))
-        rejected.append(reject_rows(again, reasons))
-        stars = stars.filter(pa.array(~repeated)).combine_chunks()
-    return stars, sort_rows(pa.concat_tables(rejected).combine_chunks(), keys)
+        progress(stage, before + sizes[number], sum(sizes))

@@ -101,12 +101,9 @@ def propagate_directions(motion: Motion, years: ArrayLike) -> tuple[Motion, Arra
     ra_deg = np.where(moved & (ra_deg >= 360.0), 0.0, ra_deg)
     dec_deg = np.where(moved, np.degrees(np.arctan2(z, ground)), motion.dec_deg)
     # East and north there: (-y, x, 0) / ground; at the very pole the right ascension tells.
-    at_pole = ground == 0.0
-    if at_pole.any():
-        cos_end = np.where(at_pole, cos_ra, np.divide(x, ground, where=~at_pole))
-        sin_end = np.where(at_pole, sin_ra, np.divide(y, ground, where=~at_pole))
-    else:
-        cos_end, sin_end = x / ground, y / ground
+    off_pole = ground > 0.0
+    cos_end = np.divide(x, ground, out=cos_ra, where=off_pole)
+    sin_end = np.divide(y, ground, out=sin_ra, where=off_pole)
     # d/dt of p/|p| along east and north: the velocity there, slowed by the distance.
     pm_ra_end = (vy * cos_end - vx * sin_end) / (length * MAS)
     pm_dec_end = (vz * ground - (vx * cos_end + vy * sin_end) * z) / (length * MAS)

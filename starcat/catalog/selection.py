@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from starcat.catalog.ingest import reject_rows
+from starcat.catalog.blocks import reject_rows
 from starcat.catalog.photometry import combined_magnitude
 from starcat.catalog.quality import Quality
 from starcat.catalog.stars import directions_of, floats_of, sort_rows, with_columns

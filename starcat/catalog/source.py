@@ -45,6 +45,17 @@ UNITS = frozenset(
 )
 """Units that a column may name; ``cas`` is 10 mas, ``darcsec`` is 0.1 arcsec."""
 
+RANGES = {
+    "h": (0.0, 24.0),
+    "min": (0.0, 60.0),
+    "arcmin": (0.0, 60.0),
+    "mag": (-30.0, 100.0),
+    "mas/yr": (-100_000.0, 100_000.0),
+    "arcsec/yr": (-100.0, 100.0),
+}
+"""What a number of a unit can be at all, in any archive: the Sun has -27 mag, and Barnard's star,
+the fastest, moves 10.4 arcsec a year."""
+
 _FORMAT = re.compile(r"^(?:(?P<text>A)\d*|(?P<int>I)\d*|(?P<float>[FDE])(?:\d+\.(?P<dec>\d+))?)$")
 _BINARY = re.compile(r"^<[if][1248]$")
 
@@ -73,6 +84,9 @@ class Column(_Model):
         Texts that mean "no value", beside a blank field.
     required : bool
         A record whose field is blank is malformed.
+    limits : tuple of float, optional
+        Least and greatest number that the field can hold, both included; a record with another
+        is malformed. `range` says what holds where this is not given.
     description : str
         Meaning, in a few words.
     """
@@ -83,6 +97,7 @@ class Column(_Model):
     unit: str | None = None
     null: tuple[str, ...] = ()
     required: bool = False
+    limits: tuple[float, float] | None = None
     description: str = ""
 
     @model_validator(mode="after")
@@ -95,6 +110,8 @@ class Column(_Model):
             )
         if self.bytes is not None and not 1 <= self.bytes[0] <= self.bytes[1]:
             raise ValueError(f"column {self.name}: bytes {self.bytes} are not first <= last")
+        if self.limits is not None and not self.limits[0] <= self.limits[1]:
+            raise ValueError(f"column {self.name}: limits {self.limits} are not least <= greatest")
         return self
 
     @property
@@ -116,6 +133,15 @@ class Column(_Model):
         if match["int"]:
             return 0
         return int(match["dec"]) if match["dec"] else None
+
+    @property
+    def range(self) -> tuple[float, float] | None:
+        """Least and greatest number of the field: its limits, or those of its digits or unit."""
+        digits = re.fullmatch(r"I(\d+)", self.format)
+        if self.limits is None and digits:
+            largest = 10.0 ** int(digits[1]) - 1.0
+            return -largest, largest
+        return self.limits or RANGES.get(self.unit or "")
 
 
 class RecordFile(_Model):

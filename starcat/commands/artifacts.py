@@ -14,20 +14,17 @@ app = typer.Typer()
 
 
 @app.command()
-def presets(json: Json = False) -> None:
-    """List the build specs that ship with starcat.
-
-    Example: starcat presets
-    """
-    from starcat.terminal.builds import print_presets
-
-    print_presets(as_json=json)
-
-
-@app.command()
 def build(
     spec: Annotated[Path | None, typer.Argument(help="A build spec (TOML).")] = None,
     preset: Annotated[str | None, typer.Option(help="A spec that ships with starcat.")] = None,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="A key of the spec, such as camera.fov_x_deg=16. Repeatable.",
+        ),
+    ] = None,
     inputs: Input = None,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder to put <name>-<version>/ into.")
@@ -42,13 +39,13 @@ def build(
 ) -> None:
     """Build a guide-star database, check it, and prove that it identifies its own fields.
 
-    Example: starcat build --preset sao-12deg --input sao=sao.dat.gz -o dist
+    Example: starcat build --preset gaia-12deg -o dist
     """
     from starcat.pipeline.build import build as run_build
     from starcat.terminal.builds import print_built
     from starcat.terminal.console import progress_bars
 
-    chosen, given = chosen_spec(spec, preset), inputs_by_source(inputs)
+    given, chosen = inputs_by_source(inputs), chosen_spec(spec, preset, changes)
     with progress_bars() as progress:
         built = run_build(
             chosen, given, output, replace=replace, workers=workers, progress=progress
@@ -140,7 +137,7 @@ def rebuild(
 
     Exits with 5 if a file differs.
 
-    Example: starcat rebuild dist/sao-12deg-1.0.0 --input sao=sao.dat.gz
+    Example: starcat rebuild dist/gaia-12deg-1.0.0
     """
     from starcat.pipeline.rebuild import rebuild as build_again
     from starcat.terminal.artifacts import print_rebuilt

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from starcat.commands.shared import Json
+from starcat.commands.shared import Json, inputs_by_source
 
 app = typer.Typer()
 
@@ -50,7 +50,7 @@ def fetch(
             output or cache_folder(),
             parts=tuple(part or ()),
             retries=retries,
-            progress=progress,
+            progress=lambda name, done, total: progress(f"fetch {name}", done, total),
         )
     print_fetched(report, as_json=json)
 
@@ -60,10 +60,14 @@ def ingest(
     source: Annotated[str, typer.Argument(help="A star catalog, such as sao.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Parquet file to write.")],
     inputs: Annotated[
-        list[Path] | None,
-        typer.Option("--input", help="File or folder of the catalog. Repeatable."),
+        list[str] | None,
+        typer.Option(
+            "--input",
+            metavar="[SOURCE=]PATH",
+            help="File or folder of the catalog. Repeatable.",
+        ),
     ] = None,
-    epoch: Annotated[
+    epoch_jyear: Annotated[
         float | None,
         typer.Option(
             min=1800, max=2200, help="Julian year to move positions to; default: its own."
@@ -78,7 +82,7 @@ def ingest(
 ) -> None:
     """Read an archive file into a star table (Parquet), with a reason for every row left out.
 
-    Example: starcat ingest sao --input sao.dat.gz -o sao.parquet --epoch 2026.0
+    Example: starcat ingest sao --input sao.dat.gz -o sao.parquet --epoch-jyear 2026.0
     """
     from starcat.catalog.fetching.locate import locate
     from starcat.catalog.ingest import ingest as read_catalog
@@ -89,9 +93,9 @@ def ingest(
     with progress_bars() as progress:
         read = read_catalog(
             source,
-            locate(source, {source: inputs or []}),
+            locate(source, inputs_by_source(inputs, source)),
             band=band,
-            epoch_jyear=epoch,
+            epoch_jyear=epoch_jyear,
             read_limit_mag=read_limit_mag,
             progress=progress,
         )
@@ -106,8 +110,8 @@ def crossmatch(
         Path, typer.Argument(metavar="B", help="Star table to look for their counterparts in.")
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Parquet file to write.")],
-    radius: Annotated[
-        float, typer.Option(min=0.001, max=600, help="Largest separation, arcsec.")
+    radius_arcsec: Annotated[
+        float, typer.Option(min=0.001, max=600, help="Largest separation.")
     ] = 10.0,
     json: Json = False,
 ) -> None:
@@ -115,11 +119,11 @@ def crossmatch(
 
     Every candidate is written with its odds; the verdicts say how sure the likeliest one is.
 
-    Example: starcat crossmatch sao.parquet hipparcos.parquet -o found.parquet
+    Example: starcat crossmatch sao.parquet gaia.parquet -o both.parquet
     """
     from starcat.pipeline.counterparts import match_files
-    from starcat.specs.build_spec import Crossmatch
+    from starcat.specs.product_sections import Crossmatch
     from starcat.terminal.crossmatches import print_crossmatch
 
-    found = match_files(a, b, output, Crossmatch(radius_arcsec=radius))
+    found = match_files(a, b, output, Crossmatch(radius_arcsec=radius_arcsec))
     print_crossmatch(found, (a.stem, b.stem), output, as_json=json)

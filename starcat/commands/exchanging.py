@@ -24,8 +24,13 @@ def export(
             metavar="SOURCE", help="An artifact's folder, a Parquet file, or a peer's file."
         ),
     ] = None,
-    to: Annotated[
-        str, typer.Option(help="csv, json, parquet, votable, fits, ecsv, npz or hats.")
+    form: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            metavar="FORMAT",
+            help="csv, json, parquet, votable, fits, ecsv, npz or hats.",
+        ),
     ] = "csv",
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder to put one file a product into.")
@@ -44,14 +49,14 @@ def export(
 ) -> None:
     """Write tables in a format of other tools: one file a product, units where it has them.
 
-    Example: starcat export dist/gaia-12deg-1.0.0 --to fits -o fits
+    Example: starcat export dist/gaia-12deg-1.0.0 --format fits -o fits
     """
     from starcat.exchange.export import export_tables
     from starcat.terminal.exports import print_exported
 
     exported = export_tables(
         _tables(source, from_peer),
-        to,
+        form,
         output,
         products=product,
         replace=replace,

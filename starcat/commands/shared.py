@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,7 +12,7 @@ import typer
 from starcat.errors import ConfigError
 
 if TYPE_CHECKING:
-    from starcat.specs.build_spec import BuildSpec
+    from starcat.specs.build_spec import BuildSpec, CameraSpec
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 Input = Annotated[
@@ -24,8 +25,8 @@ MethodName = Annotated[
 NoisePx = Annotated[float, typer.Option(min=0, max=50, help="Of a centroid, each axis.")]
 
 
-def chosen_spec(path: Path | None, name: str | None) -> BuildSpec:
-    """Return the spec of a file or of a preset; the first preset without either.
+def chosen_spec(path: Path | None, name: str | None, changes: list[str] | None = None) -> BuildSpec:
+    """Return the spec of a file or of a preset.
 
     Parameters
     ----------
@@ -33,6 +34,8 @@ def chosen_spec(path: Path | None, name: str | None) -> BuildSpec:
         A TOML file.
     name : str, optional
         A preset.
+    changes : list of str, optional
+        ``KEY=VALUE`` texts that take the place of what the spec says.
 
     Returns
     -------
@@ -42,25 +45,105 @@ def chosen_spec(path: Path | None, name: str | None) -> BuildSpec:
     Raises
     ------
     ConfigError
-        If both are given, or the spec is wrong.
+        If both are given or neither is, or the spec is wrong.
     """
-    from starcat.specs.build_spec import preset as named_preset
-    from starcat.specs.build_spec import preset_names, read_spec
+    from starcat.specs.reading import preset as named_preset
+    from starcat.specs.reading import preset_names, read_spec
 
     if path is not None and name is not None:
         raise ConfigError("give either a spec file or --preset, not both")
     if path is not None:
-        return read_spec(path)
-    return named_preset(name or preset_names()[0])
+        return read_spec(path, changed_keys(changes))
+    if name is None:
+        raise ConfigError(
+            "say what to build: a spec (TOML), or --preset with one of " + ", ".join(preset_names())
+        )
+    return named_preset(name, changed_keys(changes))
 
 
-def inputs_by_source(given: list[str] | None) -> Mapping[str, list[Path]]:
+def changed_keys(given: list[str] | None) -> dict[str, str]:
+    """Return the values of ``KEY=VALUE`` texts by key.
+
+    Parameters
+    ----------
+    given : list of str, optional
+        Texts of ``--set``.
+
+    Returns
+    -------
+    dict of str to str
+        The last of a key counts.
+
+    Raises
+    ------
+    ConfigError
+        If a text is of another form.
+    """
+    changes = {}
+    for text in given or []:
+        key, separator, value = text.partition("=")
+        if not separator or not key.strip():
+            raise ConfigError(f"--set {text!r} is not KEY=VALUE, such as camera.fov_x_deg=16")
+        changes[key.strip()] = value.strip()
+    return changes
+
+
+def camera_of_options(
+    size: str, focal_mm: float | None, pixel_um: float | None, fov_x_deg: float | None
+) -> CameraSpec:
+    """Return a camera from what a command line says of it.
+
+    Parameters
+    ----------
+    size : str
+        ``1280x960``: width and height of the detector, pixels.
+    focal_mm, pixel_um : float, optional
+        Focal length and side of a pixel, together.
+    fov_x_deg : float, optional
+        Field across the width, instead.
+
+    Returns
+    -------
+    CameraSpec
+        Checked.
+
+    Raises
+    ------
+    ConfigError
+        If the size is of another form, the scale is missing or said twice, or out of range.
+    """
+    from pydantic import ValidationError
+
+    from starcat.specs.build_spec import CameraSpec
+    from starcat.specs.reading import what_is_wrong
+
+    found = re.fullmatch(r"([0-9]{1,6})\s*[xX]\s*([0-9]{1,6})", size.strip())
+    if found is None:
+        raise ConfigError(f"--size {size!r} is not WIDTHxHEIGHT in pixels, such as 1280x960")
+    content = {
+        "width_px": int(found[1]),
+        "height_px": int(found[2]),
+        "focal_length_mm": focal_mm,
+        "pixel_um": pixel_um,
+        "fov_x_deg": fov_x_deg,
+    }
+    try:
+        return CameraSpec.model_validate(
+            {key: value for key, value in content.items() if value is not None}
+        )
+    except ValidationError as error:
+        raise what_is_wrong(error, "camera") from error
+
+
+def inputs_by_source(given: list[str] | None, only: str | None = None) -> Mapping[str, list[Path]]:
     """Return the paths of ``SOURCE=PATH`` texts by source.
 
     Parameters
     ----------
     given : list of str, optional
         Texts of ``--input``.
+    only : str, optional
+        The source that a text without one is about, where a command is about one source.
 
     Returns
     -------
@@ -77,6 +160,8 @@ def inputs_by_source(given: list[str] | None) -> Mapping[str, list[Path]]:
     inputs: dict[str, list[Path]] = {}
     for text in given or []:
         name, separator, path = text.partition("=")
+        if only is not None and (name != only or not separator):
+            name, separator, path = only, "=", text
         if not separator or not path:
             raise ConfigError(f"--input {text!r} is not SOURCE=PATH, such as sao=sao.dat.gz")
         inputs.setdefault(data_source(name).name, []).append(Path(path))

@@ -8,21 +8,21 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from starcat import __version__
-from starcat.errors import ConfigError
-from starcat.evaluation.campaign import Outcome, run_paper
+from starcat.evaluation.campaign import run_paper
+from starcat.evaluation.earlier import with_earlier
 from starcat.evaluation.papers.table import papers_named
 from starcat.evaluation.report.files import RESULTS, write_evaluation
 from starcat.evaluation.report.files import write_reproduction as write_page
 from starcat.evaluation.sweep import Sweep, sweep_paper
 from starcat.pipeline.build import Inputs, build
 from starcat.progress import Progress, no_progress
-from starcat.specs.build_spec import preset
+from starcat.specs.reading import preset
+from starcat.version import __version__
 
 
 @dataclass(frozen=True)
@@ -136,13 +136,15 @@ def evaluate_papers(
         for paper in papers
     ]
     folder = "all" if name.lower() == "all" else papers[0].name
-    return _write(output / _quick(folder, quick), "The papers, reproduced", outcomes)
+    contents = tuple(outcome.as_dict() for outcome in outcomes)
+    place, title = output / _quick(folder, quick), "The papers, reproduced"
+    return Evaluation(contents, write_evaluation(place, title, contents, _machine()))
 
 
 def evaluate_artifact(
     sweep: Sweep, output: Path, *, workers: int = 2, progress: Progress = no_progress
 ) -> Evaluation:
-    """Measure how often an artifact identifies, and write the report.
+    """Measure how often an artifact identifies, and add it to the report.
 
     Parameters
     ----------
@@ -158,7 +160,8 @@ def evaluate_artifact(
     Returns
     -------
     Evaluation
-        One content, with a group a quantity that varies.
+        One content, with a group a quantity that varies. The page and its files hold the sweeps
+        that were made into this folder before, too.
     """
     paper = sweep_paper(sweep)
     outcome = run_paper(
@@ -170,7 +173,10 @@ def evaluate_artifact(
         progress=progress,
     )
     folder = output / _quick(paper.name, sweep.is_quick)
-    return _write(folder, f"{paper.name}, evaluated", [outcome])
+    content = outcome.as_dict()
+    contents = with_earlier(folder / RESULTS, content, sweep.artifact)
+    page = write_evaluation(folder, f"{paper.name}, evaluated", contents, _machine())
+    return Evaluation((content,), page)
 
 
 def write_reproduction(output: Path, docs: Path) -> Path:
@@ -196,49 +202,13 @@ def write_reproduction(output: Path, docs: Path) -> Path:
     return write_page(output / "all" / RESULTS, docs)
 
 
-def noise_values(given: Sequence[str]) -> Mapping[str, tuple[float, ...]]:
-    """Read the values that a user gives to quantities.
-
-    Parameters
-    ----------
-    given : sequence of str
-        Each ``name=value,value,...``.
-
-    Returns
-    -------
-    mapping of str to tuple of float
-        By name.
-
-    Raises
-    ------
-    ConfigError
-        If a text is not of that form, or says a name again.
-    """
-    values: dict[str, tuple[float, ...]] = {}
-    for text in given:
-        name, _, numbers = text.partition("=")
-        try:
-            found = tuple(float(number) for number in numbers.split(","))
-        except ValueError:
-            found = ()
-        if not found or name in values:
-            raise ConfigError(
-                f"--noise {text!r}: expected NAME=VALUE,VALUE,... with each name once, such as "
-                "noise_px=0,0.5,1",
-                value=text,
-            )
-        values[name] = found
-    return values
-
-
 def _quick(name: str, is_quick: bool) -> str:
     return f"{name}-quick" if is_quick else name
 
 
-def _write(folder: Path, title: str, outcomes: Sequence[Outcome]) -> Evaluation:
-    machine = (
+def _machine() -> str:
+    """Say what the times were measured on."""
+    return (
         f"mean over the frames, processors: {os.cpu_count()} ({platform.machine()}), "
         f"starcat {__version__}, Python {platform.python_version()}"
     )
-    contents = tuple(outcome.as_dict() for outcome in outcomes)
-    return Evaluation(contents, write_evaluation(folder, title, contents, machine))

@@ -20,10 +20,10 @@ from starcat.matcher.methods.table import METHODS, best_method, method_named
 from starcat.simulation.simulate import Noise
 
 FRAMES, FEW_FRAMES = 500, 100
-"""Of a trial, unless a sweep says otherwise; of a quick one."""
+"""Frames of a trial, and of a quick trial, unless a sweep says otherwise."""
 
 NOISE_PX = 0.5
-"""Of centroids, while another quantity is varied; a sweep may say otherwise."""
+"""Noise of the centroids while another quantity is varied, unless a sweep says otherwise."""
 
 
 @dataclass(frozen=True)
@@ -42,14 +42,14 @@ class Sweep:
     limit_mag : float
         Fainter stars are not seen.
     values : mapping of str to tuple of float
-        By key of `AXES`. A single value holds for all trials; of several, each is tried while
-        the others keep theirs.
+        Values of each quantity, by key of `AXES`. A single value holds for all trials; several
+        values are tried one after the other while the other quantities keep theirs.
     frames : int
-        Of each trial.
+        Frames of each trial.
     tolerance_px : float, optional
-        Of the matcher; by default what the position noise asks for (`tolerance_for`).
+        Tolerance of the matcher; by default what the position noise asks for (`tolerance_for`).
     seed : int
-        Of all that is random.
+        Seed of all that is random.
     is_quick : bool
         Whether few frames were asked for.
     """
@@ -63,6 +63,45 @@ class Sweep:
     tolerance_px: float | None = None
     seed: int = 1
     is_quick: bool = False
+
+
+def sweep_values(**texts: str | None) -> dict[str, tuple[float, ...]]:
+    """Read the values that a user gives to quantities.
+
+    Parameters
+    ----------
+    **texts : str or None
+        ``value,value,...`` by key of `AXES`; None where nothing was said.
+
+    Returns
+    -------
+    dict of str to tuple of float
+        The values of the quantities that have some.
+
+    Raises
+    ------
+    ConfigError
+        If a text is of another form.
+
+    Examples
+    --------
+    >>> sweep_values(noise_px="0,0.5,1", k1=None)
+    {'noise_px': (0.0, 0.5, 1.0)}
+    """
+    values = {}
+    for name, text in texts.items():
+        if text is None:
+            continue
+        try:
+            values[name] = tuple(float(number) for number in text.split(","))
+        except ValueError as error:
+            raise ConfigError(
+                f"--{name.replace('_', '-')} {text!r}: expected one number, or several with commas "
+                "between them, such as 0,0.5,1",
+                key=name,
+                value=text,
+            ) from error
+    return values
 
 
 def plan_sweep(
@@ -106,27 +145,31 @@ def plan_sweep(
     ProductError
         If the folder is not an artifact, or lacks a product that the method needs.
     """
-    for name, given in values.items():
-        if name not in AXES or not given:
-            raise ConfigError(
-                f"noise {name!r} has {len(given)} values; expected one or more of one of "
-                + ", ".join(AXES),
-                key=name,
-            )
     manifest = open_artifact(artifact).manifest
-    usual = {name: axis.usual for name, axis in AXES.items() if axis.usual}
-    wanted = {name: tuple(sorted(set(given))) for name, given in values.items()}
     return Sweep(
         artifact,
         camera or open_database(artifact).camera,
         _methods(artifact, method),
         manifest["spec"]["selection"]["faint_limit_mag"],
-        wanted or usual,
+        _wanted(values),
         frames or (FEW_FRAMES if quick else FRAMES),
         tolerance_px,
         seed,
         quick,
     )
+
+
+def _wanted(values: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, ...]]:
+    """Return the values to try: those given, each once and in order, or the usual ones."""
+    for name, given in values.items():
+        if name not in AXES or not given:
+            raise ConfigError(
+                f"quantity {name!r} has {len(given)} values; expected one or more of one of "
+                + ", ".join(AXES),
+                key=name,
+            )
+    wanted = {name: tuple(sorted(set(given))) for name, given in values.items()}
+    return wanted or {name: axis.usual for name, axis in AXES.items() if axis.usual}
 
 
 def _methods(artifact: Path, method: str | None) -> tuple[str, ...]:
@@ -170,27 +213,33 @@ def sweep_paper(sweep: Sweep) -> Paper:
 
 
 def _rows(sweep: Sweep, preset: str) -> list[Row]:
-    """Return a group a quantity that varies, or one group of a single point."""
+    """Return a group a quantity that varies, or one group of a single point.
+
+    What is held at another value than usual is part of a group's title and of a trial's name,
+    so that sweeps of the same quantity under other conditions stand beside each other.
+    """
     single = {name: v[0] for name, v in sweep.values.items() if len(v) == 1}
     varied = {name: v for name, v in sweep.values.items() if name not in single}
+    held = ", ".join(f"{AXES[name].label} {value:g}" for name, value in single.items())
+    prefix = "".join(f"{name}_{value:g}_" for name, value in single.items())
+    note = f"{sweep.frames:,} frames, seed {sweep.seed}"
     rows = []
-    for method in sweep.methods:
-        base = _trial(sweep, method, single)
-        if not varied:
-            held = ", ".join(f"{AXES[name].label} {value:g}" for name, value in single.items())
-            rows.append(Row(held or "clean", method, preset, base, "starcat"))
+    if not varied:
+        for method in sweep.methods:
+            trial = _trial(sweep, method, single, prefix)
+            rows.append(Row(held or "clean", method, preset, trial, "starcat", note=note))
     for name, values in varied.items():
+        group = AXES[name].label + (f" ({held})" if held else "")
         for method in sweep.methods:
             for value in values:
-                trial = _trial(sweep, method, single | {name: value}, f"{name}_{value:g}_")
-                label = AXES[name].label
-                rows.append(Row(label, f"{value:g}", preset, trial, "starcat", x=value))
+                trial = _trial(sweep, method, single | {name: value}, f"{prefix}{name}_{value:g}_")
+                rows.append(Row(group, f"{value:g}", preset, trial, "starcat", x=value, note=note))
     return rows
 
 
-def _trial(sweep: Sweep, method: str, values: Mapping[str, float], name: str = "") -> Trial:
+def _trial(sweep: Sweep, method: str, values: Mapping[str, float], prefix: str) -> Trial:
     trial = Trial(
-        f"{name}{method}",
+        f"{prefix}{method}",
         method,
         Attitudes("random", sweep.frames),
         Noise(NOISE_PX, limit_mag=sweep.limit_mag),

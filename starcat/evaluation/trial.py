@@ -32,6 +32,7 @@ from starcat.matcher.verification import REACH
 from starcat.progress import Progress, no_progress
 from starcat.simulation.simulate import Noise, simulate_frame
 from starcat.simulation.sky import Sky
+from starcat.storage.atomic import whole_file
 
 _TYPES = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}
 
@@ -172,10 +173,8 @@ def run_trial(
         for name, kind in get_type_hints(Verdict).items()
     }
     table = pa.table(columns).replace_schema_metadata({b"starcat_trial": facts})
-    folder.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
-    pq.write_table(table, partial, compression="zstd")
-    partial.replace(path)
+    with whole_file(path) as partial:
+        pq.write_table(table, partial, compression="zstd")
     return path
 
 

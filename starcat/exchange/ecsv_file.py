@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from starcat.errors import SchemaError
 from starcat.exchange.numpy_columns import NumpyColumn
 from starcat.exchange.units import unit_text
+
+if TYPE_CHECKING:
+    from astropy.table import Table
 
 _BREAKS = re.compile(r"\0|[^\S \t\n]")
 """White space that is neither blank, tab nor newline: Python ends lines at most of it."""
@@ -31,13 +34,34 @@ def write_ecsv(columns: list[NumpyColumn], path: Path) -> None:
     SchemaError
         If a unit is not one that astropy knows, or a text would be misread.
     """
+    _check_texts(columns)
+    astropy_table(columns).write(path, format="ascii.ecsv", overwrite=True)
+
+
+def astropy_table(columns: list[NumpyColumn]) -> Table:
+    """Return columns as an astropy table.
+
+    Parameters
+    ----------
+    columns : list of NumpyColumn
+        With their facts.
+
+    Returns
+    -------
+    astropy.table.Table
+        With units, meanings and UCDs; nulls are masked.
+
+    Raises
+    ------
+    SchemaError
+        If a unit is not one that astropy knows.
+    """
     from astropy.table import Table
 
-    _check_texts(columns)
     table = Table()
     for column in columns:
         table[column.name] = _column(column)
-    table.write(path, format="ascii.ecsv", overwrite=True)
+    return table
 
 
 def _column(column: NumpyColumn) -> Any:

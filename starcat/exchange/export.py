@@ -18,12 +18,12 @@ from typing import Any
 
 import pyarrow as pa
 
-from starcat.artifact.writer import partial_folder
 from starcat.errors import ConfigError, OutputError
 from starcat.exchange.formats import FORMATS, SUFFIXES, write_batches
 from starcat.exchange.hats import MAX_ROWS, NEEDED, PROPERTIES_NAME, write_hats
 from starcat.exchange.numpy_columns import field_facts
 from starcat.exchange.tables import NamedTables
+from starcat.storage.atomic import whole_folder
 
 EXPORT_FORMATS = (*FORMATS, "hats")
 COLUMNS_NAME = "columns.csv"
@@ -135,7 +135,7 @@ def export_tables(
         )
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder}: is a file; choose a folder with --output", path=folder)
-    with partial_folder(folder) as partial:
+    with whole_folder(folder) as partial:
         files = []
         columns: list[tuple[str, ...]] = []
         for product in tables.chosen(products):

@@ -20,9 +20,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from starcat import __version__
 from starcat.catalog.stars import floats_of
 from starcat.errors import ConfigError
+from starcat.version import __version__, install_command
 
 MAX_ORDER = 29
 HEALPIX_COLUMN = "_healpix_29"
@@ -150,7 +150,7 @@ def healpix_29(ra_deg: NDArray[np.float64], dec_deg: NDArray[np.float64]) -> NDA
         from cdshealpix.nested import lonlat_to_healpix
     except ImportError as error:
         raise ConfigError(
-            "HATS needs the package cdshealpix, which is not installed; pip install 'starcat[hats]'"
+            f"HATS needs the package cdshealpix, which is not installed; {install_command('hats')}"
         ) from error
     from astropy import units
     from astropy.coordinates import Latitude, Longitude

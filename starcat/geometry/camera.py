@@ -15,6 +15,7 @@ from numbers import Integral
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.errors import ConfigError
 from starcat.geometry.distortion import NO_DISTORTION, Distortion, checked_number
 from starcat.geometry.sphere import separation
 
@@ -86,13 +87,14 @@ class Camera:
         self._refuse_fold()
 
     def _refuse_fold(self) -> None:
-        """Raise ValueError unless all of the detector lies inside the fold."""
+        """Raise ConfigError unless all of the detector lies inside the fold."""
         reach_px = float(np.hypot(*(self._corners - self.principal_point_px).T).max())
         fold_px = self.distortion.image_radius * self.focal_length_px
         if reach_px >= fold_px and not self.distortion.is_none:
-            raise ValueError(
+            raise ConfigError(
                 f"distortion folds the image back at {fold_px:.6g} px from the principal point, "
-                f"but the detector reaches out to {reach_px:.6g} px; expected a fold beyond that"
+                f"but the detector reaches out to {reach_px:.6g} px; expected a fold beyond that",
+                key="distortion",
             )
 
     @property
@@ -110,6 +112,12 @@ class Camera:
         """Return the largest separation between the directions of pixels."""
         body = self.directions_from_pixels(centroids_px)
         return float(separation(body[:, None], body[None]).max())
+
+    @property
+    def in_words(self) -> str:
+        """Pixels and field of view, as reports say them."""
+        size, field = (self.width_px, self.height_px), (self.fov_x_deg, self.fov_y_deg)
+        return f"{size[0]} x {size[1]} px, {field[0]:.4g} x {field[1]:.4g} deg"
 
     @cached_property
     def fov_x_deg(self) -> float:
@@ -220,14 +228,16 @@ def _size(name: str, value: object) -> int:
         size = int(value)
         if 1 <= size <= LARGEST_PX:
             return size
-    raise ValueError(f"{name} is {value!r}; expected a whole number from 1 to {LARGEST_PX}")
+    text = f"{name} is {value!r}; expected a whole number from 1 to {LARGEST_PX}"
+    raise ConfigError(text, key=name, value=value)
 
 
 def _point(name: str, value: Iterable[object]) -> tuple[float, float]:
     try:
         x, y = (checked_number(name, entry) for entry in value)
     except (TypeError, ValueError):
-        raise ValueError(f"{name} is {value!r}; expected two finite numbers, x and y") from None
+        text = f"{name} is {value!r}; expected two finite numbers, x and y"
+        raise ConfigError(text, key=name, value=value) from None
     return x, y
 
 
@@ -255,9 +265,11 @@ def _focal_length_px(
         other = _focal_length_from_fov("fov_y_deg", fov_y_deg, height_px)
         if abs(other - focal) > 1e-3 * focal:
             square = np.degrees(2.0 * np.arctan(0.5 * height_px / focal))
-            raise ValueError(
+            raise ConfigError(
                 f"fov_y_deg is {fov_y_deg!r}; expected {square:.6g}, "
-                f"which square pixels give with fov_x_deg {fov_x_deg!r}, or neither of the two"
+                f"which square pixels give with fov_x_deg {fov_x_deg!r}, or neither of the two",
+                key="fov_y_deg",
+                value=fov_y_deg,
             )
     return focal
 

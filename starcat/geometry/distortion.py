@@ -14,6 +14,8 @@ from numbers import Real
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.errors import ConfigError
+
 Array = NDArray[np.float64]
 Points = NDArray[np.complex128]
 
@@ -56,7 +58,8 @@ def checked_number(name: str, value: object, low: float = -np.inf, high: float =
                 return number
     above = f" above {low:g}" if low > -np.inf else ""
     below = f" and below {high:g}" if high < np.inf else ""
-    raise ValueError(f"{name} is {value!r}; expected a finite number{above}{below}")
+    text = f"{name} is {value!r}; expected a finite number{above}{below}"
+    raise ConfigError(text, key=name, value=value)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import erf
 
 from starcat.errors import ConfigError
+from starcat.version import install_command
 
 Grey = NDArray[np.float32]
 
@@ -68,7 +69,7 @@ def load_sep() -> Any:
     except ImportError as error:
         raise ConfigError(
             f"finding stars in an image needs the package sep ({error}); "
-            "pip install 'starcat[images]'"
+            f"{install_command('images')}"
         ) from error
 
 

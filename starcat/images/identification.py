@@ -21,6 +21,9 @@ from starcat.simulation.simulate import Frame
 IMAGE_SUFFIXES = (".fits", ".fit", ".fts", ".gz", ".fz", ".png", ".tif", ".tiff")
 """Files that are read as images; all others hold centroids."""
 
+CENTROIDS_SUFFIX = ".csv"
+"""Of the file that a simulated frame's centroids are written to."""
+
 
 @dataclass(frozen=True)
 class MeasuredFile:
@@ -119,13 +122,23 @@ def write_simulated(path: Path, frame: Frame, camera: Camera, seed: int) -> None
 
     Raises
     ------
+    ConfigError
+        If the suffix says neither centroids nor a kind of image that is written.
     OutputError
         If the file cannot be written.
     """
-    if path.suffix.lower() not in IMAGE_SUFFIXES:
+    from starcat.images.image_file import WRITTEN_KINDS, write_image
+
+    suffix = path.suffix.lower()
+    if suffix == CENTROIDS_SUFFIX:
         write_centroids(frame.centroids_px, path, frame.mag)
         return
-    from starcat.images.image_file import write_image
+    if suffix not in WRITTEN_KINDS:
+        raise ConfigError(
+            f"{path}: the name says no kind of frame that starcat writes; end it with one of "
+            f"{CENTROIDS_SUFFIX} (centroids), {', '.join(WRITTEN_KINDS)} (images)"
+        )
+
     from starcat.images.render import Optics, render_image
 
     size = camera.width_px, camera.height_px

@@ -31,9 +31,10 @@ _KINDS = {
     b"II+\0": "TIFF",
     b"MM\0+": "TIFF",
 }
-_SUFFIXES = {
+WRITTEN_KINDS = {
     ".fits": "FITS", ".fit": "FITS", ".fts": "FITS", ".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF",
 }  # fmt: skip
+"""What is written under which suffix."""
 _LUMINANCE = np.array([0.299, 0.587, 0.114])
 """Of red, green, blue: ITU-R BT.601."""
 
@@ -178,9 +179,9 @@ def write_image(path: Path, image: NDArray[Any]) -> None:
     OutputError
         If the file cannot be written.
     """
-    kind = _SUFFIXES.get(path.suffix.lower())
+    kind = WRITTEN_KINDS.get(path.suffix.lower())
     if kind is None:
-        raise ConfigError(f"{path}: unknown kind of image; expected {', '.join(_SUFFIXES)}")
+        raise ConfigError(f"{path}: unknown kind of image; expected {', '.join(WRITTEN_KINDS)}")
     if image.ndim != 2 or not image.size:
         raise ValueError(f"image of shape {image.shape}; expected two dimensions")
     buffer = io.BytesIO()

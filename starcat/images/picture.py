@@ -99,11 +99,7 @@ def draw_identified(
         taken = draw_compass(plate, compass)
         left_out = draw_names(plate, taken)
         _draw_legend(figure, names, left_out)
-        content = _rendered(figure, path.suffix.lower())
-    try:
-        path.write_bytes(content)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({reason(error)})", path=path) from error
+        _write(figure, path)
 
 
 def compass_from_matrix(matrix: Array) -> tuple[Array, Array]:
@@ -202,15 +198,18 @@ def _draw_legend(figure: Figure, names: Sequence[str | None], left_out: int) -> 
         figure.text(right, 0.16 / figure.get_figheight(), note, color="#777", ha="right", size=8)
 
 
-def _rendered(figure: Figure, suffix: str) -> bytes:
-    """Return the bytes of the file, without a date or a version in them."""
+def _write(figure: Figure, path: Path) -> None:
+    """Write the file, without a date or a version in it."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     buffer = io.BytesIO()
-    if suffix == ".png":
+    if path.suffix.lower() == ".png":
         FigureCanvasAgg(figure).print_figure(buffer, dpi=_DPI, metadata={"Software": None})
     else:
         nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
         FigureCanvasSVG(figure).print_figure(buffer, metadata=nothing)
-    return buffer.getvalue()
+    try:
+        path.write_bytes(buffer.getvalue())
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({reason(error)})", path=path) from error

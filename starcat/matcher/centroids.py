@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,12 +42,12 @@ class MeasuredFrame:
     mag: Array | None = None
 
 
-def read_frames(path: Path) -> list[MeasuredFrame]:
+def read_frames(path: str | os.PathLike[str]) -> list[MeasuredFrame]:
     """Read the frames of a centroid file.
 
     Parameters
     ----------
-    path : Path
+    path : str or path-like
         CSV with a header that names ``x_px`` and ``y_px``, or JSON (ending ``.json``).
 
     Returns
@@ -60,6 +61,7 @@ def read_frames(path: Path) -> list[MeasuredFrame]:
         If the file cannot be read, lacks a column or key, or holds what is not a number, with
         the line or frame.
     """
+    path = Path(path)
     try:
         # Spreadsheets put a mark of the byte order before the header.
         text = path.read_text(encoding="utf-8-sig")

@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.errors import ProductError, SchemaVersionError
+from starcat.errors import ArtifactMissing, ProductError, SchemaVersionError
 from starcat.geometry.camera import Camera
 
 Made = TypeVar("Made")
@@ -83,6 +83,11 @@ class Database:
     designation: NDArray[np.bytes_]
     products: Mapping[str, ProductArrays] = field(default_factory=dict)
     _derived: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __repr__(self) -> str:
+        """Return name, stars and products in one line."""
+        opened = ", ".join(self.products) or "no product"
+        return f"<Database {self.name}: {len(self.mag):,} stars at J{self.epoch_jyear:g}, {opened}>"
 
     def derived(self, make: Callable[..., Made], *arguments: float) -> Made:
         """Return what a method makes of the database before it can use it, made once.
@@ -159,7 +164,9 @@ def products_in(artifact: Path) -> tuple[str, ...]:
 def _database_file(artifact: Path) -> Path:
     path = artifact / "database.h5" if artifact.is_dir() else artifact
     if not path.is_file():
-        raise ProductError(f"{path}: no such database; give the folder of an artifact", path=path)
+        raise ArtifactMissing(
+            f"{path}: no such database; give the folder of an artifact", path=path
+        )
     return path
 
 

@@ -6,6 +6,7 @@ verification, and only an agreement that chance does not explain is an answer.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -54,10 +55,17 @@ class Matcher:
     selection: TriangleOrder = DEFAULT
     max_batches: int = 200
 
+    def __repr__(self) -> str:
+        """Return database, method and limits in one line."""
+        return (
+            f"<Matcher {self.method} on {self.database.name}: {len(self.database.mag):,} stars, "
+            f"tolerance {self.tolerance_px:g} px, chance {self.max_false_match_probability:g}>"
+        )
+
     @classmethod
     def open(
         cls,
-        artifact: Path,
+        artifact: str | os.PathLike[str],
         method: str | None = "triangle",
         *,
         tolerance_px: float = 2.0,
@@ -68,7 +76,7 @@ class Matcher:
 
         Parameters
         ----------
-        artifact : Path
+        artifact : str or path-like
             The artifact's folder.
         method : str, default "triangle"
             A key of `METHODS`; None for the best one that the artifact's products allow.

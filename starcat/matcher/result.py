@@ -54,6 +54,24 @@ class MatchResult:
     false_match_probability: float
     dropped: tuple[tuple[int, str], ...] = ()
 
+    def __repr__(self) -> str:
+        """Return the answer in one line."""
+        spots = f"{self.n_matched} of {len(self.star_ids)} spots"
+        if self.status != "identified":
+            return f"<MatchResult {self.status}: {len(self.star_ids)} spots>"
+        return (
+            f"<MatchResult identified: {spots}, RA {self.boresight_ra_deg:.4f}, "
+            f"Dec {self.boresight_dec_deg:+.4f}, roll {self.roll_deg:.4f} deg, residual "
+            f"{self.residual_arcsec:.1f} arcsec, chance {self.false_match_probability:.1e}>"
+        )
+
+    def _repr_html_(self) -> str:
+        """Return the answer and its stars as a table for a notebook."""
+        head = "<thead><tr><th>spot</th><th>star</th></tr></thead>"
+        named = enumerate(self.star_ids.tolist())
+        rows = "".join(f"<tr><td>{k}</td><td>{star}</td></tr>" for k, star in named if star >= 0)
+        return f"<p>{repr(self)[1:-1]}</p><table>{head}<tbody>{rows}</tbody></table>"
+
 
 def unidentified(status: Status, observation: Observation) -> MatchResult:
     """Return the answer to a frame that was not identified.

@@ -16,14 +16,7 @@ from typing import Any
 import pyarrow as pa
 
 from starcat.artifact.verify import check_artifact
-from starcat.artifact.writer import (
-    Outcome,
-    Product,
-    move_into_place,
-    partial_folder,
-    write_manifest,
-    write_products,
-)
+from starcat.artifact.writer import Product, write_manifest, write_products
 from starcat.catalog.fetching.locate import locate
 from starcat.catalog.ingest import Ingested, ingest
 from starcat.catalog.selection import Selected
@@ -48,6 +41,7 @@ from starcat.report.coverage_report import CoverageReport, holes_warning
 from starcat.report.report import write_report
 from starcat.simulation.selftest import Rates, self_test
 from starcat.specs.build_spec import BuildSpec
+from starcat.storage.atomic import Outcome, move_into_place, whole_folder
 from starcat.tables.schema import product_schema
 
 Inputs = Mapping[str, Sequence[Path]]
@@ -90,6 +84,15 @@ class Built:
     problems: tuple[str, ...]
     warnings: tuple[str, ...]
     times_s: dict[str, float]
+
+    def __repr__(self) -> str:
+        """Return the artifact and how it identifies in one line."""
+        clean, hard = self.rates
+        stars = self.manifest["products"]["stars"]["rows"]
+        return (
+            f"<Built {self.folder} ({self.outcome}): {stars:,} guide stars, identified "
+            f"{clean.identified_share:.1%} of clean and {hard.identified_share:.1%} of hard fields>"
+        )
 
 
 def build(
@@ -134,14 +137,14 @@ def build(
     """
     final = output / f"{spec.name}-{spec.version}"
     clock = Stopwatch()
-    with partial_folder(final) as partial:
+    with whole_folder(final) as partial:
         catalog, amplitudes = read_sources(spec, inputs, workers, progress)
         stars, joined = _join_all(catalog.stars, amplitudes)
         clock.lap("read")
         selected, fields = select_stars(stars, spec)
         clock.lap("select")
         products = make_products(spec, catalog, selected, fields, progress)
-        matched = match_catalogs(selected, spec, inputs, workers, progress)
+        matched = match_catalogs(stars, selected, spec, inputs, workers, progress)
         products += matched.products
         clock.lap("products")
         facts = write_products(partial, products, database_facts(spec))

@@ -26,7 +26,7 @@ from starcat.artifact.crossmatch_table import (
 from starcat.artifact.manifest import SourceFacts
 from starcat.artifact.writer import Product
 from starcat.catalog.fetching.locate import locate
-from starcat.catalog.ingest import ingest
+from starcat.catalog.ingest import Ingested, ingest
 from starcat.catalog.selection import Selected
 from starcat.catalog.stars import sort_rows
 from starcat.catalog.verdict import Reason
@@ -34,7 +34,8 @@ from starcat.errors import ParseError, SchemaError, SourceMissing, reason
 from starcat.products.crossmatch import VERDICTS, Matches, candidate_pairs, crossmatch
 from starcat.products.match_odds import ARCSEC, MatchModel
 from starcat.progress import Progress, no_progress
-from starcat.specs.build_spec import BuildSpec, Crossmatch
+from starcat.specs.build_spec import BuildSpec
+from starcat.specs.product_sections import Crossmatch
 from starcat.tables.parquet import write_table
 from starcat.tables.schema import product_schema
 
@@ -182,13 +183,15 @@ def _summary(found: Matches, table: pa.Table, stars: int, others: int, radius: f
     )
 
 
-def with_rivals(selected: Selected, radius_rad: float) -> pa.Table:
+def with_rivals(stars: pa.Table, selected: Selected, radius_rad: float) -> pa.Table:
     """Return guide stars, followed by the rejected stars that may be their counterparts' own.
 
     Parameters
     ----------
+    stars : pyarrow.Table
+        The stars that the selection chose from, with all their columns.
     selected : Selected
-        Guide stars, and the others of their catalog.
+        Guide stars, and which of the others were rejected.
     radius_rad : float
         Largest separation of a candidate.
 
@@ -204,13 +207,15 @@ def with_rivals(selected: Selected, radius_rad: float) -> pa.Table:
     """
     guide_stars = selected.guide_stars.select(NEEDED)
     apart = pc.not_equal(selected.rejected["reason"], Reason.merged.name)
-    others = selected.rejected.filter(apart).select(NEEDED)
+    rejected = selected.rejected.filter(apart)["star_id"].combine_chunks()
+    others = stars.select(NEEDED).filter(pc.is_in(stars["star_id"], rejected))
     near = candidate_pairs(moving_stars(guide_stars), moving_stars(others), 2.0 * radius_rad)
     rivals = others.take(pa.array(np.unique(near.counterpart))).cast(guide_stars.schema)
     return pa.concat_tables([guide_stars, rivals])
 
 
 def match_catalogs(
+    stars: pa.Table,
     selected: Selected,
     spec: BuildSpec,
     inputs: Mapping[str, Sequence[Path]],
@@ -221,8 +226,10 @@ def match_catalogs(
 
     Parameters
     ----------
+    stars : pyarrow.Table
+        The stars that the selection chose from.
     selected : Selected
-        Guide stars, in the order of the artifact, and the others of their catalog.
+        Guide stars, in the order of the artifact, and which of the others were rejected.
     spec : BuildSpec
         Its section ``products.crossmatch``.
     inputs : mapping of str to sequence of Path
@@ -245,7 +252,7 @@ def match_catalogs(
     wanted = spec.products.crossmatch
     if not wanted.enabled:
         return Counterparts()
-    stars = with_rivals(selected, wanted.radius_arcsec * ARCSEC)
+    both = with_rivals(stars, selected, wanted.radius_arcsec * ARCSEC)
     count = len(selected.guide_stars)
     tables: list[pa.Table] = []
     sources: list[SourceFacts] = []
@@ -260,18 +267,32 @@ def match_catalogs(
             progress=progress,
         )
         progress("product crossmatch", 0, None)
-        table, _ = match_tables(stars, read.stars, wanted)
-        table = table.filter(pc.less(table["star"], count))
-        kept, rejected = len(read.stars), read.rejected_by_reason
-        joined = counterparts_of(table, name)
-        facts = (name, "crossmatch", read.files, read.rows_read, kept, rejected, joined)
-        tables.append(table)
-        sources.append(SourceFacts(*facts))
+        table, _ = match_tables(both, read.stars, wanted)
+        tables.append(table.filter(pc.less(table["star"], count)))
+        sources.append(_source_facts(read, counterparts_of(tables[-1], name)))
         notes += read.notes
         del read  # a whole catalog: two of them need not fit into memory
-    table = sort_rows(pa.concat_tables(tables), product_schema("crossmatch").order)
-    product = Product("crossmatch", table.combine_chunks(), in_database=False)
+    product = Product("crossmatch", _in_order(tables), in_database=False)
     return Counterparts((product,), tuple(sources), tuple(notes))
+
+
+def _source_facts(read: Ingested, joined: int) -> SourceFacts:
+    """Return what the manifest says of a catalog of counterparts."""
+    return SourceFacts(
+        read.source,
+        "crossmatch",
+        read.files,
+        read.rows_read,
+        len(read.stars),
+        read.rejected_by_reason,
+        joined,
+    )
+
+
+def _in_order(tables: Sequence[pa.Table]) -> pa.Table:
+    """Return the rows of all catalogs as one product."""
+    order = product_schema("crossmatch").order
+    return sort_rows(pa.concat_tables(tables), order).combine_chunks()
 
 
 def match_files(a: Path, b: Path, output: Path, wanted: Crossmatch) -> Summary:

@@ -243,7 +243,7 @@ def artifact_coverage(artifact: Artifact) -> CoverageReport:
     """
     from starcat.pipeline.facts import coverage_report
     from starcat.products.coverage import coverage_from_counts
-    from starcat.specs.build_spec import spec_from_dict
+    from starcat.specs.reading import spec_from_dict
 
     table = artifact.table("boresights")
     boresights = np.stack([table[name].to_numpy() for name in ("x", "y", "z")], axis=-1)

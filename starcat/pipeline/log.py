@@ -8,13 +8,13 @@ from __future__ import annotations
 import os
 import platform
 import sys
-import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from starcat.artifact.manifest import software_versions
+from starcat.storage.atomic import whole_file
 from starcat.storage.digests import json_bytes
 
 
@@ -87,15 +87,6 @@ def write_build_log(artifact: Path, outcome: str, times_s: Mapping[str, float]) 
         "software": software_versions(),
     }
     final = artifact.with_name(f"{artifact.name}.build.json")
-    handle, name = tempfile.mkstemp(
-        prefix=f".{final.name}.", suffix=".partial", dir=artifact.parent
-    )
-    partial = Path(name)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(json_bytes(content))
-        partial.chmod(0o644)
-        partial.replace(final)
-    finally:
-        partial.unlink(missing_ok=True)
+    with whole_file(final) as partial:
+        partial.write_bytes(json_bytes(content))
     return final

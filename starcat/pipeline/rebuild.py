@@ -16,7 +16,7 @@ from starcat.catalog.source import data_source
 from starcat.errors import ChecksumMismatch
 from starcat.pipeline.build import Inputs, build, check_inputs
 from starcat.progress import Progress, no_progress
-from starcat.specs.build_spec import spec_from_dict
+from starcat.specs.reading import spec_from_dict
 from starcat.storage.digests import file_sha256
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
 from starcat.catalog.star_files import rejected_path
-from starcat.errors import ProductError, QueryError
+from starcat.errors import ProductError, QueryError, TargetMissing
 from starcat.progress import Progress, no_progress
 from starcat.tables.schema import ProductSchema, product_schema
 
@@ -126,8 +126,9 @@ def _open_target(text: str, scratch: Path, progress: Progress) -> Target:
         return _tables(path)
     source, inputs = _source_of(text, path)
     if source is None:
-        what = "cannot tell what it is" if path.exists() else "does not exist"
-        raise QueryError(
+        is_there = path.exists()
+        what = "cannot tell what it is" if is_there else "does not exist"
+        raise (QueryError if is_there else TargetMissing)(
             f"{text}: {what}; give the folder of an artifact or a HATS catalog, a Parquet file, an "
             "archive file (SOURCE=PATH where its name is not the archive's), or a source that "
             "'starcat sources' lists"

@@ -1,39 +1,38 @@
 """Files that several processes may write at once, and that a killed one leaves half done.
 
 A part belongs to who holds its lock, which ends with the process. Not every file system has
-locks; `locked` says so, and then nothing is shared.
+locks, and Windows has no locks of this kind; `locked` says so, and then nothing is shared.
 """
 
 from __future__ import annotations
 
 import errno
-import fcntl
 import logging
 import os
-import secrets
 import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
-from starcat.errors import OutputError, ProductError, reason
+from starcat.errors import ProductError, reason
 from starcat.progress import Progress, no_progress
 from starcat.releases.tree import Blob
 from starcat.storage.digests import file_sha256
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 _logger = logging.getLogger(__name__)
 _BLOCK_BYTES = 1 << 20
+_WITHOUT_LINKS = getattr(os, "O_NOFOLLOW", 0)
+_WITHOUT_WAITING = getattr(os, "O_NONBLOCK", 0)
+_AS_BYTES = getattr(os, "O_BINARY", 0)
+"""What Windows does not have is left out; symbolic links are looked for before opening."""
+
 _WITHOUT_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EBADF}
-_WRITING_FAILED = {
-    errno.ENOSPC,
-    errno.EDQUOT,
-    errno.EFBIG,
-    errno.EROFS,
-    errno.EACCES,
-    errno.EPERM,
-    errno.ENOTDIR,
-    errno.EEXIST,
-}
 
 
 @contextmanager
@@ -48,13 +47,17 @@ def locked(path: Path) -> Iterator[bool]:
     Yields
     ------
     bool
-        Whether nobody else holds it; False where the file system has no locks.
+        Whether nobody else holds it; False where the system or the file system has no locks.
     """
+    if fcntl is None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield False
+        return
     while True:
         if not path.is_dir():
             path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            flags = os.O_RDONLY if path.is_dir() else os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
+            flags = os.O_RDONLY if path.is_dir() else os.O_RDWR | os.O_CREAT | _WITHOUT_LINKS
             descriptor = os.open(path, flags, 0o666)
         except FileNotFoundError:  # the one before has removed the folder
             continue
@@ -86,37 +89,6 @@ def _is_still(descriptor: int, path: Path) -> bool:
         return False
 
 
-@contextmanager
-def writing(folder: Path, advice: str) -> Iterator[None]:
-    """Turn a refusal of the operating system into the error that says so.
-
-    Parameters
-    ----------
-    folder : Path
-        Where something is written.
-    advice : str
-        What to do.
-
-    Yields
-    ------
-    None
-        To the work.
-
-    Raises
-    ------
-    OutputError
-        If the folder cannot be written to, or the disk is full.
-    """
-    try:
-        yield
-    except OSError as error:
-        if error.errno not in _WRITING_FAILED:
-            raise
-        raise OutputError(
-            f"{folder}: writing failed ({reason(error)}); {advice}", path=folder
-        ) from error
-
-
 def copy_to_part(
     source: Path, blob: Blob, part: Path, progress: Progress = no_progress, stage: str = "copy"
 ) -> None:
@@ -142,12 +114,13 @@ def copy_to_part(
     """
     with _reading(source, blob) as reader:
         for goes_on in (True, False):
-            writer = os.open(part, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+            _refuse_links(part)
+            writer = os.open(part, os.O_RDWR | os.O_CREAT | _WITHOUT_LINKS | _AS_BYTES, 0o666)
             try:
                 there = os.fstat(writer).st_size
                 if not goes_on or there > blob.bytes:
                     os.ftruncate(writer, there := 0)
-                _copy_rest(reader, writer, there, lambda done: progress(stage, done, blob.bytes))
+                _copy_rest(reader, writer, there, blob, partial(progress, stage))
                 os.fsync(writer)
             finally:
                 os.close(writer)
@@ -161,8 +134,10 @@ def copy_to_part(
 @contextmanager
 def _reading(source: Path, blob: Blob) -> Iterator[int]:
     try:
+        _refuse_links(source)
         # Without waiting, should it be a pipe.
-        reader = os.open(source, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        flags = os.O_RDONLY | _WITHOUT_LINKS | _WITHOUT_WAITING | _AS_BYTES
+        reader = os.open(source, flags)
     except OSError as error:
         known = {errno.ELOOP: "a symbolic link; expected a file", errno.ENOENT: "missing"}
         what = known.get(error.errno or 0, f"cannot be read ({reason(error)})")
@@ -178,12 +153,25 @@ def _reading(source: Path, blob: Blob) -> Iterator[int]:
         os.close(reader)
 
 
-def _copy_rest(reader: int, writer: int, there: int, done: Callable[[int], None]) -> None:
-    done(there)
-    while block := os.pread(reader, _BLOCK_BYTES, there):
-        written = os.pwrite(writer, block, there)
-        there += written
-        done(there)
+def _refuse_links(path: Path) -> None:
+    """Refuse a symbolic link where the system cannot refuse it while opening."""
+    if not _WITHOUT_LINKS and path.is_symlink():
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
+
+
+def _copy_rest(
+    reader: int, writer: int, there: int, blob: Blob, done: Callable[[int, int], None]
+) -> None:
+    """Copy what is missing, and no more than the blob has, should the file grow."""
+    for descriptor in (reader, writer):
+        os.lseek(descriptor, there, os.SEEK_SET)
+    done(there, blob.bytes)
+    while block := os.read(reader, min(_BLOCK_BYTES, blob.bytes - there)):
+        rest = memoryview(block)
+        while rest:
+            rest = rest[os.write(writer, rest) :]
+        there += len(block)
+        done(there, blob.bytes)
 
 
 def damaged(path: Path, what: str) -> ProductError:
@@ -202,88 +190,3 @@ def damaged(path: Path, what: str) -> ProductError:
         To be raised.
     """
     return ProductError(f"{path}: {what}", path=path)
-
-
-def write_new(path: Path, data: bytes) -> None:
-    """Write a file that is on disk when this returns.
-
-    Parameters
-    ----------
-    path : Path
-        Must not exist.
-    data : bytes
-        All of it.
-    """
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
-    with os.fdopen(descriptor, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def replace_file(path: Path, data: bytes, beside: Path) -> None:
-    """Give a file other content, at once and for good.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    data : bytes
-        All of it.
-    beside : Path
-        Folder of the same file system for what is not finished.
-    """
-    new = unique(beside, path.name)
-    try:
-        write_new(new, data)
-        new.replace(path)
-    finally:
-        new.unlink(missing_ok=True)
-    sync_folder(path.parent)
-
-
-def unique(folder: Path, name: str) -> Path:
-    """Return a path that nobody else uses.
-
-    Parameters
-    ----------
-    folder : Path
-        Where.
-    name : str
-        What it begins with, after a dot.
-
-    Returns
-    -------
-    Path
-        Of no file.
-    """
-    return folder / f".{name}.{secrets.token_hex(8)}"
-
-
-def sync_folder(folder: Path) -> None:
-    """Have the names in a folder on disk.
-
-    Parameters
-    ----------
-    folder : Path
-        Whose names changed.
-    """
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def make_folder(folder: Path) -> None:
-    """Make a folder whose name is on disk, and those above it.
-
-    Parameters
-    ----------
-    folder : Path
-        May exist.
-    """
-    if not folder.is_dir():
-        make_folder(folder.parent)
-        folder.mkdir(exist_ok=True)
-        sync_folder(folder.parent)

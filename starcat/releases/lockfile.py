@@ -14,9 +14,10 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict
 
 from starcat.errors import ConfigError, ProductError
-from starcat.releases.files import locked, make_folder, replace_file, writing
+from starcat.releases.files import locked
 from starcat.releases.registry import is_address
 from starcat.releases.tree import Release, check_version, parse
+from starcat.storage.atomic import make_folder, replace_file, writing
 from starcat.storage.digests import json_bytes
 
 LOCK_NAME = "starcat.lock"
@@ -70,14 +71,14 @@ def read_pins(path: Path) -> dict[str, Pin]:
         data = path.read_bytes()
     except (FileNotFoundError, NotADirectoryError):
         return {}
+    where, advice = str(path), "restore the lock file, or remove it and pull again"
     try:
-        check_version("lock", parse(_Head, data, str(path)).lock_version, LOCK_VERSION, str(path))
-        lock = parse(_Lock, data, str(path))
+        head = parse(_Head, data, where, advice)
+        check_version("lock", head.lock_version, LOCK_VERSION, where)
+        lock = parse(_Lock, data, where, advice)
     except ProductError as error:
-        what = str(error).removesuffix("; the registry is damaged")
-        raise ProductError(
-            f"{what}; restore the lock file, or remove it and pull again", path=path
-        ) from error
+        error.path = path
+        raise
     return {pin.name: pin for pin in lock.artifacts}
 
 

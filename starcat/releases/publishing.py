@@ -18,19 +18,10 @@ from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.artifact.verify import check_artifact
 from starcat.errors import ConfigError, OutputError, ProductError
 from starcat.progress import Progress, no_progress
-from starcat.releases.files import (
-    copy_to_part,
-    damaged,
-    locked,
-    make_folder,
-    replace_file,
-    sync_folder,
-    unique,
-    write_new,
-    writing,
-)
+from starcat.releases.files import copy_to_part, damaged, locked
 from starcat.releases.registry import is_address
 from starcat.releases.tree import INDEX_NAME, Blob, Listed, files_of, index_bytes, parse
+from starcat.storage.atomic import make_folder, replace_file, sync, unique, writing
 from starcat.storage.digests import file_sha256, json_bytes
 
 INCOMING = ".incoming"
@@ -205,7 +196,7 @@ def _keep(root: Path, source: Path, blob: Blob) -> bool:
         final.chmod(final.stat().st_mode & 0o555)
         if not is_mine:
             part.unlink(missing_ok=True)
-        sync_folder(final.parent)
+        sync(final.parent)
     return True
 
 
@@ -226,14 +217,15 @@ def _record(root: Path, release: Listed) -> bool:
     make_folder(final.parent)
     new = unique(root / INCOMING, f"{release.title}.json")
     try:
-        write_new(new, json_bytes(release.model_dump()))
+        new.write_bytes(json_bytes(release.model_dump()))
+        sync(new)
         new.chmod(new.stat().st_mode & 0o555)
         _give_free_name(root, new, final)
     except FileExistsError:
         return not _check_not_taken(root, release)
     finally:
         new.unlink(missing_ok=True)
-    sync_folder(final.parent)
+    sync(final.parent)
     return True
 
 

@@ -15,14 +15,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
-from starcat.artifact.verify import check_artifact, verify_artifact
-from starcat.artifact.writer import move_into_place
+from starcat.artifact.manifest import MANIFEST_NAME, parse_manifest
+from starcat.artifact.verify import first_of, verify_artifact
 from starcat.errors import OutputError, ProductError, SchemaError
 from starcat.progress import Progress, no_progress
-from starcat.releases.files import locked, sync_folder, writing
+from starcat.releases.files import locked
 from starcat.releases.registry import Registry
-from starcat.releases.tree import Blob, Release, files_of
+from starcat.releases.tree import DAMAGED, Blob, Release, files_of
+from starcat.storage.atomic import move_into_place, sync, writing
 from starcat.storage.digests import file_sha256
 from starcat.storage.download import part_of
 
@@ -110,7 +110,7 @@ def pull_release(
             return Pulled(release, registry.address, final, "unchanged")
         whole = _assemble(registry, release, place, progress)
         move_into_place(whole, final, replace=False)
-        sync_folder(output)
+        sync(output)
     return Pulled(release, registry.address, final, "pulled")
 
 
@@ -159,7 +159,7 @@ def _assemble(registry: Registry, release: Release, place: Path, progress: Progr
     where = f"{registry.address}: {release.title}"
     _remove_links(place)
     _bring(registry, release.manifest, whole / MANIFEST_NAME, place)
-    manifest = _manifest_of(whole, where)
+    manifest = parse_manifest((whole / MANIFEST_NAME).read_bytes(), where, DAMAGED)
     if (manifest["name"], manifest["version"]) != (release.name, release.version):
         raise ProductError(
             f"{where}: its manifest is that of {manifest['name']}-{manifest['version']}; the "
@@ -172,20 +172,13 @@ def _assemble(registry: Registry, release: Release, place: Path, progress: Progr
         _bring(registry, blob, whole / name, place, _from(done, total, stage, progress))
         done += blob.bytes
     progress(stage, done, total)
-    try:
-        check_artifact(whole)
-    except ProductError as error:
-        what = str(error).removeprefix(f"{whole}: ")
-        raise ProductError(f"{where}: not a whole artifact: {what}") from error
+    findings = verify_artifact(whole).findings
+    if findings:
+        raise ProductError(
+            f"{where}: not a whole artifact: {first_of(findings)}. Build the artifact again, and "
+            "publish that"
+        )
     return whole
-
-
-def _manifest_of(folder: Path, where: str) -> dict[str, Any]:
-    try:
-        return read_manifest(folder)
-    except (ProductError, RecursionError) as error:
-        what = str(error).partition(": ")[2].partition("; ")[0]
-        raise ProductError(f"{where}: {what}; the registry is damaged") from error
 
 
 def _from(offset: int, total: int, stage: str, progress: Progress) -> Progress:

@@ -192,8 +192,11 @@ def check_version(kind: str, found: str, known: str, where: str) -> None:
         )
 
 
-def parse(model: type[_M], data: bytes, where: str) -> _M:
-    """Read a JSON file of a registry.
+DAMAGED = "the registry is damaged"
+
+
+def parse(model: type[_M], data: bytes, where: str, advice: str = DAMAGED) -> _M:
+    """Read a JSON file of a registry, or one like it.
 
     Parameters
     ----------
@@ -201,25 +204,25 @@ def parse(model: type[_M], data: bytes, where: str) -> _M:
         What it should be.
     data : bytes
         The file.
-    where : str
-        For messages.
+    where, advice : str
+        For messages: where it is from, and what to do or to know if it is damaged.
 
     Returns
     -------
     BaseModel
-        Of that type.
+        The content, as an object of that type.
 
     Raises
     ------
     ProductError
         If it is not what it should be, naming the first thing that is wrong.
     """
-    with _explained(where):
+    with _explained(where, advice):
         return model.model_validate_json(data)
 
 
 @contextmanager
-def _explained(where: str) -> Iterator[None]:
+def _explained(where: str, advice: str = DAMAGED) -> Iterator[None]:
     """Say what pydantic found, in one line."""
     try:
         yield
@@ -229,7 +232,7 @@ def _explained(where: str) -> Iterator[None]:
         found = "" if first["type"] == "json_invalid" else f" (found {str(first['input'])[:80]!r})"
         raise ProductError(
             f"{where}: not what starcat writes: {place + ': ' if place else ''}{first['msg']}"
-            f"{found}; the registry is damaged"
+            f"{found}; {advice}"
         ) from error
 
 

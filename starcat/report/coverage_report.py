@@ -41,6 +41,14 @@ class CoverageReport:
     summary: CoverageSummary
     gap: TilingGap
 
+    def __repr__(self) -> str:
+        """Return the stars of a field in one line."""
+        stars = self.summary.stars
+        return (
+            f"<CoverageReport: {self.summary.fields:,} fields of {stars.minimum} to "
+            f"{stars.maximum} stars, median {stars.median}>"
+        )
+
     def as_dict(self) -> dict[str, Any]:
         """Return the summary as JSON holds it.
 

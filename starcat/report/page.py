@@ -8,12 +8,20 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
+from starcat.specs.build_spec import CameraSpec
+
 STYLE = """
-:root { color-scheme: light dark; --line: #d5dbe0; --soft: #5b6770; --head: #f1f4f6; }
-@media (prefers-color-scheme: dark) {
-  :root { --line: #3a444c; --soft: #a3b0ba; --head: #20272d; }
+:root {
+  color-scheme: light dark;
+  --paper: #fff; --ink: #14181b; --line: #d5dbe0; --soft: #5b6770; --head: #f1f4f6;
 }
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
+@media (prefers-color-scheme: dark) {
+  :root { --paper: #14181b; --ink: #dbe3e9; --line: #3a444c; --soft: #a3b0ba; --head: #20272d; }
+}
+body {
+  font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem;
+  background: var(--paper); color: var(--ink);
+}
 h1 { margin-bottom: 0; }
 h2 { margin: 2.2rem 0 0.5rem; font-size: 1.2rem; }
 p.lead { color: var(--soft); margin-top: 0.2rem; }
@@ -24,9 +32,10 @@ th, td { padding: 0.2rem 0.8rem 0.2rem 0.4rem; border-bottom: 1px solid var(--li
 th { background: var(--head); text-align: left; font-weight: 600; }
 td.number, th.number { text-align: right; font-variant-numeric: tabular-nums; }
 code { font-size: 0.85em; overflow-wrap: anywhere; }
+td.digest { font: 0.8em/1.4 monospace; width: 33ch; min-width: 33ch; overflow-wrap: anywhere; }
 pre { background: var(--head); padding: 0.8rem; overflow-x: auto; font-size: 0.85rem; }
 figure { margin: 1rem 0; }
-figure img { max-width: 100%; height: auto; background: #fff; border-radius: 6px; }
+figure img { max-width: 100%; height: auto; background: var(--paper); }
 .warning { border-left: 4px solid #d1495b; padding: 0.3rem 0.8rem; background: var(--head); }
 """
 
@@ -102,7 +111,7 @@ def table(
     columns : sequence of str
         Headings.
     rows : iterable of sequence
-        Cells; whole numbers get separators, digests are cut by nobody.
+        Cells; numbers get separators, digests are broken into lines.
     numbers : sequence of int
         Columns to align at the right.
 
@@ -119,21 +128,26 @@ def table(
     lines = []
     for row in rows:
         cells = (
-            f"<td{kind}>{escape(_text(cell))}</td>" for cell, kind in zip(row, kinds, strict=True)
+            f"<td{_class(cell, kind)}>{escape(_text(cell))}</td>"
+            for cell, kind in zip(row, kinds, strict=True)
         )
         lines.append(f"<tr>{''.join(cells)}</tr>")
     above = f"<caption>{escape(caption)}</caption>\n" if caption else ""
+    heads = f"<thead><tr>{head}</tr></thead>\n" if any(columns) else ""
     body = "\n".join(lines)
-    return (
-        f'<div class="scroll"><table>\n{above}<thead><tr>{head}</tr></thead>\n'
-        f"<tbody>\n{body}\n</tbody></table></div>"
-    )
+    return f'<div class="scroll"><table>\n{above}{heads}<tbody>\n{body}\n</tbody></table></div>'
 
 
 def _text(cell: Any) -> str:
     if isinstance(cell, bool) or not isinstance(cell, int | float):
         return str(cell)
-    return f"{cell:,}" if isinstance(cell, int) else f"{cell:,.6g}"
+    return f"{cell:,}" if isinstance(cell, int) else f"{cell:,.4g}"
+
+
+def _class(cell: Any, kind: str) -> str:
+    """Return the attribute of a cell: that of its column, or of a digest."""
+    is_digest = isinstance(cell, str) and len(cell) == 64 and cell.isalnum()
+    return ' class="digest"' if is_digest else kind
 
 
 def _plot(name: str, plots: Mapping[str, bytes]) -> str:
@@ -144,12 +158,13 @@ def _plot(name: str, plots: Mapping[str, bytes]) -> str:
 
 
 def _summary(content: Mapping[str, Any]) -> str:
-    camera, stars = content["spec"]["camera"], content["products"]["stars"]["rows"]
+    camera = CameraSpec.model_validate(content["spec"]["camera"]).camera()
+    stars = content["products"]["stars"]["rows"]
     clean = content["self_test"][0]
     rows = [
         ("guide stars", f"{stars:,}"),
         ("positions", f"{content['frame']}, epoch J{content['epoch_jyear']:g}"),
-        ("camera", f"{camera['width_px']} x {camera['height_px']} px"),
+        ("camera", camera.in_words),
         ("fewest guide stars in a field", f"{content['coverage']['stars']['minimum']:,}"),
         ("identified in the self-test", f"{clean['identified_share']:.2%} of the clean frames"),
     ]
@@ -189,7 +204,7 @@ def _filters(filters: Sequence[Mapping[str, Any]]) -> str:
 def _coverage(coverage: Mapping[str, Any]) -> str:
     names = ("minimum", "one_percent", "median", "mean", "maximum")
     rows = [
-        (kind, *(coverage[kind][name] for name in names))
+        (kind, *(_rounded(coverage[kind][name]) for name in names))
         for kind in ("stars", "pairs", "triangles")
     ]
     heads = ("in a field", "fewest", "1 % of the fields", "median", "mean", "most")
@@ -203,6 +218,10 @@ def _coverage(coverage: Mapping[str, Any]) -> str:
         f"direction farthest from all boresights is {tiling['covering_radius_deg']:.3f}° away from "
         "the nearest.</p>"
     )
+
+
+def _rounded(value: float) -> str:
+    return f"{value:,.1f}" if isinstance(value, float) else f"{value:,}"
 
 
 def _products(products: Mapping[str, Mapping[str, Any]], database_bytes: int) -> str:

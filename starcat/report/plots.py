@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,6 +39,19 @@ STYLE: dict[Any, Any] = {
 }
 _DPI = 100
 _BLUE, _GREY, _RED = "#2c6e9e", "#b9c4cc", "#d1495b"
+_DARK = """
+@media (prefers-color-scheme: dark) {
+  svg { fill: #dbe3e9; }
+  path[style*="fill: #ffffff"] { fill: #14181b !important; }
+  [style*="fill: #555"] { fill: #a3b0ba !important; }
+  [style*="fill: #2c6e9e"] { fill: #4f9fd6 !important; }
+  [style*="fill: #b9c4cc"] { fill: #5b6770 !important; }
+  [style*="stroke: #2c6e9e"] { stroke: #4f9fd6 !important; }
+  [style*="stroke: #000000"], [style*="stroke: #333333"] { stroke: #a3b0ba !important; }
+  [style*="stroke: #e3e7ea"] { stroke: #2f383f !important; }
+}
+"""
+"""Colours of a drawing where the reader's system is dark; the file is the same for all."""
 MAG_BIN = 0.5
 """Width of a bin of magnitudes."""
 _RASTER_WIDTH = 720
@@ -260,7 +274,7 @@ def _whole_ticks() -> Any:
 
 
 def save_plot(figure: Figure, folder: Path, name: str) -> None:
-    """Write a drawing as PNG and as SVG.
+    """Write a drawing as PNG, and as SVG that turns dark where the reader's system is.
 
     Parameters
     ----------
@@ -274,9 +288,12 @@ def save_plot(figure: Figure, folder: Path, name: str) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
+    drawn = StringIO()
     with own_style():
         FigureCanvasAgg(figure).print_figure(
             folder / f"{name}.png", dpi=_DPI, metadata={"Software": None}
         )
         nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        FigureCanvasSVG(figure).print_figure(folder / f"{name}.svg", metadata=nothing)
+        FigureCanvasSVG(figure).print_figure(drawn, metadata=nothing)
+    text = drawn.getvalue().replace("</style>", f"{_DARK}</style>", 1)
+    (folder / f"{name}.svg").write_text(text, encoding="utf-8")

@@ -123,9 +123,8 @@ def _camera(table: dict[str, Any], path: Path, prefix: str) -> Camera:
             length_mm = checked_number("focal_length_mm", arguments.pop("focal_length_mm"), 0.0)
             arguments["focal_length_px"] = length_mm * 1000.0 / pixel_um
         return Camera(**arguments, distortion=distortion)
-    except ValueError as error:
-        # The message opens with the name of what is wrong.
-        name = str(error).split()[0]
+    except ConfigError as error:
+        name = error.key or ""
         value = inside.get(name, table.get(name))
         raise ConfigError(f"{path}: {where}{error}", key=where + name, value=value) from error
 

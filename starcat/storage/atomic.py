@@ -1,17 +1,40 @@
-"""Files that are whole at their final name, or not there."""
+"""The one way to write a file or a folder: whole at its final name, or not there.
+
+What is not finished has a hidden name in the folder of the final one, ``.<name>.*.partial``, so
+that the last step is a rename within one file system. A file that must survive a power cut is
+synchronised before that step, and its folder after it.
+"""
 
 from __future__ import annotations
 
+import errno
+import filecmp
 import os
+import secrets
+import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Literal
 
 from starcat.errors import OutputError, reason
 
-if TYPE_CHECKING:  # other rooms write files without reading a catalog
-    pass
+Outcome = Literal["written", "unchanged", "replaced"]
+
+READ_ONLY = 0o444
+"""Mode of the files of a folder that `move_into_place` has put at its final name."""
+
+_WRITING_FAILED = {
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EFBIG,
+    errno.EROFS,
+    errno.EACCES,
+    errno.EPERM,
+    errno.ENOTDIR,
+    errno.EEXIST,
+}
 
 
 @contextmanager
@@ -33,16 +56,230 @@ def whole_file(path: Path) -> Iterator[Path]:
     OutputError
         If the file cannot be written.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        yield partial
-        partial.replace(path)
+        with _renamed(unique(path.parent, path.name), path) as partial:
+            yield partial
     except OSError as error:
         raise OutputError(
             f"{path}: cannot be written ({reason(error)}); choose another --output",
             path=path,
         ) from error
+
+
+def replace_file(path: Path, data: bytes, beside: Path) -> None:
+    """Give a file other content, at once and for good.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    data : bytes
+        All of it.
+    beside : Path
+        Folder of the same file system for what is not finished.
+    """
+    with _renamed(unique(beside, path.name), path) as new:
+        new.write_bytes(data)
+        sync(new)
+    sync(path.parent)
+
+
+@contextmanager
+def _renamed(partial: Path, final: Path) -> Iterator[Path]:
+    """Rename a file when the work is done; remove it if that fails."""
+    try:
+        yield partial
+        partial.replace(final)
     finally:
         with suppress(OSError):  # where the folder could not be made there is nothing to remove
             partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def whole_folder(final: Path) -> Iterator[Path]:
+    """Give a folder to write into, beside the final one, and remove it afterwards.
+
+    Parameters
+    ----------
+    final : Path
+        The name that `move_into_place` will give it.
+
+    Yields
+    ------
+    Path
+        An empty folder ``.<name>.*.partial`` on the same file system.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be made, or the disk is full.
+    """
+    try:
+        final.parent.mkdir(parents=True, exist_ok=True)
+        made = Path(tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".partial", dir=final.parent))
+    except OSError as error:
+        raise OutputError(
+            f"{final.parent}: cannot write there ({reason(error)}); choose another folder "
+            "with --output",
+            path=final.parent,
+        ) from error
+    try:
+        made.chmod(0o755)
+        with writing(final.parent, "nothing was left there"):
+            yield made
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
+
+
+@contextmanager
+def writing(folder: Path, advice: str) -> Iterator[None]:
+    """Turn a refusal of the operating system into the error that says so.
+
+    Parameters
+    ----------
+    folder : Path
+        Where something is written.
+    advice : str
+        What to do, or what has become of the work.
+
+    Yields
+    ------
+    None
+        To the work.
+
+    Raises
+    ------
+    OutputError
+        If the folder cannot be written to, or the disk is full.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _WRITING_FAILED:
+            raise
+        raise OutputError(
+            f"{folder}: writing failed ({reason(error)}); {advice}", path=folder
+        ) from error
+
+
+def move_into_place(partial: Path, final: Path, *, replace: bool) -> Outcome:
+    """Give a complete folder its final name; its files can only be read from then on.
+
+    Parameters
+    ----------
+    partial : Path
+        Complete and checked.
+    final : Path
+        The name to give it.
+    replace : bool
+        Whether a different folder of that name may be replaced.
+
+    Returns
+    -------
+    {"written", "unchanged", "replaced"}
+        ``unchanged`` where the final folder already held the same files.
+
+    Raises
+    ------
+    OutputError
+        If something else is there and ``replace`` is false.
+    """
+    for path in sorted(partial.rglob("*")):
+        if path.is_file():
+            path.chmod(READ_ONLY)
+            sync(path)
+    if not final.exists() and _rename(partial, final):
+        return "written"
+    if _holds_all(final, partial):
+        return "unchanged"
+    if not replace:
+        raise OutputError(
+            f"{final} already exists and differs; raise the version in the spec, choose another "
+            "--output, or pass --replace",
+            path=final,
+        )
+    aside = partial.with_name(f"{partial.name}.old.partial")
+    try:
+        final.rename(aside)
+        partial.rename(final)
+    except BaseException:  # a signal between the two must not leave the name empty
+        if aside.exists() and not final.exists():
+            aside.rename(final)
+        raise
+    shutil.rmtree(aside, ignore_errors=True)
+    return "replaced"
+
+
+def _rename(partial: Path, final: Path) -> bool:
+    """Rename, and return False where another process has just taken the name."""
+    try:
+        partial.rename(final)
+    except OSError:
+        if final.exists():
+            return False
+        raise
+    return True
+
+
+def _holds_all(final: Path, partial: Path) -> bool:
+    """Return whether every file of the new folder is in the old one with the same bytes."""
+    names = [path.relative_to(partial) for path in partial.rglob("*") if path.is_file()]
+    return all(
+        (final / name).is_file() and filecmp.cmp(final / name, partial / name, shallow=False)
+        for name in names
+    )
+
+
+def unique(folder: Path, name: str) -> Path:
+    """Return a hidden path that nobody else uses.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder that it is in.
+    name : str
+        The name that is being written.
+
+    Returns
+    -------
+    Path
+        ``.<name>.*.partial``, of no file.
+    """
+    return folder / f".{name}.{secrets.token_hex(8)}.partial"
+
+
+def sync(path: Path) -> None:
+    """Have the content of a file, or the names in a folder, on disk.
+
+    Parameters
+    ----------
+    path : Path
+        A file or a folder.
+
+    Notes
+    -----
+    Windows synchronises files only while they are open for writing, and folders not at all:
+    nothing is done there.
+    """
+    if os.name == "nt":
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder whose name is on disk, and those above it.
+
+    Parameters
+    ----------
+    folder : Path
+        May exist.
+    """
+    if not folder.is_dir():
+        make_folder(folder.parent)
+        folder.mkdir(exist_ok=True)
+        sync(folder.parent)

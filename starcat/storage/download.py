@@ -27,9 +27,9 @@ import requests
 from pydantic import BaseModel, ConfigDict
 from urllib3.exceptions import HTTPError
 
-from starcat import __version__
 from starcat.errors import DownloadError, OutputError
 from starcat.progress import Progress, no_progress
+from starcat.version import __version__
 
 Arrival = Literal["downloaded", "resumed"]
 """Fetched in one go; continued from an earlier part."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from rich.markup import escape
-
 from starcat.artifact.diff import Change, Difference, Moved, OneSided
 from starcat.artifact.verify import Verification
 from starcat.pipeline.rebuild import Rebuilt
@@ -35,7 +33,7 @@ def print_verification(found: Verification, *, as_json: bool) -> None:
     if not count:
         print_table("", (title,), [])
         return
-    rows = [(f.file, f.product, escape(f.problem)) for f in found.findings]
+    rows = [(f.file, f.product, f.problem) for f in found.findings]
     print_table(title, ("file", "product", "problem"), rows)
 
 
@@ -116,7 +114,7 @@ def print_rebuilt(rebuilt: Rebuilt, *, as_json: bool) -> None:
     print_table(
         f"{rebuilt.name}: {len(rebuilt.changes)} of {rebuilt.files} files differ",
         ("file", "what differs"),
-        [(change.file, escape(change.what)) for change in rebuilt.changes],
+        [(change.file, change.what) for change in rebuilt.changes],
     )
     rows = [(change.name, _value(change.a), _value(change.b)) for change in rebuilt.software]
     if rows:
@@ -130,7 +128,7 @@ def _capped(title: str, count: int) -> str:
 def _value(value: Any) -> str:
     text = "-" if value is None else str(value)
     # Of a digest the beginning is enough to tell it from another.
-    return escape(text[:16] if len(text) == 64 and " " not in text else text)
+    return text[:16] if len(text) == 64 and " " not in text else text
 
 
 def _count(rows: int | None) -> str:

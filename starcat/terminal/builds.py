@@ -69,24 +69,6 @@ def print_sources(*, as_json: bool) -> None:
     )
 
 
-def print_presets(*, as_json: bool) -> None:
-    """Print the presets.
-
-    Parameters
-    ----------
-    as_json : bool
-        Whether to print JSON, with every key of every spec.
-    """
-    from starcat.specs.build_spec import preset, preset_names
-
-    specs = [preset(name) for name in preset_names()]
-    if as_json:
-        print_json([spec.model_dump(mode="json") for spec in specs])
-        return
-    rows = [(spec.name, spec.version, spec.catalog.source, spec.description) for spec in specs]
-    print_table("", ("preset", "version", "source", "what it is"), rows)
-
-
 def print_fetched(report: FetchReport, *, as_json: bool) -> None:
     """Print what was fetched.
 
@@ -185,13 +167,14 @@ def print_built(built: Built, *, as_json: bool) -> None:
     as_json : bool
         Whether to print JSON.
     """
-    manifest = built.manifest
+    manifest, report = built.manifest, built.folder / "report" / "index.html"
     for warning in built.warnings:
         say(f"warning: {warning}")
     if as_json:
         print_json(
             {
                 "artifact": str(built.folder),
+                "report": str(report),
                 "outcome": built.outcome,
                 "filters": [vars(step) for step in built.filters],
                 "coverage": built.coverage.as_dict(),
@@ -231,6 +214,7 @@ def print_built(built: Built, *, as_json: bool) -> None:
     print_table("Times", ("stage", "seconds"), seconds, numbers=(1,))
     print_problems(built.problems)
     say(f"{built.outcome}: {built.folder}")
+    say(f"report: {report}")
 
 
 def print_products(manifest: dict[str, Any]) -> None:
@@ -300,12 +284,14 @@ def print_artifact(artifact: Artifact, *, as_json: bool) -> None:
     as_json : bool
         Whether to print the manifest as JSON.
     """
+    from starcat.specs.build_spec import CameraSpec
+
     manifest = artifact.manifest
     if as_json:
         print_json(manifest)
         return
     spec = manifest["spec"]
-    camera = spec["camera"]
+    camera = CameraSpec.model_validate(spec["camera"]).camera()
     selection = spec["selection"]
     print_table(
         f"{manifest['name']}-{manifest['version']}",
@@ -313,7 +299,7 @@ def print_artifact(artifact: Artifact, *, as_json: bool) -> None:
         [
             ("description", spec["description"]),
             ("frame, epoch", f"{manifest['frame']}, J{manifest['epoch_jyear']:g}"),
-            ("camera", f"{camera['width_px']} x {camera['height_px']} px"),
+            ("camera", camera.in_words),
             ("faint limit", f"{selection['faint_limit_mag']:g} mag"),
             ("made by", ", ".join(f"{k} {v}" for k, v in manifest["software"].items())),
         ],

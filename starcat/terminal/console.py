@@ -5,15 +5,25 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+from rich.filesize import decimal
+from rich.progress import (
+    BarColumn,
+    ProgressColumn,
+    Task,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+)
 from rich.progress import Progress as Bars
 from rich.table import Table
+from rich.text import Text
 
-from starcat.progress import Progress
+from starcat.progress import BYTE_STAGES, Progress
+from starcat.terminal.failures import AT_STAGE
 
 MAX_WIDTH = 100
 
@@ -27,7 +37,6 @@ def out() -> Console:
         On stdout, at most 100 columns wide, plain where it is not a terminal.
     """
     width = min(Console().width, MAX_WIDTH) if sys.stdout.isatty() else MAX_WIDTH
-    # Brackets are units and indices here, no markup.
     return Console(highlight=False, markup=False, width=width)
 
 
@@ -58,11 +67,13 @@ def print_table(
     numbers : sequence of int
         Columns to align at the right.
     """
-    table = Table(title=title or None, title_justify="left", box=None, pad_edge=False)
+    # Texts, not strings: rich takes strings for markup, and brackets are units and folders here.
+    heading = Text(title, style="italic") if title else None
+    table = Table(title=heading, title_justify="left", box=None, pad_edge=False)
     for k, name in enumerate(columns):
-        table.add_column(name, justify="right" if k in numbers else "left", overflow="fold")
+        table.add_column(Text(name), justify="right" if k in numbers else "left", overflow="fold")
     for row in rows:
-        table.add_row(*(str(cell) for cell in row))
+        table.add_row(*(Text(str(cell)) for cell in row))
     out().print(table)
 
 
@@ -81,27 +92,94 @@ def say(text: str) -> None:
 def progress_bars() -> Iterator[Progress]:
     """Draw a bar a stage on stderr while work goes on; nothing where it is not a terminal.
 
+    An exception that passes gets a note with the stage that it was raised in.
+
     Yields
     ------
     Progress
         The callback to hand to the work.
     """
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield lambda stage, done, total: None
-        return
-    columns = (
-        TextColumn("{task.description:<22}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-    )
-    with Bars(*columns, console=console, transient=True) as bars:
-        tasks: dict[str, Any] = {}
+    console = Console(stderr=True, markup=False)
+    reached = [""]
+    with ExitStack() as stack:
+        bars = stack.enter_context(StageBars(console)) if console.is_terminal else None
 
         def draw(stage: str, done: int, total: int | None) -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=total)
-            bars.update(tasks[stage], completed=done, total=total)
+            reached[0] = stage
+            if bars is not None:
+                bars.show(stage, done, total)
 
-        yield draw
+        try:
+            yield draw
+        except Exception as error:
+            if reached[0]:
+                error.add_note(f"{AT_STAGE}{reached[0]}")
+            raise
+
+
+class StageBars(Bars):
+    """A bar a stage, one below the other.
+
+    Parameters
+    ----------
+    console : rich.console.Console
+        Where to draw.
+    """
+
+    def __init__(self, console: Console) -> None:
+        columns = (
+            TextColumn("{task.description:<22}", markup=False),
+            BarColumn(),
+            AmountColumn(),
+            TimeElapsedColumn(),
+        )
+        super().__init__(*columns, console=console, transient=True)
+        self.stages: dict[str, TaskID] = {}
+
+    def show(self, stage: str, done: int, total: int | None) -> None:
+        """Draw an event.
+
+        Parameters
+        ----------
+        stage : str
+            A new one ends those before it that do not know their total, as nothing else does.
+        done, total : int
+            As of `Progress`.
+        """
+        if stage not in self.stages:
+            self.end_open()
+            self.stages[stage] = self.add_task(stage, total=total)
+        self.update(self.stages[stage], completed=done, total=total)
+
+    def end_open(self) -> None:
+        """Fill the bars, and stop the clocks, of the stages that do not know their total."""
+        for task in self.tasks:
+            if task.total is None:
+                end = max(1, int(task.completed))
+                self.update(task.id, completed=end, total=end, is_uncounted=True)
+
+
+class AmountColumn(ProgressColumn):
+    """How much of a stage is done: bytes with units, other things with separators."""
+
+    def render(self, task: Task) -> Text:
+        """Return the amount.
+
+        Parameters
+        ----------
+        task : rich.progress.Task
+            Of a stage.
+
+        Returns
+        -------
+        rich.text.Text
+            Empty where nothing is counted.
+        """
+        done, total = int(task.completed), task.total
+        if task.fields.get("is_uncounted"):
+            return Text("done" if done == 1 else f"{done:,}")
+        if total is None:
+            return Text(f"{done:,}" if done else "")
+        if task.description.split(" ")[0] in BYTE_STAGES:
+            return Text(f"{decimal(done)} / {decimal(int(total))}")
+        return Text(f"{done:,} / {int(total):,}")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from rich.markup import escape
-
 from starcat.exchange.export import COLUMNS_NAME, Exported
 from starcat.terminal.console import print_json, print_table, say
 
@@ -25,10 +23,9 @@ def print_exported(exported: Exported, *, as_json: bool) -> None:
         print_json(exported.as_dict())
         return
     rows = [
-        (file.product, escape(file.name), f"{file.rows:,}", f"{file.bytes:,}")
-        for file in exported.files
+        (file.product, file.name, f"{file.rows:,}", f"{file.bytes:,}") for file in exported.files
     ]
     title = f"{exported.source} as {exported.file_format}"
-    print_table(escape(title), ("product", "file", "rows", "bytes"), rows, numbers=(2, 3))
+    print_table(title, ("product", "file", "rows", "bytes"), rows, numbers=(2, 3))
     beside = f", {COLUMNS_NAME} says what the columns are" if exported.has_columns else ""
-    print_table("", (escape(f"in {exported.folder}{beside}"),), [])
+    print_table("", (f"in {exported.folder}{beside}",), [])

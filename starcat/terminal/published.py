@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from rich.markup import escape
-
 from starcat.terminal.console import print_json, print_table, say
 
 if TYPE_CHECKING:
@@ -64,7 +62,7 @@ def print_pulled(pulled: Sequence[Pulled], *, as_json: bool) -> None:
             one.release.name,
             one.release.version,
             one.release.manifest.sha256[:DIGEST_LETTERS],
-            escape(str(one.folder)),
+            str(one.folder),
         )
         for one in pulled
     ]

@@ -39,7 +39,7 @@ from starcat.matcher.matcher import MIN_STARS, Matcher
 from starcat.matcher.methods.table import METHODS
 from starcat.pipeline.build import build
 from starcat.simulation.simulate import Frame, Noise, simulate_frames
-from starcat.specs.build_spec import preset
+from starcat.specs.reading import preset
 
 SEED = 86_028_121
 NOISE_PX = 0.5

@@ -24,7 +24,8 @@ from starcat.catalog.ingest import ingest
 from starcat.catalog.selection import select_guide_stars
 from starcat.catalog.stars import directions_of
 from starcat.pipeline.recipes import RECIPES, Sky, cook, tile_guide_stars
-from starcat.specs.build_spec import BuildSpec, preset
+from starcat.specs.build_spec import BuildSpec
+from starcat.specs.reading import preset
 from starcat.tables.parquet import write_parquet
 from starcat.tables.schema import product_schema
 

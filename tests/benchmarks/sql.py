@@ -20,7 +20,7 @@ from starcat.catalog.selection import select_guide_stars
 from starcat.catalog.stars import directions_of
 from starcat.pipeline.recipes import Sky, cook, tile_guide_stars
 from starcat.query.session import open_session
-from starcat.specs.build_spec import preset, spec_from_dict
+from starcat.specs.reading import preset, spec_from_dict
 from starcat.tables.parquet import write_parquet
 
 LIMIT_MAG = 8.0

@@ -15,6 +15,8 @@ from starcat.evaluation.report.files import reproduction_page
 from starcat.query.gallery import gallery
 from starcat.query.macros import macros
 from starcat.resources import resource_folder
+from starcat.specs.keys import REQUIRED, SpecKey, spec_sections
+from starcat.specs.spec_toml import toml_value
 from starcat.tables.schema import read_schema
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -102,10 +104,58 @@ def sources_page() -> str:
     return "\n".join(page)
 
 
+def spec_page() -> str:
+    """Return the reference of the build spec, from its own definition."""
+    page = [
+        NOTE + "# The build spec\n",
+        "One TOML file says everything that a database depends on, but for its input files.",
+        "`starcat init` writes one for a camera, `starcat presets NAME --toml` prints one that",
+        "ships with starcat, both with every key explained; `starcat build --set KEY=VALUE`",
+        "changes a key for one build. A key that is not listed here is refused, with the nearest",
+        "that is.\n",
+        LIMIT_ADVICE,
+    ]
+    for section in spec_sections():
+        name = ".".join(section.path)
+        page.append(f"## {f'[{name}]' if name else 'At the top'}\n\n{section.description}\n")
+        if not section.keys:
+            continue
+        page.append("| key | unit | range | default | example | meaning |\n" + "|---" * 6 + "|")
+        for key in section.keys:
+            cells = (f"`{key.name}`", key.unit or key.kind, key.range, _default(key), _example(key))
+            page.append(f"| {' | '.join(cells)} | {key.description} |")
+        page.append("")
+    return "\n".join(page)
+
+
+LIMIT_ADVICE = """\
+## Choosing the faint limit
+
+A frame is identified from 4 stars on, and surely from about 8. Take the limit at which 99 of 100
+fields have 8: `starcat init` finds it (12 deg: G = 6.2 on a 4:3 detector; 50 deg: 3.6; 2 deg: 9.9)
+and prints the stars of a field for limits around it. It must not be fainter than what the camera
+sees; where it would be, the field is too small for that camera's stars. Much fainter than needed is
+no gain: the triangles are of each field's `boresights.brightest` stars, the others only make the
+database larger and the search longer. `selection.max_stars_per_field` thins the Milky Way and
+leaves the poles of the galaxy as they are.
+"""
+
+
+def _default(key: SpecKey) -> str:
+    if key.default is REQUIRED:
+        return "required"
+    return "" if key.default in (None, "", []) else f"`{toml_value(key.default)}`"
+
+
+def _example(key: SpecKey) -> str:
+    return "" if key.example is None else f"`{toml_value(key.example)}`"
+
+
 def pages() -> dict[str, str]:
     """Return all generated pages by file name."""
     return {
         "cli.md": cli_page(),
+        "spec.md": spec_page(),
         "sql.md": sql_page(),
         "products.md": products_page(),
         "sources.md": sources_page(),

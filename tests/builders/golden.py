@@ -19,7 +19,7 @@ from catalog_folder import write_catalog_folder
 
 from starcat.artifact.reader import open_artifact
 from starcat.pipeline.build import build
-from starcat.specs.build_spec import preset
+from starcat.specs.reading import preset
 
 MADE = "sao-12deg-made"
 """The preset sao-12deg on the catalogs that are made up where there are no excerpts."""

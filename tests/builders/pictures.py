@@ -18,7 +18,7 @@ from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.matcher import Matcher
 from starcat.pipeline.build import build
 from starcat.simulation.simulate import Noise, simulate_frames
-from starcat.specs.build_spec import preset
+from starcat.specs.reading import preset
 
 FIGURES = Path(__file__).parents[2] / "docs" / "figures"
 NAME, SEED = "orion", 552

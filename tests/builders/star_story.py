@@ -19,7 +19,8 @@ from starcat.artifact.reader import Artifact, open_artifact
 from starcat.catalog.stars import directions_of
 from starcat.cli import app
 from starcat.pipeline.build import Built, build
-from starcat.specs.build_spec import BuildSpec, preset
+from starcat.specs.build_spec import BuildSpec
+from starcat.specs.reading import preset
 
 Array = NDArray[np.float64]
 

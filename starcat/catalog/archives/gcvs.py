@@ -6,23 +6,27 @@ Gaia DR3 source id. Magnitude flag 1 says that the "minimum" is an amplitude its
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.catalog.ingest import FileFacts
+from starcat.catalog.ingest import FileFacts, numbered_blocks
 from starcat.catalog.readers.delimited import parse_delimited
-from starcat.catalog.readers.files import DigestReader, find_files, read_blocks
+from starcat.catalog.readers.files import find_files
 from starcat.catalog.readers.malformed import check_malformed, not_this_archive
-from starcat.catalog.readers.records import Problem, Records
-from starcat.catalog.source import data_source
+from starcat.catalog.readers.records import Problem, Records, number_from_text
+from starcat.catalog.source import RANGES, data_source
 from starcat.catalog.verdict import Reason
 from starcat.progress import Progress, no_progress
 
 COLUMNS = ("star_ref", "var_type", "mag_max", "mag_flag", "mag_min")
+
+_DIGITS = re.compile(r"[0-9]{1,19}")
+_LARGEST_HIP = 999_999
 
 
 @dataclass(frozen=True)
@@ -34,7 +38,7 @@ class Gcvs:
     files : tuple of FileFacts
         What was read.
     rejected : dict of str to int
-        Records that could not be used, by reason.
+        Records that could not be used, by reason: malformed ones, and those without a number.
     hip_number, gaia_id : ndarray of int64
         The star's number; 0 where it is known by the other.
     amplitude_mag : ndarray of float64
@@ -59,12 +63,12 @@ def read_gcvs(paths: Sequence[Path], progress: Progress = no_progress) -> Gcvs:
     paths : sequence of Path
         Its file or the folder that holds it.
     progress : Progress
-        Called with ("read gcvs", blocks done, None).
+        Called with ("read gcvs", bytes done, bytes in all) after every block.
 
     Returns
     -------
     Gcvs
-        One row a record.
+        One row for each record that names its star by a number.
 
     Raises
     ------
@@ -77,21 +81,15 @@ def read_gcvs(paths: Sequence[Path], progress: Progress = no_progress) -> Gcvs:
     parts: list[Records] = []
     problems: list[tuple[int, Problem]] = []
     rows = [0] * len(files)
-    for number, file in enumerate(files):
-
-        def note(raw: DigestReader, name: str = file.path.name) -> None:
-            facts.append(FileFacts(name, raw.sha256, raw.bytes_read, 0))
-
-        for block in read_blocks(file, source.name, note):
-            records = parse_delimited(block.data, file.layout, COLUMNS, block.first_line)
-            if not len(records) and not rows[number] and records.problems:
-                raise not_this_archive(file, source, records.problems)
-            rows[number] += len(records) + len(records.problems)
-            problems += [(number, problem) for problem in records.problems]
-            parts.append(records)
-            progress("read gcvs", len(parts), None)
+    for number, block in numbered_blocks(files, source, facts, progress):
+        records = parse_delimited(block.data, block.file.layout, COLUMNS, block.first_line)
+        if not len(records) and not rows[number] and records.problems:
+            raise not_this_archive(files[number], source, records.problems)
+        rows[number] += len(records) + len(records.problems)
+        problems += [(number, problem) for problem in records.problems]
+        parts.append(records)
     check_malformed(files, rows, problems, source)
-    filled = [FileFacts(f.name, f.sha256, f.bytes, n) for f, n in zip(facts, rows, strict=True)]
+    filled = [replace(fact, rows=count) for fact, count in zip(facts, rows, strict=True)]
     rejected = {Reason.malformed_record.name: len(problems)} if problems else {}
     return _from_records(parts, tuple(filled), rejected)
 
@@ -102,33 +100,43 @@ def _from_records(
     def text(name: str) -> list[str]:
         return [value.decode("latin-1").strip() for part in parts for value in part[name].tolist()]
 
-    number = np.array(
-        [int(ref) if ref.isdigit() else 0 for ref in text("star_ref")], dtype=np.int64
-    )
-    brightest, faintest = (_numbers(text(name)) for name in ("mag_max", "mag_min"))
+    number = np.array([_star_number(ref) for ref in text("star_ref")], dtype=np.int64)
+    is_known = number > 0
+    if not is_known.all():
+        rejected = {**rejected, Reason.no_identity.name: int(np.count_nonzero(~is_known))}
+    brightest, faintest = (_magnitudes(text(name)) for name in ("mag_max", "mag_min"))
     flag = np.concatenate([np.asarray(part["mag_flag"], dtype=np.float64) for part in parts])
     # A few records contradict themselves: an "amplitude" fainter than the maximum is a
     # magnitude after all, and a minimum brighter than the maximum says nothing.
     is_amplitude = (flag == 1) & ~(faintest > brightest)
     amplitude = np.where(is_amplitude, faintest, faintest - brightest)
     amplitude[amplitude < 0.0] = np.nan
-    is_hip = number < 1_000_000
+    is_hip = number <= _LARGEST_HIP
+    var_type = np.array([kind or None for kind in text("var_type")], dtype=object)
     return Gcvs(
         files,
         rejected,
-        np.where(is_hip, number, 0),
-        np.where(is_hip, 0, number),
-        amplitude,
-        np.array([kind or None for kind in text("var_type")], dtype=object),
+        np.where(is_hip, number, 0)[is_known],
+        np.where(is_hip, 0, number)[is_known],
+        amplitude[is_known],
+        var_type[is_known],
     )
 
 
-def _numbers(texts: list[str]) -> NDArray[np.float64]:
-    """Return magnitudes; a limit sign leaves the number that it stands before."""
+def _star_number(text: str) -> int:
+    """Return the number that names a star; 0 where the text is none."""
+    number = int(text) if _DIGITS.fullmatch(text) else 0
+    return number if number < 2**63 else 0
+
+
+def _magnitudes(texts: list[str]) -> NDArray[np.float64]:
+    """Return magnitudes, NaN where there is none; a limit sign stands before its number."""
     values = np.full(len(texts), np.nan)
-    for i, value in enumerate(texts):
+    for i, text in enumerate(texts):
         try:
-            values[i] = float(value.lstrip("<>("))
+            values[i] = number_from_text(text.lstrip("<>(").encode("latin-1"))
         except ValueError:
             continue
+    least, greatest = RANGES["mag"]
+    values[(values < least) | (values > greatest)] = np.nan
     return values

@@ -147,6 +147,7 @@ def _positions(records: Records) -> tuple[Array, Array]:
     degrees = records["de2000_d"] + records["de2000_m"] / 60.0 + records["de2000_s"] / 3600.0
     ra, dec = np.degrees(records["ra2000_rad"]), np.degrees(records["de2000_rad"])
     has_radians = ~(np.isnan(ra) | np.isnan(dec))
+    degrees = np.where(degrees > 90.0, np.nan, degrees)  # 90 deg and some minutes: nowhere
     return np.where(has_radians, ra, 15.0 * hours), np.where(has_radians, dec, sign * degrees)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from starcat.catalog.quality import Quality, quality_flags
 from starcat.catalog.readers.records import Records
-from starcat.catalog.stars import StarBlock, join_flags, where_known
+from starcat.catalog.stars import StarBlock, Values, join_flags, where_known
 from starcat.catalog.verdict import Reason, Verdicts
 
 COLUMNS = {
@@ -74,11 +74,6 @@ def stars(records: Records, band: str) -> StarBlock:
     estimated = records["r_bt_mag"] == b"T"
     verdicts.reject(estimated | (records["remark"] == b"M"), Reason.uncertain_magnitude)
     quality = records["q"]
-    is_double = np.isin(records["mult_flag"], [b"D", b"R", b"S"]) | (quality == 6)
-    variable = np.isin(records["var_flag"], [b"U", b"V", b"W"])
-    named = np.isin(records["var"], [b"G", b"N"])
-    # VTmax and VTmin are percentiles of noisy transits: an amplitude only if flagged.
-    amplitude = np.where(variable, records["vt_min"] - records["vt_max"], np.nan)
     second = "VT" if band != "VT" else "BT"
     return StarBlock(
         {
@@ -95,20 +90,8 @@ def stars(records: Records, band: str) -> StarBlock:
             "second_band": second,
             "colour_mag": records["b_v"],
             "colour_bands": "B-V",
-            "double_flag": join_flags(
-                {
-                    "T49": (~records.is_blank("mult_flag"), records["mult_flag"]),
-                    "T40=6": (quality == 6, None),
-                    "Proxy": (~records.is_blank("proxy"), records["proxy"]),
-                }
-            ),
-            "is_flagged_double": is_double,
-            "variable_flag": join_flags(
-                {"T47": (named, records["var"]), "T48": (variable, records["var_flag"])}
-            ),
-            "is_flagged_variable": variable | named,
-            "amplitude_mag": amplitude,
-            "amplitude_source": where_known(amplitude, "tycho1"),
+            **_duplicity(records),
+            **_variability(records),
             "hip_number": records["hip"],
             "hd_number": records["hd"],
             "quality_flags": quality_flags(
@@ -123,6 +106,34 @@ def stars(records: Records, band: str) -> StarBlock:
         },
         verdicts,
     )
+
+
+def _duplicity(records: Records) -> dict[str, Values]:
+    is_suspect = records["q"] == 6
+    flag = join_flags(
+        {
+            "T49": (~records.is_blank("mult_flag"), records["mult_flag"]),
+            "T40=6": (is_suspect, None),
+            "Proxy": (~records.is_blank("proxy"), records["proxy"]),
+        }
+    )
+    is_double = np.isin(records["mult_flag"], [b"D", b"R", b"S"]) | is_suspect
+    return {"double_flag": flag, "is_flagged_double": is_double}
+
+
+def _variability(records: Records) -> dict[str, Values]:
+    variable = np.isin(records["var_flag"], [b"U", b"V", b"W"])
+    named = np.isin(records["var"], [b"G", b"N"])
+    # VTmax and VTmin are percentiles of noisy transits: an amplitude only if flagged.
+    amplitude = np.where(variable, records["vt_min"] - records["vt_max"], np.nan)
+    return {
+        "variable_flag": join_flags(
+            {"T47": (named, records["var"]), "T48": (variable, records["var_flag"])}
+        ),
+        "is_flagged_variable": variable | named,
+        "amplitude_mag": amplitude,
+        "amplitude_source": where_known(amplitude, "tycho1"),
+    }
 
 
 def tycho_identity(records: Records) -> tuple[NDArray[np.int64], pa.Array]:

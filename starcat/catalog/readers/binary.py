@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from starcat.catalog.readers.records import Problem, Records
+from starcat.catalog.readers.records import Problem, Records, reject_impossible_numbers
 from starcat.catalog.source import RecordFile
 
 
@@ -29,7 +29,7 @@ def parse_binary(
     Returns
     -------
     Records
-        The records, and a problem for a last one that is cut off.
+        The good records, and a problem for each of the others, such as a last one cut off.
     """
     size = layout.record_bytes or 1
     columns = [layout.column(name) for name in names]
@@ -44,13 +44,14 @@ def parse_binary(
     count, rest = divmod(len(data), size)
     table = np.frombuffer(data, dtype=packed, count=count)
     line = np.arange(first_line, first_line + count, dtype=np.int64)
-    values = {
-        name: table[name].astype(np.int64 if packed[name].kind == "i" else np.float64)
-        for name in names
-    }
+    with np.errstate(invalid="ignore"):  # a signalling NaN is a NaN like any other
+        values = {
+            name: table[name].astype(np.int64 if packed[name].kind == "i" else np.float64)
+            for name in names
+        }
     problems = []
     if rest:
         problems.append(
             Problem(first_line + count, "record", None, f"{rest} bytes", f"{size} bytes")
         )
-    return Records(layout.name, line, values, problems)
+    return reject_impossible_numbers(Records(layout.name, line, values, problems), layout)

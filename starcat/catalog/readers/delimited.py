@@ -20,9 +20,11 @@ from starcat.catalog.readers.records import (
     Records,
     apply_nulls,
     number_from_text,
+    reject_impossible_numbers,
     reject_required_blanks,
 )
 from starcat.catalog.source import Column, RecordFile
+from starcat.errors import quoted
 
 
 def parse_delimited(
@@ -78,7 +80,7 @@ def parse_delimited(
         bad = np.zeros(len(line), dtype=bool)
         columns = {c.name: _array_by_field(table[c.name], c, line, bad, problems) for c in chosen}
     records = Records(layout.name, line, columns).without(bad, problems)
-    return reject_required_blanks(records, layout)
+    return reject_impossible_numbers(reject_required_blanks(records, layout), layout)
 
 
 def _read_csv(
@@ -137,7 +139,7 @@ def _array_by_field(
             numbers[i] = np.nan if text is None else number_from_text(text)
         except ValueError:
             if not bad[i]:
-                found, kind = repr(text.decode("latin-1")), f"a number like {column.format}"
+                found, kind = quoted(text), f"a number like {column.format}"
                 problems.append(Problem(int(line[i]), column.name, None, found, kind))
             bad[i] = True
     apply_nulls(numbers, column)

@@ -53,11 +53,14 @@ class Block:
         The lines.
     first_line : int
         1-based number of the first line (or record) in the file.
+    bytes_read : int
+        Bytes of the file, as it lies on disk, that had been read when the block was whole.
     """
 
     file: InputFile
     data: bytes
     first_line: int
+    bytes_read: int = 0
 
 
 class DigestReader(io.RawIOBase):
@@ -318,10 +321,10 @@ def read_blocks(
             if len(tail) > MAX_LINE_BYTES:
                 raise _endless_line(file, source_name, line)
             if cut:
-                yield Block(file, data[:cut], line)
+                yield Block(file, data[:cut], line, raw.bytes_read)
                 line += _count(data[:cut], file.layout)
         if tail:
-            yield Block(file, tail, line)
+            yield Block(file, tail, line, raw.bytes_read)
         elif line == 1:
             raise ParseError(
                 f"{file.path}: the file is empty; expected records of {source_name}",

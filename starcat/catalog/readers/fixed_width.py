@@ -19,9 +19,11 @@ from starcat.catalog.readers.records import (
     Records,
     apply_nulls,
     number_from_text,
+    reject_impossible_numbers,
     reject_required_blanks,
 )
 from starcat.catalog.source import Column, RecordFile
+from starcat.errors import quoted
 
 _NEWLINE, _RETURN, _SPACE, _PLUS, _MINUS, _POINT = b"\n\r +-."
 
@@ -68,7 +70,7 @@ def parse_fixed_width(
         else:
             columns[name] = _parse_numbers(field, column, line, bad, problems)
     records = Records(layout.name, line, columns).without(bad, problems)
-    return reject_required_blanks(records, layout)
+    return reject_impossible_numbers(reject_required_blanks(records, layout), layout)
 
 
 def _byte_range(column: Column) -> tuple[int, int]:
@@ -129,7 +131,7 @@ def _check_literals(
         byte = int(position)
         wrong = (chars[:, byte - 1] != ord(text)) & ~bad
         for i in np.flatnonzero(wrong):
-            found = repr(chr(chars[i, byte - 1]))
+            found = quoted(chars[i, byte - 1].tobytes())
             problems.append(Problem(int(line[i]), "separator", (byte, byte), found, repr(text)))
         bad |= wrong
     return problems
@@ -153,7 +155,7 @@ def _parse_numbers(
                 raise ValueError(text)
         except ValueError:
             if not bad[i]:
-                found, kind = repr(text.decode("latin-1")), f"a number like {column.format}"
+                found, kind = quoted(text), f"a number like {column.format}"
                 problems.append(Problem(int(line[i]), column.name, column.bytes, found, kind))
             bad[i] = True
     apply_nulls(values, column)

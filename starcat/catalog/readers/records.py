@@ -132,6 +132,42 @@ class Records:
         return Records(self.layout, self.line[keep], columns, merged)
 
 
+def reject_impossible_numbers(records: Records, layout: RecordFile) -> Records:
+    """Leave out the records with a number that its column cannot hold.
+
+    Parameters
+    ----------
+    records : Records
+        What a reader has parsed.
+    layout : RecordFile
+        The layout; the range of each column says what it can hold.
+
+    Returns
+    -------
+    Records
+        The others, and a problem for each that is left out.
+    """
+    bad = np.zeros(len(records), dtype=bool)
+    problems: list[Problem] = []
+    for column in layout.columns:
+        values = records.columns.get(column.name)
+        if values is None or values.dtype.kind == "S":
+            continue
+        least, greatest = column.range or (-np.inf, np.inf)
+        wrong = (values < least) | (values > greatest) | np.isinf(values)
+        expected = f"{least:.10g} to {greatest:.10g}" if column.range else "a finite number"
+        if column.is_integer and values.dtype.kind == "f":
+            wrong |= ~np.isnan(values) & (np.trunc(values) != values)
+            expected = f"a whole number, {expected}"
+        for i in np.flatnonzero(wrong & ~bad):
+            found = f"{values[i]:.10g}"
+            problems.append(
+                Problem(int(records.line[i]), column.name, column.bytes, found, expected)
+            )
+        bad |= wrong
+    return records.without(bad, problems)
+
+
 def number_from_text(text: bytes) -> float:
     """Return the number that a field holds.
 

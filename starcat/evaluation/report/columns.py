@@ -224,16 +224,15 @@ LONG = (
 
 LEGEND = (
     ("paper", "what the paper prints, percent and mean milliseconds"),
-    ("measured [95 %]", "successes by the paper's own rule over all frames, percent, and Wilson's "
-     "interval"),
+    ("measured [95 %]", "successes by {own} over all frames, percent, and Wilson's interval"),
     ("difference", "measured less paper, percentage points"),
     ("ceiling", "frames that hold at least four guide stars, percent: what a method that needs "
      "four can reach"),
-    ("4+", "successes by the paper's rule over the frames with at least four guide stars"),
+    ("4+", "successes by {own} over the frames with at least four guide stars"),
     ("own rule, own 4+", "the same two by starcat's own rule: {starcat}"),
     ("wrong", "frames that starcat would have accepted with a wrong attitude"),
     ("ms", "mean time of an identification"),
     ("goal, reached", "what starcat wants to reach, of all frames or of those with four guide "
      "stars"),
 )  # fmt: skip
-"""What the columns mean; ``{starcat}`` is the rule."""
+"""What the columns mean; ``{starcat}`` is starcat's rule, ``{own}`` says whose rule counts."""

@@ -89,8 +89,10 @@ def legend(contents: Sequence[Content]) -> list[tuple[str, str]]:
     used = {
         head for content in contents for one in rate_tables(content, LONG) for head in one.heads
     }
+    is_of_papers = any(content["citation"] for content in contents)
+    own = "the paper's own rule" if is_of_papers else "starcat's rule"
     return [
-        (heads, meaning.format(starcat=MEANINGS["starcat"]))
+        (heads, meaning.format(starcat=MEANINGS["starcat"], own=own))
         for heads, meaning in LEGEND
         if used.intersection(heads.split(", "))
     ]
@@ -121,7 +123,8 @@ def _paper_html(content: Content, plots: Mapping[str, bytes]) -> Iterator[str]:
     if content["citation"]:
         yield f'<p class="lead">{escape(content["citation"])}</p>'
     if content["is_quick"]:
-        yield '<p class="warning">A quick run: fewer frames than the paper\'s.</p>'
+        usual = "the paper's" if content["citation"] else "usual"
+        yield f'<p class="warning">A quick run: fewer frames than {usual}.</p>'
     names = {group: name for name, group, _ in curves(content)}
     for one in rate_tables(content, LONG):
         yield f"<h3>{escape(_capital(one.title))}</h3>"

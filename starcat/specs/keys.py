@@ -1,0 +1,183 @@
+"""The keys of a build spec as data: unit, range, default, example and meaning of each.
+
+They come from the spec's own definition, so what is printed and what is checked are one thing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+from starcat.specs.build_spec import BuildSpec
+
+UNITS = {
+    "deg": "deg",
+    "arcsec": "arcsec",
+    "mag": "mag",
+    "px": "px",
+    "mm": "mm",
+    "um": "um",
+    "jyear": "Julian year",
+}
+"""Units by the last part of a name; proper motions are the one unit of two parts."""
+
+REQUIRED = object()
+"""The default of a key that has none."""
+
+
+@dataclass(frozen=True)
+class SpecKey:
+    """One key of a spec.
+
+    Attributes
+    ----------
+    section : tuple of str
+        Names of the tables around it; empty at the top.
+    name : str
+        The key itself.
+    kind : str
+        ``text``, ``whole number``, ``number``, ``true or false``, ``list`` or ``one of``.
+    unit : str
+        Of a number; empty where it has none.
+    range : str
+        Smallest and largest value, or the choices; empty where all are allowed.
+    default : object
+        `REQUIRED` where the spec has to say it.
+    example : object
+        A value that is allowed; None where the default is example enough.
+    description : str
+        What it means.
+    """
+
+    section: tuple[str, ...]
+    name: str
+    kind: str
+    unit: str
+    range: str
+    default: Any
+    example: Any
+    description: str
+
+    @property
+    def path(self) -> str:
+        """Dotted name, as ``camera.fov_x_deg``."""
+        return ".".join((*self.section, self.name))
+
+
+@dataclass(frozen=True)
+class SpecSection:
+    """One table of a spec.
+
+    Attributes
+    ----------
+    path : tuple of str
+        Names of the tables around it and its own; empty for the top.
+    description : str
+        What it is about, in one sentence.
+    keys : tuple of SpecKey
+        In the order of the definition.
+    """
+
+    path: tuple[str, ...]
+    description: str
+    keys: tuple[SpecKey, ...]
+
+
+@cache
+def spec_sections() -> tuple[SpecSection, ...]:
+    """Return all tables of a spec, a table before those inside it.
+
+    Returns
+    -------
+    tuple of SpecSection
+        The top first.
+
+    Examples
+    --------
+    >>> spec_sections()[1].path
+    ('catalog',)
+    """
+    schema = BuildSpec.model_json_schema()
+    return tuple(_sections(schema, schema["$defs"], ()))
+
+
+def unit_of(name: str) -> str:
+    """Return the unit that a key's name ends with.
+
+    Parameters
+    ----------
+    name : str
+        Such as ``radius_deg``.
+
+    Returns
+    -------
+    str
+        Empty where it has none.
+
+    Examples
+    --------
+    >>> unit_of("unknown_motion_mas_yr"), unit_of("fov_x_deg"), unit_of("count")
+    ('mas/yr', 'deg', '')
+    """
+    return "mas/yr" if name.endswith("_mas_yr") else UNITS.get(name.rpartition("_")[2], "")
+
+
+def _sections(
+    table: dict[str, Any], known: dict[str, Any], path: tuple[str, ...]
+) -> Iterator[SpecSection]:
+    keys, inner = [], []
+    for name, field in table["properties"].items():
+        reference = field.get("$ref")
+        if reference is not None:
+            inner.append((name, known[reference.rpartition("/")[2]]))
+        else:
+            keys.append(_key(path, name, field, is_required=name in table.get("required", ())))
+    yield SpecSection(path, table["description"].partition("\n")[0], tuple(keys))
+    for name, section in inner:
+        yield from _sections(section, known, (*path, name))
+
+
+def _key(path: tuple[str, ...], name: str, field: dict[str, Any], *, is_required: bool) -> SpecKey:
+    value = next((one for one in field.get("anyOf", [field]) if one.get("type") != "null"), field)
+    examples = field.get("examples", [None])
+    return SpecKey(
+        path,
+        name,
+        _kind(value),
+        unit_of(name),
+        _range(value),
+        REQUIRED if is_required else field["default"],
+        examples[0],
+        field["description"],
+    )
+
+
+def _kind(value: dict[str, Any]) -> str:
+    kinds = {
+        "string": "text",
+        "integer": "whole number",
+        "number": "number",
+        "boolean": "true or false",
+        "array": "list",
+    }
+    return "one of" if "enum" in value else kinds[value["type"]]
+
+
+def _range(value: dict[str, Any]) -> str:
+    choices = value.get("enum") or value.get("items", {}).get("enum")
+    if choices:
+        return ", ".join(choices)
+    if "pattern" in value:
+        return f"`{value['pattern']}`"
+    low = value.get("minimum", value.get("exclusiveMinimum"))
+    high = value.get("maximum", value.get("exclusiveMaximum"))
+    if low is None or high is None:
+        return f"at most {value['maxLength']:,} characters" if "maxLength" in value else ""
+    below = "below " if "exclusiveMaximum" in value else ""
+    return f"{_plain(low)} to {below}{_plain(high)}"
+
+
+def _plain(number: float) -> str:
+    return f"{int(number):,}" if number == int(number) else f"{number:g}"

@@ -1,0 +1,191 @@
+"""Specs as files and presets: reading, changing and checking them, and saying what is wrong."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import (
+    ValidationError,
+)
+
+from starcat.errors import ConfigError, suggest
+from starcat.resources import resource_folder
+from starcat.specs.build_spec import BuildSpec
+
+PathLike = str | os.PathLike[str]
+Changes = Mapping[str, str]
+"""Values by dotted key, as somebody types them: ``{"camera.fov_x_deg": "16"}``."""
+
+
+def read_spec(path: PathLike, changes: Changes | None = None) -> BuildSpec:
+    """Read a build spec from a TOML file.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+    changes : mapping of str to str, optional
+        Values by dotted key that take the place of the file's, as TOML writes them. A text that
+        is no TOML value is itself the value; an empty one removes the key.
+
+    Returns
+    -------
+    BuildSpec
+        Checked.
+
+    Raises
+    ------
+    ConfigError
+        If the file is missing or not TOML, or a key is unknown, missing or out of range.
+    """
+    path = Path(path)
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(
+            f"{path}: no such spec; 'starcat presets' lists those that ship with starcat"
+        ) from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+        raise ConfigError(f"{path}: not a readable TOML file: {error}") from error
+    for key, text in (changes or {}).items():
+        _change(content, key, text)
+    return spec_from_dict(content, path.name)
+
+
+def _change(content: dict[str, Any], key: str, text: str) -> None:
+    *tables, name = key.split(".")
+    for table in tables:
+        content = content.setdefault(table, {})
+        if not isinstance(content, dict):
+            raise ConfigError(f"{key}: {table} is a value, not a table of the spec", key=key)
+    if text:
+        content[name] = _value(text)
+    else:
+        content.pop(name, None)
+
+
+def _value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def spec_from_dict(content: dict[str, Any], origin: str) -> BuildSpec:
+    """Check a spec that is already parsed.
+
+    Parameters
+    ----------
+    content : dict
+        Keys as in the TOML file.
+    origin : str
+        Where it is from, for messages.
+
+    Returns
+    -------
+    BuildSpec
+        Checked.
+
+    Raises
+    ------
+    ConfigError
+        Naming the first wrong key, what was found and what is allowed.
+    """
+    try:
+        return BuildSpec.model_validate(content)
+    except ValidationError as error:
+        raise what_is_wrong(error, origin) from error
+
+
+def what_is_wrong(error: ValidationError, origin: str) -> ConfigError:
+    """Return what to tell somebody whose spec, or part of one, was refused.
+
+    Parameters
+    ----------
+    error : ValidationError
+        Of pydantic.
+    origin : str
+        Where the values are from.
+
+    Returns
+    -------
+    ConfigError
+        About the first wrong key; a misspelt one comes first, since it is missing too.
+    """
+    wrong = sorted(error.errors(), key=lambda entry: entry["type"] != "extra_forbidden")
+    first = wrong[0]
+    names = (str(part) for part in first["loc"])
+    key = ".".join(name if name.isprintable() else repr(name) for name in names) or "spec"
+    return ConfigError(f"{origin}: {key}: {_explain(dict(first))}", key=key, value=first["input"])
+
+
+def _explain(error: dict[str, Any]) -> str:
+    kind, context = error["type"], error.get("ctx", {})
+    if kind == "extra_forbidden":
+        known = _known_keys(error["loc"][:-1])
+        hint = suggest(str(error["loc"][-1]), known)
+        return f"unknown key; {hint}known keys here: {', '.join(known)}"
+    if kind == "missing":
+        return "missing; every spec needs it"
+    if kind == "value_error":
+        return str(context.get("error", error["msg"]))
+    found = repr(error["input"])
+    return f"found {found if len(found) < 60 else found[:57] + '...'}; {error['msg']}"
+
+
+def _known_keys(location: tuple[Any, ...]) -> list[str]:
+    model: Any = BuildSpec
+    for part in location:
+        model = model.model_fields[part].annotation
+    return sorted(model.model_fields)
+
+
+def preset_names() -> tuple[str, ...]:
+    """Return the names of the presets that ship with starcat, the default first.
+
+    Returns
+    -------
+    tuple of str
+        Names.
+
+    Examples
+    --------
+    >>> preset_names()[0]
+    'gaia-12deg'
+    """
+    names = sorted(path.stem for path in resource_folder("specs/presets").glob("*.toml"))
+    return tuple(sorted(names, key=lambda name: (name != "gaia-12deg", name)))
+
+
+def preset(name: str, changes: Changes | None = None) -> BuildSpec:
+    """Return a preset.
+
+    Parameters
+    ----------
+    name : str
+        One of `preset_names`.
+    changes : mapping of str to str, optional
+        As for `read_spec`.
+
+    Returns
+    -------
+    BuildSpec
+        Checked.
+
+    Raises
+    ------
+    ConfigError
+        If there is none of that name, with the nearest that there is.
+    """
+    if name not in preset_names():
+        hint = suggest(name, preset_names())
+        raise ConfigError(
+            f"unknown preset {name!r}; {hint}known presets: {', '.join(preset_names())}",
+            key="preset",
+            value=name,
+        )
+    return read_spec(resource_folder("specs/presets") / f"{name}.toml", changes)

@@ -1,0 +1,191 @@
+"""What is said when a command fails: one line of prose, or of JSON, and an exit code.
+
+Every exception that reaches the command line is told here and nowhere else. Those of
+`starcat.errors` say themselves what is wrong; whatever else arrives is a defect of starcat, and
+is called so.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+
+from typer import Abort, TyperException
+
+from starcat.errors import StarcatError, reason
+
+DEFECT = 70
+"""Exit code of a defect of starcat: that of an internal error among those of BSD."""
+
+AT_STAGE = "at stage: "
+"""Begins the note that an exception gets from the progress bars that it passes."""
+
+MAX_MESSAGE, MAX_FOREIGN = 2000, 400
+"""Characters of a message that are shown; of one of a library."""
+
+_SENTENCE = re.compile(r"; |\. (?=[A-Z])")
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why a command ended without a result.
+
+    Attributes
+    ----------
+    code : int
+        What the shell sees.
+    kind : str
+        Name of the exception's class.
+    message : str
+        What was found, where, and what to do.
+    hint : str, optional
+        The part of the message that says what to do.
+    """
+
+    code: int
+    kind: str
+    message: str
+    hint: str | None = None
+
+    def as_text(self) -> str:
+        """Return what people read.
+
+        Returns
+        -------
+        str
+            With a line end.
+        """
+        return f"starcat: error: {self.message}\n"
+
+    def as_json(self) -> str:
+        """Return what programs read.
+
+        Returns
+        -------
+        str
+            An object on one line, with a line end.
+        """
+        content = {
+            "code": self.code,
+            "kind": self.kind,
+            "message": self.message,
+            "hint": self.hint,
+        }
+        return json.dumps({"error": content}, ensure_ascii=False) + "\n"
+
+
+def failure_of(error: Exception, doing: str) -> Failure:
+    """Return what is to be said of an exception.
+
+    Parameters
+    ----------
+    error : Exception
+        Whatever a command raised.
+    doing : str
+        The command that ran, such as ``starcat build``.
+
+    Returns
+    -------
+    Failure
+        With a message of bounded length and without control characters.
+    """
+    if isinstance(error, Abort) and isinstance(error.__cause__, Exception):
+        error = error.__cause__  # an EOFError of a library, which typer takes for Ctrl-D
+    kind = type(error).__name__
+    if isinstance(error, StarcatError):
+        message = shown(str(error), MAX_MESSAGE)
+        return Failure(error.exit_code, kind, message, hint_in(message))
+    if isinstance(error, TyperException):
+        return Failure(
+            error.exit_code, kind, shown(error.format_message(), MAX_MESSAGE), _usage(error)
+        )
+    if isinstance(error, MemoryError):
+        hint = "ask for less at a time, or use a machine with more memory"
+        text = f"out of memory{_in_brackets(error)} while '{doing}' ran{_stage_of(error)}; {hint}"
+        return Failure(1, kind, text, hint)
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename else ""
+        return Failure(1, kind, shown(f"{where}{reason(error)}", MAX_MESSAGE))
+    hint = "run again with --debug for the traceback, and report it"
+    text = shown(str(error), MAX_FOREIGN) or "no message"
+    what = f"this is a defect of starcat: '{doing}'{_stage_of(error)} ended with {kind}: {text}"
+    return Failure(DEFECT, kind, f"{what}; {hint}", hint)
+
+
+def shown(text: str, most: int) -> str:
+    """Return a text as a terminal may show it.
+
+    Parameters
+    ----------
+    text : str
+        Perhaps with what a file held in it.
+    most : int
+        Characters that are left; of a longer text the middle is left out.
+
+    Returns
+    -------
+    str
+        Control characters but line ends are written as escapes.
+
+    Examples
+    --------
+    >>> shown("a" * 50 + "b" * 50, 11)
+    'aaaaa…bbbbb'
+    """
+    if len(text) > most:
+        half = (most - 1) // 2
+        text = f"{text[:half]}…{text[-half:]}"
+    return "".join(
+        c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text
+    )
+
+
+def hint_in(message: str) -> str | None:
+    """Return the part of a message that says what to do.
+
+    Parameters
+    ----------
+    message : str
+        Of one of starcat's own errors, which end with it.
+
+    Returns
+    -------
+    str or None
+        What stands behind the last semicolon or full stop outside of brackets; None without.
+
+    Examples
+    --------
+    >>> hint_in("sao.dat: cut off (EOF; 3 bytes); fetch the file again")
+    'fetch the file again'
+    >>> hint_in("2 px. Check the limits of [selection]")
+    'Check the limits of [selection]'
+    >>> hint_in("limits swapped") is None
+    True
+    """
+    level, depth = [], 0
+    for c in message:
+        depth += (c in "([{") - (c in ")]}")
+        level.append(depth)
+    ends = [found for found in _SENTENCE.finditer(message) if level[found.start()] <= 0]
+    return message[ends[-1].end() :].strip() or None if ends else None
+
+
+def _usage(error: TyperException) -> str | None:
+    context = getattr(error, "ctx", None)
+    return f"Try '{context.command_path} --help' for help." if context else None
+
+
+def _stage_of(error: Exception) -> str:
+    """Return the stage that an exception was raised in, where progress bars noted one."""
+    notes = [n.removeprefix(AT_STAGE) for n in _notes(error) if n.startswith(AT_STAGE)]
+    return f" at '{shown(notes[0], 80)}'" if notes else ""
+
+
+def _notes(error: Exception) -> list[str]:
+    return [note for note in getattr(error, "__notes__", []) if isinstance(note, str)]
+
+
+def _in_brackets(error: Exception) -> str:
+    text = shown(str(error), MAX_FOREIGN)
+    return f" ({text})" if text else ""

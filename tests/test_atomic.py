@@ -1,0 +1,183 @@
+"""Files and folders that are whole at their final name, or not there."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from starcat.errors import OutputError
+from starcat.storage.atomic import (
+    make_folder,
+    move_into_place,
+    replace_file,
+    sync,
+    whole_file,
+    whole_folder,
+    writing,
+)
+
+
+def mode_of(path: Path) -> int:
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+def usual_mode(folder: Path) -> int:
+    (folder / "usual").write_bytes(b"")
+    mode = mode_of(folder / "usual")
+    (folder / "usual").unlink()
+    return mode
+
+
+def names_in(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_file_appears_when_it_is_whole(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "table.csv"
+    with whole_file(path) as partial:
+        partial.write_bytes(b"half")
+        assert not path.exists()
+        assert partial.parent == path.parent
+        assert partial.name.startswith(".table.csv.")
+        partial.write_bytes(b"whole")
+    assert path.read_bytes() == b"whole"
+    assert names_in(path.parent) == ["table.csv"]
+    assert mode_of(path) == usual_mode(tmp_path)
+
+
+def test_a_file_that_fails_leaves_the_one_before(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_bytes(b"before")
+
+    def fail() -> None:
+        with whole_file(path) as partial:
+            partial.write_bytes(b"half")
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert path.read_bytes() == b"before"
+    assert names_in(tmp_path) == ["table.csv"]
+
+
+def test_two_writers_of_one_process_do_not_share_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    with whole_file(path) as one, whole_file(path) as other:
+        assert one != other
+        one.write_bytes(b"one")
+        other.write_bytes(b"other")
+    assert path.read_bytes() == b"one"
+    assert names_in(tmp_path) == ["table.csv"]
+
+
+def test_a_file_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    place = whole_file(tmp_path / "file" / "table.csv")
+    with pytest.raises(OutputError, match="choose another --output"):
+        place.__enter__()
+
+
+def test_replaced_for_good(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[int] = []
+    monkeypatch.setattr(os, "fsync", lambda descriptor: done.append(os.fstat(descriptor).st_mode))
+    (tmp_path / "beside").mkdir()
+    path = tmp_path / "index.json"
+    path.write_bytes(b"before")
+    replace_file(path, b"after", tmp_path / "beside")
+    assert path.read_bytes() == b"after"
+    assert names_in(tmp_path / "beside") == []
+    # The content first, then the name.
+    assert [stat.S_ISDIR(mode) for mode in done] == [False, True]
+
+
+def test_a_folder_appears_when_it_is_whole_and_cannot_be_changed(tmp_path: Path) -> None:
+    final = tmp_path / "dist" / "small-1.0.0"
+    with whole_folder(final) as partial:
+        (partial / "report").mkdir()
+        (partial / "report" / "index.html").write_text("page")
+        (partial / "stars.parquet").write_text("stars")
+        assert not final.exists()
+        assert move_into_place(partial, final, replace=False) == "written"
+    assert names_in(tmp_path / "dist") == ["small-1.0.0"]
+    files = [path for path in final.rglob("*") if path.is_file()]
+    assert [mode_of(path) for path in files] == [0o444, 0o444]
+    assert mode_of(final) == 0o755
+
+
+def filled(folder: Path, **files: str) -> Path:
+    folder.mkdir()
+    for name, text in files.items():
+        (folder / name).write_text(text)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("new", "replace", "outcome"),
+    [
+        ({"a": "1", "b": "2"}, False, "unchanged"),
+        ({"a": "1", "b": "2"}, True, "unchanged"),
+        ({"a": "1"}, False, "unchanged"),
+        ({"a": "3", "b": "2"}, True, "replaced"),
+        ({"a": "1", "c": "2"}, True, "replaced"),
+    ],
+)
+def test_a_folder_in_place_of_another(
+    new: dict[str, str], replace: bool, outcome: str, tmp_path: Path
+) -> None:
+    final = tmp_path / "small"
+    move_into_place(filled(tmp_path / "old", a="1", b="2"), final, replace=False)
+    assert move_into_place(filled(tmp_path / "new", **new), final, replace=replace) == outcome
+    if outcome == "replaced":
+        assert {path.name: path.read_text() for path in final.iterdir()} == new
+        assert names_in(tmp_path) == ["small"]
+
+
+def test_a_different_folder_stays(tmp_path: Path) -> None:
+    final = tmp_path / "small"
+    move_into_place(filled(tmp_path / "old", a="1"), final, replace=False)
+    with pytest.raises(OutputError, match="already exists and differs"):
+        move_into_place(filled(tmp_path / "new", a="2"), final, replace=False)
+    assert (final / "a").read_text() == "1"
+
+
+def test_what_the_system_refuses_becomes_an_output_error(tmp_path: Path) -> None:
+    with (
+        pytest.raises(OutputError, match=r"space left on device\); try later"),
+        writing(tmp_path, "try later"),
+    ):
+        raise OSError(28, "wrapped")
+    with pytest.raises(ConnectionResetError), writing(tmp_path, "try later"):
+        raise ConnectionResetError(104, "reset")
+
+
+def test_folders_above_are_made_and_synchronised(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[Path] = []
+    monkeypatch.setattr("starcat.storage.atomic.sync", seen.append)
+    make_folder(tmp_path / "a" / "b")
+    make_folder(tmp_path / "a" / "b")
+    assert seen == [tmp_path, tmp_path / "a"]
+
+
+def test_nothing_is_synchronised_where_the_system_cannot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any) -> int:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(os, "open", refuse)
+    with pytest.raises(PermissionError):
+        sync(tmp_path)
+    monkeypatch.setattr(os, "name", "nt")
+    sync(tmp_path)
+
+
+def test_the_files_of_a_built_artifact_can_only_be_read(small_artifact: Path) -> None:
+    modes = {mode_of(path) for path in small_artifact.rglob("*") if path.is_file()}
+    assert modes == {0o444}
+    assert mode_of(small_artifact) & 0o200

@@ -1,0 +1,243 @@
+"""Hostile archives: records of every source, damaged in all the ways that came to mind.
+
+The property is the same for each reader: whatever is in the file, an error is one of starcat's
+own; else every record is either kept or rejected, the tables follow their schemas, and every
+kept star is somewhere on the sky. The records are synthetic, so that no excerpt is needed.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from starcat.catalog.archives.gcvs import COLUMNS as GCVS_COLUMNS
+from starcat.catalog.archives.gcvs import read_gcvs
+from starcat.catalog.blocks import CATALOGS
+from starcat.catalog.ingest import ingest
+from starcat.catalog.source import Column, RecordFile, data_source
+from starcat.catalog.stars import directions_of, floats_of
+from starcat.errors import StarcatError
+from starcat.tables.schema import product_schema
+
+sys.path.insert(0, str(Path(__file__).parent / "builders"))
+from archives import archive_records, file_header, synthetic_sky
+
+TARGETS = [
+    ("sao", "sao"),
+    ("hipparcos", "hip_main"),
+    ("tycho1", "tyc_main"),
+    ("tycho2", "tyc2"),
+    ("tycho2", "suppl_1"),
+    ("2mass", "psc"),
+    ("gaia", "gaia_merged"),
+    ("gcvs", "gcvs"),
+]
+"""Every source and layout that has a reader."""
+
+TEXTS = [
+    *("", "-", "+", ".", "*", "\\N", "NULL", "nan", "inf", "-inf", "Infinity", "x.2", "--1", "1 1"),
+    *("0", "-0", "1", "-1", "7", "90.0", "-90.0", "91", "359.99999999", "360.0", "360.00000001"),
+    *("1e308", "-1e308", "1e400", "1E99", "9e18", "1d5", "1D-400", "99.9", "100000", "0x10", "1_0"),
+    *("9" * 10, "9" * 19, "9" * 20, "-9223372036854775808", "9223372036854775807", "65536.5"),
+    *("\u0663\u0664", "\uff11\uff12", "\u00b2\u00b3", "\u0967", "\x00", "\xff\xfe", "\u2212 5"),
+    *("|" * 3, "\t", "#", "\r", '"', "D", "X", "T", "A", "\u00e9" * 9, "7" * 20_000, "z" * 20_000),
+]
+"""What is put into fields: null texts, limits, huge numbers, digits of other scripts, marks."""
+
+NUMBERS = [
+    np.nan,
+    np.inf,
+    -np.inf,
+    1e308,
+    -1e308,
+    0.0,
+    -0.0,
+    360.0,
+    -90.0,
+    1e5,
+    -(2.0**63),
+    2.0**62,
+]
+"""What is put into the fields of packed records."""
+
+KINDS = ("flip", "text", "text", "text", "swap", "blank", "cut", "lengthen", "join", "repeat")
+
+
+@dataclass(frozen=True)
+class Damage:
+    """One thing that happens to one record; which of the numbers count depends on the kind."""
+
+    record: int
+    kind: str
+    column: int
+    other: int
+    text: str
+    number: float
+    byte: int
+
+
+DAMAGE = st.builds(
+    Damage,
+    record=st.integers(0, 59),
+    kind=st.sampled_from(KINDS),
+    column=st.integers(0, 99),
+    other=st.integers(0, 99),
+    text=st.sampled_from(TEXTS) | st.text(max_size=12),
+    number=st.sampled_from(NUMBERS) | st.floats(),
+    byte=st.integers(0, 255),
+)
+
+
+@cache
+def good_records(source_name: str, layout_name: str) -> tuple[bytes, ...]:
+    """60 records of stars that do not exist."""
+    # The supplement has only the brightest stars, and the catalogue of variables only those.
+    count = {"suppl_1": 250, "gcvs": 1500}.get(layout_name, 70)
+    sky = synthetic_sky(count, faint_limit_mag=3.0 if layout_name == "suppl_1" else 7.0)
+    return tuple(archive_records(source_name, sky)[layout_name][:60])
+
+
+def layout_of(source_name: str, layout_name: str) -> RecordFile:
+    return next(file for file in data_source(source_name).files if file.name == layout_name)
+
+
+def columns_read(source_name: str, layout: RecordFile) -> list[Column]:
+    """The columns that the catalog's module asks for: damage elsewhere is not seen."""
+    names: Sequence[str] = (
+        GCVS_COLUMNS if source_name == "gcvs" else CATALOGS[source_name].columns[layout.name]
+    )
+    return [layout.column(name) for name in names]
+
+
+def damaged(source_name: str, layout: RecordFile, record: bytes, damage: Damage) -> bytes:
+    columns = columns_read(source_name, layout)
+    column = columns[damage.column % len(columns)]
+    other = columns[damage.other % len(columns)]
+    place = damage.other * 7 % max(1, len(record) - 1)
+    if damage.kind == "flip":
+        return record[:place] + bytes([damage.byte]) + record[place + 1 :]
+    if damage.kind == "cut":
+        return record[:place] + (b"" if layout.layout == "binary" else b"\n")
+    if damage.kind == "lengthen":
+        return record[:place] + damage.text.encode() + record[place:]
+    if damage.kind == "join":
+        return record.removesuffix(b"\n")
+    if damage.kind == "repeat":
+        return record * 2
+    if damage.kind == "swap":
+        mine, theirs = (field_of(layout, record, each) for each in (column, other))
+        return with_field(layout, with_field(layout, record, column, theirs), other, mine)
+    if damage.kind == "blank":
+        return with_field(layout, record, column, b"")
+    if layout.layout == "binary":
+        return with_field(layout, record, column, packed(column, damage.number))
+    return with_field(layout, record, column, damage.text.encode())
+
+
+def packed(column: Column, number: float) -> bytes:
+    if "i" in column.format:
+        number = max(-(2**63), min(2**63 - 1024, int(np.nan_to_num(number))))
+    with np.errstate(over="ignore"):
+        return np.array(number).astype(column.format).tobytes()
+
+
+def field_of(layout: RecordFile, record: bytes, column: Column) -> bytes:
+    if layout.layout == "delimited":
+        fields = record.rstrip(b"\n").split(layout.delimiter.encode())
+        place = layout.columns.index(column)
+        return fields[place] if place < len(fields) else b""
+    first, last = column.bytes or (1, 1)
+    return record[first - 1 : last]
+
+
+def with_field(layout: RecordFile, record: bytes, column: Column, content: bytes) -> bytes:
+    """Put bytes into a field; those of fixed width are cut, or filled up on the left."""
+    if layout.layout == "delimited":
+        fields = record.rstrip(b"\n").split(layout.delimiter.encode())
+        place = layout.columns.index(column)
+        fields[place : place + 1] = [content]
+        return layout.delimiter.encode().join(fields) + b"\n"
+    first, last = column.bytes or (1, 1)
+    width = last - first + 1
+    fill = b"\0" if layout.layout == "binary" else b" "
+    return record[: first - 1] + content[:width].rjust(width, fill) + record[last:]
+
+
+def check_archive(folder: Path, source_name: str, layout_name: str, hits: list[Damage]) -> None:
+    layout = layout_of(source_name, layout_name)
+    records = list(good_records(source_name, layout_name))
+    for hit in hits:
+        which = hit.record % len(records)
+        records[which] = damaged(source_name, layout, records[which], hit)
+    path = folder / layout.file_names[0].replace("{part}", "aaa")
+    path.write_bytes(file_header(layout, len(records)) + b"".join(records))
+    said = ""
+    try:
+        check_gcvs(path) if source_name == "gcvs" else check_stars(source_name, path)
+    except StarcatError as error:
+        said = str(error)
+    assert len(said) < 1000 + len(str(path)), "a message quotes too much of its input"
+
+
+def check_stars(source_name: str, path: Path) -> None:
+    read = ingest(source_name, [path], epoch_jyear=2026.0)
+    assert read.rows_read == len(read.stars) + len(read.rejected)
+    assert sum(read.rejected_by_reason.values()) == len(read.rejected)
+    product_schema("stars").check(read.stars)
+    product_schema("rejected").check(read.rejected)
+    ra_deg, dec_deg = (floats_of(read.stars, name) for name in ("ra_deg", "dec_deg"))
+    assert ((ra_deg >= 0.0) & (ra_deg < 360.0)).all()
+    assert ((dec_deg >= -90.0) & (dec_deg <= 90.0)).all()
+    length = np.linalg.norm(directions_of(read.stars), axis=1)
+    np.testing.assert_allclose(length, 1.0, rtol=0, atol=1e-12)
+    for name in ("mag", "second_mag", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr", "epoch_jyear"):
+        assert not np.isinf(floats_of(read.stars, name)).any()
+    assert all(len(problem) < 400 for problem in read.problems)
+
+
+def check_gcvs(path: Path) -> None:
+    read = read_gcvs([path])
+    kept = len(read.amplitude_mag)
+    assert sum(file.rows for file in read.files) == kept + sum(read.rejected.values())
+    assert ((read.hip_number > 0) ^ (read.gaia_id > 0)).all()
+    assert not (read.amplitude_mag < 0.0).any()
+    assert not np.isinf(read.amplitude_mag).any()
+
+
+def run(folder: Path, source_name: str, layout_name: str, cases: int) -> None:
+    check: Callable[..., None] = given(hits=st.lists(DAMAGE, min_size=1, max_size=5))(
+        lambda hits: check_archive(folder, source_name, layout_name, hits)
+    )
+    settings(max_examples=cases, suppress_health_check=list(HealthCheck))(check)()
+
+
+@pytest.mark.parametrize(("source_name", "layout_name"), TARGETS)
+def test_the_undamaged_records_are_kept(tmp_path: Path, source_name: str, layout_name: str) -> None:
+    check_archive(tmp_path, source_name, layout_name, [])
+    layout = layout_of(source_name, layout_name)
+    path = tmp_path / layout.file_names[0].replace("{part}", "aaa")
+    if source_name == "gcvs":
+        assert len(read_gcvs([path]).amplitude_mag) == len(good_records("gcvs", "gcvs"))
+    else:
+        stars = ingest(source_name, [path], epoch_jyear=2026.0).stars
+        assert len(stars) == len(good_records(source_name, layout_name)) == 60
+
+
+@pytest.mark.parametrize(("source_name", "layout_name"), TARGETS)
+def test_damaged_records(tmp_path: Path, source_name: str, layout_name: str) -> None:
+    run(tmp_path, source_name, layout_name, 100)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(("source_name", "layout_name"), TARGETS)
+def test_many_damaged_records(tmp_path: Path, source_name: str, layout_name: str) -> None:
+    run(tmp_path, source_name, layout_name, 2000)

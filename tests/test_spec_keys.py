@@ -1,0 +1,242 @@
+"""Specs as something to write: keys explained, TOML that reads back, keys changed, starters."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from starcat.errors import ConfigError
+from starcat.pipeline.starter import ENOUGH_STARS, boresight_count
+from starcat.specs.build_spec import BuildSpec, CameraSpec
+from starcat.specs.keys import REQUIRED, spec_sections
+from starcat.specs.reading import preset, preset_names, read_spec, spec_from_dict
+from starcat.specs.spec_toml import spec_toml, toml_value
+
+
+def all_keys():
+    return [key for section in spec_sections() for key in section.keys]
+
+
+def test_every_key_says_what_it_means():
+    for key in all_keys():
+        assert len(key.description) > 8, key.path
+
+
+def test_every_number_has_two_ends():
+    numbers = [key for key in all_keys() if key.kind in ("number", "whole number")]
+    assert len(numbers) > 40
+    assert [key.path for key in numbers if " to " not in key.range] == []
+
+
+def test_a_key_without_a_value_has_an_example_or_a_default():
+    assert [k.path for k in all_keys() if k.default is REQUIRED and k.example is None] == []
+
+
+def test_the_keys_are_those_of_the_model():
+    dumped = preset("gaia-12deg").model_dump(mode="json")
+
+    def paths(values, before=()):
+        for name, value in values.items():
+            if isinstance(value, dict):
+                yield from paths(value, (*before, name))
+            else:
+                yield ".".join((*before, name))
+
+    assert {key.path for key in all_keys()} == set(paths(dumped))
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_a_preset_as_toml_reads_back(name):
+    text = spec_toml(preset(name))
+    assert spec_from_dict(tomllib.loads(text), "text") == preset(name)
+    assert max(map(len, text.splitlines())) <= 120
+
+
+@given(
+    description=st.text(max_size=60),
+    faint=st.floats(-20.0, 30.0),
+    count=st.integers(1, 1_000_000),
+    join=st.lists(st.sampled_from(["hipparcos", "tycho1", "gcvs"]), max_size=3),
+    grid=st.booleans(),
+)
+def test_any_spec_as_toml_reads_back(description, faint, count, join, grid):
+    content = preset("gaia-12deg").model_dump(mode="json")
+    content["description"] = description
+    content["selection"] |= {"faint_limit_mag": faint}
+    content["selection"]["variables"]["join"] = join
+    content["boresights"]["count"] = count
+    content["products"]["grid"]["enabled"] = grid
+    spec = spec_from_dict(content, "made")
+    assert spec_from_dict(tomllib.loads(spec_toml(spec)), "text") == spec
+
+
+@given(st.one_of(st.text(), st.booleans(), st.integers(-(2**62), 2**62), st.floats(-1e300, 1e300)))
+def test_a_value_is_written_as_toml_reads_it(value):
+    assert tomllib.loads(f"value = {toml_value(value)}")["value"] == value
+
+
+@pytest.mark.parametrize(
+    ("key", "text", "found"),
+    [
+        ("camera.fov_x_deg", "16", lambda spec: spec.camera.fov_x_deg == 16.0),
+        ("name", "other", lambda spec: spec.name == "other"),
+        ("name", '"quoted"', lambda spec: spec.name == "quoted"),
+        ("version", "1.2.3", lambda spec: spec.version == "1.2.3"),
+        ("products.grid.enabled", "false", lambda spec: not spec.products.grid.enabled),
+        ("selection.variables.join", '["gcvs"]', lambda s: s.selection.variables.join == ("gcvs",)),
+        ("self_test.seed", "", lambda spec: spec.self_test.seed == 20_000),
+    ],
+)
+def test_a_key_is_changed(key, text, found):
+    assert found(preset("sao-12deg", {key: text}))
+
+
+def test_a_scale_takes_the_place_of_another():
+    changes = {
+        "camera.focal_length_mm": "",
+        "camera.pixel_um": "",
+        "camera.fov_x_deg": "16",
+    }
+    assert preset("2mass-8x6", changes).camera.camera().fov_x_deg == pytest.approx(16.0)
+
+
+@pytest.mark.parametrize(
+    ("key", "words"),
+    [
+        ("camera.fov_y", "did you mean 'fov_x_deg'"),
+        ("name.first", "name is a value, not a table"),
+        ("selection.faint_limit_mag", "selection.faint_limit_mag: found 'six'"),
+    ],
+)
+def test_a_change_that_makes_no_sense_is_refused(key, words):
+    with pytest.raises(ConfigError, match=words):
+        preset("sao-12deg", {key: "six"})
+
+
+def test_a_file_is_read_by_its_name(tmp_path):
+    (tmp_path / "own.toml").write_text(spec_toml(preset("gaia-12deg")))
+    assert read_spec(str(tmp_path / "own.toml"), {"name": "own"}).name == "own"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "camera.fov_x_deg",
+        "products.neighbours.angle_bin_deg",
+        "products.neighbours.separation_bin_deg",
+        "products.neighbours.radius_deg",
+        "products.grid.radius_deg",
+        "products.pairs.max_separation_deg",
+        "boresights.fov_x_deg",
+        "products.crossmatch.radius_arcsec",
+        "products.crossmatch.colour_spread_mag",
+    ],
+)
+@pytest.mark.parametrize("value", ["1e-300", "5e-324"])
+def test_numbers_next_to_nothing_are_refused(path, value):
+    with pytest.raises(ConfigError, match=path.rpartition(".")[2]):
+        preset("gaia-12deg", {path: value})
+
+
+@pytest.mark.parametrize("lens", [{"focal_length_mm": 1e6, "pixel_um": 0.01}])
+def test_a_field_next_to_nothing_is_refused(lens):
+    with pytest.raises(ValueError, match=r"fov_x_deg is .*Check the units"):
+        CameraSpec.model_validate({"width_px": 16, "height_px": 16, **lens})
+
+
+def test_a_spec_is_one_line_to_look_at():
+    for name in preset_names():
+        assert "\n" not in repr(preset(name))
+        assert len(repr(preset(name))) < 120
+    assert str(preset("gaia-12deg")).startswith("<BuildSpec gaia-12deg-1.0.0: gaia to 6 mag")
+
+
+@pytest.mark.parametrize(("fov_deg", "count"), [(60.0, 2000), (12.0, 5300), (2.0, 50_000)])
+def test_narrow_fields_get_more_boresights(fov_deg, count):
+    camera = CameraSpec(width_px=1000, height_px=1000, fov_x_deg=fov_deg)
+    assert boresight_count(camera) == count
+
+
+@pytest.fixture
+def started(starcat, tmp_path):
+    path = tmp_path / "mycam.toml"
+    lens = ["--size", "1280x960", "--focal-mm", "25", "--pixel-um", "5.5"]
+    return path, starcat(["init", path, *lens])
+
+
+def test_init_writes_a_spec_and_says_how_many_stars_a_field_has(started):
+    path, done = started
+    assert done.code == 0, done.err
+    spec = read_spec(path)
+    assert (spec.name, spec.camera.focal_length_mm, spec.camera.pixel_um) == ("mycam", 25.0, 5.5)
+    assert f"{spec.selection.faint_limit_mag:g} *" in done.out
+    assert "16.03 x 12.06 deg" in done.out
+    assert f"starcat build {path}" in done.err
+
+
+def test_init_finds_a_limit_with_enough_stars(starcat, tmp_path):
+    size = ["--size", "1280x960", "--fov-x-deg", "30", "--json"]
+    found = json.loads(starcat(["init", tmp_path / "a.toml", *size]).out)
+    limit = found["spec"]["selection"]["faint_limit_mag"]
+    (own,) = [row for row in found["limits"] if row["faint_limit_mag"] == limit]
+    fainter = [row for row in found["limits"] if row["faint_limit_mag"] < limit]
+    # Doubles are taken out after the limit was chosen.
+    assert own["stars"]["one_percent"] >= ENOUGH_STARS - 2
+    assert max(row["stars"]["one_percent"] for row in fainter) < ENOUGH_STARS
+
+
+def test_init_keeps_a_file_that_is_there(starcat, tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text("mine")
+    done = starcat(["init", path, "--size", "64x64", "--fov-x-deg", "40"])
+    assert done.code == 1
+    assert "--replace" in done.err
+    assert path.read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--size", "wide"], "not WIDTHxHEIGHT"),
+        (["--size", "1280x960"], "give either fov_x_deg, or focal_length_mm and pixel_um"),
+        (["--size", "8x8", "--fov-x-deg", "10"], "width_px: found 8"),
+        (["--size", "640x480", "--focal-mm", "0.001", "--pixel-um", "5"], "focal_length_mm"),
+    ],
+)
+def test_init_says_what_is_wrong_with_a_camera(starcat, tmp_path, options, words):
+    done = starcat(["init", tmp_path / "a.toml", *options])
+    assert done.code == 2
+    assert words in done.err
+    assert not (tmp_path / "a.toml").exists()
+
+
+def test_a_name_that_no_artifact_may_have_is_made_one(starcat, tmp_path):
+    size = ["--size", "640x480", "--fov-x-deg", "40", "--faint-limit", "4"]
+    assert starcat(["init", tmp_path / "My Cam_2.toml", *size]).code == 0
+    assert read_spec(tmp_path / "My Cam_2.toml").name == "my-cam-2"
+
+
+def test_presets_prints_one(starcat):
+    done = starcat(["presets", "sao-12deg"])
+    assert "12 x 12 deg" in done.out
+    text = starcat(["presets", "sao-12deg", "--toml"]).out
+    assert spec_from_dict(tomllib.loads(text), "text") == preset("sao-12deg")
+    assert BuildSpec.model_validate(json.loads(starcat(["presets", "sao-12deg", "--json"]).out))
+    assert starcat(["presets", "--toml"]).code == 2
+
+
+def test_build_changes_a_key(starcat, tmp_path, sao_lines, small_spec):
+    (tmp_path / "sao.dat").write_bytes(b"".join(sao_lines))
+    (tmp_path / "small.toml").write_text(small_spec)
+    given = ["build", tmp_path / "small.toml", "--input", f"sao={tmp_path / 'sao.dat'}"]
+    done = starcat(
+        [*given, "-o", tmp_path, "--set", "version=2.0.0", "--set", "self_test.frames=3"]
+    )
+    assert done.code == 0, done.err
+    manifest = json.loads((tmp_path / "small-2.0.0" / "manifest.json").read_text())
+    assert manifest["spec"]["self_test"]["frames"] == 3
+    assert starcat([*given, "--set", "version"]).code == 2
