@@ -99,25 +99,27 @@ def parts_of(star: dict[str, Any], expected: dict[str, Any]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("source", "name", "kept", "rejected"),
+    ("source", "name", "kept", "made", "rejected"),
     [
-        ("sao", "sao.dat.gz", 15_935, {}),
-        ("hipparcos", "hip_main.dat.gz", 9_928, {"no_position": 5}),
-        ("tycho1", "tyc_main.dat.gz", 45_978, {}),
-        ("tycho2", "tyc2.dat.gz", 44_626, {}),
-        ("2mass", "psc_measured.gz", 3_122, {}),
-        ("2mass", "psc_estimated.gz", 48_717, {}),
+        ("sao", "sao.dat.gz", 15_935, 8_647, {}),
+        ("hipparcos", "hip_main.dat.gz", 9_928, 8_642, {"no_position": 5}),
+        ("tycho1", "tyc_main.dat.gz", 45_978, 8_647, {}),
+        ("tycho2", "tyc2.dat.gz", 44_626, 8_595, {}),
+        ("2mass", "psc_measured.gz", 3_122, 4_502, {}),
+        ("2mass", "psc_estimated.gz", 48_717, 8_647, {}),
     ],
 )
 def test_every_record_is_kept_or_rejected(
     catalogs: Path,
     excerpt: Callable[[str, str], Ingested],
+    has_excerpts: bool,
     source: str,
     name: str,
     kept: int,
+    made: int,
     rejected: dict[str, int],
 ) -> None:
-    read = excerpt(source, name)
+    read, kept = excerpt(source, name), kept if has_excerpts else made
     with gzip.open(catalogs / name) as file:
         assert read.rows_read == sum(1 for _ in file)
     assert len(read.stars) == kept
@@ -156,10 +158,12 @@ def test_the_embedded_sky_of_gaia() -> None:
     assert set(read.stars["epoch_jyear"].to_pylist()) == {2016.0}
 
 
-def test_number_of_naked_eye_stars_of_sao(excerpt: Callable[[str, str], Ingested]) -> None:
+def test_number_of_naked_eye_stars_of_sao(
+    excerpt: Callable[[str, str], Ingested], has_excerpts: bool
+) -> None:
     mag = floats_of(excerpt("sao", "sao.dat.gz").stars, "mag")
-    assert (mag <= 6.0).sum() == 5_103
-    assert (mag <= 6.9).sum() == 14_195
+    assert (mag <= 6.0).sum() == (5_103 if has_excerpts else 5_179)
+    assert (mag <= 6.9).sum() == (14_195 if has_excerpts else 8_647)
 
 
 def test_the_digests_are_those_of_the_files(
@@ -168,14 +172,13 @@ def test_the_digests_are_those_of_the_files(
     (fact,) = excerpt("sao", "sao.dat.gz").files
     content = (catalogs / "sao.dat.gz").read_bytes()
     assert (fact.sha256, fact.bytes) == (hashlib.sha256(content).hexdigest(), len(content))
-    assert fact.rows == 15_935
+    assert fact.rows == gzip.decompress(content).count(b"\n")
 
 
 def test_sao_positions_are_those_of_the_fk5(
-    catalogs: Path, excerpt: Callable[[str, str], Ingested]
+    catalogs: Path, excerpt: Callable[[str, str], Ingested], has_excerpts: bool
 ) -> None:
     text = (catalogs / "fk5_sao_cross_index.txt").read_text(encoding="ascii")
-    assert "  1   0  8 23.265 +01.039 +29  5 25.58 -016.33" in text  # Alpheratz, SAO 73765
     fk5 = {
         int(line[79:85]): (
             15.0 * (int(line[4:8]) + int(line[8:11]) / 60 + float(line[11:18]) / 3600),
@@ -185,14 +188,16 @@ def test_sao_positions_are_those_of_the_fk5(
         for line in text.splitlines()
         if line[79:85].strip()
     }
-    assert fk5[73765] == pytest.approx((2.0969375, 29.0904389), abs=1e-7)
+    if has_excerpts:
+        assert "  1   0  8 23.265 +01.039 +29  5 25.58 -016.33" in text  # Alpheratz, SAO 73765
+        assert fk5[73765] == pytest.approx((2.0969375, 29.0904389), abs=1e-7)
     stars = excerpt("sao", "sao.dat.gz").stars
     number = stars["star_id"].to_numpy()
     common = np.isin(number, list(fk5))
     positions = np.array([fk5[n] for n in number[common]])
     found = directions_of(stars)[common]
     apart = separation(found, directions_from_radec(positions[:, 0], positions[:, 1]))
-    assert common.sum() == 1_512
+    assert common.sum() == (1_512 if has_excerpts else 1_442)
     assert np.median(apart) < 0.2 * ARCSEC_RAD
     assert (apart < 1.0 * ARCSEC_RAD).mean() >= 0.98
 
@@ -243,8 +248,8 @@ def test_a_blank_position_of_hipparcos_is_the_reason(
 # Tycho-1
 
 
-def test_the_literal_records_are_the_samples(catalogs: Path) -> None:
-    samples = catalogs / "samples"
+def test_the_literal_records_are_the_samples(excerpts: Path) -> None:
+    samples = excerpts / "samples"
     for name, lines in (
         ("tycho1_I239_records.txt", TYC_MAIN),
         ("tycho2_I259_records.txt", TYC2),
@@ -252,7 +257,7 @@ def test_the_literal_records_are_the_samples(catalogs: Path) -> None:
         ("twomass_psc_record.txt", [PSC]),
     ):
         assert (samples / name).read_bytes().splitlines()[: len(lines)] == lines
-    with gzip.open(catalogs / "sao.dat.gz") as file:
+    with gzip.open(excerpts / "sao.dat.gz") as file:
         assert file.readline().rstrip(b"\n") == SAO
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import re
 import subprocess
@@ -207,7 +208,7 @@ def test_ingest_of_the_excerpt(starcat: Run, catalogs: Path, tmp_path: Path) -> 
     run = starcat(
         ["ingest", "sao", "--input", archive, "-o", out, "--epoch-jyear", "2026", "--json"]
     )
-    assert json.loads(run.out)["rows_read"] == 15_935
+    assert json.loads(run.out)["rows_read"] == gzip.decompress(archive.read_bytes()).count(b"\n")
     product_schema("stars").check(pq.read_table(out))
 
 

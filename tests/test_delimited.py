@@ -7,18 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from genuine_records import PSC as RECORD
 
 from starcat.catalog.readers.delimited import parse_delimited
 from starcat.catalog.readers.records import Problem
 from starcat.catalog.source import Column, RecordFile, data_source
 
-# The genuine record of samples/twomass_psc_record.txt.
-RECORD = (
-    rb"1.119851|-89.91861|0.11|0.06|90|00042876-8955069 |12.467|0.018|0.021|359.4|12.131|0.025|"
-    rb"0.026|224.7|11.963|0.023|0.025|133.7|AAA|222|111|000|666666|37.2|245|1329023254|0|0|"
-    rb"1101364107|s|2000-09-22|64|302.951|-27.208|1.6|2451809.7124|1.07|1.18|0.81|12.481|0.014|"
-    rb"12.112|0.028|11.98|0.012|332|251|sw|1|1|0|\N|\N|\N|\N|0|\N|59038|1357874|267"
-)
 PSC = data_source("2mass").files[0]
 GCVS = data_source("gcvs").files[0]
 
@@ -34,10 +28,6 @@ TINY = RecordFile(
         Column(name="code", format="A1", null=("?",)),
     ),
 )
-
-
-def test_the_sample_is_the_record_above(catalogs: Path) -> None:
-    assert (catalogs / "samples" / "twomass_psc_record.txt").read_bytes().strip() == RECORD
 
 
 def test_every_field_of_a_genuine_2mass_record() -> None:
@@ -183,7 +173,7 @@ def test_blocks_do_not_matter(catalogs: Path) -> None:
     cut = data.index(b"\n", len(data) // 3) + 1
     first = parse_delimited(data[:cut], PSC, names)
     second = parse_delimited(data[cut:], PSC, names, first_line=data[:cut].count(b"\n") + 1)
-    assert len(whole) == 3_122
+    assert len(whole) == data.count(b"\n") > 3_000
     assert [*first.line, *second.line] == whole.line.tolist()
     for name in names:
         np.testing.assert_array_equal(np.concatenate([first[name], second[name]]), whole[name])

@@ -32,17 +32,15 @@ def check_neighbours(read: Ingested) -> None:
         assert stated[row] == pytest.approx(angle.min(), rel=1e-9, abs=1e-7)
 
 
-@pytest.mark.usefixtures("catalogs")
-def test_sao(tmp_path: Path) -> None:
-    read = ingest("sao", [make_sao(tmp_path)], epoch_jyear=2026.0)
+def test_sao(tmp_path: Path, catalogs: Path) -> None:
+    read = ingest("sao", [make_sao(tmp_path, catalogs)], epoch_jyear=2026.0)
     assert read.rows_read == len(read.stars) == SAO_ROWS
     assert read.stars["star_id"].to_pylist() == list(range(1, SAO_ROWS + 1))
     check_neighbours(read)
 
 
-@pytest.mark.usefixtures("catalogs")
-def test_tycho2_in_parts_and_in_one_file(tmp_path: Path) -> None:
-    parts = make_tycho2(tmp_path / "parts", compress=False)
+def test_tycho2_in_parts_and_in_one_file(tmp_path: Path, catalogs: Path) -> None:
+    parts = make_tycho2(tmp_path / "parts", catalogs, compress=False)
     read = ingest("tycho2", [parts], epoch_jyear=2026.0)
     number = read.stars["star_id"].to_numpy()
     assert read.rows_read == len(read.stars) == TYCHO2_ROWS

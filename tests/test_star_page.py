@@ -29,35 +29,53 @@ def page() -> str:
     return (ROOT / "docs" / "star.md").read_text(encoding="utf-8")
 
 
-def cells(page: str, first: str) -> list[str]:
+def sections(builder: ModuleType, catalogs: Path) -> str:
+    """The first two sections of the page, of the record in some catalogs."""
+    number, record = builder.find_record(catalogs)
+    both = builder.record_section(number, record), builder.conversion_section(record)
+    return "\n\n".join(map(builder.wrapped, both))
+
+
+@pytest.fixture(scope="module", params=["page", "made"])
+def told(request: pytest.FixtureRequest, builder: ModuleType, page: str) -> str:
+    """The committed page, and what the builder writes of a record that is made up."""
+    if request.param == "page":
+        return page
+    return sections(builder, request.getfixturevalue("made_catalogs"))
+
+
+def cells(told: str, first: str) -> list[str]:
     """The cells of the first table row that begins with a text."""
-    line = next(line for line in page.splitlines() if line.startswith(f"| {first} |"))
+    line = next(line for line in told.splitlines() if line.startswith(f"| {first} |"))
     return [cell.strip() for cell in line.strip("|").split("|")]
 
 
 def test_the_first_two_sections_are_what_the_record_says(
-    builder: ModuleType, catalogs: Path, page: str
+    builder: ModuleType, excerpts: Path, page: str
 ) -> None:
-    number, record = builder.find_record(catalogs)
-    for section in (builder.record_section(number, record), builder.conversion_section(record)):
-        assert builder.wrapped(section) in page
+    assert sections(builder, excerpts) in page
 
 
-def test_the_bytes_on_the_page_are_in_the_file(catalogs: Path, page: str) -> None:
-    number = int(re.search(r"line\s(\d+)\sof", page)[1])  # type: ignore[index]
+@pytest.mark.parametrize("folder", ["excerpts", "made_catalogs"])
+def test_the_bytes_on_the_page_are_in_the_file(
+    builder: ModuleType, page: str, folder: str, request: pytest.FixtureRequest
+) -> None:
+    catalogs = request.getfixturevalue(folder)
+    told = page if folder == "excerpts" else sections(builder, catalogs)
+    number = int(re.search(r"line\s(\d+)\sof", told)[1])  # type: ignore[index]
     with gzip.open(catalogs / "sao.dat.gz", "rt", encoding="ascii") as file:
         record = file.read().splitlines()[number - 1]
-    shown = re.findall(r"^\| (\d+)(?:-(\d+))? \| (\w+) \| `([^`]*)` \|", page, re.MULTILINE)
+    shown = re.findall(r"^\| (\d+)(?:-(\d+))? \| (\w+) \| `([^`]*)` \|", told, re.MULTILINE)
     assert len(shown) == 8
     for first, last, name, characters in shown:
         assert record[int(first) - 1 : int(last or first)] == characters, name
 
 
-def test_astropy_finds_the_positions_on_the_page(page: str) -> None:
-    radians = [float(cells(page, place)[2].strip("`")) for place in ("184-193", "194-204")]
+def test_astropy_finds_the_positions_on_the_page(told: str) -> None:
+    radians = [float(cells(told, place)[2].strip("`")) for place in ("184-193", "194-204")]
     written = SkyCoord(*radians, unit=u.rad, frame=FK5(equinox="J2000"))
-    fk5 = cells(page, "FK5, as the record has it")[1:3]
-    icrs = cells(page, "ICRS, J2000.0")[1:3]
+    fk5 = cells(told, "FK5, as the record has it")[1:3]
+    icrs = cells(told, "ICRS, J2000.0")[1:3]
     # Six decimals of a degree of declination are 1.8 mas.
     for found, frame, truth in (
         (fk5, FK5(equinox="J2000"), written),
@@ -67,16 +85,26 @@ def test_astropy_finds_the_positions_on_the_page(page: str) -> None:
         assert told.separation(truth) < 2.0 * u.mas
 
 
-def test_its_motion_has_the_cosine_of_the_declination_in_it(page: str) -> None:
-    seconds, arcsec = (float(cells(page, field)[2].strip("`")) for field in ("161-167", "178-183"))
-    cosine = np.cos(float(cells(page, "194-204")[2].strip("`")))
-    east, north = map(float, cells(page, "FK5, as the record has it")[3:])
+def test_its_motion_has_the_cosine_of_the_declination_in_it(told: str) -> None:
+    seconds, arcsec = (float(cells(told, field)[2].strip("`")) for field in ("161-167", "178-183"))
+    cosine = np.cos(float(cells(told, "194-204")[2].strip("`")))
+    east, north = map(float, cells(told, "FK5, as the record has it")[3:])
     assert east == pytest.approx(15_000.0 * seconds * cosine, abs=0.005)
     assert north == pytest.approx(1000.0 * arcsec, abs=0.005)
 
 
 @pytest.mark.slow
 def test_the_page_is_what_its_builder_writes(
-    builder: ModuleType, catalogs: Path, page: str
+    builder: ModuleType, excerpts: Path, page: str
 ) -> None:
-    assert builder.star_page(catalogs) == page
+    assert builder.star_page(excerpts) == page
+
+
+@pytest.mark.slow
+def test_a_page_of_made_catalogs_has_all_sections(
+    builder: ModuleType, made_catalogs: Path, page: str
+) -> None:
+    written = builder.star_page(made_catalogs)
+    headings = re.compile(r"^## .*$", re.MULTILINE)
+    assert headings.findall(written) == headings.findall(page)
+    assert sections(builder, made_catalogs) in written

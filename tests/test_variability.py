@@ -252,9 +252,10 @@ def test_another_file_is_not_taken_for_gcvs(tmp_path: Path) -> None:
         read_amplitudes("gcvs", [tmp_path])
 
 
-def test_the_class_of_hipparcos_is_a_lower_bound(catalogs: Path) -> None:
+def test_the_class_of_hipparcos_is_a_lower_bound(catalogs: Path, has_excerpts: bool) -> None:
     table = read_amplitudes("hipparcos", [catalogs / "hip_main.dat.gz"])
-    assert (table.kept, table.rejected) == (9_928, {"no_position": 5})
+    assert table.kept == (9_928 if has_excerpts else 8_642)
+    assert table.rejected == {"no_position": 5}
     codes = np.array([str(flag) for flag in table.flag])
     large = np.char.find(codes, "H6=3") >= 0
     assert large.sum() > 40
@@ -296,22 +297,24 @@ def test_tycho1_into_tycho2(tmp_path: Path, catalogs: Path) -> None:
     assert found["variable_flag"].to_pylist() == [None, "tycho1:T48=V", None]
 
 
-def test_strongly_variable_naked_eye_stars_of_sao(catalogs: Path) -> None:
+def test_strongly_variable_naked_eye_stars_of_sao(catalogs: Path, has_excerpts: bool) -> None:
     stars = ingest("sao", [catalogs / "sao.dat.gz"], neighbours=False).stars
     table = read_amplitudes("hipparcos", [catalogs / "hip_main.dat.gz"])
     found, count = join_amplitudes(stars, table)
-    assert count == 9_916
+    assert count == (9_916 if has_excerpts else 8_647)
     is_strong = (floats_of(found, "mag") <= 6.0) & (floats_of(found, "amplitude_mag") > 0.6)
-    assert is_strong.sum() == 34
+    assert is_strong.sum() == (34 if has_excerpts else 30)
     assert len(found) == len(stars)
 
 
-def test_the_whole_gcvs(catalogs: Path) -> None:
+def test_the_whole_gcvs(catalogs: Path, has_excerpts: bool) -> None:
     table = read_amplitudes("gcvs", [catalogs / "gcvs.tsv.gz"])
-    assert (table.kept, table.rejected) == (49_992, {})
-    assert (table.numbers["hip_number"] > 0).sum() == 6_892
-    assert (table.numbers["gaia"] > 0).sum() == 43_100
+    of_hipparcos, of_gaia = (6_892, 43_100) if has_excerpts else (209, 209)
+    assert (table.kept, table.rejected) == (of_hipparcos + of_gaia, {})
+    assert (table.numbers["hip_number"] > 0).sum() == of_hipparcos
+    assert (table.numbers["gaia"] > 0).sum() == of_gaia
     assert np.nanmin(table.amplitude_mag) >= 0.0
-    mira = table.numbers["hip_number"].tolist().index(10826)
-    assert table.amplitude_mag[mira] == pytest.approx(8.5)
-    assert table.flag[mira] == "M"
+    if has_excerpts:
+        mira = table.numbers["hip_number"].tolist().index(10826)
+        assert table.amplitude_mag[mira] == pytest.approx(8.5)
+        assert table.flag[mira] == "M"

@@ -23,9 +23,9 @@ def catalogs_folder() -> Path:
     return Path(os.environ.get("STARCAT_CATALOGS", default))
 
 
-def read_lines(name: str, length: int) -> np.ndarray:
+def read_lines(path: Path, length: int) -> np.ndarray:
     """Return the records of an excerpt as a matrix of bytes, line ends included."""
-    data = gzip.decompress((catalogs_folder() / name).read_bytes())
+    data = gzip.decompress(path.read_bytes())
     return np.frombuffer(data, dtype=np.uint8).reshape(-1, length + 1)
 
 
@@ -57,10 +57,10 @@ def by_region(ra: np.ndarray, dec: np.ndarray) -> np.ndarray:
     return np.lexsort((dec, np.floor(ra / 3.75), np.floor(dec / 7.5)))
 
 
-def make_sao(folder: Path) -> Path:
+def make_sao(folder: Path, catalogs: Path | None = None) -> Path:
     """Write a file of the size and layout of sao.dat."""
     generator = np.random.default_rng(1)
-    lines = read_lines("sao.dat.gz", 204)
+    lines = read_lines((catalogs or catalogs_folder()) / "sao.dat.gz", 204)
     records = lines[generator.integers(len(lines), size=SAO_ROWS)].copy()
     ra, dec = random_sky(SAO_ROWS, generator)
     put(records, 1, np.arange(1, SAO_ROWS + 1), 6)
@@ -75,11 +75,11 @@ def make_sao(folder: Path) -> Path:
     return path
 
 
-def make_tycho2(folder: Path, *, compress: bool) -> Path:
+def make_tycho2(folder: Path, catalogs: Path | None = None, *, compress: bool) -> Path:
     """Write the 20 parts of tyc2.dat, plain or compressed; return their folder."""
     folder.mkdir(parents=True, exist_ok=True)
     generator = np.random.default_rng(2)
-    lines = read_lines("tyc2.dat.gz", 206)
+    lines = read_lines((catalogs or catalogs_folder()) / "tyc2.dat.gz", 206)
     all_ra, all_dec = random_sky(TYCHO2_ROWS, generator)
     order = by_region(all_ra, all_dec)
     all_ra, all_dec = all_ra[order], all_dec[order]

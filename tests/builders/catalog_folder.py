@@ -69,7 +69,7 @@ def bright_sky(faint_limit_mag: float = FAINT_LIMIT_MAG, seed: int = 1) -> Sky:
         hip=hip,
         hd=1 + generator.permutation(359_083)[:count],
         sao=generator.choice(others, count, replace=False),
-        gaia_id=np.where(known, 0, gaia["source_id"]),
+        gaia_id=np.where(known, 10**17 + hip, gaia["source_id"]),
     )
     number, ra_deg, dec_deg = POLARIS
     polaris = np.argmin(np.hypot(sky.ra_deg - ra_deg, sky.dec_deg - dec_deg))
@@ -85,7 +85,7 @@ def write_catalog_folder(folder: Path) -> None:
     bright_in_k = sky.where(np.flatnonzero(sky.v_mag - 2.2 * sky.b_v <= 4.4))
     files = {
         "sao.dat.gz": _with_b1950(archive_records("sao", sky)["sao"], sky),
-        "hip_main.dat.gz": _without_positions(archive_records("hipparcos", sky)["hip_main"]),
+        "hip_main.dat.gz": _hipparcos(archive_records("hipparcos", sky)["hip_main"], sky),
         "tyc_main.dat.gz": archive_records("tycho1", sky)["tyc_main"],
         "tyc2.dat.gz": archive_records("tycho2", sky)["tyc2"],
         "psc_estimated.gz": archive_records("2mass", sky)["psc"],
@@ -152,8 +152,14 @@ def _clock(ra_rad: float, dec_rad: float) -> tuple[int, int]:
     return ms, round(abs(np.degrees(dec_rad)) * 360_000.0)
 
 
-def _without_positions(lines: list[bytes]) -> list[bytes]:
+def _hipparcos(lines: list[bytes], sky: Sky) -> list[bytes]:
+    """Round the declinations in text, and leave a few stars without a solution."""
     layout, nothing = data_source("hipparcos").files[0], {"ra_deg": "", "de_deg": ""}
+    for row, dec_deg in enumerate(sky.at(1991.25).dec_deg.tolist()):
+        tenths = round(abs(dec_deg) * 36_000.0)
+        text = f"{tenths // 36_000:02d} {tenths // 600 % 60:02d} {tenths % 600 / 10:04.1f}"
+        fields = {"de_dms": f"{'-' if dec_deg < 0 else '+'}{text}"}
+        lines[row] = _patched(lines[row], layout, fields)
     without = [{**nothing, "v_mag": ""}] + [nothing] * (NO_POSITION - 1)
     rows = range(len(lines) // 20, len(lines), len(lines) // NO_POSITION)
     for row, fields in zip(islice(rows, NO_POSITION), without, strict=True):

@@ -1,4 +1,4 @@
-"""Write the golden figures of two builds: ``make golden``; look at the difference.
+"""Write the golden figures of three builds: ``make golden``; look at the difference.
 
 Whole numbers and texts are held as digests. Real numbers are held as sums and first rows, as
 their last bit may differ between processors (docs/decisions.md).
@@ -15,12 +15,16 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
+from catalog_folder import write_catalog_folder
 
 from starcat.artifact.reader import open_artifact
 from starcat.pipeline.build import build
 from starcat.specs.reading import preset
 
-PRESETS = ("gaia-12deg", "sao-12deg")
+MADE = "sao-12deg-made"
+"""The preset sao-12deg on the catalogs that are made up where there are no excerpts."""
+
+BUILDS = ("gaia-12deg", "sao-12deg", MADE)
 GOLDEN = Path(__file__).parents[1] / "golden"
 
 
@@ -30,9 +34,9 @@ def golden_figures(name: str, catalogs: Path) -> dict[str, Any]:
     Parameters
     ----------
     name : str
-        A preset.
+        A preset, or `MADE`.
     catalogs : Path
-        Folder of the excerpts.
+        Folder of the excerpts, or of the made catalogs.
 
     Returns
     -------
@@ -40,8 +44,12 @@ def golden_figures(name: str, catalogs: Path) -> dict[str, Any]:
         By product: rows, digest of the exact columns, sums and first rows of the others.
     """
     inputs = {"sao": [catalogs / "sao.dat.gz"]} if name.startswith("sao") else {}
+    if name == MADE:
+        inputs["hipparcos"] = [catalogs / "hip_main.dat.gz"]
     with tempfile.TemporaryDirectory() as folder:
-        artifact = open_artifact(build(preset(name), inputs, Path(folder)).folder)
+        artifact = open_artifact(
+            build(preset(name.removesuffix("-made")), inputs, Path(folder)).folder
+        )
         return {product: figures(artifact.table(product)) for product in artifact.products}
 
 
@@ -63,13 +71,18 @@ def figures(table: pa.Table) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Write one file a preset."""
+    """Write one file a build; that of the excerpts only where they are."""
     default = Path(__file__).parents[3] / "shared" / "catalogs"
     catalogs = Path(os.environ.get("STARCAT_CATALOGS", default))
     GOLDEN.mkdir(exist_ok=True)
-    for name in PRESETS:
-        text = json.dumps(golden_figures(name, catalogs), indent=1, sort_keys=True)
-        (GOLDEN / f"{name}.json").write_text(text + "\n", encoding="utf-8")
+    with tempfile.TemporaryDirectory() as made:
+        write_catalog_folder(Path(made))
+        for name in BUILDS:
+            folder = Path(made) if name == MADE else catalogs
+            if name == "sao-12deg" and not folder.is_dir():
+                continue
+            text = json.dumps(golden_figures(name, folder), indent=1, sort_keys=True)
+            (GOLDEN / f"{name}.json").write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
