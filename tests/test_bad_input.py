@@ -302,7 +302,7 @@ def _(place: Place) -> Call:
 @case("no folder has all files", 3)
 def _(place: Place) -> Call:
     place.write("tyc2.dat.00.gz", b"")
-    return place.build("boresights", 'products.crossmatch.catalogs = ["tycho2"]\nboresights')
+    return with_counterparts(place, '{ enabled = true, catalogs = ["tycho2"] }')
 
 
 @case("joined catalog missing", 3)
