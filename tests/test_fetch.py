@@ -13,8 +13,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -878,3 +880,81 @@ def test_cache_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert cache_folder().name == "starcat"
     monkeypatch.delenv("STARCAT_CACHE")
     assert cache_folder().is_absolute()
+
+
+def in_parallel(*calls: Callable[[], FetchReport]) -> list[FetchReport]:
+    with ThreadPoolExecutor(len(calls)) as pool:
+        return [future.result() for future in [pool.submit(call) for call in calls]]
+
+
+def test_parallel_fetches_keep_each_others_entries(archive: Archive, tmp_path: Path) -> None:
+    rows = 60_000
+    for attempt in range(3):
+        folder, end = tmp_path / str(attempt), threading.Event()
+        sources = []
+        for k in range(4):
+            # Without a length a body ends when the server says so: all four at the same moment.
+            name = f"/{attempt}/{k}.dat"
+            url = archive.serve(name, records(rows, 7901 + k), says_length=False, stall=end)
+            sources.append(tiny_source(url, name=f"tiny{k}", file_names=[f"{k}.dat"], rows=rows))
+        asked = len(archive.requests) + 4
+
+        def release(asked: int = asked, end: threading.Event = end) -> None:
+            while len(archive.requests) < asked or any(r.sent == 0 for r in archive.requests):
+                time.sleep(0.005)
+            end.set()
+
+        threading.Thread(target=release, daemon=True).start()
+        in_parallel(*(partial(fetch, source, folder) for source in sources))
+        assert sorted(read_lock(folder)) == ["0.dat", "1.dat", "2.dat", "3.dat"]
+        assert names_in(folder) == {"0.dat", "1.dat", "2.dat", "3.dat", LOCK_NAME}
+
+
+def test_parallel_fetches_of_one_file_download_it_once(archive: Archive, tmp_path: Path) -> None:
+    source = tiny_source(archive.serve("/tiny.dat", BODY))
+    reports = in_parallel(*[partial(fetch, source, tmp_path)] * 4)
+    statuses = sorted(report.files[0].status for report in reports)
+    assert statuses == ["downloaded", "present", "present", "present"]
+    assert len(archive.requests) == 1
+    assert names_in(tmp_path) == {"tiny.dat", LOCK_NAME}
+
+
+def test_a_fetch_waits_for_a_slow_one_of_the_same_file(archive: Archive, tmp_path: Path) -> None:
+    end = threading.Event()
+    source = tiny_source(archive.serve("/tiny.dat", BODY, says_length=False, stall=end))
+    threading.Timer(0.5, end.set).start()
+    reports = in_parallel(*[partial(fetch, source, tmp_path)] * 2)
+    assert {report.files[0].sha256 for report in reports} == {sha256(BODY)}
+    assert len(archive.requests) == 1
+
+
+def test_where_there_are_no_locks_every_fetch_has_its_own_part(
+    archive: Archive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("starcat.storage.locks.fcntl", None)
+    (tmp_path / "tiny.dat.part").write_bytes(OTHER[:HALF])  # of another process, at work
+    source = tiny_source(archive.serve("/tiny.dat", BODY))
+    assert fetch(source, tmp_path).files[0].status == "downloaded"
+    assert (tmp_path / "tiny.dat").read_bytes() == BODY
+    assert (tmp_path / "tiny.dat.part").read_bytes() == OTHER[:HALF]
+    assert names_in(tmp_path) == {"tiny.dat", "tiny.dat.part", LOCK_NAME}
+
+
+def test_another_version_recorded_meanwhile_is_a_mismatch(
+    archive: Archive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Without locks two processes may bring two versions of one file: the first recorded holds.
+    monkeypatch.setattr("starcat.storage.locks.fcntl", None)
+    end = threading.Event()
+    first = tiny_source(archive.serve("/a/tiny.dat", BODY))
+    second = tiny_source(archive.serve("/b/tiny.dat", OTHER, says_length=False, stall=end))
+    with ThreadPoolExecutor(1) as pool:
+        late = pool.submit(fetch, second, tmp_path)
+        while not archive.requests:
+            time.sleep(0.005)
+        fetch(first, tmp_path)
+        end.set()
+        with pytest.raises(ChecksumMismatch, match="its first arrival"):
+            late.result()
+    assert read_lock(tmp_path)["tiny.dat"].sha256 == sha256(BODY)
+    assert (tmp_path / "tiny.dat").read_bytes() == BODY

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +32,7 @@ from starcat.errors import (
     SourceError,
     SourceMissing,
 )
+from starcat.storage.locks import locked
 
 LOCK_NAME = "starcat-sources.lock"
 """File beside the data with the digest of every file that has arrived."""
@@ -262,20 +264,32 @@ def examine(expected: ExpectedFile, path: Path, final: Path, url: str) -> LockEn
             rows = _count_records(expected, path, final.name)
             entry = LockEntry(sha256=digest, bytes=path.stat().st_size, rows=rows, url=url)
         _check_total(expected, final, entry.rows, lock)
+        if lock.get(final.name) != entry:
+            _record(expected, final, entry)
     except SourceError as error:
         error.source, error.path = expected.source.name, path
         error.args = (str(error).replace(str(path), final.name),)
         raise
-    if lock.get(final.name) != entry:
-        _write_lock(final.parent, lock | {final.name: entry})
     return entry
+
+
+def _record(expected: ExpectedFile, final: Path, entry: LockEntry) -> None:
+    """Add an entry to the lock file as it is now.
+
+    While this file was counted, another process may have recorded others, or this very one.
+    """
+    with locked(final.parent):
+        lock = read_lock(final.parent)
+        _check_digest(expected, final, entry.sha256, lock.get(final.name))
+        _check_total(expected, final, entry.rows, lock)
+        _write_lock(final.parent, lock | {final.name: entry})
 
 
 def _write_lock(folder: Path, entries: Mapping[str, LockEntry]) -> None:
     """Write the lock file, whole or not at all."""
     path = folder / LOCK_NAME
     content = {name: entry.model_dump() for name, entry in entries.items()}
-    partial = folder / f"{LOCK_NAME}.partial"
+    partial = folder / f".{LOCK_NAME}.{secrets.token_hex(4)}.partial"
     try:
         with partial.open("w", encoding="utf-8", newline="\n") as stream:
             stream.write(json.dumps(content, indent=2, sort_keys=True) + "\n")

@@ -2,7 +2,8 @@
 
 Input is a `DataSource` and a folder; output is a `FetchReport`. A body goes to
 ``<name>.part``, is continued there after an interruption, is checked on arrival and only
-then gets its name; a file that fails the checks is kept as ``<name>.rejected``.
+then gets its name; a file that fails the checks is kept as ``<name>.rejected``. Processes that
+fetch into the same folder at the same time wait for each other, file by file.
 
 pooch gives the cache folder, the digests and FTP; `starcat.storage.download` continues downloads.
 Several addresses for one file and keeping a file whose digest is wrong are done here. This
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import logging
 import os
+import secrets
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -39,6 +41,7 @@ from starcat.storage.download import (
     part_of,
     rename,
 )
+from starcat.storage.locks import locked
 
 Status = Literal["downloaded", "resumed", "present"]
 """Fetched in one go; continued from an earlier part; already in the folder."""
@@ -150,17 +153,15 @@ def fetch_source(
         If the folder cannot be written to.
     DownloadError
         If a file came from none of its addresses.
-    ChecksumMismatch
-        If a file has another digest than the one committed or recorded at its first arrival.
-    ParseError
-        If the number of records or the length of one is wrong.
-    SourceError
-        If a gzip file or the lock file is damaged.
+    ChecksumMismatch, ParseError, SourceError
+        If a file has another digest than the one committed or recorded at its first arrival, its
+        records are not those expected, or it or the lock file is damaged.
 
     Notes
     -----
-    The number of records of a file in parts is checked when its last part arrives. A file
-    with the right digest is not asked for again.
+    The number of records of a file in parts is checked when its last part arrives. A file with
+    the right digest is not asked for again. Several processes may fetch into one folder: each
+    file is downloaded by one of them, and the others wait for it.
     """
     wanted = expected_files(source, parts)
     _make_writable(folder)
@@ -184,15 +185,36 @@ def _make_writable(folder: Path) -> None:
 
 
 def _fetch_file(expected: ExpectedFile, folder: Path, options: DownloadOptions) -> FetchedFile:
-    """Take the file that is there, or else the first address that delivers."""
-    for name in expected.names:
-        if (folder / name).exists():
-            return _take_present(expected, folder / name)
+    """Take the file that is there, or else the first address that delivers.
+
+    Who holds the lock of the file is alone with its part, which can be continued later. A second
+    process waits for it and then finds the file. Where there are no locks, every process has a
+    part of its own, which no other continues.
+    """
+    mark = folder / f".{expected.names[0]}.fetching"
+    with locked(mark) as is_alone:
+        try:
+            suffix = "" if is_alone else f".{secrets.token_hex(4)}"
+            return _present(expected, folder) or _download(expected, folder, suffix, options)
+        finally:
+            mark.unlink(missing_ok=True)
+
+
+def _present(expected: ExpectedFile, folder: Path) -> FetchedFile | None:
+    found = (folder / name for name in expected.names if (folder / name).exists())
+    path = next(found, None)
+    return _take_present(expected, path) if path else None
+
+
+def _download(
+    expected: ExpectedFile, folder: Path, suffix: str, options: DownloadOptions
+) -> FetchedFile:
     failures: list[tuple[str, SourceError]] = []
     for name, url in expected.addresses:
+        own = beside(folder / name, suffix)
         try:
-            status = download(url, folder / name, options)
-            return _take_arrived(expected, folder / name, url, status)
+            status = download(url, own, options)
+            return _take_arrived(expected, own, folder / name, url, status)
         except SourceError as error:
             _logger.warning("%s: %s", url, error)
             failures.append((url, error))
@@ -228,19 +250,21 @@ def _take_present(expected: ExpectedFile, path: Path) -> FetchedFile:
     return _fetched(path, entry, entry.url, "present")
 
 
-def _take_arrived(expected: ExpectedFile, path: Path, url: str, status: Status) -> FetchedFile:
+def _take_arrived(
+    expected: ExpectedFile, own: Path, path: Path, url: str, status: Status
+) -> FetchedFile:
     """Check a file that has come, then give it its name or set it aside."""
-    part = part_of(path)
+    part = part_of(own)
     try:
         entry = examine(expected, part, path, url=url)
     except SourceError as error:
         error.path = beside(path, ".rejected")
         rename(part, error.path)
-        forget_part(path)
+        forget_part(own)
         error.args = (f"{str(error).rstrip('.')}. The file is kept as {error.path}.",)
         raise
     rename(part, path)
-    forget_part(path)
+    forget_part(own)
     return _fetched(path, entry, url, status)
 
 
