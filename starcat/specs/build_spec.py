@@ -21,6 +21,7 @@ from pydantic import (
 from starcat.errors import ConfigError, suggest
 from starcat.geometry.camera import Camera
 from starcat.resources import resource_folder
+from starcat.specs.version import NAME_PATTERN, VERSION_PATTERN
 
 Mag = Annotated[float, Field(ge=-30.0, le=40.0)]
 
@@ -305,8 +306,8 @@ class SelfTest(_Section):
 class BuildSpec(_Section):
     """Everything that a database depends on, but for its input files."""
 
-    name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]{0,63}$")
-    version: str = Field(pattern=r"^\d+\.\d+\.\d+$", description="of the data: semantic")
+    name: str = Field(pattern=NAME_PATTERN)
+    version: str = Field(pattern=VERSION_PATTERN, description="of the data: semantic")
     description: str = ""
     epoch_jyear: float = Field(ge=1800.0, le=2200.0, description="Julian year of all positions")
     catalog: Catalog
