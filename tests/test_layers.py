@@ -31,7 +31,11 @@ SINGLE_MODULES = {
 }
 
 GEOMETRY = ("attitude", "camera", "distortion", "kvector", "sphere")
-LIGHT = {"starcat.errors", *(f"starcat.geometry.{name}" for name in GEOMETRY)}
+LIGHT = {
+    "starcat.errors",
+    "starcat.storage.hdf5",
+    *(f"starcat.geometry.{name}" for name in GEOMETRY),
+}
 """What a small machine carries along with the matcher."""
 
 

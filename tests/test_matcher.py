@@ -772,16 +772,6 @@ def copy(small_artifact, tmp_path) -> Path:
     return Path(shutil.copytree(small_artifact, tmp_path / "copy", copy_function=shutil.copyfile))
 
 
-def test_a_dataset_that_is_not_contiguous_is_read(copy):
-    with h5py.File(copy / "database.h5", "r+") as file:
-        values = file["pairs/separation_rad"][()]
-        del file["pairs/separation_rad"]
-        file["pairs"].create_dataset("separation_rad", data=values, chunks=True, compression=1)
-    found = everything(copy).products["pairs"]["separation_rad"]
-    assert np.array_equal(found, values)
-    assert not isinstance(mapping_under(found), mmap.mmap)
-
-
 @pytest.mark.parametrize("method", METHODS)
 def test_a_missing_product_is_named_with_the_line_that_adds_it(copy, method):
     name = METHODS[method].products[0]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from starcat.artifact.database import INDICES, LAYOUT_VERSION, column_datasets, dataset_attributes
 from starcat.products.index import row_offsets
+from starcat.storage.hdf5 import own_dataset
 from starcat.tables.schema import ProductSchema
 
 
@@ -68,15 +69,22 @@ def group_problems(
             continue
         values = table[column.name].combine_chunks()
         for name, expected in column_datasets(column, values, star_count).items():
-            stored = group.get(name)
-            if stored is None:
+            if name not in group:
                 yield f"{group.name}/{name} is missing"
                 continue
-            if stored.dtype != expected.dtype:
-                yield f"{stored.name} holds {stored.dtype}; expected {expected.dtype}"
+            stored = _dataset(group, name)
+            if (stored.dtype, stored.shape) != (expected.dtype, expected.shape):
+                yield (
+                    f"{stored.name} holds {stored.shape} {stored.dtype}; expected "
+                    f"{expected.shape} {expected.dtype}"
+                )
             elif stored[()].tobytes() != expected.tobytes():
                 yield f"{stored.name} differs from the Parquet file"
             yield from _attribute_problems(stored, dataset_attributes(column, name))
+
+
+def _dataset(group: h5py.Group, name: str) -> h5py.Dataset:
+    return own_dataset(group, name, group.file.id.get_filesize())
 
 
 def _attribute_problems(place: Any, expected: Mapping[str, object]) -> Iterator[str]:
@@ -117,14 +125,16 @@ def index_problems(
         elif name == "kvector_counts":
             yield from _kvector_problems(group, table[schema.order[0]].to_numpy())
         elif name == "star_offsets":
-            if not np.array_equal(group[name], row_offsets(table["star"].to_numpy(), star_count)):
+            if not np.array_equal(
+                _dataset(group, name), row_offsets(table["star"].to_numpy(), star_count)
+            ):
                 yield f"{group.name}/{name} does not say where the rows of each star are"
         elif name.endswith("_offsets"):
             yield from _bin_problems(group, name.removesuffix("_offsets"), len(table))
 
 
 def _kvector_problems(group: h5py.Group, values: NDArray[Any]) -> Iterator[str]:
-    counts, place = group["kvector_counts"][()], f"{group.name}/kvector_counts"
+    counts, place = _dataset(group, "kvector_counts")[()], f"{group.name}/kvector_counts"
     line = [float(group.attrs[f"kvector_{name}"]) for name in ("intercept", "slope")]
     n = len(values)
     if len(counts) != n:
@@ -149,7 +159,7 @@ def _bin_problems(group: h5py.Group, stem: str, row_count: int) -> Iterator[str]
     place = f"{group.name}/{stem}"
     if f"{stem}_rows" not in group:
         return  # its absence is a problem of its own
-    offsets, rows = group[f"{stem}_offsets"][()], group[f"{stem}_rows"][()]
+    offsets, rows = (_dataset(group, f"{stem}_{part}")[()] for part in ("offsets", "rows"))
     ends = (offsets[0], offsets[-1]) if len(offsets) else (-1, -1)
     if ends != (0, len(rows)) or np.any(offsets[1:] < offsets[:-1]):
         yield f"{place}_offsets does not ascend from 0 to the {len(rows)} of {stem}_rows"

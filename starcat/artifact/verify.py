@@ -35,6 +35,7 @@ from starcat.artifact.table_checks import (
 from starcat.catalog.stars import directions_of
 from starcat.errors import ArtifactMissing, ProductError, StarcatError
 from starcat.storage.digests import file_sha256, json_bytes
+from starcat.storage.hdf5 import own_group
 
 T = TypeVar("T")
 
@@ -345,7 +346,8 @@ def _check_database(artifact: Artifact, held: dict[str, HeldProduct], log: _Log)
     with h5py.File(artifact.folder / DATABASE_NAME, "r") as file:
         log.run(DATABASE_NAME, "database", root_problems, file, artifact.manifest)
         for name, product in held.items():
-            if name in file:
+            group = log.get(DATABASE_NAME, name, own_group, file, name) if name in file else None
+            if group is not None:
                 for check in (group_problems, index_problems):
-                    parts = (file[name], product.table, product.schema, stars)
+                    parts = (group, product.table, product.schema, stars)
                     log.run(DATABASE_NAME, name, check, *parts)

@@ -52,6 +52,9 @@ def pull(
     lock: Annotated[Path, typer.Option(help="File that pins versions by digest.")] = Path(
         "starcat.lock"
     ),
+    max_bytes: Annotated[
+        int | None, typer.Option(min=0, help="Refuse an artifact with more bytes than this.")
+    ] = None,
     retries: Retries = 3,
     json: Json = False,
 ) -> None:
@@ -67,9 +70,9 @@ def pull(
     options = DownloadOptions(retries)
     with progress_bars() as progress:
         if locked:
-            pulled = pull_pinned(wanted, registry, output, lock, options, progress)
+            pulled = pull_pinned(wanted, registry, output, lock, options, progress, max_bytes)
         elif wanted:
-            pulled = [pull_wanted(wanted, registry, output, lock, options, progress)]
+            pulled = [pull_wanted(wanted, registry, output, lock, options, progress, max_bytes)]
         else:
             raise ConfigError("pull what? Name it, NAME@VERSION, or say --locked for all pins")
     print_pulled(pulled, as_json=json)

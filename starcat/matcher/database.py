@@ -1,12 +1,14 @@
 """The products of an artifact as the matcher holds them: arrays mapped from its HDF5 file.
 
-Only what a method needs is opened. Contiguous datasets are not read but mapped, so opening
-takes milliseconds whatever the size of the database.
+Only what a method needs is opened. Datasets are not read but mapped; every index is checked
+against its table once, when the database is opened (`starcat.matcher.layout`). A database may
+come from anywhere, so nothing that leads out of its file is followed (`starcat.storage.hdf5`).
 """
 
 from __future__ import annotations
 
 import json
+import math
 import mmap
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -18,8 +20,10 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.errors import ArtifactMissing, ProductError, SchemaVersionError
+from starcat.errors import ArtifactMissing, ProductError, SchemaVersionError, StarcatError
 from starcat.geometry.camera import Camera
+from starcat.matcher.layout import LAYOUT, check_product
+from starcat.storage.hdf5 import own_dataset, own_group
 
 Made = TypeVar("Made")
 
@@ -129,7 +133,7 @@ def open_database(artifact: Path, products: Iterable[str] = ()) -> Database:
     Raises
     ------
     ProductError
-        If there is no database, or it lacks a product.
+        If there is no database, it lacks a product, or a part of it is not what a build writes.
     SchemaVersionError
         If its layout or a product's schema is of another major version.
     """
@@ -158,7 +162,7 @@ def products_in(artifact: Path) -> tuple[str, ...]:
         If there is no readable database.
     """
     with _readable(_database_file(artifact)) as file:
-        return tuple(sorted(file))
+        return tuple(sorted(name for name in file if name in LAYOUT))
 
 
 def _database_file(artifact: Path) -> Path:
@@ -175,7 +179,15 @@ def _readable(path: Path) -> Iterator[h5py.File]:
     try:
         with h5py.File(path, "r") as file:
             yield file
-    except (OSError, KeyError, ValueError, RuntimeError) as error:
+    except ProductError as error:
+        raise ProductError(
+            str(error) if str(path) in str(error) else f"{path}: {error}",
+            product=error.product,
+            path=path,
+        ) from error
+    except StarcatError:
+        raise
+    except Exception as error:  # whatever damage makes the library raise
         raise ProductError(
             f"{path}: not a readable starcat database ({error}); build it again", path=path
         ) from error
@@ -185,43 +197,75 @@ def _read(file: h5py.File, mapped: mmap.mmap, path: Path, products: tuple[str, .
     _check_version(str(file.attrs["layout_version"]), READABLE_LAYOUT, "database", path)
     stars = _product(file, mapped, "stars", path)
     camera = json.loads(file.attrs["camera"])
+    count = len(stars["star_id"])
     return Database(
         name=f"{file.attrs['name']}-{file.attrs['version']}",
-        camera=Camera(camera["width_px"], camera["height_px"], camera["focal_length_px"]),
-        epoch_jyear=float(file.attrs["epoch_jyear"]),
+        camera=Camera(
+            _whole(camera["width_px"]),
+            _whole(camera["height_px"]),
+            _finite(camera["focal_length_px"]),
+        ),
+        epoch_jyear=_finite(file.attrs["epoch_jyear"]),
         star_id=stars["star_id"],
         directions=np.stack([stars[axis] for axis in ("x", "y", "z")], axis=-1),
         mag=stars["mag"],
         designation=stars["designation"],
-        products={name: _product(file, mapped, name, path) for name in products},
+        products={name: _product(file, mapped, name, path, count) for name in products},
     )
 
 
-def _product(file: h5py.File, mapped: mmap.mmap, name: str, path: Path) -> ProductArrays:
-    if name not in file:
+def _whole(value: Any) -> int:
+    if not isinstance(value, int) or not 0 < value < 1 << 20:
+        raise ValueError(f"a size of {str(value)[:40]} pixels")
+    return value
+
+
+def _finite(value: Any) -> float:
+    if not math.isfinite(value):
+        raise ValueError(f"a number that is {value}")
+    return float(value)
+
+
+def _product(
+    file: h5py.File, mapped: mmap.mmap, name: str, path: Path, star_count: int | None = None
+) -> ProductArrays:
+    """Return a product, its indices checked against its rows and the stars."""
+    if name not in file or name not in LAYOUT:
         raise ProductError(
             f"{path}: has no product {name!r}; set 'products.{name}.enabled = true' in its spec "
             f"and build it again, or choose a method that works with {', '.join(sorted(file))}",
             product=name,
             path=path,
         )
-    group = file[name]
-    _check_version(str(group.attrs["schema"]).rpartition("-")[2], READABLE_SCHEMAS, name, path)
+    group = own_group(file, name)
+    schema = group.attrs.get("schema")
+    if not isinstance(schema, str):
+        raise ProductError(
+            f"{path}: {name} does not name its schema; build it again", product=name, path=path
+        )
+    _check_version(schema.rpartition("-")[2], READABLE_SCHEMAS, name, path)
     numbers = {
         key: float(value)
         for key, value in group.attrs.items()
         if isinstance(value, (int, float, np.number))
     }
-    return ProductArrays({key: _map(group[key], mapped) for key in group}, numbers)
+    arrays: dict[str, NDArray[Any]] = {}
+    for key in LAYOUT[name].datasets:
+        if key not in group:
+            raise ProductError(
+                f"{path}: {name}/{key} is missing; build it again", product=name, path=path
+            )
+        arrays[key] = _map(own_dataset(group, key, len(mapped)), mapped)
+    rows = len(arrays[LAYOUT[name].columns[0]])
+    check_product(name, arrays, numbers, rows if star_count is None else star_count)
+    return ProductArrays(arrays, numbers)
 
 
 def _map(dataset: h5py.Dataset, mapped: mmap.mmap) -> NDArray[Any]:
-    """Return a dataset as a view of the mapped file; what is not contiguous is read."""
-    offset = dataset.id.get_offset()
-    if offset is None or dataset.chunks is not None:
-        return np.asarray(dataset[()])
-    count = int(np.prod(dataset.shape))
-    return np.frombuffer(mapped, dataset.dtype, count, offset).reshape(dataset.shape)
+    """Return a dataset of `own_dataset` as a view of the mapped file."""
+    count = dataset.shape[0]
+    offset = dataset.id.get_offset() if count else 0
+    return np.frombuffer(mapped, dataset.dtype, count, offset)
 
 
 def _check_version(found: str, readable: int, product: str, path: Path) -> None:

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from starcat.errors import ConfigError, ProductError
 from starcat.progress import Progress, no_progress
-from starcat.releases.lockfile import pin_of, pinned_registry, prepare, read_pins, write_pin
+from starcat.releases.lockfile import Pin, pin_of, pinned_registry, prepare, read_pins, write_pin
 from starcat.releases.pulling import Pulled, pull_release
 from starcat.releases.registry import open_registry
-from starcat.releases.tree import choose, parse_wanted
+from starcat.releases.tree import Release, choose, parse_wanted
 from starcat.storage.download import DownloadOptions
 
 
@@ -20,6 +20,7 @@ def pull_wanted(
     lock: Path,
     options: DownloadOptions | None = None,
     progress: Progress = no_progress,
+    max_bytes: int | None = None,
 ) -> Pulled:
     """Pull what a registry lists, and pin it.
 
@@ -37,6 +38,8 @@ def pull_wanted(
         How to download.
     progress : Progress
         Called with ("pull <name>", bytes done, bytes in all).
+    max_bytes : int, optional
+        An artifact whose files have more together is refused before they are brought.
 
     Returns
     -------
@@ -57,26 +60,36 @@ def pull_wanted(
     """
     name, version = parse_wanted(wanted)
     pin = read_pins(lock).get(name)
-    if registry is None and pin is None:
+    opened = open_registry(registry or _registry_of(lock, name, pin), options)
+    release = choose(opened.releases(), name, version, opened.address)
+    _check_pin(lock, pin, release, opened.address)
+    prepare(lock)
+    pulled = pull_release(opened, release, output, progress, max_bytes)
+    write_pin(lock, release, opened.address)
+    return pulled
+
+
+def _registry_of(lock: Path, name: str, pin: Pin | None) -> str:
+    """Return where an artifact was pulled from before."""
+    if pin is None:
         raise ConfigError(
             f"{lock} does not pin {name}, so nothing says where it comes from; name a folder or "
             "an address with --registry",
             key="registry",
         )
-    opened = open_registry(registry or (pinned_registry(lock, pin) if pin else ""), options)
-    release = choose(opened.releases(), name, version, opened.address)
+    return pinned_registry(lock, pin)
+
+
+def _check_pin(lock: Path, pin: Pin | None, release: Release, address: str) -> None:
+    """Refuse a version that is pinned with another content."""
     if pin and pin.version == release.version and pin.manifest != release.manifest:
         raise ProductError(
-            f"{opened.address}: the manifest of {release.title} is "
+            f"{address}: the manifest of {release.title} is "
             f"{release.manifest.sha256[:12]}; {lock} pins {pin.manifest.sha256[:12]}. A published "
             "version never changes: find out who changed it, or remove the entry from the lock "
             "file to accept it",
             path=lock,
         )
-    prepare(lock)
-    pulled = pull_release(opened, release, output, progress)
-    write_pin(lock, release, opened.address)
-    return pulled
 
 
 def pull_pinned(
@@ -86,6 +99,7 @@ def pull_pinned(
     lock: Path,
     options: DownloadOptions | None = None,
     progress: Progress = no_progress,
+    max_bytes: int | None = None,
 ) -> list[Pulled]:
     """Pull exactly what a lock file says; no index is read, and the lock file stays.
 
@@ -103,6 +117,8 @@ def pull_pinned(
         How to download.
     progress : Progress
         Called with ("pull <name>", bytes done, bytes in all).
+    max_bytes : int, optional
+        An artifact whose files have more together is refused before they are brought.
 
     Returns
     -------
@@ -130,7 +146,11 @@ def pull_pinned(
         chosen = [pin_of(lock, pins, *parse_wanted(wanted))]
     return [
         pull_release(
-            open_registry(registry or pinned_registry(lock, pin), options), pin, output, progress
+            open_registry(registry or pinned_registry(lock, pin), options),
+            pin,
+            output,
+            progress,
+            max_bytes,
         )
         for pin in chosen
     ]

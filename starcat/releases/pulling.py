@@ -21,7 +21,7 @@ from starcat.errors import OutputError, ProductError, SchemaError
 from starcat.progress import Progress, no_progress
 from starcat.releases.files import locked
 from starcat.releases.registry import Registry
-from starcat.releases.tree import DAMAGED, Blob, Release, files_of
+from starcat.releases.tree import DAMAGED, MAX_MANIFEST_BYTES, Blob, Release, files_of
 from starcat.storage.atomic import move_into_place, sync, writing
 from starcat.storage.digests import file_sha256
 from starcat.storage.download import part_of
@@ -68,7 +68,11 @@ class Pulled:
 
 
 def pull_release(
-    registry: Registry, release: Release, output: Path, progress: Progress = no_progress
+    registry: Registry,
+    release: Release,
+    output: Path,
+    progress: Progress = no_progress,
+    max_bytes: int | None = None,
 ) -> Pulled:
     """Pull a release into a folder.
 
@@ -82,6 +86,8 @@ def pull_release(
         Folder to put ``<name>-<version>/`` into.
     progress : Progress
         Called with ("pull <name>", bytes done, bytes in all).
+    max_bytes : int, optional
+        A release whose files have more together is refused before they are brought.
 
     Returns
     -------
@@ -91,7 +97,8 @@ def pull_release(
     Raises
     ------
     OutputError
-        If something else has the name there, or the folder cannot be written to.
+        If something else has the name there, the folder cannot be written to, or the release is
+        larger than it may be or than the disk has room for.
     DownloadError
         If a file does not come; what has arrived is kept.
     ProductError
@@ -108,7 +115,7 @@ def pull_release(
     ):
         if _is_there(final, release):  # another pull was faster, or killed after the last step
             return Pulled(release, registry.address, final, "unchanged")
-        whole = _assemble(registry, release, place, progress)
+        whole = _assemble(registry, release, place, progress, max_bytes)
         move_into_place(whole, final, replace=False)
         sync(output)
     return Pulled(release, registry.address, final, "pulled")
@@ -153,11 +160,22 @@ def _workplace(final: Path, release: Release) -> Iterator[Path]:
         shutil.rmtree(place, ignore_errors=True)
 
 
-def _assemble(registry: Registry, release: Release, place: Path, progress: Progress) -> Path:
+def _assemble(
+    registry: Registry,
+    release: Release,
+    place: Path,
+    progress: Progress,
+    max_bytes: int | None,
+) -> Path:
     """Bring what is missing of a release, and return its folder, found whole."""
     whole, stage = place / "artifact", f"pull {release.name}"
     where = f"{registry.address}: {release.title}"
     _remove_links(place)
+    if release.manifest.bytes > MAX_MANIFEST_BYTES:
+        raise ProductError(
+            f"{where}: a manifest of {release.manifest.bytes:,} bytes; expected at most "
+            f"{MAX_MANIFEST_BYTES:,}; {DAMAGED}"
+        )
     _bring(registry, release.manifest, whole / MANIFEST_NAME, place)
     manifest = parse_manifest((whole / MANIFEST_NAME).read_bytes(), where, DAMAGED)
     if (manifest["name"], manifest["version"]) != (release.name, release.version):
@@ -168,6 +186,7 @@ def _assemble(registry: Registry, release: Release, place: Path, progress: Progr
     files = files_of(manifest, where)
     _remove_unlisted(whole, files)
     done, total = 0, sum(blob.bytes for blob in files.values())
+    _check_size(where, release.manifest.bytes + total, place, max_bytes)
     for name, blob in files.items():
         _bring(registry, blob, whole / name, place, _from(done, total, stage, progress))
         done += blob.bytes
@@ -179,6 +198,24 @@ def _assemble(registry: Registry, release: Release, place: Path, progress: Progr
             "publish that"
         )
     return whole
+
+
+def _check_size(where: str, total: int, place: Path, max_bytes: int | None) -> None:
+    """Refuse a release that is larger than it may be, or than the disk has room for."""
+    if max_bytes is not None and total > max_bytes:
+        raise OutputError(
+            f"{where}: {total:,} bytes; --max-bytes allows {max_bytes:,}. Allow more if you trust "
+            "the registry",
+            path=place.parent,
+        )
+    there = sum(path.stat().st_size for path in place.rglob("*") if path.is_file())
+    free = shutil.disk_usage(place).free
+    if total - there > free:
+        raise OutputError(
+            f"{where}: {total - there:,} bytes are still to come, and {place.parent} has room for "
+            f"{free:,}; make room, or choose another --output",
+            path=place.parent,
+        )
 
 
 def _from(offset: int, total: int, stage: str, progress: Progress) -> Progress:

@@ -67,13 +67,18 @@ class FolderRegistry:
         """
         path = self.root / INDEX_NAME
         try:
-            data = path.read_bytes()
+            with path.open("rb") as file:
+                data = file.read(MAX_INDEX_BYTES + 1)
         except OSError as error:
             raise SourceMissing(
                 f"{self.root}: no registry, {INDEX_NAME} cannot be read ({reason(error)}); "
                 "'starcat publish' makes one",
                 path=path,
             ) from error
+        if len(data) > MAX_INDEX_BYTES:
+            raise ProductError(
+                f"{path}: longer than {MAX_INDEX_BYTES} bytes; the registry is damaged", path=path
+            )
         return read_index(data, str(path))
 
     def bring(self, blob: Blob, path: Path, progress: Progress) -> None:
@@ -240,8 +245,13 @@ def is_address(text: str) -> bool:
     """
     if "://" not in text:
         return False
-    address = urlsplit(text)
-    if address.scheme not in ("http", "https") or address.query or address.fragment:
+    try:
+        address = urlsplit(text)
+        is_usable = address.scheme in ("http", "https") and bool(address.hostname)
+        is_usable &= not (address.query or address.fragment) and address.port != 0
+    except ValueError:  # brackets without a pair, or a port that is no number
+        is_usable = False
+    if not is_usable:
         raise ConfigError(
             f"registry {text!r}: expected a folder, or an address that begins with http:// or "
             "https:// and has no ? or #",

@@ -17,20 +17,21 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 
 from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.errors import ConfigError, ProductError, SchemaVersionError, SourceMissing
+from starcat.specs.version import NAME_PATTERN, VERSION_PATTERN
 from starcat.storage.digests import json_bytes
 
 INDEX_NAME = "index.json"
 REGISTRY_VERSION = "1.0.0"
 LATEST = "latest"
-MAX_INDEX_BYTES = 1 << 26
+MAX_INDEX_BYTES = MAX_MANIFEST_BYTES = 1 << 26
+"""More than any index or manifest has: a longer one is refused, not read."""
 
-_NUMBER = r"(0|[1-9][0-9]{0,17})"
 _STEP = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}"
 _FILE_NAME = re.compile(rf"{_STEP}(/{_STEP}){{0,7}}")
 _M = TypeVar("_M", bound=BaseModel)
 
-Name = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9-]{0,63}$")]
-Version = Annotated[str, StringConstraints(pattern=rf"^{_NUMBER}\.{_NUMBER}\.{_NUMBER}$")]
+Name = Annotated[str, StringConstraints(pattern=NAME_PATTERN)]
+Version = Annotated[str, StringConstraints(pattern=VERSION_PATTERN)]
 
 
 class _Model(BaseModel):

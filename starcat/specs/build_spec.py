@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 from starcat.geometry.camera import Camera
 from starcat.specs.product_sections import Products
 from starcat.specs.section import FieldDeg, Mag, Section
+from starcat.specs.version import NAME_PATTERN, VERSION_PATTERN
 
 
 class Catalog(Section):
@@ -184,12 +185,12 @@ class BuildSpec(Section):
     """Everything that a database depends on, but for its input files."""
 
     name: str = Field(
-        pattern=r"^[a-z0-9][a-z0-9-]{0,63}$",
+        pattern=NAME_PATTERN,
         description="name of the artifact: small letters, digits and hyphens",
         examples=["mycam"],
     )
     version: str = Field(
-        pattern=r"^\d+\.\d+\.\d+$",
+        pattern=VERSION_PATTERN,
         description="version of the data. Patch: other stars. Minor: a new product. Major: "
         "another layout, unit or frame",
         examples=["1.0.0"],

@@ -37,6 +37,7 @@ Arrival = Literal["downloaded", "resumed"]
 _logger = logging.getLogger(__name__)
 _BLOCK_BYTES = 1 << 18
 _LONGEST_WAIT_S = 60.0
+_SIZE = "[0-9]{1,18}"
 
 
 class NotFound(DownloadError):  # noqa: N818 - the name reads as the fact
@@ -130,23 +131,24 @@ def download(url: str, path: Path, options: DownloadOptions) -> Arrival:
     """
     reason: Exception | None = None
     attempts = 1 + max(0, options.retries)
+    is_ftp = url.lower().startswith("ftp:")
     for attempt in range(attempts):
         if attempt:
             time.sleep(min(options.backoff_s * 2.0 ** (attempt - 1), _LONGEST_WAIT_S))
         try:
-            if urlsplit(url).scheme == "ftp":
+            if is_ftp:
                 _transfer_ftp(url, path, options)
                 return "downloaded"
             return "resumed" if _transfer_http(url, path, options) else "downloaded"
         except _Refused as error:
             kind = NotFound if error.status in (404, 410) else DownloadError
-            raise kind(f"{error}") from error
+            raise kind(_short(str(error))) from error
         except ftplib.error_perm as error:
-            raise DownloadError(f"{error}") from error
+            raise DownloadError(_short(str(error))) from error
         except _WORTH_A_RETRY as error:
             _logger.info("%s, attempt %d: %s", url, attempt + 1, error)
             reason = error
-    raise DownloadError(f"{reason} (attempts: {attempts})") from reason
+    raise DownloadError(f"{_short(str(reason))} (attempts: {attempts})") from reason
 
 
 def _transfer_http(url: str, path: Path, options: DownloadOptions) -> bool:
@@ -159,7 +161,9 @@ def _transfer_http(url: str, path: Path, options: DownloadOptions) -> bool:
     if state:
         headers |= {"Range": f"bytes={there}-"}
         headers |= {} if state.is_fixed else {"If-Range": state.validator}
-    with requests.get(url, headers=headers, stream=True, timeout=options.timeout_s) as response:
+    with _understood():
+        answer = requests.get(url, headers=headers, stream=True, timeout=options.timeout_s)
+    with answer as response:
         if not state or response.status_code not in (206, 416):
             _receive_whole(response, url, path, options)
             return False
@@ -174,7 +178,8 @@ def _transfer_http(url: str, path: Path, options: DownloadOptions) -> bool:
 def _continues(response: requests.Response, state: _PartState, there: int) -> bool:
     """Tell whether a partial answer begins where the part ends, in the same version."""
     found = re.fullmatch(
-        r"bytes (\d+)-(\d+)/(\d+|\*)", response.headers.get("Content-Range", "").strip()
+        rf"bytes ({_SIZE})-({_SIZE})/({_SIZE}|\*)",
+        response.headers.get("Content-Range", "").strip(),
     )
     if response.status_code != 206 or found is None or int(found[1]) != there:
         return False
@@ -189,7 +194,7 @@ def _receive_whole(
     response: requests.Response, url: str, path: Path, options: DownloadOptions
 ) -> None:
     """Take an answer that begins at the first byte, noting what a later part must match."""
-    answer = f"the server answered {response.status_code} {response.reason}"
+    answer = f"the server answered {response.status_code} {_short(response.reason or '')}"
     if response.status_code >= 500 or response.status_code in (408, 429):
         raise _Broken(answer)
     if response.status_code != 200:
@@ -197,8 +202,10 @@ def _receive_whole(
     packed = response.headers.get("Content-Encoding", "identity") != "identity"
     if packed and not path.name.endswith(".gz"):
         raise _Refused("the server packs the body although it was asked not to")
-    length = response.headers.get("Content-Length", "")
-    total = int(length) if length.isdecimal() else options.fixed_bytes
+    length = response.headers.get("Content-Length")
+    if length is not None and not re.fullmatch(_SIZE, length):
+        raise _Refused(f"the server says that the file has {_short(length)!r} bytes")
+    total = options.fixed_bytes if length is None else int(length)
     if options.fixed_bytes not in (None, total):
         raise _Refused(f"the server has {total} bytes; expected {options.fixed_bytes}")
     forget_part(path)
@@ -229,7 +236,7 @@ def _receive(
     with _appending(part_of(path), path.name, there, total, options.progress) as write:
         try:
             # As sent: a .gz is not unpacked, whatever its headers say.
-            while block := response.raw.read1(_BLOCK_BYTES, decode_content=False):
+            while block := _next_block(response):
                 if limits and done + len(block) > min(limits):
                     raise _Refused(f"the body is longer than {min(limits)} bytes")
                 done = write(block)
@@ -238,6 +245,33 @@ def _receive(
             raise _Broken(reason) from error
     if total is not None and done != total:
         raise _Broken(f"received {done} of {total} bytes")
+
+
+def _next_block(response: requests.Response) -> bytes:
+    with _understood():
+        block: bytes = response.raw.read1(_BLOCK_BYTES, decode_content=False)
+    return block
+
+
+@contextmanager
+def _understood() -> Iterator[None]:
+    """Turn what the libraries of HTTP raise about a malformed answer into a refusal.
+
+    A broken connection is worth another attempt and passes. Anything else, such as what a
+    redirect to no address raises, would come again.
+    """
+    try:
+        yield
+    except _WORTH_A_RETRY:
+        raise
+    except Exception as error:
+        what = f"{type(error).__name__}: {_short(str(error))}"
+        raise _Refused(f"the server's answer makes no sense ({what})") from error
+
+
+def _short(text: str) -> str:
+    """Return the beginning of a text that somebody else chose."""
+    return text if len(text) <= 200 else f"{text[:200]}..."
 
 
 def _transfer_ftp(url: str, path: Path, options: DownloadOptions) -> None:

@@ -1,0 +1,102 @@
+"""Opening parts of an HDF5 file that somebody else may have made.
+
+HDF5 can say that a part of a file is somewhere else: links lead to other files, datasets are
+stored in raw files beside it or put together from others, and a declared shape need not have
+anything behind it. What is opened here lies in the file itself, as one piece.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from starcat.errors import ProductError
+
+NUMBERS_AND_TEXTS = "iufS"
+"""Kinds of dtype that a dataset may have: integers, floats and texts of a fixed width."""
+
+
+def own_group(file: Any, name: str) -> Any:
+    """Return a group of a file.
+
+    Parameters
+    ----------
+    file : h5py.File
+        Open for reading.
+    name : str
+        A name that the file has.
+
+    Returns
+    -------
+    h5py.Group
+        The group.
+
+    Raises
+    ------
+    ProductError
+        If the name is a link to somewhere else, or something else than a group.
+    """
+    group = _own(file, name)
+    if not hasattr(group, "keys"):
+        raise _refused(group.name, "no group")
+    return group
+
+
+def own_dataset(group: Any, name: str, file_bytes: int) -> Any:
+    """Return a dataset whose values lie in the file, one behind the other.
+
+    Parameters
+    ----------
+    group : h5py.Group
+        A group of `own_group`.
+    name : str
+        A name that the group has.
+    file_bytes : int
+        Size of the file.
+
+    Returns
+    -------
+    h5py.Dataset
+        One-dimensional, contiguous, of integers, floats or texts of a fixed width. Nothing of it
+        has been read.
+
+    Raises
+    ------
+    ProductError
+        If it is anything else; the message names it.
+    """
+    dataset = _own(group, name)
+    place = f"{group.name}/{name}"
+    if not hasattr(dataset, "shape"):
+        raise _refused(place, "no dataset")
+    if dataset.is_virtual or dataset.external is not None:
+        raise _refused(place, "stored in other files")
+    if dataset.chunks is not None:
+        raise _refused(place, "stored in chunks")
+    try:
+        dtype = dataset.dtype
+    except (TypeError, ValueError, KeyError) as error:
+        raise _refused(place, f"of a type that numpy lacks ({error})") from error
+    if dtype.kind not in NUMBERS_AND_TEXTS or not dtype.isnative:
+        raise _refused(place, f"of type {dtype}")
+    if dataset.shape is None or len(dataset.shape) != 1:
+        raise _refused(place, f"of shape {dataset.shape}")
+    size = dataset.shape[0] * dtype.itemsize
+    offset = dataset.id.get_offset()
+    if size and (offset is None or offset + size > file_bytes):
+        raise _refused(place, f"declared with {size} bytes, which are not in the file")
+    return dataset
+
+
+def _own(group: Any, name: str) -> Any:
+    """Return what a hard link of a group leads to; other links may lead anywhere."""
+    link = type(group.get(name, getlink=True)).__name__
+    if link != "HardLink":
+        raise _refused(f"{group.name.rstrip('/')}/{name}", f"a link to somewhere else ({link})")
+    return group[name]
+
+
+def _refused(place: str, what: str) -> ProductError:
+    return ProductError(
+        f"{place} is {what}; expected what 'starcat build' writes, one piece in the file itself. "
+        "Build the artifact again, or get it from somebody you trust"
+    )

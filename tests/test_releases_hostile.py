@@ -1,0 +1,340 @@
+"""Registries that answer with nonsense, and systems that lack what POSIX has."""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import shutil
+import socketserver
+import subprocess
+import sys
+import threading
+import tomllib
+from collections import namedtuple
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from starcat.errors import ConfigError, DownloadError, OutputError, ProductError, StarcatError
+from starcat.releases import files
+from starcat.releases.project import pull_pinned, pull_wanted
+from starcat.releases.publishing import publish_artifact
+from starcat.releases.registry import FolderRegistry, open_registry
+from starcat.releases.tree import MAX_INDEX_BYTES, MAX_MANIFEST_BYTES, Blob, parse_wanted
+from starcat.specs.build_spec import spec_from_dict
+from starcat.storage.digests import file_sha256, json_bytes
+from starcat.storage.download import DownloadOptions, download, part_of
+
+ONCE = DownloadOptions(retries=0, timeout_s=5.0, backoff_s=0.0)
+
+
+@contextmanager
+def answering(*answers: bytes) -> Iterator[str]:
+    """A server that sends these bytes, one answer a connection, the last one again and again."""
+    waiting = list(answers)
+
+    class Handler(socketserver.StreamRequestHandler):
+        def handle(self) -> None:
+            while self.rfile.readline().strip():
+                pass
+            self.wfile.write(waiting.pop(0) if len(waiting) > 1 else waiting[0])
+
+    class Server(socketserver.ThreadingTCPServer):
+        daemon_threads = True
+        allow_reuse_address = True
+
+        def handle_error(self, *_: object) -> None:
+            """The client has gone: that is what is tested."""
+
+    with Server(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_address[1]}"
+        server.shutdown()
+        thread.join()
+
+
+def head(status: str = "200 OK", **fields: str) -> bytes:
+    lines = [f"HTTP/1.1 {status}", "Connection: close"]
+    lines += [f"{name.replace('_', '-')}: {value}" for name, value in fields.items()]
+    return "\r\n".join([*lines, "", ""]).encode("latin-1")
+
+
+REDIRECTS = [
+    "http://[::1",
+    "http://[bad]/x",
+    "http://:99999999/",
+    "http://127.0.0.1:notaport/",
+    "http://" + "a" * 70 + ".example/",
+    "http://a..b/",
+    "http://\xff\xfe/",
+    "//",
+    "http://",
+    "file:///etc/passwd",
+    "ftp://127.0.0.1/x",
+    "x" * 3000,
+    "http://%",
+    "http:///x",
+    "http://user:pass@[/",
+]
+ANSWERS: dict[str, bytes] = {
+    **{f"redirect to {where[:20]!r}": head("302 Found", Location=where) for where in REDIRECTS},
+    "length of 5,000 digits": head(Content_Length="9" * 5000) + b"{}",
+    "length of other digits": head(Content_Length="\xb2") + b"{}",
+    "length below nothing": head(Content_Length="-1") + b"{}",
+    "two lengths": head(Content_Length="2, 3") + b"{}",
+    "length that is a word": head(Content_Length="two") + b"{}",
+    "no answer": b"",
+    "no HTTP": b"SSH-2.0-OpenSSH\r\n\r\n",
+    "no status": b"HTTP/1.1\r\n\r\n",
+    "status of words": b"HTTP/1.1 fine OK\r\n\r\n{}",
+    "status of 5,000 digits": b"HTTP/1.1 " + b"2" * 5000 + b" OK\r\n\r\n{}",
+    "reason of 50,000 letters": b"HTTP/1.1 404 " + b"x" * 50_000 + b"\r\n\r\n",
+    "endless line": b"HTTP/1.1 200 OK\r\nX: " + b"x" * 200_000 + b"\r\n\r\n{}",
+    "1,000 fields": b"HTTP/1.1 200 OK\r\n" + b"A: b\r\n" * 1000 + b"\r\n{}",
+    "chunk of no size": head(Transfer_Encoding="chunked") + b"zz\r\n{}\r\n0\r\n\r\n",
+    "chunk below nothing": head(Transfer_Encoding="chunked") + b"-5\r\n{}\r\n0\r\n\r\n",
+    "chunk of 5,000 digits": head(Transfer_Encoding="chunked") + b"f" * 5000 + b"\r\n{}\r\n",
+    "unknown coding": head(Transfer_Encoding="nonsense", Content_Encoding="nonsense") + b"{}",
+    "odd cookie": head(Set_Cookie='a="\x01; expires=99999999999999999999') + b"{}",
+}
+
+
+# The libraries leave the sockets of answers that they cannot read to be closed by Python.
+leaves_sockets = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+
+
+@leaves_sockets
+@pytest.mark.parametrize("answer", ANSWERS)
+def test_nonsense_of_a_server_is_an_error_of_starcat(answer: str, tmp_path: Path) -> None:
+    with answering(ANSWERS[answer]) as address, pytest.raises(StarcatError) as caught:
+        open_registry(address, ONCE).releases()
+    text = str(caught.value)
+    assert address in text
+    assert len(text) < 1000
+    gc.collect()
+
+
+@leaves_sockets
+@pytest.mark.parametrize("answer", ANSWERS)
+def test_nonsense_in_place_of_a_blob_is_an_error_of_starcat(answer: str, tmp_path: Path) -> None:
+    with answering(ANSWERS[answer]) as address, pytest.raises(StarcatError):
+        open_registry(address, ONCE).bring(
+            Blob(sha256="0" * 64, bytes=10), tmp_path / "blob", lambda *_: None
+        )
+    gc.collect()
+
+
+def test_nonsense_where_a_part_goes_on(tmp_path: Path) -> None:
+    part_of(tmp_path / "blob").write_bytes(b"12345")
+    ranges = ["bytes 5-9/" + "9" * 5000, "bytes ٥-9/10", "bytes 5-9/10/11", "bytes */*", "x"]
+    for text in ranges:
+        answer = head("206 Partial Content", Content_Range=text.encode().decode("latin-1"))
+        with answering(answer + b"67890", head(Content_Length="10") + b"1234567890") as address:
+            assert download(address, tmp_path / "blob", DownloadOptions(fixed_bytes=10)) == (
+                "downloaded"
+            )
+        assert part_of(tmp_path / "blob").read_bytes() == b"1234567890"
+        part_of(tmp_path / "blob").write_bytes(b"12345")
+
+
+@pytest.mark.parametrize("fixed", [None, 100])
+def test_a_body_without_end_is_not_read_on(fixed: int | None, tmp_path: Path) -> None:
+    endless = head() + b"x" * (1 << 22)
+    options = DownloadOptions(retries=0, fixed_bytes=fixed, most_bytes=1 << 20)
+    with answering(endless) as address, pytest.raises(DownloadError, match="longer than"):
+        download(address, tmp_path / "blob", options)
+    # A block more than allowed has come at most, and is not written.
+    assert part_of(tmp_path / "blob").stat().st_size <= (fixed or 1 << 20)
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "http://[::1",
+        "http://[x]/",
+        "http://host:port/",
+        "http://host:99999999/",
+        "http://",
+        "https:///x",
+    ],
+)
+def test_addresses_that_are_none(address: str) -> None:
+    with pytest.raises(ConfigError, match="expected a folder, or an address"):
+        open_registry(address)
+
+
+# How much ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def registry(small_artifact: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    publish_artifact(small_artifact, "registry")
+    return Path("registry")
+
+
+def pull(registry: Path | str, max_bytes: int | None = None) -> Path:
+    lock, output = Path("starcat.lock"), Path("out")
+    return pull_wanted("small", str(registry), output, lock, ONCE, max_bytes=max_bytes).folder
+
+
+def declare(registry: Path, bytes_: int) -> None:
+    """Have the manifest of the registry declare a database of so many bytes."""
+    path = registry / "versions/small/1.0.0.json"
+    release = json.loads(path.read_bytes())
+    blob = registry / Blob(**release["manifest"]).path
+    manifest = json.loads(blob.read_bytes())
+    manifest["files"]["database.h5"]["bytes"] = bytes_
+    put_manifest(registry, json_bytes(manifest))
+
+
+def put_manifest(registry: Path, data: bytes, declared: int | None = None) -> None:
+    (registry / "new").write_bytes(data)
+    held = {"sha256": file_sha256(registry / "new"), "bytes": declared or len(data)}
+    target = registry / Blob(sha256=held["sha256"], bytes=0).path
+    target.parent.mkdir(exist_ok=True)
+    (registry / "new").replace(target)
+    index = json.loads((registry / "index.json").read_bytes())
+    index["releases"][0]["manifest"] = held
+    (registry / "index.json").write_bytes(json_bytes(index))
+
+
+def test_more_than_the_disk_has_room_for_is_not_begun(registry: Path) -> None:
+    declare(registry, 10**15)
+    with pytest.raises(
+        OutputError, match=r"1,000,000,00\d,\d+,\d+ bytes are still to come, and out"
+    ):
+        pull(registry)
+    assert not list(Path("out").rglob("database.h5*"))
+
+
+def test_what_is_there_already_needs_no_room(
+    registry: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(0, 0, 1000))
+    with pytest.raises(OutputError, match="has room for 1,000;"):
+        pull(registry)
+    place = next(Path("out").glob(".small-*.partial"))
+    for blob in registry.glob("blobs/sha256/*/*"):
+        (place / "parts").mkdir(exist_ok=True)
+        shutil.copyfile(blob, part_of(place / "parts" / blob.name))
+    assert pull(registry).name == "small-1.0.0"
+
+
+def test_the_user_says_how_much(registry: Path, starcat: Any) -> None:
+    ran = starcat(["pull", "small", "--registry", "registry", "-o", "out", "--max-bytes", 1000])
+    assert ran.code == 1
+    assert "bytes; --max-bytes allows 1,000. Allow more if you trust the registry" in ran.err
+    assert not list(Path("out").rglob("*.parquet"))
+    size = sum(path.stat().st_size for path in registry.glob("blobs/sha256/*/*"))
+    assert (
+        starcat(["pull", "small", "--registry", "registry", "-o", "out", "--max-bytes", size]).code
+        == 0
+    )
+    with pytest.raises(OutputError, match="--max-bytes allows"):
+        pull_pinned(None, None, Path("other"), Path("starcat.lock"), max_bytes=1000)
+
+
+def test_a_manifest_too_large_to_be_one_is_not_brought(registry: Path) -> None:
+    put_manifest(registry, b"{}", MAX_MANIFEST_BYTES + 1)
+    with pytest.raises(ProductError, match="a manifest of 67,108,865 bytes"):
+        pull(registry)
+
+
+def test_an_index_too_large_to_be_one_is_not_read(registry: Path) -> None:
+    os.truncate(registry / "index.json", MAX_INDEX_BYTES + 1)
+    with pytest.raises(ProductError, match="longer than"):
+        FolderRegistry(registry).releases()
+
+
+# Versions ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "version",
+    [
+        "01.2.3",
+        "1.02.3",
+        "1.2.03",
+        "１.2.3",
+        "1.2.3\n",
+        "1.2",
+        "1.2.3.4",
+        "٣.0.0",
+        "9" * 19 + ".0.0",
+    ],
+)
+def test_a_spec_and_a_registry_refuse_the_same_versions(version: str, small_spec: str) -> None:
+    content = tomllib.loads(small_spec) | {"version": version}
+    with pytest.raises(ConfigError, match="version"):
+        spec_from_dict(content, "spec.toml")
+    with pytest.raises(ConfigError, match="is not NAME@VERSION"):
+        pull_wanted(f"small@{version}", "registry", Path("out"), Path("lock"))
+
+
+@pytest.mark.parametrize("version", ["0.0.0", "1.10.0", "10.20.30", "9" * 18 + ".0.0"])
+def test_a_spec_and_a_registry_take_the_same_versions(version: str, small_spec: str) -> None:
+    content = tomllib.loads(small_spec) | {"version": version}
+    assert spec_from_dict(content, "spec.toml").version == version
+    assert parse_wanted(f"small@{version}") == ("small", version)
+
+
+# Systems without POSIX --------------------------------------------------------------------------
+
+WITHOUT_POSIX = """
+import os, sys
+sys.modules["fcntl"] = sys.modules["resource"] = None
+for name in ("O_NOFOLLOW", "O_NONBLOCK", "pread", "pwrite"):
+    delattr(os, name)
+from pathlib import Path
+from starcat.releases.project import pull_wanted
+from starcat.releases.publishing import publish_artifact
+from starcat.releases import files
+assert files.fcntl is None and not files._WITHOUT_LINKS
+print(publish_artifact(Path(sys.argv[1]), "registry").outcome)
+print(pull_wanted("small", "registry", Path("out"), Path("starcat.lock")).outcome)
+print(pull_wanted("small", "registry", Path("out"), Path("starcat.lock")).outcome)
+"""
+
+
+def test_publish_and_pull_without_what_posix_has(small_artifact: Path, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_POSIX, str(small_artifact)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert done.stdout.split() == ["published", "pulled", "unchanged"], done.stderr
+    assert (tmp_path / "starcat.lock").is_file()
+
+
+def test_links_are_refused_where_the_system_cannot_refuse_them(
+    registry: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files, "_WITHOUT_LINKS", 0)
+    blob = max(registry.glob("blobs/sha256/*/*"), key=lambda path: path.stat().st_size)
+    blob.rename("elsewhere")
+    blob.symlink_to(Path("elsewhere").absolute())
+    with pytest.raises(ProductError, match="a symbolic link; expected a file"):
+        pull(registry)
+
+
+def test_a_file_that_grows_is_not_copied_on(tmp_path: Path) -> None:
+    source, part = tmp_path / "source", tmp_path / "part"
+    source.write_bytes(b"x" * 100)
+    blob = Blob(sha256=file_sha256(source), bytes=100)
+
+    def grow(stage: str, done: int, total: int | None) -> None:
+        with source.open("ab") as file:
+            file.write(b"x" * 100)
+
+    files.copy_to_part(source, blob, part, grow)
+    assert part.stat().st_size == 100
