@@ -292,7 +292,7 @@ def test_the_page_says_what_the_camera_sees_and_rounds_means(
     page: Page, report: dict[str, Any]
 ) -> None:
     assert ["camera", "512 x 512 px, 20 x 20 deg"] in page.tables[0]
-    means = [t for t in page.tables if t[0][0] == "in a field"][0]
+    means = next(t for t in page.tables if t[0][0] == "in a field")
     assert [row[4] for row in means[1:]] == [
         f"{report['coverage'][kind]['mean']:,.1f}" for kind in ("stars", "pairs", "triangles")
     ]
