@@ -1,5 +1,8 @@
 """The documentation site: Markdown pages of this folder, built by ``make docs``."""
 
+from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
+
 from starcat.version import __version__
 
 project = "starcat"
@@ -11,8 +14,8 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
-    "sphinx.ext.mathjax",
 ]
+html_math_renderer = "mathml"
 myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 3
 
@@ -30,3 +33,21 @@ html_title = f"starcat {__version__}"
 html_show_copyright = False
 html_copy_source = False
 exclude_patterns = ["figures"]
+
+
+def write_inline(page, node):
+    """Write a formula of the text as MathML, which browsers draw without a script."""
+    page.body.append(tex2mathml(node.astext()))
+    raise nodes.SkipNode
+
+
+def write_block(page, node):
+    """Write a formula that stands by itself."""
+    formula = tex2mathml(node.astext().strip(), as_block=True)
+    page.body.append(f'<div class="math">{formula}</div>\n')
+    raise nodes.SkipNode
+
+
+def setup(app):
+    """Take the two in place of MathJax, which would be loaded from another server."""
+    app.add_html_math_renderer("mathml", (write_inline, None), (write_block, None))

@@ -60,12 +60,33 @@ def test_links_between_pages_lead_somewhere():
             assert (page.parent / target).exists(), f"{page.name}: {target}"
 
 
-def test_the_site_builds_without_a_warning(tmp_path):
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The built site; warnings are errors."""
+    folder = tmp_path_factory.mktemp("site")
     # In a process of its own: Sphinx 9 itself uses what Python will drop.
     made = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"]
     done = subprocess.run(
-        [*made, ROOT / "docs", tmp_path], capture_output=True, text=True, check=False
+        [*made, ROOT / "docs", folder], capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stderr) == (0, "")
+    return folder
+
+
+def test_the_site_has_every_page(site):
     every = {page.stem for page in (ROOT / "docs").glob("*.md")}
-    assert every == {page.stem for page in tmp_path.glob("*.html")} - {"genindex", "search"}
+    assert every == {page.stem for page in site.glob("*.html")} - {"genindex", "search"}
+
+
+def test_the_site_loads_nothing_from_elsewhere(site):
+    """Formulas included: they are MathML, which needs no script."""
+    for page in site.rglob("*.html"):
+        for tag in re.findall(r"<(?:script|link|img|iframe)\b[^>]*>", page.read_text()):
+            assert not re.search(r"(?:src|href)=[\"'](?:https?:)?//", tag), f"{page.name}: {tag}"
+    text = (site / "algorithms.html").read_text()
+    source = (ROOT / "docs" / "algorithms.md").read_text()
+    blocks = source.count("$$") // 2
+    assert text.count('<div class="math"><math') == blocks > 20
+    inline = re.findall(r"\$[^$]+\$", re.sub(r"\$\$.*?\$\$", "", source, flags=re.DOTALL))
+    assert text.count("<math ") == blocks + len(inline)
+    assert "$" not in re.sub(r"<(script|pre|code)\b.*?</\1>", "", text, flags=re.DOTALL)

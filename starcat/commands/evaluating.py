@@ -86,7 +86,7 @@ def evaluate(
     quantity each is tried in turn, a single value holds for all trials; without any, each
     quantity takes its usual values.
 
-    Example: starcat evaluate dist/gaia-12deg-1.0.0 --noise-px 0,0.5,1 --frames 200
+    Example: starcat evaluate dist/gaia-12deg-1.0.0 --noise-px 0,0.5,1 --frames 50
     """
     from starcat.evaluation.run import evaluate_artifact, evaluate_papers
     from starcat.evaluation.sweep import plan_sweep, sweep_values

@@ -107,7 +107,7 @@ def selftest(
 ) -> None:
     """Identify simulated fields with a database and print the rates.
 
-    Example: starcat selftest dist/gaia-12deg-1.0.0 --frames 1000
+    Example: starcat selftest dist/gaia-12deg-1.0.0 --frames 100
     """
     from starcat.matcher.matcher import Matcher
     from starcat.simulation.selftest import self_test

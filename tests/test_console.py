@@ -1,0 +1,84 @@
+"""What the terminal shows: brackets as they are, bars that say how much of what."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from starcat.artifact.verify import Finding, Verification
+from starcat.exchange.export import Exported
+from starcat.pipeline.rebuild import FileChange, Rebuilt
+from starcat.progress import BYTE_STAGES
+from starcat.terminal.artifacts import print_rebuilt, print_verification
+from starcat.terminal.console import StageBars, print_table
+from starcat.terminal.exports import print_exported
+
+BRACKETS = "/data/[old]/a[0] [bold]b[/bold] \\[c]"
+
+
+def test_brackets_are_shown_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    """In titles, headings and cells: rich would take them for markup."""
+    print_table(f"t {BRACKETS}", (f"h {BRACKETS}",), [(f"c {BRACKETS}",)])
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.rstrip() for line in lines] == [f"{k} {BRACKETS}" for k in "thc"]
+
+
+def test_no_command_escapes_them_once_more(capsys: pytest.CaptureFixture[str]) -> None:
+    folder = Path("/data/[old]")
+    print_exported(Exported("a", "csv", folder, (), False), as_json=False)
+    finding = Finding("stars.parquet", "stars", f"{folder}: gone")
+    print_verification(Verification(folder / "a-1.0.0", 1, (finding,)), as_json=False)
+    change = FileChange("stars.parquet", f"{folder}: differs")
+    print_rebuilt(Rebuilt("a", 1, (change,), ()), as_json=False)
+    shown = capsys.readouterr().out
+    assert shown.count("/data/[old]") == 3
+    assert "\\" not in shown
+
+
+def drawn(bars: StageBars) -> list[str]:
+    """The lines of the bars, without colours."""
+    out = io.StringIO()
+    Console(file=out, width=100, color_system=None).print(bars.get_renderable())
+    return out.getvalue().splitlines()
+
+
+@pytest.fixture
+def bars() -> StageBars:
+    return StageBars(Console(file=io.StringIO(), force_terminal=True, width=100))
+
+
+def test_bytes_have_units_and_counts_have_separators(bars: StageBars) -> None:
+    bars.show("read sao", 1_500_000, 51_000_000)
+    bars.show("self-test", 1234, 5000)
+    bars.show("fetch [a].gz", 10, None)
+    lines = drawn(bars)
+    assert "1.5 MB / 51.0 MB" in lines[0]
+    assert "1,234 / 5,000" in lines[1]
+    assert lines[2].startswith("fetch [a].gz")
+    assert {"fetch", "publish", "pull", "read"} == {*BYTE_STAGES}
+
+
+def test_a_stage_without_a_total_ends_when_the_next_begins(bars: StageBars) -> None:
+    bars.show("product pairs", 0, None)
+    assert "done" not in drawn(bars)[0]
+    bars.show("product grid", 0, None)
+    first, second = bars.tasks
+    assert first.finished
+    assert not second.finished
+    assert "done" in drawn(bars)[0]
+    assert "done" not in drawn(bars)[1]
+    stopped = first.finished_time
+    bars.show("verify", 3, 10)
+    assert (bars.tasks[1].finished, bars.tasks[2].finished) == (True, False)
+    assert first.finished_time == stopped is not None
+
+
+def test_a_stage_that_knows_its_total_ends_by_itself(bars: StageBars) -> None:
+    bars.show("read sao", 1, 10)
+    bars.show("read gaia", 10, 10)
+    assert [task.finished for task in bars.tasks] == [False, True]
+    bars.show("read sao", 10, 10)
+    assert [task.finished for task in bars.tasks] == [True, True]

@@ -1,0 +1,107 @@
+"""The examples that the commands' help prints run as they are printed.
+
+Each runs in a folder with what a user would have there: an archive file, and the artifacts that
+the other examples speak of, built from a small sky so that most of this takes no time.
+"""
+
+from __future__ import annotations
+
+import gzip
+import re
+import shlex
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from starcat.cli import app
+from starcat.commands.shared import chosen_spec
+from starcat.pipeline.build import build
+
+Run = Callable[[list[Any]], Any]
+
+COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+NETWORK = {"fetch": "downloads an archive from its servers; test_fetch has servers of its own"}
+NEEDS = {
+    "crossmatch": ("ingest",),
+    "releases": ("publish",),
+    "pull": ("publish",),
+    "identify": ("simulate",),
+}
+"""The commands whose examples make what another example reads."""
+SLOW = ("build", "rebuild")
+"""They build the preset itself, from the whole embedded sky."""
+
+
+def examples() -> dict[str, str]:
+    """The example of each command."""
+    found = {}
+    for name, command in COMMANDS.items():
+        (line,) = re.findall(r"^Example: (.+(?:\n.+)*)", command.help, re.MULTILINE)
+        found[name] = " ".join(line.split())
+    return found
+
+
+@pytest.fixture(scope="module")
+def workplace(
+    tmp_path_factory: pytest.TempPathFactory, small_spec: str, sao_lines: list[bytes]
+) -> Path:
+    """An archive file, and two versions of a database called as in the examples."""
+    folder = tmp_path_factory.mktemp("examples")
+    (folder / "sao.dat.gz").write_bytes(gzip.compress(b"".join(sao_lines), mtime=0))
+    for version in ("1.0.0", "1.1.0"):
+        spec = small_spec.replace('"small"', '"gaia-12deg"').replace("1.0.0", version)
+        (folder / "spec.toml").write_text(spec)
+        build(
+            chosen_spec(folder / "spec.toml", None),
+            {"sao": [folder / "sao.dat.gz"]},
+            folder / "dist",
+        )
+    return folder
+
+
+@pytest.fixture
+def here(workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the workplace, and in it."""
+    folder = tmp_path / "here"
+    shutil.copytree(workplace, folder)
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def run_example(name: str, starcat: Run) -> Any:
+    words = shlex.split(examples()[name])
+    assert words[:2] == ["starcat", name]
+    return starcat(words[1:])
+
+
+@pytest.mark.parametrize("name", [n for n in COMMANDS if n not in (*SLOW, *NETWORK)])
+def test_an_example_runs_as_printed(name: str, starcat: Run, here: Path) -> None:
+    if name == "crossmatch":
+        table = ["ingest", "gaia", "-o", "gaia.parquet", "--read-limit-mag", "5"]
+        assert starcat(table).code == 0
+    for other in NEEDS.get(name, ()):
+        assert run_example(other, starcat).code == 0
+    run = run_example(name, starcat)
+    assert run.code == 0, run.err
+    for path in re.findall(r"(?:-o|--picture) (\S+)", examples()[name]):
+        assert (here / path).exists()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_the_examples_of_a_whole_build_run_as_printed(
+    starcat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in SLOW:
+        run = run_example(name, starcat)
+        assert run.code == 0, run.err
+
+
+def test_what_is_not_run_is_known_and_still_there() -> None:
+    assert set(NETWORK) | set(SLOW) <= set(COMMANDS)
+    assert examples()["fetch"].startswith("starcat fetch ")
