@@ -56,7 +56,7 @@ class Allowance:
     left_s: float
 
 
-class WorkerEnded(QueryError):
+class WorkerEnded(QueryError):  # noqa: N818 - the name reads as the fact
     """A process that ended by itself while it was asked, with what is known of why."""
 
 

@@ -48,7 +48,7 @@ TABLE_FUNCTIONS = {
     "parquet_schema",
     "pragma_version",
 }
-"""Functions of DuckDB that make rows or tell about tables, and read no file that a view does not."""
+"""Functions of DuckDB that make rows or tell about tables; they read no file but those of views."""
 
 EXPLAIN_FORMATS = {"default", "text", "json", "html", "graphviz", "yaml", "mermaid"}
 

@@ -124,7 +124,7 @@ class Worker:
             self._send(kind, found)
 
     def schema_name(self, path: str) -> str:
-        """Return the name of the schema in the footer of a Parquet file; empty where it has none."""
+        """Return the name of the schema in the footer of a Parquet file, or nothing."""
         asked = "SELECT decode(value) FROM parquet_kv_metadata($path) WHERE key = encode($key)"
         values = {"path": path, "key": SCHEMA_KEY}
         found = self._connection.execute(asked, values).fetchall()
