@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from functools import cached_property
+from functools import cached_property, partial
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
-import duckdb
-
+from starcat.progress import Progress, no_progress
 from starcat.query.columns import Facts, column_facts
+from starcat.query.engine import Allowance, Engine
 
 if TYPE_CHECKING:
     import pyarrow as pa
-    from duckdb import DuckDBPyConnection
-
-BATCH_ROWS = 1 << 16
 
 
 class Answer:
@@ -22,24 +20,30 @@ class Answer:
 
     Parameters
     ----------
-    connection : duckdb.DuckDBPyConnection
-        Where it runs.
+    engine : Engine
+        Where the query runs.
     text : str
-        SQL, checked.
+        SQL that was checked.
     values : dict of str to object, optional
-        Of the ``$name`` in it.
+        The values of the ``$name`` in it.
     known : mapping of str to Facts
-        Of the columns of the views, by name.
+        What is known of the columns of the views, by name.
+    allowance : Allowance
+        The time that it may take.
+    progress : Progress
+        Called with ("query", percent, 100) while it runs.
     """
 
     def __init__(
         self,
-        connection: DuckDBPyConnection,
+        engine: Engine,
         text: str,
         values: dict[str, Any] | None,
         known: Mapping[str, Facts],
+        allowance: Allowance,
+        progress: Progress = no_progress,
     ) -> None:
-        self._connection = connection
+        self._ask = partial(engine.ask, allowance=allowance, progress=progress)
         self._text = text
         self._values = values
         self._known = known
@@ -47,8 +51,8 @@ class Answer:
     @cached_property
     def _described(self) -> list[tuple[str, str]]:
         """Names and types of the columns."""
-        bound = self._connection.sql(self._text, params=self._values)
-        return [(name, str(kind)) for name, kind in zip(bound.columns, bound.types, strict=True)]
+        [found] = self._ask("columns", self._text, self._values)
+        return list(found)
 
     @property
     def columns(self) -> list[str]:
@@ -77,13 +81,18 @@ class Answer:
         -------
         list of tuple
             Fewer where there are no more.
+
+        Raises
+        ------
+        QueryError
+            If the query asks for what is not there.
+        QueryLimitError
+            If it takes longer, or more memory and disk, than it may.
         """
-        running = self._connection.execute(self._text, self._values)
+        *parts, (described, last) = self._ask("rows", self._text, self._values, count)
         # Known now, without looking at the files once more.
-        self._described = [(str(column[0]), str(column[1])) for column in running.description]
-        found = list(running.fetchmany(count))
-        running.abort()
-        return found
+        self._described = described
+        return list(chain(*parts, last))
 
     def batches(self) -> pa.RecordBatchReader:
         """Return all rows as Arrow batches, with units and meanings in the field metadata.
@@ -91,32 +100,21 @@ class Answer:
         Returns
         -------
         pyarrow.RecordBatchReader
-            To be read before the next query.
+            To be read before the next query. Reading raises what `rows` raises.
         """
         import pyarrow as pa
 
-        relation = self._connection.sql(self._text, params=self._values)
-        reader = relation.to_arrow_reader(BATCH_ROWS)
+        [begun] = self._ask("batches", self._text, self._values)
         schema = pa.schema(
             field.with_metadata(column_facts(field.name, self._known).as_metadata())
-            for field in reader.schema
+            for field in pa.ipc.open_stream(begun).schema
         )
-        return pa.RecordBatchReader.from_batches(schema, _described(reader, schema))
+        return pa.RecordBatchReader.from_batches(schema, self._batches(schema))
 
+    def _batches(self, schema: pa.Schema) -> Iterator[pa.RecordBatch]:
+        """Give the batches that follow, with a schema that has the metadata."""
+        import pyarrow as pa
 
-def _described(reader: pa.RecordBatchReader, schema: pa.Schema) -> Iterator[pa.RecordBatch]:
-    """Give the batches another schema; what goes wrong comes as DuckDB's own exceptions."""
-    import pyarrow as pa
-
-    try:
-        for batch in reader:
-            yield pa.record_batch(batch.columns, schema=schema)
-    except (OSError, pa.ArrowException) as error:
-        # Arrow passes on the words alone.
-        words = str(error)
-        kinds = {
-            "INTERRUPT": duckdb.InterruptException,
-            "Out of Memory": duckdb.OutOfMemoryException,
-        }
-        kind = next((kinds[name] for name in kinds if words.startswith(name)), duckdb.Error)
-        raise kind(words) from error
+        while (found := self._ask("next_batch")[0]) is not None:
+            for batch in pa.ipc.open_stream(found):
+                yield pa.record_batch(batch.columns, schema=schema)

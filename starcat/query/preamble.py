@@ -8,8 +8,13 @@ from pathlib import Path
 
 from starcat.errors import QueryError
 from starcat.query.columns import Facts
+from starcat.query.engine import Engine
 from starcat.query.macros import macros
+from starcat.query.names import short_names
 from starcat.query.targets import Target, View, open_targets
+
+PREAMBLE_GB = 1.0
+"""Memory for looking into the footers of Parquet files."""
 
 
 def schemas_of(targets: Sequence[Target]) -> dict[str, Target]:
@@ -23,10 +28,10 @@ def schemas_of(targets: Sequence[Target]) -> dict[str, Target]:
     Returns
     -------
     dict of str to Target
-        A target alone is ``main`` and its own name; several are ``a``, ``b``, ``c`` … and their
-        names.
+        A target alone is ``main`` and its own name; several are ``a``, ``b`` … ``z``, ``aa``,
+        ``ab`` … and their names.
     """
-    short = ["main"] if len(targets) == 1 else [chr(ord("a") + k) for k in range(len(targets))]
+    short = ["main"] if len(targets) == 1 else short_names(len(targets))
     named = {target.name: target for target in targets}
     return {**dict(zip(short, targets, strict=True)), **named}
 
@@ -72,7 +77,11 @@ def preamble_of(given: Sequence[str]) -> str:
         If a target is an archive, which has no tables before it is ingested.
     """
     with tempfile.TemporaryDirectory(prefix="starcat-sql-") as folder:
-        targets = open_targets(given, Path(folder))
+        engine = Engine(Path(folder), PREAMBLE_GB, PREAMBLE_GB)
+        try:
+            targets = open_targets(given, Path(folder), engine)
+        finally:
+            engine.close()
         for target in targets:
             if any(Path(folder) in p.parents for view in target.views for p in view.paths):
                 raise QueryError(

@@ -1,22 +1,26 @@
 """What a query may say: one statement that only reads, and only what was named.
 
-DuckDB is told to open no other file (`starcat.query.session`), but a COPY over a file that it
-may read would be within its rights, and DuckDB takes a COPY in a WITH for a SELECT. So the
-statement is parsed first, and every part of it has to be of a kind that reads.
+DuckDB is told to open no other file (`starcat.query.worker`), but it would let a COPY overwrite a
+file that it may read, and it takes a COPY in a WITH for a SELECT. So DuckDB parses the text, every
+part of the syntax tree has to be of a kind that reads, and DuckDB writes the text that runs from
+that tree. The text that was given never runs: where starcat and DuckDB should disagree on where a
+comment ends, nothing comes of it.
 """
 
 from __future__ import annotations
 
 import json
-import re
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import duckdb
+from duckdb import DuckDBPyConnection, StatementType
 
 from starcat.errors import QueryError
+from starcat.query.messages import Statement
 
-if TYPE_CHECKING:
-    from duckdb import DuckDBPyConnection
+POINTED_CHARACTERS = 200
+"""How much of a line with an error is shown."""
 
 READING_NODES = {"SELECT_NODE", "SET_OPERATION_NODE", "RECURSIVE_CTE_NODE", "CTE_NODE"}
 """Nodes of DuckDB's syntax tree that read; COPY_QUERY_NODE and the like write."""
@@ -44,36 +48,15 @@ TABLE_FUNCTIONS = {
     "parquet_schema",
     "pragma_version",
 }
-"""Those of DuckDB that make rows or tell about tables. None reads a file that a view does not."""
+"""Functions of DuckDB that make rows or tell about tables; they read no file but those of views."""
 
-_EXPLAIN = re.compile(r"explain\b", re.IGNORECASE)
-_EXPLAIN_OPTIONS = re.compile(r"analyze\b|\([^)]*\)", re.IGNORECASE)
-_COMMENT = re.compile(r"\s*(?:--[^\n]*(?:\n|$)|/\*.*?\*/)", re.DOTALL)
-
-
-@dataclass(frozen=True)
-class Statement:
-    """A query that may run.
-
-    Attributes
-    ----------
-    text : str
-        As it was given, without comments before it.
-    is_description : bool
-        Whether it is a DESCRIBE, whose rows are columns.
-    parameters : tuple of str
-        Names of the ``$name`` in it.
-    """
-
-    text: str
-    is_description: bool = False
-    parameters: tuple[str, ...] = ()
+EXPLAIN_FORMATS = {"default", "text", "json", "html", "graphviz", "yaml", "mermaid"}
 
 
 def check_statement(
     text: str, connection: DuckDBPyConnection, macros: frozenset[str] = frozenset()
 ) -> Statement:
-    """Check that a text is one statement that reads.
+    """Check that a text is one statement that reads, and write that statement anew.
 
     Parameters
     ----------
@@ -87,53 +70,107 @@ def check_statement(
     Returns
     -------
     Statement
-        What is known of it.
+        What may run.
 
     Raises
     ------
     QueryError
         If it is no SQL, more than one statement, or does more than read.
     """
-    text = _without_comments_before(text)
-    read = _explained(text)
-    tree = _syntax_tree(read, connection)
-    if len(tree["statements"]) != 1:
-        raise QueryError(
-            f"found {len(tree['statements'])} statements; give one query, such as "
-            '"SELECT count(*) FROM stars"'
-        )
-    for part in _parts(tree):
-        _check_part(part, macros)
-    statement = tree["statements"][0]
+    explain, read = _explained(text)
+    tree = _checked_tree(read, connection, macros)
+    [(written,)] = connection.execute("SELECT json_deserialize_sql(?)", [tree]).fetchall()
+    # What runs is what was checked, even if DuckDB should read its own words in another way.
+    _checked_tree(written, connection, macros)
+    runs = explain + written
+    kind = StatementType.EXPLAIN if explain else StatementType.SELECT
+    if [statement.type for statement in connection.extract_statements(runs)] != [kind]:
+        raise QueryError(f"DuckDB writes the query as {runs!r}, which is not one; write it simpler")
+    statement = json.loads(tree)["statements"][0]
     source = statement["node"].get("from_table") or {}
     describes = source.get("type") == "SHOW_REF" and source.get("show_type") == "DESCRIBE"
     parameters = tuple(sorted(entry["key"] for entry in statement.get("named_param_map", ())))
-    return Statement(text, describes and read == text, parameters)
+    view = _described_view(source) if describes else None
+    return Statement(runs, describes and not explain, view, parameters)
 
 
-def _explained(text: str) -> str:
-    """Return the query after EXPLAIN and its options, or the text where it has none."""
-    word = _EXPLAIN.match(text)
-    if not word:
-        return text
-    rest = _without_comments_before(text[word.end() :])
-    options = _EXPLAIN_OPTIONS.match(rest)
-    return _without_comments_before(rest[options.end() :]) if options else rest
+def _checked_tree(text: str, connection: DuckDBPyConnection, macros: frozenset[str]) -> str:
+    """Return the syntax tree of a query as DuckDB writes it; every part of it reads."""
+    found = _syntax_tree(text, connection)
+    try:
+        tree = json.loads(found)
+        if len(tree["statements"]) != 1:
+            raise QueryError(
+                f"found {len(tree['statements'])} statements; give one query, such as "
+                '"SELECT count(*) FROM stars"'
+            )
+        for part in _parts(tree):
+            _check_part(part, macros)
+    except RecursionError as error:
+        raise QueryError(
+            "the query is nested too deeply to be checked; write it with fewer parentheses or "
+            "functions within each other"
+        ) from error
+    return found
 
 
-def _without_comments_before(text: str) -> str:
-    while comment := _COMMENT.match(text):
-        text = text[comment.end() :]
-    return text.strip()
+def _described_view(source: dict[str, Any]) -> tuple[str, str] | None:
+    """Return schema and name of the view that a DESCRIBE is about, if it is about one."""
+    query = source.get("query") or {}
+    table = query.get("from_table") or {}
+    stars = [column["type"] for column in query.get("select_list", ())] == ["STAR"]
+    if table.get("type") != "BASE_TABLE" or not stars:
+        return None
+    return str(table["schema_name"]), str(table["table_name"])
 
 
-def _syntax_tree(text: str, connection: DuckDBPyConnection) -> Any:
-    if not text:
+def _explained(text: str) -> tuple[str, str]:
+    """Return EXPLAIN with its options as we write it, and the query after it."""
+    words = _words(text)
+    if not words or words[0][1] != "explain":
+        return "", text
+    if [word for _, word in words[1:2]] == ["analyze"]:
+        return "EXPLAIN ANALYZE ", _text_from(text, words, 2)
+    if len(words) < 3 or words[1][1] != "(" or words[2][1] not in ("analyze", "format"):
+        return "EXPLAIN ", _text_from(text, words, 1)
+    end = next((k for k, (_, word) in enumerate(words) if word == ")"), len(words))
+    options = " ".join(word for _, word in words[2:end]).split(" , ")
+    for option in options:
+        name, _, value = option.partition(" ")
+        if not (option == "analyze" or (name == "format" and value in EXPLAIN_FORMATS)):
+            raise QueryError(
+                f"EXPLAIN with {option!r}; give ANALYZE, FORMAT with one of "
+                f"{', '.join(sorted(EXPLAIN_FORMATS))}, or both"
+            )
+    return f"EXPLAIN ({', '.join(options)}) ", _text_from(text, words, end + 1)
+
+
+def _words(text: str) -> list[tuple[int, str]]:
+    """Return the words of a text, with the bytes before each, as DuckDB divides it."""
+    data = text.encode()
+    tokens = duckdb.tokenize(text)
+    starts = [start for start, _ in tokens] + [len(data)]
+    return [
+        (start, data[start:end].decode(errors="replace").strip().lower())
+        for (start, kind), end in zip(tokens, starts[1:], strict=True)
+        if kind != duckdb.token_type.comment
+    ]
+
+
+def _text_from(text: str, words: Sequence[tuple[int, str]], number: int) -> str:
+    return text.encode()[words[number][0] :].decode() if number < len(words) else ""
+
+
+def _syntax_tree(text: str, connection: DuckDBPyConnection) -> str:
+    if not _words(text):
         raise QueryError('the query is empty; try "SELECT count(*) FROM stars"')
+    if "\0" in text:
+        raise QueryError("the query has a character NUL, which SQL cannot hold; leave it out")
     [(found,)] = connection.execute("SELECT json_serialize_sql(?)", [text]).fetchall()
+    # An error is a flat object; a tree may be too deep to be read.
+    if not found.startswith('{"error":true'):
+        return str(found)
     tree = json.loads(found)
-    if not tree["error"]:
-        return tree
     if tree["error_type"] == "not implemented":
         raise QueryError(_refusal(text))
     raise QueryError(f"no valid SQL: {tree['error_message']}{_pointer(text, tree)}")
@@ -141,7 +178,7 @@ def _syntax_tree(text: str, connection: DuckDBPyConnection) -> Any:
 
 def _refusal(text: str) -> str:
     """Return why a statement that is no SELECT is refused."""
-    word = (re.match(r"\w+", text) or [text[:12]])[0].upper()
+    word = _words(text)[0][1][:24].upper()
     if word in ("PIVOT", "FROM", "WITH"):
         return f"{word}: give the values of a pivot, as in PIVOT t ON band IN ('V', 'G') USING ..."
     return (
@@ -155,21 +192,23 @@ def _pointer(text: str, tree: Any) -> str:
     position = tree.get("position")
     if position is None or not str(position).isdigit():
         return ""
-    before = text[: int(position)]
-    line = text.splitlines()[before.count("\n")]
+    before = text.encode()[: int(position)].decode(errors="ignore")
+    line = text.split("\n")[before.count("\n")]
     column = len(before) - (before.rfind("\n") + 1)
-    return f"\n  {line}\n  {' ' * column}^"
+    start = max(0, column - POINTED_CHARACTERS // 2)
+    return f"\n  {line[start : start + POINTED_CHARACTERS]}\n  {' ' * (column - start)}^"
 
 
 def _parts(tree: Any) -> Iterator[dict[str, Any]]:
     """Give every node of a syntax tree."""
-    if isinstance(tree, dict):
-        yield tree
-        for value in tree.values():
-            yield from _parts(value)
-    elif isinstance(tree, list):
-        for value in tree:
-            yield from _parts(value)
+    left = [tree]
+    while left:
+        part = left.pop()
+        if isinstance(part, dict):
+            yield part
+            left += part.values()
+        elif isinstance(part, list):
+            left += part
 
 
 def _check_part(part: dict[str, Any], macros: frozenset[str]) -> None:

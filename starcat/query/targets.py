@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,10 +10,11 @@ from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
 from starcat.catalog.star_files import rejected_path
 from starcat.errors import ProductError, QueryError, TargetMissing
 from starcat.progress import Progress, no_progress
+from starcat.query.engine import Engine
+from starcat.query.names import distinct, identifier, short_names
 from starcat.tables.schema import ProductSchema, product_schema
 
 HATS_NAMES = ("hats.properties", "properties")
-SCHEMA_KEY = "starcat.schema"
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Target:
 
 
 def open_targets(
-    given: Sequence[str], scratch: Path, progress: Progress = no_progress
+    given: Sequence[str], scratch: Path, engine: Engine, progress: Progress = no_progress
 ) -> tuple[Target, ...]:
     """Find the tables of what was named.
 
@@ -68,13 +68,16 @@ def open_targets(
         finds.
     scratch : Path
         Folder for the star tables of archive files.
+    engine : Engine
+        Looks into Parquet files.
     progress : Progress
         Called while archive files are read.
 
     Returns
     -------
     tuple of Target
-        With names that differ: where two are the same, version or number is added.
+        With names that differ: where two are the same, version or number is added, and where one
+        is a short name of another target, an underscore.
 
     Raises
     ------
@@ -83,47 +86,27 @@ def open_targets(
     ProductError, SchemaVersionError, SourceError
         If it is, but cannot be read.
     """
-    targets = [_open_target(text, scratch / str(k), progress) for k, text in enumerate(given)]
+    targets = [
+        _open_target(text, scratch / str(k), engine, progress) for k, text in enumerate(given)
+    ]
     names = [target.name for target in targets]
     if len(set(names)) < len(names):
         names = [identifier(f"{target.name}_{target.version}".strip("_")) for target in targets]
-    numbered = [
-        f"{name}_{names[:k].count(name) + 1}" if name in names[:k] else name
-        for k, name in enumerate(names)
-    ]
-    return tuple(replace(target, name=name) for target, name in zip(targets, numbered, strict=True))
+    taken = short_names(len(targets)) if len(targets) > 1 else []
+    return tuple(
+        replace(target, name=name)
+        for target, name in zip(targets, distinct(names, taken), strict=True)
+    )
 
 
-def identifier(text: str) -> str:
-    """Return a name that SQL needs no quotes for.
-
-    Parameters
-    ----------
-    text : str
-        Any.
-
-    Returns
-    -------
-    str
-        Lower case letters, digits and underscores.
-
-    Examples
-    --------
-    >>> identifier("gaia-12deg"), identifier("2mass-8x6")
-    ('gaia_12deg', '_2mass_8x6')
-    """
-    name = re.sub(r"\W+", "_", text.lower(), flags=re.ASCII).strip("_") or "table"
-    return f"_{name}" if name[0].isdigit() else name
-
-
-def _open_target(text: str, scratch: Path, progress: Progress) -> Target:
+def _open_target(text: str, scratch: Path, engine: Engine, progress: Progress) -> Target:
     path = Path(text)
     if path.is_dir() and (path / MANIFEST_NAME).exists():
         return _artifact(path)
     if path.is_dir() and any((path / name).exists() for name in HATS_NAMES):
-        return _hats(path)
+        return _hats(path, engine)
     if path.is_file() and path.suffix == ".parquet":
-        return _tables(path)
+        return _tables(path, engine)
     source, inputs = _source_of(text, path)
     if source is None:
         is_there = path.exists()
@@ -173,16 +156,16 @@ def _check_file(path: Path) -> None:
         )
 
 
-def _tables(path: Path) -> Target:
+def _tables(path: Path, engine: Engine) -> Target:
     """Return a Parquet file, with the rejected rows beside it where there are any."""
-    views = [_table(path)]
+    views = [_table(path, engine)]
     beside = rejected_path(path)
     if beside.is_file():
-        views.append(_table(beside))
+        views.append(_table(beside, engine))
     return Target(identifier(path.stem), "", tuple(views))
 
 
-def _hats(folder: Path) -> Target:
+def _hats(folder: Path, engine: Engine) -> Target:
     """Return a HATS catalog: one table in many files, each a part of the sky."""
     parts = tuple(sorted(folder.glob("dataset/Norder=*/Dir=*/Npix=*.parquet")))
     if not parts:
@@ -192,21 +175,20 @@ def _hats(folder: Path) -> Target:
             path=folder,
         )
     name = identifier(folder.resolve().name)
-    view = _table(parts[0])
+    view = _table(parts[0], engine)
     return Target(name, "", (replace(view, name=view.name if view.schema else name, paths=parts),))
 
 
-def _table(path: Path) -> View:
-    import duckdb
-
+def _table(path: Path, engine: Engine) -> View:
     _check_file(path)
-    asked = "SELECT decode(value) FROM parquet_kv_metadata($path) WHERE decode(key) = $key"
     try:
-        with duckdb.connect() as connection:
-            found = connection.execute(asked, {"path": str(path), "key": SCHEMA_KEY}).fetchall()
-    except duckdb.Error as error:
-        raise ProductError(f"{path}: cannot be read ({error}); get the file again") from error
-    name, _, version = (found[0][0] if found else "").rpartition("-")
+        [found] = engine.ask("schema_name", str(path))
+    except QueryError as error:
+        told = str(error).splitlines()[0]
+        raise ProductError(
+            f"{path}: cannot be read ({told}); get the file again", path=path
+        ) from error
+    name, _, version = found.rpartition("-")
     schema = product_schema(name, version) if name else None
     return View(schema.product if schema else identifier(path.stem), (path,), schema)
 

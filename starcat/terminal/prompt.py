@@ -68,7 +68,6 @@ def prompt(session: Session, rows: int, read: Callable[[str], str] = input) -> N
         except StarcatError as error:
             say(f"error: {error}")
         except KeyboardInterrupt:
-            session.connection.interrupt()
             say("stopped")
     _keep_history()
 

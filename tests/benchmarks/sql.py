@@ -18,7 +18,7 @@ from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest
 from starcat.catalog.selection import select_guide_stars
 from starcat.catalog.stars import directions_of
-from starcat.pipeline.recipes import Sky, cook, tile_guide_stars
+from starcat.pipeline.recipes import Ingredients, cook, tile_guide_stars
 from starcat.query.session import open_session
 from starcat.specs.reading import preset, spec_from_dict
 from starcat.tables.parquet import write_parquet
@@ -58,10 +58,10 @@ def make_tables(folder: Path) -> tuple[Path, Path]:
     spec = spec_from_dict(content, "bench")
     read = ingest("gaia", [embedded_sky()], epoch_jyear=spec.epoch_jyear)
     stars = select_guide_stars(read.stars, spec.selection).guide_stars
-    sky = Sky(directions_of(stars), tile_guide_stars(stars, spec), spec)
+    given = Ingredients(directions_of(stars), tile_guide_stars(stars, spec), spec)
     paths = folder / "stars.parquet", folder / "pairs.parquet"
     write_parquet(stars, paths[0])
-    write_parquet(cook("pairs", sky).table, paths[1])
+    write_parquet(cook("pairs", given).table, paths[1])
     return paths
 
 

@@ -1,0 +1,262 @@
+"""The process that runs the queries of a session, as the session sees it.
+
+It is started once and asked many times. One that takes too long is killed, and so is one whose
+question was dropped halfway; the next question starts another.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from starcat.errors import QueryError, QueryLimitError
+from starcat.progress import Progress, no_progress
+from starcat.query.messages import (
+    BROKEN,
+    DONE,
+    ENDINGS,
+    PART,
+    PROGRESS,
+    REFUSED,
+    SHORT,
+    Opening,
+    Views,
+)
+
+OPENING_S = 60.0
+"""How long a process may take until it has opened the targets, seconds."""
+
+_PROGRAM = "import sys; sys.path[:] = sys.argv[1:]; from starcat.query.worker import serve; serve()"
+
+
+@dataclass
+class Allowance:
+    """The time that a query may take.
+
+    Attributes
+    ----------
+    total_s : float
+        Seconds in all.
+    left_s : float
+        Seconds that are left of them. Only waiting for the answer counts.
+    """
+
+    total_s: float
+    left_s: float
+
+
+class WorkerEnded(QueryError):  # noqa: N818 - the name reads as the fact
+    """A process that ended by itself while it was asked, with what is known of why."""
+
+
+class Engine:
+    """A process with a DuckDB, started again when it was ended.
+
+    Parameters
+    ----------
+    scratch : Path
+        Folder for its log, and for what does not fit into its memory.
+    memory_gb, disk_gb : float
+        Gigabytes that it may take of each.
+    """
+
+    def __init__(self, scratch: Path, memory_gb: float, disk_gb: float) -> None:
+        self._opening = Opening(scratch / "spill", memory_gb, disk_gb, os.getpid())
+        self._log = scratch / "worker.log"
+        self._views: Views | None = None
+        self._asking = threading.RLock()
+        self._ending = threading.Lock()
+        self._question = 0
+        self._is_late = False
+        self._process = self._started()
+
+    def open(self, views: Views) -> None:
+        """Make the views; from here on the process reads nothing else.
+
+        Parameters
+        ----------
+        views : Views
+            Views and macros; made again in every process that is started.
+
+        Raises
+        ------
+        QueryError
+            If they cannot be made.
+        """
+        self.ask("open", views)
+        self._views = views
+
+    def ask(
+        self,
+        name: str,
+        *arguments: Any,
+        allowance: Allowance | None = None,
+        progress: Progress = no_progress,
+    ) -> list[Any]:
+        """Ask the process for something, and wait for the answer.
+
+        Parameters
+        ----------
+        name : str
+            A method of `starcat.query.worker.Worker`.
+        *arguments : object
+            Of the method.
+        allowance : Allowance, optional
+            Time that it may take; what it took is taken from it.
+        progress : Progress
+            Called with ("query", percent, 100) while it runs.
+
+        Returns
+        -------
+        list of object
+            The parts of the answer; most have one.
+
+        Raises
+        ------
+        QueryError
+            If there is none.
+        QueryLimitError
+            If it takes longer, or more memory and disk, than it may.
+        """
+        with self._asking:
+            if self._process.poll() is not None:
+                self._process = self._started()
+                if self._views is not None:
+                    self._answered("open", (self._views,), Allowance(OPENING_S, OPENING_S))
+            time_s = allowance or Allowance(OPENING_S, OPENING_S)
+            return self._answered(name, arguments, time_s, progress)
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.kill()
+        self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                with suppress(OSError):
+                    pipe.close()
+
+    def _started(self) -> subprocess.Popen[bytes]:
+        shutil.rmtree(self._opening.spill, ignore_errors=True)
+        self._opening.spill.mkdir()
+        # Arrow's own allocators reserve gigabytes, which count as memory that is used.
+        environment = {**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system"}
+        with self._log.open("wb") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-c", _PROGRAM, *sys.path],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                env=environment,
+            )
+        self._process = process
+        with suppress(OSError):
+            self._write(self._opening)
+        return process
+
+    def _answered(
+        self,
+        name: str,
+        arguments: tuple[Any, ...],
+        allowance: Allowance,
+        progress: Progress = no_progress,
+    ) -> list[Any]:
+        try:
+            content = pickle.dumps(arguments)
+        except Exception as error:  # whatever somebody's own class does
+            raise QueryError(f"a value of the query cannot be passed on: {error}") from error
+        parts: list[Any] = []
+        kind = ""
+        try:
+            with self._within(allowance):
+                self._write((name, allowance.left_s, content))
+                while kind not in ENDINGS:
+                    kind, found = self._read()
+                    if kind == PROGRESS:
+                        progress("query", found, 100)
+                    elif kind in (PART, DONE):
+                        parts.append(found)
+        except (EOFError, OSError, pickle.UnpicklingError) as error:
+            raise self._ended(allowance) from error
+        finally:
+            # A question that was dropped halfway, as by Ctrl-C, would be answered to the next.
+            if kind not in (DONE, REFUSED):
+                self.close()
+        if kind == DONE:
+            return parts
+        if kind == SHORT:
+            raise QueryLimitError(
+                f"the query needs more than {self._opening.memory_gb:g} GB of memory and "
+                f"{self._opening.disk_gb:g} GB of disk; ask for less, or allow more with "
+                "--memory-limit-gb"
+            )
+        told = "DuckDB failed: " if kind == BROKEN else ""
+        raise QueryError(f"{told}{found}")
+
+    def _write(self, content: Any) -> None:
+        pipe = self._process.stdin
+        if pipe is not None:
+            pickle.dump(content, pipe, pickle.HIGHEST_PROTOCOL)
+            pipe.flush()
+
+    def _read(self) -> tuple[str, Any]:
+        kind, found = pickle.load(self._process.stdout)  # type: ignore[arg-type]
+        return kind, found
+
+    @contextmanager
+    def _within(self, allowance: Allowance) -> Iterator[None]:
+        """Kill the process when the time is over, and count the time."""
+        self._question += 1
+        self._is_late = False
+        timer = threading.Timer(max(0.0, allowance.left_s), self._end, (self._question,))
+        timer.daemon = True
+        timer.start()
+        began = time.monotonic()
+        try:
+            yield
+        finally:
+            with self._ending:
+                self._question += 1
+            timer.cancel()
+            allowance.left_s -= time.monotonic() - began
+
+    def _end(self, question: int) -> None:
+        with self._ending:
+            if question == self._question:
+                self._is_late = True
+                self._process.kill()
+
+    def _ended(self, allowance: Allowance) -> QueryError:
+        """Return what to say of a process that ended before it answered."""
+        # The pipe is closed a moment before the process is gone.
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(1.0)
+        self.close()
+        code = self._process.returncode
+        name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        if self._is_late or name == "SIGXCPU":
+            return QueryLimitError(
+                f"stopped after {allowance.total_s:g} s; ask for less, or allow more with "
+                "--time-limit-s"
+            )
+        if name == "SIGKILL":
+            return QueryLimitError(
+                "the process of the query was killed from outside, as a system does that runs out "
+                "of memory; ask for less, or allow less with --memory-limit-gb"
+            )
+        lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        last = f": {lines[-1][:200]}" if lines else ""
+        return WorkerEnded(
+            f"the process of the query ended by itself ({name}{last}); DuckDB cannot answer it. "
+            "Ask in another way; other queries are answered as before"
+        )

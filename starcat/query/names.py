@@ -1,0 +1,116 @@
+"""Names of schemas and views that SQL needs no quotes for.
+
+A name that is a word of SQL ends with an underscore: ``group.parquet`` is ``group_``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from itertools import count, product
+from string import ascii_lowercase
+
+_WORDS = """
+all analyse analyze and anti any array as asc asof asymmetric at authorization between
+bigint binary bit boolean both by case cast char character check coalesce collate
+collation column columns columns concurrently constraint create cross dec decimal default
+deferrable desc describe distinct do else end except exists extract false fetch float for
+foreign freeze from full generated generated glob group grouping grouping_id having ilike
+in initially inner inout int integer intersect interval into is isnull join lambda lateral
+leading left like limit map map national natural nchar none not notnull null nullif
+numeric offset on only or order out outer overlaps overlay pivot pivot_longer pivot_wider
+placing position positional precision primary qualify real references returning right row
+select semi setof show similar smallint some struct struct substring summarize symmetric
+table tablesample then time timestamp to trailing treat trim true try_cast try_cast tuple
+tuple union unique unpack unpivot using values varchar variadic verbose when where window
+with xmlattributes xmlconcat xmlelement xmlexists xmlforest xmlnamespaces xmlparse xmlpi
+xmlroot xmlserialize xmltable
+"""
+
+SQL_WORDS = frozenset(_WORDS.split())
+"""Words that DuckDB takes for no name of a table. Listed here, so that a name does not depend on
+the version of DuckDB."""
+
+CATALOGS = frozenset({"main", "memory", "temp", "system", "information_schema", "pg_catalog"})
+"""Schemas and catalogs that every DuckDB has."""
+
+
+def identifier(text: str) -> str:
+    """Return a name that SQL needs no quotes for.
+
+    Parameters
+    ----------
+    text : str
+        Any.
+
+    Returns
+    -------
+    str
+        Lower case letters, digits and underscores; a word of SQL ends with an underscore.
+
+    Examples
+    --------
+    >>> identifier("gaia-12deg"), identifier("2mass-8x6"), identifier("Group")
+    ('gaia_12deg', '_2mass_8x6', 'group_')
+    """
+    name = re.sub(r"\W+", "_", text.lower(), flags=re.ASCII).strip("_") or "table"
+    if name in SQL_WORDS or name in CATALOGS:
+        return f"{name}_"
+    return f"_{name}" if name[0].isdigit() else name
+
+
+def short_names(many: int) -> list[str]:
+    """Return the short names of several targets, in their order.
+
+    Parameters
+    ----------
+    many : int
+        How many targets.
+
+    Returns
+    -------
+    list of str
+        ``a`` to ``z``, then ``aa``, ``ab`` …; words of SQL end with an underscore.
+
+    Examples
+    --------
+    >>> short_names(3), short_names(45)[-1]
+    (['a', 'b', 'c'], 'as_')
+    """
+    letters = ("".join(word) for size in count(1) for word in product(ascii_lowercase, repeat=size))
+    return [identifier(word) for word, _ in zip(letters, range(many), strict=False)]
+
+
+def distinct(names: Sequence[str], taken: Sequence[str] = ()) -> list[str]:
+    """Return names that differ from each other and from those that are taken.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Identifiers.
+    taken : sequence of str
+        Identifiers that mean something else.
+
+    Returns
+    -------
+    list of str
+        The first of a name as it is, the next with ``_2``, ``_3`` … behind it; a taken one with
+        an underscore.
+
+    Examples
+    --------
+    >>> distinct(["sao", "sao", "sao_2", "a"], ["a", "b"])
+    ['sao', 'sao_2', 'sao_2_2', 'a_']
+    """
+    found: list[str] = []
+    for name in names:
+        free = (n for n in _variants(name, name in taken) if n not in found and n not in taken)
+        found.append(next(free))
+    return found
+
+
+def _variants(name: str, is_taken: bool) -> Iterator[str]:
+    name = f"{name}_" if is_taken else name
+    yield name
+    for number in count(2):
+        yield f"{name}_{number}"

@@ -1,0 +1,295 @@
+"""The process that runs queries: a DuckDB in memory behind two pipes, with hard limits.
+
+`starcat.query.engine` starts it, writes requests to its standard input and reads replies from its
+standard output. It opens no file but those of the views, loads no extension, and its settings are
+locked before the first query. What it may take of the machine is limited by the operating system
+(`starcat.query.confinement`), so that a single call of a function cannot take more either.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import re
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import duckdb
+
+from starcat.errors import QueryError
+from starcat.query.confinement import forbid_writing, limit_memory, limit_time
+from starcat.query.messages import (
+    BROKEN,
+    DONE,
+    PART,
+    PROGRESS,
+    REFUSED,
+    SHORT,
+    Opening,
+    Statement,
+    Views,
+)
+from starcat.query.statement import check_statement
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+BATCH_ROWS = 1 << 16
+ROWS_AT_ONCE = 1 << 12
+
+WATCH_S = 0.2
+"""How often a running query is looked at."""
+
+NESTED_CALLS = 10_000
+"""How deep a syntax tree may be for Python to read it."""
+
+BESIDE_BYTES = 512 << 20
+"""What Python, Arrow and the stacks of threads may take beside DuckDB."""
+
+SCHEMA_KEY = "starcat.schema"
+
+_ZONED = re.compile(r"TIMESTAMP\w* WITH TIME ZONE")
+
+
+def serve() -> None:
+    """Answer requests until there are no more."""
+    # Ctrl-C reaches every process of a terminal; the one that asks decides what becomes of this.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    sys.setrecursionlimit(NESTED_CALLS)
+    replies = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    # Whatever a library prints goes to the log.
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    requests = sys.stdin.buffer
+    try:
+        worker = Worker(pickle.load(requests), replies)
+        while True:
+            worker.answer(*pickle.load(requests))
+    except (EOFError, BrokenPipeError):
+        # The other end is closed. Threads of a query that still runs are not waited for.
+        os._exit(0)
+
+
+class Worker:
+    """A DuckDB and what it is asked.
+
+    Parameters
+    ----------
+    opening : Opening
+        Limits, and the folder that may be written in.
+    replies : binary file
+        Where the replies go.
+    """
+
+    def __init__(self, opening: Opening, replies: BinaryIO) -> None:
+        self._opening = opening
+        self._replies = replies
+        self._sending = threading.Lock()
+        self._is_running = False
+        self._reader: pa.RecordBatchReader | None = None
+        self._macros: frozenset[str] = frozenset()
+        # Before DuckDB starts its threads.
+        forbid_writing(except_in=opening.spill)
+        self._connection = duckdb.connect(":memory:", config=_settings(opening))
+        limit_memory(int(opening.memory_gb * 1e9) + BESIDE_BYTES)
+        threading.Thread(target=self._watch, daemon=True).start()
+
+    def answer(self, name: str, time_s: float, arguments: bytes) -> None:
+        """Answer a request.
+
+        Parameters
+        ----------
+        name : str
+            One of the methods below.
+        time_s : float
+            Seconds after which nobody waits for the answer.
+        arguments : bytes
+            Pickled, those of the method.
+        """
+        limit_time(max(1.0, time_s) * (os.cpu_count() or 1) + 1.0)
+        with self._sending:
+            self._is_running = True
+        try:
+            if name != "next_batch":
+                self._let_go()
+            kind, found = DONE, getattr(self, name)(*pickle.loads(arguments))
+        except Exception as error:
+            kind, found = _failure(error)
+        with self._sending:
+            self._is_running = False
+            self._send(kind, found)
+
+    def schema_name(self, path: str) -> str:
+        """Return the name of the schema in the footer of a Parquet file, or nothing."""
+        asked = "SELECT decode(value) FROM parquet_kv_metadata($path) WHERE key = encode($key)"
+        values = {"path": path, "key": SCHEMA_KEY}
+        found = self._connection.execute(asked, values).fetchall()
+        return str(found[0][0]) if found else ""
+
+    def look_at(self, files: list[str]) -> None:
+        """Read the columns of the Parquet files of a table, as a view would."""
+        self._connection.execute("FROM read_parquet($files) LIMIT 0", {"files": files})
+
+    def open(self, views: Views) -> None:
+        """Make the views, and allow no other file and no other setting from here on."""
+        self._connection.execute(views.sql)
+        self._macros = views.macros
+        # Progress is kept, and printed by who asks for it. Times have the zone UTC everywhere.
+        self._connection.execute(
+            "SET enable_progress_bar = true; SET enable_progress_bar_print = false; "
+            "SET TimeZone = 'UTC'"
+        )
+        self._connection.execute("SET allowed_paths = $files", {"files": list(views.files)})
+        self._connection.execute("SET enable_external_access = false")
+        self._connection.execute("SET lock_configuration = true")
+
+    def statements(self, text: str) -> list[str]:
+        """Return the queries of a text; a text that is no SQL is one."""
+        try:
+            return [statement.query for statement in self._connection.extract_statements(text)]
+        except duckdb.Error:
+            return [text]
+
+    def check(self, text: str) -> Statement:
+        """Return what may run of a text."""
+        return check_statement(text, self._connection, self._macros)
+
+    def columns(self, text: str, values: dict[str, Any] | None) -> list[tuple[str, str]]:
+        """Return names and types of the columns of a query."""
+        bound = self._connection.sql(text, params=values)
+        return [(name, str(kind)) for name, kind in zip(bound.columns, bound.types, strict=True)]
+
+    def rows(
+        self, text: str, values: dict[str, Any] | None, count: int
+    ) -> tuple[list[tuple[str, str]], list[tuple[Any, ...]]]:
+        """Send the first rows of a query in parts; return its columns, and the last part."""
+        running = self._connection.execute(text, values)
+        columns = [(str(column[0]), str(column[1])) for column in running.description]
+        zoned = [k for k, (_, kind) in enumerate(columns) if _ZONED.search(kind)]
+        if zoned:
+            running = self._connection.execute(_without_zones(text, columns), values)
+        part: list[tuple[Any, ...]] = []
+        for following in _parts(running, count):
+            if part:
+                with self._sending:
+                    self._send(PART, part)
+            part = _in_utc(following, zoned) if zoned else following
+        self._connection.abort()
+        return columns, part
+
+    def batches(self, text: str, values: dict[str, Any] | None) -> bytes:
+        """Begin to read all rows as Arrow batches; return their schema as an Arrow stream."""
+        relation = self._connection.sql(text, params=values)
+        self._reader = relation.to_arrow_reader(BATCH_ROWS)
+        return _as_stream(self._reader.schema)
+
+    def next_batch(self) -> bytes | None:
+        """Return the next batch as an Arrow stream; none at the end."""
+        if self._reader is None:
+            raise QueryError("rows were asked for after the end, or after another query")
+        for batch in self._reader:
+            return _as_stream(batch.schema, batch)
+        return None
+
+    def _let_go(self) -> None:
+        """Drop what is left of an answer, which DuckDB keeps open otherwise."""
+        if self._reader is not None:
+            self._reader.close()
+            self._reader = None
+        self._connection.abort()
+
+    def _send(self, kind: str, found: Any) -> None:
+        pickle.dump((kind, found), self._replies, pickle.HIGHEST_PROTOCOL)
+        self._replies.flush()
+
+    def _watch(self) -> None:
+        """Tell how far a query is; end this process when the one that asks is gone."""
+        while True:
+            time.sleep(WATCH_S)
+            if os.name == "posix" and os.getppid() != self._opening.parent:
+                os._exit(1)
+            with self._sending:
+                percent = self._connection.query_progress() if self._is_running else -1.0
+                if percent >= 0.0:
+                    self._send(PROGRESS, int(percent))
+
+
+def _settings(opening: Opening) -> dict[str, Any]:
+    return {
+        "memory_limit": f"{opening.memory_gb}GB",
+        "temp_directory": str(opening.spill),
+        "max_temp_directory_size": f"{opening.disk_gb}GB",
+        "autoinstall_known_extensions": False,
+        "autoload_known_extensions": False,
+        "allow_community_extensions": False,
+        "python_enable_replacements": False,
+    }
+
+
+def _parts(running: Any, count: int) -> Iterator[list[tuple[Any, ...]]]:
+    """Give the first rows of a query, some thousand at once."""
+    left = count
+    while left > 0:
+        asked = min(left, ROWS_AT_ONCE)
+        part = running.fetchmany(asked)
+        yield part
+        left = left - asked if len(part) == asked else 0
+
+
+def _without_zones(text: str, columns: list[tuple[str, str]]) -> str:
+    """Return a query whose times with a zone are times in UTC, or text where they are in lists.
+
+    DuckDB makes them with a package that starcat does not need otherwise.
+    """
+    chosen = []
+    for k, (name, kind) in enumerate(columns, start=1):
+        if _ZONED.fullmatch(kind):
+            value = f"#{k} AT TIME ZONE 'UTC'"
+        else:
+            value = f"CAST(#{k} AS VARCHAR)" if _ZONED.search(kind) else f"#{k}"
+        quoted = name.replace('"', '""')
+        chosen.append(f'{value} AS "{quoted}"')
+    return f"SELECT {', '.join(chosen)} FROM ({text})"
+
+
+def _in_utc(rows: list[tuple[Any, ...]], zoned: list[int]) -> list[tuple[Any, ...]]:
+    """Give times their zone; what is no time, as infinity, stays."""
+    given = set(zoned)
+    return [
+        tuple(
+            value.replace(tzinfo=UTC) if k in given and isinstance(value, datetime) else value
+            for k, value in enumerate(row)
+        )
+        for row in rows
+    ]
+
+
+def _as_stream(schema: pa.Schema, batch: pa.RecordBatch | None = None) -> bytes:
+    """Return a batch, or the schema alone, as an Arrow stream."""
+    import pyarrow as pa
+
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, schema) as stream:
+        if batch is not None:
+            stream.write_batch(batch)
+    return bytes(sink.getvalue())
+
+
+def _failure(error: Exception) -> tuple[str, str]:
+    """Return the kind of a failure, and what is to be said about it."""
+    words = str(error).strip() or type(error).__name__
+    if isinstance(error, QueryError):
+        return REFUSED, words
+    if isinstance(error, (duckdb.OutOfMemoryException, MemoryError)) or words.startswith(
+        ("Out of Memory", "std::bad_alloc", "malloc of size")
+    ):
+        return SHORT, words
+    if isinstance(error, duckdb.PermissionException):
+        return REFUSED, f"refused: {words.splitlines()[0]}; a query reads the named targets only"
+    if isinstance(error, (duckdb.InternalException, duckdb.FatalException)):
+        return BROKEN, words.splitlines()[0]
+    return REFUSED, words if isinstance(error, duckdb.Error) else f"{type(error).__name__}: {words}"
