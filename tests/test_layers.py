@@ -27,10 +27,10 @@ ROOMS = rooms_of_the_house()
 
 SINGLE_MODULES = {
     "ground": ["errors", "progress", "resources", "version"],
-    "entry": ["", "cli", "__main__"],  # "" is starcat itself,
+    "entry": ["", "cli", "__main__"],  # "" is starcat itself
 }
 
-GEOMETRY = ("attitude", "camera", "distortion", "kvector", "sphere")
+GEOMETRY = ("attitude", "camera", "distortion", "kvector", "patterns", "sphere")
 LIGHT = {
     "starcat.errors",
     "starcat.storage.hdf5",
