@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from starcat.errors import SchemaError
+from starcat.exchange.label import UNLABELLED, Label
 from starcat.exchange.numpy_columns import NumpyColumn
 from starcat.exchange.units import unit_text
 
@@ -16,7 +17,7 @@ _BREAKS = re.compile(r"\0|[^\S \t\n]")
 """White space that is neither blank, tab nor newline: Python ends lines at most of it."""
 
 
-def write_ecsv(columns: list[NumpyColumn], path: Path) -> None:
+def write_ecsv(columns: list[NumpyColumn], path: Path, label: Label = UNLABELLED) -> None:
     """Write columns as ECSV.
 
     Parameters
@@ -25,6 +26,8 @@ def write_ecsv(columns: list[NumpyColumn], path: Path) -> None:
         The table.
     path : Path
         Overwritten if it exists.
+    label : Label
+        The table's name, artifact and version, which go into ``meta``.
 
     Raises
     ------
@@ -34,7 +37,7 @@ def write_ecsv(columns: list[NumpyColumn], path: Path) -> None:
     from astropy.table import Table
 
     _check_texts(columns)
-    table = Table()
+    table = Table(meta={**({"name": label.table} if label.table else {}), **label.origin})
     for column in columns:
         table[column.name] = _column(column)
     table.write(path, format="ascii.ecsv", overwrite=True)
