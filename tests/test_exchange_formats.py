@@ -6,6 +6,8 @@ import csv
 import io
 import json
 import math
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,7 @@ from hypothesis import strategies as st
 
 from starcat.artifact.reader import open_artifact
 from starcat.errors import ConfigError, OutputError, SchemaError
+from starcat.exchange.export import export_tables
 from starcat.exchange.formats import (
     FORMATS,
     SUFFIXES,
@@ -31,6 +34,8 @@ from starcat.exchange.formats import (
     write_batches,
     write_text_batches,
 )
+from starcat.exchange.label import Label
+from starcat.exchange.tables import tables_of
 from starcat.resources import resource_folder
 from starcat.tables.schema import product_schema
 
@@ -124,6 +129,121 @@ def check_astropy(table: pa.Table, path: Path, file_format: str) -> None:
         assert not wrong, f"{field.name}: {wrong[:3]}"
         unit = (field.metadata or {}).get(b"unit")
         assert read[field.name].unit == (units.Unit(unit.decode()) if unit else None)
+
+
+# What a file says of itself ------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def exported(small_artifact: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """All products in all formats that say what they are."""
+    folder = tmp_path_factory.mktemp("exported")
+    for file_format in ASTROPY:
+        export_tables(tables_of(small_artifact), file_format, folder / file_format)
+    return folder
+
+
+def test_fits_names_product_artifact_and_version(exported: Path) -> None:
+    paths = sorted((exported / "fits").iterdir())
+    assert len(paths) >= 5
+    for path in paths:
+        with fits.open(path) as file:
+            file.verify("exception")
+            header = file[1].header
+            named = [header[key] for key in ("EXTNAME", "ARTIFACT", "VERSION", "LONGSTRN")]
+            assert named == [path.stem, "small", "1.0.0", "OGIP 1.0"]
+            # Before the first text that needs it.
+            cards = [card.keyword for card in header.cards]
+            assert cards.index("LONGSTRN") < cards.index("TCOMM1")
+
+
+@pytest.mark.skipif(shutil.which("fitsverify") is None, reason="fitsverify is not installed")
+def test_fitsverify_finds_nothing(exported: Path) -> None:
+    for path in sorted((exported / "fits").iterdir()):
+        done = subprocess.run(
+            ["fitsverify", str(path)], capture_output=True, text=True, check=False
+        )
+        assert "found 0 warning(s) and 0 error(s)" in done.stdout, done.stdout
+
+
+def test_votable_names_product_artifact_and_version(exported: Path) -> None:
+    for path in sorted((exported / "votable").iterdir()):
+        found = parse(path, verify="exception")
+        (resource,) = found.resources
+        assert {info.name: info.value for info in resource.infos} == {
+            "artifact": "small", "version": "1.0.0"
+        }  # fmt: skip
+        assert resource.tables[0].name == path.stem
+
+
+def test_votable_positions_are_in_a_coordinate_system(exported: Path) -> None:
+    stars = parse(exported / "votable" / "stars.vot", verify="exception")
+    (system,) = stars.resources[0].coordinate_systems
+    assert (system.system, system.epoch) == ("ICRS", "J2026")
+    refer = {field.name for field in stars.get_first_table().fields if field.ref == system.ID}
+    assert refer == {"ra_deg", "dec_deg", "x", "y", "z", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr"}
+    pairs = parse(exported / "votable" / "pairs.vot", verify="exception")
+    assert not pairs.resources[0].coordinate_systems
+
+
+def test_stars_of_several_epochs_have_none_in_common(tmp_path: Path) -> None:
+    schema = product_schema("stars").arrow_schema
+    fields = [schema.field(name) for name in ("ra_deg", "epoch_jyear")]
+    for epochs, expected in (
+        ([2000.0, 2000.5], None),
+        ([1991.25, 1991.25], "J1991.25"),
+        ([], None),
+    ):
+        columns = [pa.array([1.0] * len(epochs), pa.float64()), pa.array(epochs, pa.float64())]
+        table = pa.table(columns, schema=pa.schema(fields))
+        path = tmp_path / "table.vot"
+        write_batches(table.to_reader(), path, "votable")
+        (system,) = parse(path).resources[0].coordinate_systems
+        assert system.epoch == expected
+
+
+def test_ecsv_names_product_artifact_and_version(exported: Path) -> None:
+    for path in sorted((exported / "ecsv").iterdir()):
+        meta = Table.read(path).meta
+        assert meta == {"name": path.stem, "artifact": "small", "version": "1.0.0"}
+
+
+def test_a_table_of_no_artifact_says_nothing_of_one(tmp_path: Path) -> None:
+    # Its name is that of a column, which has an identifier too.
+    table = pa.table({"mag": [1.0]})
+    write_batches(table.to_reader(), tmp_path / "a.vot", "votable", Label("mag"))
+    found = parse(tmp_path / "a.vot", verify="exception")
+    assert found.resources[0].infos == []
+    assert found.get_first_table().name == "mag"
+    write_batches(table.to_reader(), tmp_path / "a.fits", "fits")
+    with fits.open(tmp_path / "a.fits") as file:
+        assert not {"EXTNAME", "ARTIFACT", "VERSION"} & set(file[1].header)
+
+
+@pytest.mark.parametrize("file_format", ["votable", "fits", "ecsv", "npz"])
+def test_a_column_without_a_name_is_refused(file_format: str, tmp_path: Path) -> None:
+    for table in (pa.table({"": [1]}), pa.table({"a": [1], "": ["x"]})):
+        with pytest.raises(SchemaError, match=f"an empty name, which {file_format} cannot hold"):
+            write_batches(table.to_reader(), tmp_path / "a", file_format)
+
+
+@pytest.mark.filterwarnings("ignore:It is strongly recommended")
+@pytest.mark.parametrize(
+    ("file_format", "longest"),
+    [("fits", "x" * 68), ("fits", "'" * 34), ("npz", "x" * 65_531), ("npz", "é" * 32_765)],
+)
+def test_names_as_long_as_can_be(file_format: str, longest: str, tmp_path: Path) -> None:
+    path = tmp_path / f"a{SUFFIXES[file_format][0]}"
+    write_batches(pa.table({longest: [7]}).to_reader(), path, file_format)
+    if file_format == "fits":
+        assert Table.read(path)[longest][0] == 7
+    else:
+        with np.load(path) as file:
+            assert file[longest][0] == 7
+    longer = pa.table({f"{longest}{longest[0]}": [7]})
+    with pytest.raises(SchemaError, match=r"has a name of .* letters") as caught:
+        write_batches(longer.to_reader(), path, file_format)
+    assert len(str(caught.value)) < 200
 
 
 # Products ----------------------------------------------------------------------------------

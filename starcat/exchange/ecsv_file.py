@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcat.errors import SchemaError
+from starcat.exchange.label import UNLABELLED, Label
 from starcat.exchange.numpy_columns import NumpyColumn
 from starcat.exchange.units import unit_text
 
@@ -19,7 +20,7 @@ _BREAKS = re.compile(r"\0|[^\S \t\n]")
 """White space that is neither blank, tab nor newline: Python ends lines at most of it."""
 
 
-def write_ecsv(columns: list[NumpyColumn], path: Path) -> None:
+def write_ecsv(columns: list[NumpyColumn], path: Path, label: Label = UNLABELLED) -> None:
     """Write columns as ECSV.
 
     Parameters
@@ -28,6 +29,8 @@ def write_ecsv(columns: list[NumpyColumn], path: Path) -> None:
         The table.
     path : Path
         Overwritten if it exists.
+    label : Label
+        The table's name, artifact and version, which go into ``meta``.
 
     Raises
     ------
@@ -35,7 +38,9 @@ def write_ecsv(columns: list[NumpyColumn], path: Path) -> None:
         If a unit is not one that astropy knows, or a text would be misread.
     """
     _check_texts(columns)
-    astropy_table(columns).write(path, format="ascii.ecsv", overwrite=True)
+    table = astropy_table(columns)
+    table.meta |= {**({"name": label.table} if label.table else {}), **label.origin}
+    table.write(path, format="ascii.ecsv", overwrite=True)
 
 
 def astropy_table(columns: list[NumpyColumn]) -> Table:

@@ -21,6 +21,7 @@ import pyarrow as pa
 from starcat.errors import ConfigError, OutputError
 from starcat.exchange.formats import FORMATS, SUFFIXES, write_batches
 from starcat.exchange.hats import MAX_ROWS, NEEDED, PROPERTIES_NAME, write_hats
+from starcat.exchange.label import Label
 from starcat.exchange.numpy_columns import field_facts
 from starcat.exchange.tables import NamedTables
 from starcat.storage.atomic import whole_folder
@@ -127,26 +128,18 @@ def export_tables(
     OutputError
         If the folder cannot be written to, or already holds something else.
     """
-    if file_format not in EXPORT_FORMATS:
-        raise ConfigError(
-            f"format {file_format!r} is unknown; choose one of {', '.join(EXPORT_FORMATS)}",
-            key="to",
-            value=file_format,
-        )
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(f"{folder}: is a file; choose a folder with --output", path=folder)
+    _check_asked(file_format, folder)
+    columns: list[tuple[str, ...]] = []
     with whole_folder(folder) as partial:
         files = []
-        columns: list[tuple[str, ...]] = []
         for product in tables.chosen(products):
             table = tables.readers[product]()
-            if file_format == "hats":
-                if products or set(NEEDED) <= set(table.column_names):
-                    name = f"{tables.name}-{product}" if product != tables.name else product
-                    files.append(_write_hats(table, partial / product, name, max_partition_rows))
-                continue
-            files.append(_write_file(table, partial, product, file_format))
-            columns += _described(product, table.schema)
+            if file_format != "hats":
+                files.append(_write_file(table, partial, tables.label(product), file_format))
+                columns += _described(product, table.schema)
+            elif products or set(NEEDED) <= set(table.column_names):
+                name = f"{tables.name}-{product}" if product != tables.name else product
+                files.append(_write_hats(table, partial / product, name, max_partition_rows))
         if not files:
             raise ConfigError(f"{tables.name} has no star table, which HATS is for")
         has_columns = file_format in WITHOUT_UNITS
@@ -156,10 +149,22 @@ def export_tables(
     return Exported(tables.name, file_format, folder, tuple(files), has_columns)
 
 
-def _write_file(table: pa.Table, folder: Path, product: str, file_format: str) -> ExportedFile:
-    path = folder / f"{product}{SUFFIXES[file_format][0]}"
-    rows = write_batches(table.to_reader(), path, file_format)
-    return ExportedFile(product, path.name, rows, path.stat().st_size)
+def _check_asked(file_format: str, folder: Path) -> None:
+    """Refuse what cannot be done before anything is read."""
+    if file_format not in EXPORT_FORMATS:
+        raise ConfigError(
+            f"format {file_format!r} is unknown; choose one of {', '.join(EXPORT_FORMATS)}",
+            key="to",
+            value=file_format,
+        )
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder}: is a file; choose a folder with --output", path=folder)
+
+
+def _write_file(table: pa.Table, folder: Path, label: Label, file_format: str) -> ExportedFile:
+    path = folder / f"{label.table}{SUFFIXES[file_format][0]}"
+    rows = write_batches(table.to_reader(), path, file_format, label)
+    return ExportedFile(label.table, path.name, rows, path.stat().st_size)
 
 
 def _write_hats(table: pa.Table, folder: Path, name: str, max_rows: int) -> ExportedFile:

@@ -3,7 +3,8 @@
 FITS text is ASCII, and an empty text is its null. Nulls are NaN in floating-point columns, TNULL
 (the smallest number that the column does not use) in integer ones, and an empty list in ragged
 ones. A column of truth values with nulls becomes bytes 0 and 1 with TNULL, since readers take
-the null of a logical column for False.
+the null of a logical column for False. Texts of the header that are longer than a card go on in
+the next, which ``LONGSTRN`` announces.
 """
 
 from __future__ import annotations
@@ -15,15 +16,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.errors import SchemaError
+from starcat.exchange.label import UNLABELLED, Label
 from starcat.exchange.numpy_columns import NumpyColumn
 from starcat.exchange.units import unit_text
 
 _CODES = {"b1": "L", "u1": "B", "i2": "I", "i4": "J", "i8": "K", "f4": "E", "f8": "D"}
+_NAME_LETTERS = 68
+"""What a card of a FITS header has room for; a quotation mark counts twice."""
+
 _HEAP_LIMIT_BYTES = 2**31 - 1
 """What a descriptor of 32 bits reaches; beyond it FITS has one of 64 bits."""
 
 
-def write_fits(columns: list[NumpyColumn], rows: int, path: Path) -> None:
+def write_fits(
+    columns: list[NumpyColumn], rows: int, path: Path, label: Label = UNLABELLED
+) -> None:
     """Write columns as a FITS file with one binary table.
 
     Parameters
@@ -34,6 +41,9 @@ def write_fits(columns: list[NumpyColumn], rows: int, path: Path) -> None:
         How many there are.
     path : Path
         Overwritten if it exists.
+    label : Label
+        The table's name, which becomes ``EXTNAME``, and its artifact and version, which become
+        ``ARTIFACT`` and ``VERSION``.
 
     Raises
     ------
@@ -48,6 +58,11 @@ def write_fits(columns: list[NumpyColumn], rows: int, path: Path) -> None:
     table = fits.BinTableHDU.from_columns(
         [_column(column, descriptor) for column in columns], nrows=rows
     )
+    named = {"EXTNAME": label.table, "ARTIFACT": label.artifact, "VERSION": label.version}
+    for key, text in named.items():
+        if text:
+            table.header[key] = _header_text(text)
+    table.header["LONGSTRN"] = ("OGIP 1.0", "long texts go on in CONTINUE")
     for number, column in enumerate(columns, start=1):
         for key, fact in (("TCOMM", "description"), ("TUCD", "ucd")):
             if column.facts.get(fact):
@@ -67,6 +82,12 @@ def _check_names(columns: list[NumpyColumn]) -> None:
         if not (name.isascii() and name.isprintable()):
             raise SchemaError(
                 f"column {name!r}: names are ASCII in FITS; rename it with AS", field=name
+            )
+        if len(name.replace("'", "''")) > _NAME_LETTERS:
+            raise SchemaError(
+                f"column {name[:20]}... has a name of {len(name)} letters, and FITS has room for "
+                f"{_NAME_LETTERS}; rename it with AS",
+                field=name,
             )
         if name.lower() in seen:
             raise SchemaError(

@@ -16,8 +16,9 @@ import pyarrow as pa
 from starcat.errors import ConfigError, OutputError
 from starcat.exchange.ecsv_file import write_ecsv
 from starcat.exchange.fits_file import write_fits
+from starcat.exchange.label import UNLABELLED, Label
 from starcat.exchange.npz_file import write_npz
-from starcat.exchange.numpy_columns import numpy_columns
+from starcat.exchange.numpy_columns import check_names, numpy_columns
 from starcat.exchange.parquet_stream import write_parquet_stream
 from starcat.exchange.text import csv_chunks, json_chunks
 from starcat.exchange.votable_file import write_votable
@@ -76,7 +77,9 @@ def format_of(path: str | Path) -> str:
     )
 
 
-def write_batches(batches: pa.RecordBatchReader, target: Path, file_format: str) -> int:
+def write_batches(
+    batches: pa.RecordBatchReader, target: Path, file_format: str, label: Label = UNLABELLED
+) -> int:
     """Write a table to a file, which appears at its name when it is whole.
 
     Parameters
@@ -87,6 +90,8 @@ def write_batches(batches: pa.RecordBatchReader, target: Path, file_format: str)
         The file; replaced if it exists.
     file_format : str
         One of `FORMATS`.
+    label : Label
+        What VOTable, FITS and ECSV say of the table as a whole.
 
     Returns
     -------
@@ -111,7 +116,7 @@ def write_batches(batches: pa.RecordBatchReader, target: Path, file_format: str)
     watched = pa.RecordBatchReader.from_batches(batches.schema, _watched(batches, failures))
     try:
         with whole_file(target) as partial:
-            return _write(watched, partial, file_format)
+            return _write(watched, partial, file_format, label)
     except OutputError:
         if failures:  # DuckDB's errors come as those of files do, but it was no writing that failed
             raise failures[0] from None
@@ -159,7 +164,7 @@ def _watched(batches: pa.RecordBatchReader, failures: list[Exception]) -> Iterat
         raise
 
 
-def _write(batches: pa.RecordBatchReader, path: Path, file_format: str) -> int:
+def _write(batches: pa.RecordBatchReader, path: Path, file_format: str, label: Label) -> int:
     if file_format in TEXT_FORMATS:
         rows = 0
         with path.open("wb") as stream:
@@ -169,17 +174,18 @@ def _write(batches: pa.RecordBatchReader, path: Path, file_format: str) -> int:
         return rows
     if file_format == "parquet":
         return write_parquet_stream(batches, path)
-    return _write_table(batches.read_all(), path, file_format)
+    return _write_table(batches.read_all(), path, file_format, label)
 
 
-def _write_table(table: pa.Table, path: Path, file_format: str) -> int:
+def _write_table(table: pa.Table, path: Path, file_format: str, label: Label) -> int:
     columns = numpy_columns(table, signed=file_format in ("votable", "fits"))
+    check_names(columns, file_format)
     if file_format == "votable":
-        write_votable(columns, len(table), path)
+        write_votable(columns, len(table), path, label)
     elif file_format == "fits":
-        write_fits(columns, len(table), path)
+        write_fits(columns, len(table), path, label)
     elif file_format == "ecsv":
-        write_ecsv(columns, path)
+        write_ecsv(columns, path, label)
     else:
         write_npz(columns, path)
     return len(table)

@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from starcat.errors import SchemaError
 from starcat.exchange.numpy_columns import NumpyColumn
 
+_NAME_BYTES = (1 << 16) - 1
+"""What an entry of a zip file has room for."""
+
 
 def write_npz(columns: list[NumpyColumn], path: Path) -> None:
     """Write columns as an npz file.
@@ -31,7 +34,7 @@ def write_npz(columns: list[NumpyColumn], path: Path) -> None:
     Raises
     ------
     SchemaError
-        If a text ends with a null character.
+        If a text ends with a null character, or a name is too long.
     """
     # Not numpy.savez: it takes a column named "file" for its own argument.
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -57,6 +60,12 @@ def _texts(column: NumpyColumn) -> NDArray[np.str_]:
 
 
 def _add(archive: zipfile.ZipFile, name: str, values: NDArray[Any]) -> None:
+    if len(f"{name}.npy".encode()) > _NAME_BYTES:
+        raise SchemaError(
+            f"column {name[:20]}... has a name of {len(name)} letters, which npz has no room for; "
+            "rename it with AS",
+            field=name,
+        )
     if f"{name}.npy" in archive.namelist():
         raise SchemaError(
             f"column {name!r}: the file has an array of that name already, for a column's lists "

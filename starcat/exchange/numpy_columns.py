@@ -88,6 +88,30 @@ def numpy_columns(table: pa.Table, *, signed: bool) -> list[NumpyColumn]:
     ]
 
 
+def check_names(columns: list[NumpyColumn], file_format: str) -> None:
+    """Refuse a column without a name, which these formats have no place for.
+
+    Parameters
+    ----------
+    columns : list of NumpyColumn
+        The table.
+    file_format : str
+        For the message.
+
+    Raises
+    ------
+    SchemaError
+        If a name is empty.
+    """
+    for number, column in enumerate(columns, start=1):
+        if not column.name:
+            raise SchemaError(
+                f"column {number} has an empty name, which {file_format} cannot hold; give it "
+                "one with AS",
+                field=column.name,
+            )
+
+
 def field_facts(field: pa.Field) -> dict[str, str]:
     """Return what the metadata of a field says about its column.
 

@@ -11,6 +11,7 @@ import pyarrow as pa
 
 from starcat.artifact.reader import open_artifact
 from starcat.errors import ConfigError, SourceError, SourceMissing, suggest
+from starcat.exchange.label import Label
 from starcat.tables.parquet import read_parquet
 
 
@@ -24,10 +25,29 @@ class NamedTables:
         Of all of them together, such as the artifact's name and version.
     readers : mapping of str to callable
         What returns each table, by product.
+    artifact, version : str
+        The artifact that they are products of; empty where they are of none.
     """
 
     name: str
     readers: Mapping[str, Callable[[], pa.Table]]
+    artifact: str = ""
+    version: str = ""
+
+    def label(self, product: str) -> Label:
+        """Return what an exported file says of its table.
+
+        Parameters
+        ----------
+        product : str
+            One of the names.
+
+        Returns
+        -------
+        Label
+            With the name of the product.
+        """
+        return Label(product, self.artifact, self.version)
 
     def chosen(self, products: Sequence[str] | None) -> list[str]:
         """Return the names asked for, in the order of the tables.
@@ -82,7 +102,8 @@ def tables_of(path: Path) -> NamedTables:
     if path.is_dir():
         artifact = open_artifact(path)
         readers = {name: partial(artifact.table, name) for name in artifact.products}
-        return NamedTables(f"{artifact.manifest['name']}-{artifact.manifest['version']}", readers)
+        name, version = artifact.manifest["name"], artifact.manifest["version"]
+        return NamedTables(f"{name}-{version}", readers, name, version)
     if not path.exists():
         raise SourceMissing(
             f"{path}: does not exist; give the folder of an artifact or a Parquet file", path=path
