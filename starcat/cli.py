@@ -44,7 +44,7 @@ class WholeSummaries(TyperGroup):
         Parameters
         ----------
         ctx : click.Context
-            Of the help.
+            Context of the help.
         formatter : click.HelpFormatter
             Wraps the lines.
         """
@@ -127,7 +127,7 @@ def _run(arguments: Sequence[str]) -> int:
         code = command.main(list(arguments), "starcat", standalone_mode=False)
         sys.stdout.flush()
     except BrokenPipeError:
-        # Whoever read the output has had enough; what is left goes nowhere, without a word.
+        # The reader of the output is gone: what is left goes nowhere, and nothing is said.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     return code if isinstance(code, int) else 0

@@ -18,7 +18,7 @@ def reason(error: OSError) -> str:
     Parameters
     ----------
     error : OSError
-        Of Python or of a library, which often puts more before the system's own words.
+        The error, of Python or of a library, which often puts more before the system's words.
 
     Returns
     -------

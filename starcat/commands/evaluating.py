@@ -13,7 +13,7 @@ from starcat.errors import ConfigError
 app = typer.Typer()
 
 METAVAR = "VALUE[,VALUE...]"
-"""Of the quantities that a sweep varies."""
+"""Form of what is said of a quantity that a sweep varies."""
 
 Folder = Annotated[
     Path | None, typer.Argument(help="The folder <name>-<version>; or else --paper.")

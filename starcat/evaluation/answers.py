@@ -33,7 +33,7 @@ def with_matcher(
     Parameters
     ----------
     matcher : Matcher
-        With a database open.
+        The matcher, with a database open.
     centroids_px : ndarray of float64, shape (N, 2)
         Pixels.
     camera : Camera
@@ -60,7 +60,7 @@ def bare(name: Name) -> Answer:
     Returns
     -------
     Answer
-        Its results have stars, but no attitude and no false-match probability below 1.
+        A result that has stars, but no attitude and no false-match probability below 1.
     """
 
     def answer(
@@ -87,7 +87,7 @@ def _angular_capped(observation: Observation, database: Database) -> Rows:
 
 
 def _l2(observation: Observation, database: Database) -> Rows:
-    # The circle inside the frame, whatever the scale may be.
+    # This is the circle inside the frame, whatever the scale may be.
     reach = 0.5 * min(observation.camera.width_px, observation.camera.height_px)
     radius_rad = float(np.arctan(reach / observation.camera.focal_length_px))
     stars, _ = hausdorff_l2.rank_stars(observation, database, count=1, radius_rad=radius_rad)

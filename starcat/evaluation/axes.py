@@ -20,13 +20,13 @@ class Axis:
     Attributes
     ----------
     label : str
-        In words, with its unit.
+        The quantity in words, with its unit.
     usual : tuple of float
         Values that a sweep tries unless told otherwise; none for none.
     low, high : float
         Values outside of this range mean nothing.
     read : callable
-        Its value in a trial; NaN where it has none.
+        Function that returns its value in a trial; NaN where the trial has none.
     write : callable
         The same trial with another value.
     """
@@ -44,9 +44,9 @@ class Axis:
         Parameters
         ----------
         trial : Trial
-            Whose ``camera`` and ``assumed`` are given.
+            A trial whose ``camera`` and ``assumed`` are given.
         value : float
-            In the unit of the label.
+            The value, in the unit of the label.
 
         Returns
         -------
@@ -146,7 +146,7 @@ AXES: dict[str, Axis] = {
     ),
     "limit_mag": _noise("limit_mag", "faintest magnitude that is seen, mag", (), -30.0, 40.0),
 }  # fmt: skip
-"""By name; the camera as it is, not as the matcher takes it to be, is what changes."""
+"""Quantities by name. Of a camera the true one changes, not the one that the matcher assumes."""
 
 
 def axis_label(trials: Sequence[Trial], x: Sequence[float]) -> str:

@@ -36,7 +36,7 @@ class MeasuredRow:
     row : Row
         The paper's.
     rates : TrialRates
-        Of its trial.
+        Rates of the row's trial.
     failures : dict of str to int
         Frames without success by the row's rule, by cause.
     """
@@ -61,7 +61,7 @@ class MeasuredRow:
         Returns
         -------
         dict
-            For JSON: the row, its trial in full, the rates with their intervals.
+            Plain values for JSON: the row, its trial in full, the rates with their intervals.
         """
         rates = {
             name: value.as_dict() if isinstance(value, Share) else round(value, 4)
@@ -87,7 +87,7 @@ class Outcome:
     is_quick : bool
         Whether fewer frames were tried than the paper's.
     rows : tuple of MeasuredRow
-        In the paper's order.
+        The measured rows, in the paper's order.
     statistics : tuple of Statistic
         Numbers that need no trial.
     """
@@ -132,7 +132,7 @@ def is_goal_reached(statistic: Statistic) -> bool | None:
     Parameters
     ----------
     statistic : Statistic
-        With or without a goal.
+        The number, with or without a goal.
 
     Returns
     -------
@@ -218,11 +218,12 @@ def _measured(row: Row, records: Path) -> MeasuredRow:
 def _running(
     tasks: list[tuple[Trial, Path]], folder: Path, workers: int
 ) -> Iterator[Iterator[Trial]]:
-    """Give the trials as they end; leaving early drops those that have not ended."""
+    """Yield the trials as they end; leaving the block early drops those that have not ended."""
     if workers == 1:
         yield (_run(trial, artifact, folder) for trial, artifact in tasks)
         return
-    # Processes that are copies of this one would hold locks of its libraries' threads.
+    # Processes are spawned: a forked one inherits locks that the threads of libraries hold, and
+    # waits for them without end.
     context, others = multiprocessing.get_context("spawn"), multiprocessing.active_children()
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with_parent)
     try:

@@ -92,7 +92,7 @@ def blend(sky: Sky, limit_rad: float) -> Sky:
     Returns
     -------
     Sky
-        In the order of each group's brightest member.
+        Merged stars, in the order of each group's brightest member.
     """
     pairs, apart = pairs_within(sky.directions, limit_rad)
     i, j = pairs[apart < limit_rad].T

@@ -32,7 +32,7 @@ class Verdict:
     n_centroids, n_guide_stars, n_false : int
         What the frame holds; guide stars are those that the camera saw.
     status : str
-        Of the answer: ``identified``, ``no_match`` or ``too_few_stars``.
+        Status of the answer: ``identified``, ``no_match`` or ``too_few_stars``.
     n_named, n_right, n_wrong : int
         Centroids with a star; those with their own; those with a star that is elsewhere.
     is_reference_right : bool
@@ -42,7 +42,7 @@ class Verdict:
     boresight_error_arcsec, roll_error_arcsec : float
         The same, across and about the true boresight.
     false_match_probability : float
-        As the matcher says.
+        The probability that the matcher states.
     time_ms : float
         Processor time of the identification.
     """
@@ -81,7 +81,7 @@ def judge(
     Parameters
     ----------
     number : int
-        Of the frame.
+        Number of the frame.
     frame : Frame
         The truth.
     result : MatchResult
@@ -94,7 +94,7 @@ def judge(
         A star is elsewhere if its true place is farther than this from the centroid. A false
         spot on the place of a star that is missing cannot be told from that star.
     time_ms : float
-        Of the identification.
+        Time of the identification.
 
     Returns
     -------
@@ -134,7 +134,7 @@ def reference_of(frame: Frame, camera: Camera) -> int | None:
     frame : Frame
         The truth.
     camera : Camera
-        Its size.
+        The camera, for its size.
 
     Returns
     -------

@@ -20,7 +20,7 @@ class Row:
     group : str
         Title of the table or curve.
     label : str
-        Of the line.
+        Name of the line.
     preset : str
         The artifact that is used, by its preset.
     trial : Trial
@@ -62,13 +62,13 @@ class Statistic:
     Attributes
     ----------
     group, label : str
-        As of a row.
+        Title of the table, and name of the line.
     measured : float
-        By starcat.
+        The number that starcat measures.
     unit : str
-        Of the numbers; empty for counts.
+        Unit of the numbers; empty for counts.
     published, goal : float, optional
-        By the paper, and what starcat wants to reach.
+        The number that the paper prints, and the one that starcat wants to reach.
     is_lower_better : bool or None
         How to read the goal; None where it is to be met within 1 percent.
     note : str
@@ -98,9 +98,9 @@ class Paper:
     presets : tuple of str
         Artifacts that it needs.
     rows : callable
-        Its rows; of a quick run (True) with fewer frames.
+        Function that returns the rows; for a quick run (True) with fewer frames.
     statistics : callable
-        Its other numbers, from the artifacts' folders by preset.
+        Function that returns the other numbers, from the artifacts' folders by preset.
     deviations : tuple of str
         What the paper leaves unsaid, and what is done instead.
     """
@@ -138,7 +138,7 @@ def product_mib(artifact: Path, product: str) -> float:
     artifact : Path
         The artifact's folder.
     product : str
-        Its name.
+        Name of the product.
 
     Returns
     -------

@@ -20,7 +20,7 @@ RULES = {
     "reference": "is_reference_right",
     "two_stars": "n_right >= 2 AND n_wrong = 0",
 }
-"""Success as a condition on a record: starcat's own, and those of S4, of S1 and S2, of S5."""
+"""Rules of success as conditions on a record: starcat's own, S4's, that of S1 and S2, S5's."""
 
 MEANINGS = {
     "starcat": "accepted at a false-match probability of 1e-9, the attitude right, no star wrong",
@@ -28,7 +28,7 @@ MEANINGS = {
     "reference": "the guide star nearest to the centre of the frame has its own name",
     "two_stars": "at least two stars right, none wrong",
 }
-"""The same in words."""
+"""What each rule means, in words."""
 
 CAUSES = {
     "under 4 guide stars": "n_guide_stars < 4",
@@ -36,7 +36,7 @@ CAUSES = {
     "no answer": "status <> 'identified'",
     "wrong answer": "true",
 }
-"""Why a frame failed, as a condition on its record: the first that holds."""
+"""Causes of a failure, as conditions on a frame's record; the first that holds is the cause."""
 
 _RATES = """
 WITH record AS (
@@ -101,7 +101,7 @@ class Share:
         Returns
         -------
         dict
-            For JSON; ``percent`` is None of none.
+            Plain values for JSON; ``percent`` is None where there are no frames.
         """
         low, high = self.interval_percent
         return {
@@ -148,7 +148,7 @@ def rates_of(records: Path, rule: str, reach_px: float) -> TrialRates:
     Parameters
     ----------
     records : Path
-        Its Parquet file.
+        The trial's Parquet file.
     rule : str
         A key of `RULES`.
     reach_px : float
@@ -157,7 +157,7 @@ def rates_of(records: Path, rule: str, reach_px: float) -> TrialRates:
     Returns
     -------
     TrialRates
-        Of all frames.
+        Rates over all frames of the trial.
     """
     query = _RATES.format(rule=RULES[rule], own=RULES["starcat"], accepted=_ACCEPTED, holds=_HOLDS)
     (row,) = _rows(query, records, reach_px)
@@ -181,11 +181,11 @@ def failures_of(records: Path, rule: str, reach_px: float) -> dict[str, int]:
     Parameters
     ----------
     records : Path
-        Its Parquet file.
+        The trial's Parquet file.
     rule : str
         A key of `RULES`.
     reach_px : float
-        As for `rates_of`.
+        The limit that `rates_of` takes.
 
     Returns
     -------

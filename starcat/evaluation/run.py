@@ -58,7 +58,7 @@ def prepare_artifacts(
     inputs : mapping of str to sequence of Path
         Input files or folders by source; others are looked for.
     folder : Path
-        Where to build them. An artifact that is there already is left as it is if the build
+        Folder to build them in. An artifact that is there already is left as it is if the build
         gives the same one, else replaced.
     workers : int, default 2
         Threads.
@@ -73,7 +73,7 @@ def prepare_artifacts(
     Raises
     ------
     SourceError, BuildError, OutputError
-        As `build` does.
+        The errors of `build`.
     """
     artifacts = {}
     for name in dict.fromkeys(presets):

@@ -129,7 +129,7 @@ def plan_sweep(
     camera : Camera, optional
         The artifact's own by default.
     frames, tolerance_px, seed
-        As `Sweep` has them.
+        Values for `Sweep`, as it describes them.
     quick : bool, default False
         Whether few frames will do where ``frames`` does not say how many.
 

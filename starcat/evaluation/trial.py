@@ -56,9 +56,9 @@ class Attitudes:
     count : int
         Number of frames; 0 for the whole grid. Of a grid, so many are drawn, in order.
     step_deg : float
-        Of the grid.
+        Step of the grid.
     roll_deg : float or None
-        Of ``grid`` and ``stars``; None draws it at random.
+        Roll of ``grid`` and ``stars``; None draws it at random.
     """
 
     kind: str = "random"
@@ -74,11 +74,11 @@ class Trial:
     Attributes
     ----------
     name : str
-        Of the result's file.
+        Name of the file of results.
     method : str
-        Of the matcher.
+        Name of the matcher's method.
     attitudes : Attitudes
-        Where the camera looks.
+        The attitudes of the camera.
     noise : Noise
         What the frames suffer.
     camera : Camera, optional
@@ -86,7 +86,7 @@ class Trial:
     assumed : Camera, optional
         What the matcher is told; default: the same.
     tolerance_px : float
-        Of the matcher.
+        Tolerance of the matcher.
     max_false_match_probability : float
         The least certain answer that is recorded; 1e-9 is what starcat itself accepts.
     with_magnitudes : bool
@@ -94,11 +94,11 @@ class Trial:
     answer : str
         Key of `ANSWERS`: the matcher as it is, or a paper's method without verification.
     selection : TriangleOrder
-        Of triangles.
+        Order in which the matcher takes triangles.
     guide_stars_only : bool
         Whether nothing but guide stars shines.
     seed : int
-        Of all that is random; frame by frame, so their number changes none of them.
+        Seed of all that is random. Each frame has its own, so that their number changes none.
     """
 
     name: str
@@ -186,7 +186,7 @@ def description(trial: Trial, artifact: Path) -> bytes:
     trial : Trial
         The trial.
     artifact : Path
-        Its artifact.
+        The artifact's folder.
 
     Returns
     -------
@@ -301,7 +301,7 @@ def attitude_of(
     trial : Trial
         The trial.
     number : int
-        Of the frame.
+        Number of the frame.
     guide_stars : ndarray of float64, shape (N, 3)
         Directions, for boresights at stars.
     generator : numpy.random.Generator

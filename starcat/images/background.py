@@ -136,7 +136,7 @@ def repair_hot_pixels(levels: Levels, psf_sigma_px: float) -> Levels:
     Returns
     -------
     Levels
-        With another ``above``; ``raw`` stays.
+        The same levels with another ``above``; ``raw`` stays.
     """
     centre, square = (erf(half / (np.sqrt(2.0) * psf_sigma_px)) ** 2 for half in (0.5, 1.5))
     y, x = np.nonzero(levels.above > _HOT_NOISE * levels.noise)

@@ -103,13 +103,13 @@ def find_spots(
     Returns
     -------
     Spots
-        By flux, equal ones by x, then by y. Empty if nothing stands out.
+        Spots by flux, equal ones by x, then by y. Empty if nothing stands out.
 
     Raises
     ------
     ConfigError
         If sep is not installed; if the image is not 2-D, too small, without a finite value, or
-        has too much in it to be a levels; if a parameter is not positive.
+        has too much in it to tell stars from the sky; if a parameter is not positive.
 
     References
     ----------
@@ -156,8 +156,8 @@ def _detect(levels: Levels, sigma: float, threshold: float) -> NDArray[Any]:
         )  # fmt: skip
     except Exception as error:  # sep raises nothing more special when a buffer is full
         raise ConfigError(
-            f"the image has too much in it to be a levels ({error}); raise the threshold "
-            f"({threshold:g} sigma) or check that it is a star image"
+            f"the image has too much in it to tell stars from the sky ({error}); raise the "
+            f"threshold ({threshold:g} sigma) or check that it is a star image"
         ) from error
     return np.asarray(found)
 
@@ -165,7 +165,7 @@ def _detect(levels: Levels, sigma: float, threshold: float) -> NDArray[Any]:
 def _measured_sigma(levels: Levels, found: NDArray[Any]) -> float:
     """Return sigma of the spots that stand out well, from the radius with half of their light.
 
-    Of these the middle by brightness: the brightest may be saturated, which makes them wide.
+    The middle ones by brightness are taken: the brightest may be saturated and so too wide.
     """
     order = np.argsort(-found["flux"], kind="stable")
     clear = int((found["flux"] > _CLEAR_NOISE * levels.noise[found["ypeak"], found["xpeak"]]).sum())
@@ -225,7 +225,7 @@ def brightest_first(flux: Array, centroids_px: Array) -> NDArray[np.int64]:
     flux : ndarray of float64, shape (N,)
         Light of each spot.
     centroids_px : ndarray of float64, shape (N, 2)
-        Their places.
+        Places of the spots.
 
     Returns
     -------

@@ -22,7 +22,7 @@ IMAGE_SUFFIXES = (".fits", ".fit", ".fts", ".gz", ".fz", ".png", ".tif", ".tiff"
 """Files that are read as images; all others hold centroids."""
 
 CENTROIDS_SUFFIX = ".csv"
-"""Of the file that a simulated frame's centroids are written to."""
+"""Suffix of the file that a simulated frame's centroids are written to."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def identify_frames(matcher: Matcher, measured: MeasuredFile, camera: Camera) ->
     Parameters
     ----------
     matcher : Matcher
-        With a database open.
+        The matcher, with a database open.
     measured : MeasuredFile
         The frames.
     camera : Camera
@@ -116,9 +116,9 @@ def write_simulated(path: Path, frame: Frame, camera: Camera, seed: int) -> None
     frame : Frame
         Centroids and magnitudes.
     camera : Camera
-        Its size.
+        The camera, for its size.
     seed : int
-        Of the image's noise.
+        Seed of the image's noise.
 
     Raises
     ------
@@ -161,7 +161,7 @@ def draw(
     database : Database
         Names of the stars.
     camera : Camera
-        Its size.
+        The camera, for its size.
 
     Raises
     ------

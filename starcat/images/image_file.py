@@ -36,7 +36,7 @@ WRITTEN_KINDS = {
 }  # fmt: skip
 """What is written under which suffix."""
 _LUMINANCE = np.array([0.299, 0.587, 0.114])
-"""Of red, green, blue: ITU-R BT.601."""
+"""Weights of red, green and blue: ITU-R BT.601."""
 
 
 def read_image(path: Path, *, flip: bool | None = None, hdu: int | None = None) -> Grey:

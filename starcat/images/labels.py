@@ -28,7 +28,7 @@ def place_labels(
     centres : ndarray of float64, shape (N, 2)
         Middles of all marks (x right, y down), in any unit that all lengths here share.
     radii : ndarray of float64, shape (N,)
-        Of the marks.
+        Radii of the marks.
     sizes : ndarray of float64, shape (N, 2)
         Width and height of each mark's label.
     wanted : sequence of int

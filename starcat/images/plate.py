@@ -37,7 +37,7 @@ class Plate:
     Attributes
     ----------
     axes : matplotlib.axes.Axes
-        In pixels of the camera, y down.
+        Axes in pixels of the camera, y down.
     scale : float
         Points of the drawing per pixel.
     size : tuple of int
@@ -47,7 +47,7 @@ class Plate:
     names : sequence of str or None, length N
         What each mark is; None where it is not known.
     radii : ndarray of float64, shape (N,)
-        Of the marks, points.
+        Radii of the marks, points.
     """
 
     axes: Axes

@@ -86,7 +86,7 @@ def star_electrons(
     camera_size : tuple of int
         Width and height, pixels.
     optics : Optics
-        Its spot and its zero point; the well has no bottom here.
+        The optics: spot and zero point; the well has no bottom here.
 
     Returns
     -------
@@ -157,7 +157,7 @@ def render_image(
     optics : Optics
         Spot, zero point, noise and limits.
     seed : int
-        Of all that is random; the same seed gives the same image.
+        Seed of all that is random; the same seed gives the same image.
 
     Returns
     -------
@@ -167,7 +167,7 @@ def render_image(
     Raises
     ------
     ValueError
-        As `star_electrons` does.
+        The errors of `star_electrons`.
 
     Notes
     -----

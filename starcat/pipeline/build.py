@@ -61,13 +61,13 @@ class Built:
     outcome : {"written", "unchanged", "replaced"}
         What happened to the folder.
     manifest : dict
-        Of the artifact.
+        Manifest of the artifact.
     filters : tuple of FilterCoverage
         What each filter left.
     coverage : CoverageReport
-        Of the guide stars.
+        Coverage by the guide stars.
     rates : tuple of Rates
-        Of the self-test: clean and hard frames.
+        Rates of the self-test: clean and hard frames.
     problems : tuple of str
         The first malformed records.
     warnings : tuple of str
@@ -198,7 +198,7 @@ def read_sources(
     spec : BuildSpec
         Which sources, and the epoch.
     inputs : mapping of str to sequence of Path
-        As for `build`.
+        Inputs, as `build` takes them.
     workers : int
         Threads.
     progress : Progress
@@ -209,7 +209,7 @@ def read_sources(
     catalog : Ingested
         The star table, at the epoch of the spec.
     amplitudes : list of AmplitudeTable
-        In the order of the spec.
+        Catalogs, in the order of the spec.
     """
     joins = spec.selection.variables.join
     check_inputs(spec, inputs)
@@ -235,7 +235,7 @@ def check_inputs(spec: BuildSpec, inputs: Inputs) -> None:
     spec : BuildSpec
         Which sources.
     inputs : mapping of str to sequence of Path
-        As for `build`.
+        Inputs, as `build` takes them.
 
     Raises
     ------
@@ -267,9 +267,9 @@ def report_build(folder: Path, results: Results) -> CoverageReport:
     Parameters
     ----------
     folder : Path
-        With the products written; gets a folder ``report``.
+        Folder with the products written; it gets a folder ``report``.
     results : Results
-        Of the stages before.
+        Results of the stages before.
 
     Returns
     -------
@@ -310,7 +310,7 @@ def make_products(
     Returns
     -------
     list of Product
-        In the order of the database.
+        Products, in the order of the database.
     """
     rejected = pa.concat_tables([catalog.rejected, selected.rejected]).combine_chunks()
     order = product_schema("rejected").order
@@ -359,7 +359,7 @@ def run_self_test(folder: Path, spec: BuildSpec, progress: Progress) -> tuple[Ra
     Parameters
     ----------
     folder : Path
-        With ``database.h5``.
+        Folder with ``database.h5``.
     spec : BuildSpec
         How many fields, their noise and seed.
     progress : Progress
@@ -381,7 +381,7 @@ def check_rates(rates: tuple[Rates, Rates], spec: BuildSpec) -> None:
     Parameters
     ----------
     rates : tuple of Rates
-        Of the self-test.
+        Rates of the self-test.
     spec : BuildSpec
         ``self_test.min_identified``.
 

@@ -69,7 +69,7 @@ def filter_coverage(step: Step, spec: BuildSpec) -> FilterCoverage:
     Returns
     -------
     FilterCoverage
-        For the table of filters.
+        One line of the table of filters.
     """
     fields = tile_sphere(
         spec.boresights.count,
@@ -94,14 +94,14 @@ def coverage_report(coverage: Coverage, spec: BuildSpec) -> CoverageReport:
     Parameters
     ----------
     coverage : Coverage
-        By boresight.
+        Stars, pairs and triangles by boresight.
     spec : BuildSpec
         Says how far a field reaches at any roll: half of its narrower angle.
 
     Returns
     -------
     CoverageReport
-        With the gaps of the tiling.
+        Coverage with the gaps of the tiling.
     """
     size = field_size(spec)
     return report_coverage(coverage, 0.5 * float(np.radians(min(size.fov_x_deg, size.fov_y_deg))))
@@ -179,7 +179,7 @@ class Results:
     filters : sequence of FilterCoverage
         What each filter left.
     rates : sequence of Rates
-        Of the self-test.
+        Rates of the self-test.
     """
 
     spec: BuildSpec
@@ -197,9 +197,9 @@ def build_facts(folder: Path, results: Results) -> BuildFacts:
     Parameters
     ----------
     folder : Path
-        With the products written.
+        Folder with the products written.
     results : Results
-        Of the stages before.
+        Results of the stages before.
 
     Returns
     -------

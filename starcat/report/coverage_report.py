@@ -20,7 +20,7 @@ from starcat.report.plots import draw_histogram, draw_map, save_plot
 from starcat.storage.digests import json_bytes
 
 DECIMALS = 6
-"""Of degrees in a report: 4 milliarcseconds."""
+"""Decimals of degrees in a report; six are 4 milliarcseconds."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class CoverageReport:
     Attributes
     ----------
     coverage : Coverage
-        By boresight.
+        Stars, pairs and triangles by boresight.
     summary : CoverageSummary
-        In a few numbers.
+        The coverage in a few numbers.
     gap : TilingGap
         The widest gap between the boresights.
     """
@@ -92,7 +92,7 @@ def report_coverage(coverage: Coverage, tile_radius_rad: float) -> CoverageRepor
     Parameters
     ----------
     coverage : Coverage
-        By boresight.
+        Stars, pairs and triangles by boresight.
     tile_radius_rad : float
         Radians: of the largest circle inside a field.
 
@@ -134,7 +134,7 @@ def coverage_csv(coverage: Coverage) -> bytes:
     Parameters
     ----------
     coverage : Coverage
-        By boresight.
+        Stars, pairs and triangles by boresight.
 
     Returns
     -------
@@ -155,7 +155,7 @@ def histogram_csv(summary: CoverageSummary) -> bytes:
     Parameters
     ----------
     summary : CoverageSummary
-        With the histogram.
+        Summary with the histogram.
 
     Returns
     -------

@@ -52,7 +52,7 @@ def report_page(content: Mapping[str, Any], plots: Mapping[str, bytes]) -> str:
     Parameters
     ----------
     content : mapping
-        Of `report_content`.
+        The report, as `report_content` returns it.
     plots : mapping of str to bytes
         SVG by name.
 

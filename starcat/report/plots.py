@@ -79,9 +79,9 @@ def draw_map(title: str, coverage: Coverage, summary: CoverageSummary) -> Figure
     title : str
         Name of the database.
     coverage : Coverage
-        By boresight.
+        Stars by boresight.
     summary : CoverageSummary
-        Of it; says which field is the worst.
+        Summary of the coverage; it says which field is the worst.
 
     Returns
     -------
@@ -163,7 +163,7 @@ def _graticule(axes: Axes) -> None:
     for ra in (0, 60, 120, 240, 300):
         x, y = project(np.full(91, ra), dec)
         axes.plot(x, y, **line)
-        # On the side of the meridian that the galactic equator does not cross.
+        # The label is on the side of the meridian that the galactic equator does not cross.
         axes.text(float(x[45]) - 0.03, 0.03, f"{ra}°", color="white", ha="right", size=8)
     for value in range(-60, 90, 30):
         x, y = project([180.0, 180.0], [value, value])
@@ -199,7 +199,7 @@ def draw_histogram(title: str, summary: CoverageSummary) -> Figure:
     title : str
         Name of the database.
     summary : CoverageSummary
-        With the histogram.
+        Summary with the histogram.
 
     Returns
     -------
@@ -240,7 +240,7 @@ def draw_magnitudes(title: str, band: str, counts: Mapping[str, Any]) -> Figure:
     title : str
         Name of the database.
     band : str
-        Of the magnitudes.
+        Band of the magnitudes.
     counts : mapping of str to sequence
         ``from_mag``, ``to_mag``, ``guide_stars`` and ``rejected``, a bin each.
 
@@ -281,9 +281,9 @@ def save_plot(figure: Figure, folder: Path, name: str) -> None:
     figure : matplotlib.figure.Figure
         The drawing.
     folder : Path
-        Where to.
+        Folder to write to.
     name : str
-        Of the files, without a suffix.
+        Name of the files, without a suffix.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.backends.backend_svg import FigureCanvasSVG

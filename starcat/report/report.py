@@ -30,23 +30,23 @@ class BuildFacts:
     spec : mapping
         The whole build spec.
     sources : sequence of mapping
-        As in the manifest.
+        The sources, as the manifest has them.
     reasons : mapping of str to str
         What each reason means.
     products : mapping of str to mapping
-        As in the manifest, by product, with ``bytes``.
+        The products as the manifest has them, by name, with ``bytes``.
     database_bytes : int
         Size of the matcher's file.
     filters : sequence of mapping
         What each filter left in the fields of the tiling, in order.
     coverage : CoverageReport
-        Of the guide stars.
+        Coverage by the guide stars.
     self_test : sequence of mapping
         Rates.
     software : mapping of str to str
         Versions.
     band : str
-        Of the magnitudes.
+        Band of the magnitudes.
     guide_star_mag, rejected_mag : ndarray of float64, shape (N,) and (M,)
         Magnitudes; NaN where there is none.
     """
@@ -112,7 +112,7 @@ def report_content(facts: BuildFacts) -> dict[str, Any]:
     Parameters
     ----------
     facts : BuildFacts
-        Of the build.
+        What is known of the build.
 
     Returns
     -------
@@ -152,7 +152,7 @@ def write_report(folder: Path, facts: BuildFacts) -> None:
     folder : Path
         An existing folder.
     facts : BuildFacts
-        Of the build.
+        What is known of the build.
     """
     content = report_content(facts)
     write_coverage(folder, facts.title, facts.coverage)

@@ -36,7 +36,7 @@ class Rates:
     identified, wrong : int
         Identified rightly; answered with a wrong star or attitude.
     median_residual_arcsec : float
-        Of the identified; 0 where there are none.
+        Median over the identified frames; 0 where there are none.
     """
 
     name: str
@@ -73,20 +73,20 @@ def self_test(
     Parameters
     ----------
     matcher : Matcher
-        With the database open.
+        The matcher, with the database open.
     frames : int
         Fields of each kind.
     noise_px : float
         Standard deviation of a centroid, each axis.
     seed : int
-        Of the attitudes and the noise.
+        Seed of the attitudes and the noise.
     progress : Progress
         Called with ("self-test", frames done, frames in all).
 
     Returns
     -------
     clean, hard : Rates
-        With noise only; and with stars missing and false ones beside it.
+        Rates with noise only, and with stars missing and false ones beside it.
     """
     kinds = {"clean": Noise(noise_px), "hard": Noise(noise_px, **HARD)}  # type: ignore[arg-type]
     made = []
@@ -139,11 +139,11 @@ def answers_rightly(result: MatchResult, frame: Frame, matcher: Matcher) -> bool
     Parameters
     ----------
     result : MatchResult
-        Of the frame, identified.
+        The answer to the frame, which is identified.
     frame : Frame
         The truth.
     matcher : Matcher
-        Whose camera and tolerance say how near is near.
+        The matcher, whose camera and tolerance say how near is near.
 
     Returns
     -------

@@ -94,14 +94,14 @@ def simulate_frames(
     noise : Noise
         What they suffer.
     seed : int
-        Of all that is random; the same seed gives the same frames.
+        Seed of all that is random; the same seed gives the same frames.
     mag : ndarray of float64, shape (N,), optional
-        Their magnitudes; 0 each by default.
+        Magnitudes of the stars; 0 each by default.
 
     Yields
     ------
     Frame
-        As `simulate_frame` makes them.
+        Frames, each as `simulate_frame` makes it.
     """
     generator = np.random.default_rng(seed)
     stars = np.arange(len(directions), dtype=np.int32)

@@ -43,7 +43,7 @@ class Sky:
         Returns
         -------
         Sky
-            In the same order.
+            Stars that are left, in the same order.
         """
         seen = self.mag <= limit_mag
         return Sky(self.directions[seen], self.mag[seen], self.star_index[seen])

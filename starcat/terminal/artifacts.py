@@ -20,7 +20,7 @@ def print_verification(found: Verification, *, as_json: bool) -> None:
     Parameters
     ----------
     found : Verification
-        Of `verify_artifact`.
+        What `verify_artifact` returned.
     as_json : bool
         Whether to print JSON.
     """
@@ -43,9 +43,9 @@ def print_difference(found: Difference, names: tuple[str, str], *, as_json: bool
     Parameters
     ----------
     found : Difference
-        Of `diff_artifacts`.
+        What `diff_artifacts` returned.
     names : tuple of str
-        Of A and B, for the headings.
+        Names of A and B, for the headings.
     as_json : bool
         Whether to print JSON, with every star.
     """
@@ -101,7 +101,7 @@ def print_rebuilt(rebuilt: Rebuilt, *, as_json: bool) -> None:
     Parameters
     ----------
     rebuilt : Rebuilt
-        Of `rebuild`.
+        What `rebuild` returned.
     as_json : bool
         Whether to print JSON.
     """
@@ -127,7 +127,7 @@ def _capped(title: str, count: int) -> str:
 
 def _value(value: Any) -> str:
     text = "-" if value is None else str(value)
-    # Of a digest the beginning is enough to tell it from another.
+    # The beginning of a digest is enough to tell it from another.
     return text[:16] if len(text) == 64 and " " not in text else text
 
 

@@ -75,7 +75,7 @@ def print_fetched(report: FetchReport, *, as_json: bool) -> None:
     Parameters
     ----------
     report : FetchReport
-        Of `fetch_source`.
+        What `fetch_source` returned.
     as_json : bool
         Whether to print JSON.
     """
@@ -103,7 +103,7 @@ def print_ingested(read: Ingested, output: Path, *, as_json: bool) -> None:
     Parameters
     ----------
     read : Ingested
-        Of `ingest`.
+        What `ingest` returned.
     output : Path
         File of the star table.
     as_json : bool
@@ -163,7 +163,7 @@ def print_built(built: Built, *, as_json: bool) -> None:
     Parameters
     ----------
     built : Built
-        Of `pipeline.build`.
+        What `pipeline.build` returned.
     as_json : bool
         Whether to print JSON.
     """
@@ -223,7 +223,7 @@ def print_products(manifest: dict[str, Any]) -> None:
     Parameters
     ----------
     manifest : dict
-        Of the artifact.
+        Manifest of the artifact.
     """
     files = manifest["files"]
     rows = [
@@ -246,7 +246,7 @@ def print_rates(rates: Sequence[Rates], *, as_json: bool) -> None:
     Parameters
     ----------
     rates : sequence of Rates
-        Of `self_test`.
+        What `self_test` returned.
     as_json : bool
         Whether to print JSON.
     """

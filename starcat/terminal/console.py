@@ -123,7 +123,7 @@ class StageBars(Bars):
     Parameters
     ----------
     console : rich.console.Console
-        Where to draw.
+        Console to draw on.
     """
 
     def __init__(self, console: Console) -> None:
@@ -144,7 +144,7 @@ class StageBars(Bars):
         stage : str
             A new one ends those before it that do not know their total, as nothing else does.
         done, total : int
-            As of `Progress`.
+            Counts, as `Progress` describes them.
         """
         if stage not in self.stages:
             self.end_open()
@@ -168,7 +168,7 @@ class AmountColumn(ProgressColumn):
         Parameters
         ----------
         task : rich.progress.Task
-            Of a stage.
+            Task of a stage.
 
         Returns
         -------

@@ -24,7 +24,7 @@ def print_coverage(artifact: Artifact, folder: Path | None, *, as_json: bool) ->
     artifact : Artifact
         Open.
     folder : Path, optional
-        Where to write CSV, JSON, PNG and SVG.
+        Folder to write CSV, JSON, PNG and SVG to.
     as_json : bool
         Whether to print JSON.
     """
@@ -53,7 +53,7 @@ def print_coverage_table(report: CoverageReport) -> None:
     Parameters
     ----------
     report : CoverageReport
-        Of a build or an artifact.
+        Coverage of a build or an artifact.
     """
     summary, gap = report.summary, report.gap
     spreads = {"stars": summary.stars, "pairs": summary.pairs, "triangles": summary.triangles}
@@ -88,7 +88,7 @@ def histogram_rows(report: CoverageReport) -> list[tuple[str, str, str]]:
     Parameters
     ----------
     report : CoverageReport
-        With the histogram.
+        Coverage with the histogram.
 
     Returns
     -------

@@ -17,7 +17,7 @@ MEANINGS = {
     "taken": "the candidate fits another star better",
     "doubtful": "more likely no candidate at all",
 }
-"""Of the verdicts on a star's likeliest candidate."""
+"""What the verdicts on a star's likeliest candidate mean."""
 
 
 def print_crossmatch(
@@ -28,7 +28,7 @@ def print_crossmatch(
     Parameters
     ----------
     found : Summary
-        Of `match_files`.
+        What `match_files` returned.
     names : tuple of str
         What the two tables are called.
     output : Path

@@ -25,7 +25,7 @@ def print_evaluation(evaluation: Evaluation, *, as_json: bool) -> None:
     Parameters
     ----------
     evaluation : Evaluation
-        With its report written.
+        The evaluation, with its report written.
     as_json : bool
         Whether to print JSON, with every trial in full.
     """

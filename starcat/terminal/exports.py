@@ -12,7 +12,7 @@ def print_exported(exported: Exported, *, as_json: bool) -> None:
     Parameters
     ----------
     exported : Exported
-        Of `export_tables`.
+        What `export_tables` returned.
     as_json : bool
         Whether to print JSON.
     """

@@ -19,10 +19,10 @@ DEFECT = 70
 """Exit code of a defect of starcat: that of an internal error among those of BSD."""
 
 AT_STAGE = "at stage: "
-"""Begins the note that an exception gets from the progress bars that it passes."""
+"""Beginning of the note that an exception gets from the progress bars that it passes."""
 
 MAX_MESSAGE, MAX_FOREIGN = 2000, 400
-"""Characters of a message that are shown; of one of a library."""
+"""Characters that are shown of a message of starcat, and of a message of a library."""
 
 _SENTENCE = re.compile(r"; |\. (?=[A-Z])")
 
@@ -54,7 +54,7 @@ class Failure:
         Returns
         -------
         str
-            With a line end.
+            One line, with its end.
         """
         return f"starcat: error: {self.message}\n"
 
@@ -147,7 +147,7 @@ def hint_in(message: str) -> str | None:
     Parameters
     ----------
     message : str
-        Of one of starcat's own errors, which end with it.
+        Message of one of starcat's own errors, which end with the hint.
 
     Returns
     -------

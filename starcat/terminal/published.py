@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from starcat.releases.tree import Listed
 
 DIGEST_LETTERS = 16
-"""Of a digest that a table shows; JSON has all."""
+"""Letters of a digest that a table shows; JSON has all."""
 
 
 def print_published(published: Published, *, as_json: bool) -> None:
@@ -22,7 +22,7 @@ def print_published(published: Published, *, as_json: bool) -> None:
     Parameters
     ----------
     published : Published
-        Of `publish_artifact`.
+        What `publish_artifact` returned.
     as_json : bool
         Whether to print JSON.
     """
@@ -50,7 +50,7 @@ def print_pulled(pulled: Sequence[Pulled], *, as_json: bool) -> None:
     Parameters
     ----------
     pulled : sequence of Pulled
-        Of `pull_wanted` or `pull_pinned`.
+        What `pull_wanted` or `pull_pinned` returned.
     as_json : bool
         Whether to print JSON.
     """
@@ -77,7 +77,7 @@ def print_releases(releases: Sequence[Listed], *, as_json: bool) -> None:
     Parameters
     ----------
     releases : sequence of Listed
-        By name, then by version.
+        Releases by name, then by version.
     as_json : bool
         Whether to print JSON.
     """

@@ -24,7 +24,7 @@ WAYS = {
     "L1": ("hausdorff_l1", "S1 L1"),
     "L1 within 12 px": ("hausdorff_l1", "S1 L1 limited"),
 }
-"""Label to method and bare answer."""
+"""Method and bare answer by the label in the paper."""
 
 
 def camera_of_scale(scale: float) -> tuple[Camera, Camera]:
@@ -33,12 +33,12 @@ def camera_of_scale(scale: float) -> tuple[Camera, Camera]:
     Parameters
     ----------
     scale : float
-        Of the image, about its centre.
+        Factor that the image is magnified by, about its centre.
 
     Returns
     -------
     as_it_is, as_told : Camera
-        With the same detector, which shows the same field at every scale.
+        A camera with the same detector, which shows the same field at every scale.
     """
     size = round(1024 * scale)
     told = Camera(1024, 1024, fov_x_deg=6.0).focal_length_px

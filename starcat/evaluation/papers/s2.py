@@ -16,13 +16,13 @@ PRESET = "sao-12deg"
 LIMIT_MAG = 6.0
 
 GRID = Attitudes("grid", 0, 2.0)
-"""Every 2 degrees in right ascension and declination: 16,200 images, the roll at random."""
+"""Attitudes of the paper: every 2 degrees in both coordinates, 16,200 images, rolls at random."""
 
 FEWER = Attitudes("grid", 2025, 2.0)
-"""Every eighth of them, for the inner points of curves."""
+"""Attitudes of the inner points of curves: every eighth of the grid."""
 
 QUARTER = Attitudes("grid", 4050, 2.0)
-"""Every fourth of them, for the baselines behind a distorting lens."""
+"""Attitudes of the baselines behind a distorting lens: every fourth of the grid."""
 
 PUBLISHED = {
     "pairs": ("improved triangle", 93.75, 2.38, 44.75),

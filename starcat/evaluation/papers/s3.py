@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 PRESET = "sao-12deg-512"
 
 LIMIT_MAG = 6.0
-"""Of the paper's CAMERA."""
+"""Faintest magnitude that the paper's camera sees."""
 
 CAMERA = Camera(512, 512, fov_x_deg=12.0)
 """The paper's field; its focal length and pixels (40 mm, 16 um) would make 11.7 degrees."""
@@ -38,7 +38,7 @@ def field_centroids(artifact: Path, step_deg: float) -> list[Array]:
     Parameters
     ----------
     artifact : Path
-        Its catalog is used, doubles and all: to pass over those is what S3 is about.
+        The artifact whose catalog is used, doubles and all: S3 is about passing over doubles.
     step_deg : float
         Boresights lie at right ascensions 0, step, ... and in the middle of declination cells;
         the roll is 0.

@@ -28,7 +28,7 @@ def rows(quick: bool) -> list[Row]:
     Returns
     -------
     list of Row
-        Its three curves and the mixed test.
+        The rows of its three curves and of the mixed test.
     """
     count = 50 if quick else 1000
     return [

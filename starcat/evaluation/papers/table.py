@@ -18,12 +18,12 @@ def papers_named(name: str) -> list[Paper]:
     Parameters
     ----------
     name : str
-        Of one paper, in any case, or ``all``.
+        Name of one paper, in any case, or ``all``.
 
     Returns
     -------
     list of Paper
-        In the order of their names.
+        The papers, in the order of their names.
 
     Raises
     ------

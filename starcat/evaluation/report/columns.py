@@ -18,7 +18,7 @@ class Column:
     Attributes
     ----------
     head : str
-        Its heading.
+        Heading of the column.
     cell : callable
         Text of a row.
     is_wanted : callable

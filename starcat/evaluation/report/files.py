@@ -38,9 +38,9 @@ def write_evaluation(
     folder : Path
         Made if it is not there.
     title : str
-        Of the page.
+        Title of the page.
     contents : sequence of mapping
-        Of `Outcome.as_dict`.
+        Evaluations as `Outcome.as_dict` returns them.
     machine : str
         What the times were measured on.
 

@@ -40,9 +40,9 @@ def evaluation_page(
     Parameters
     ----------
     title : str
-        Of the page.
+        Title of the page.
     contents : sequence of mapping
-        Of `Outcome.as_dict`.
+        Evaluations as `Outcome.as_dict` returns them.
     plots : mapping of str to bytes
         SVG by name.
     machine : str
@@ -79,7 +79,7 @@ def legend(contents: Sequence[Content]) -> list[tuple[str, str]]:
     Parameters
     ----------
     contents : sequence of mapping
-        Of `Outcome.as_dict`.
+        Evaluations as `Outcome.as_dict` returns them.
 
     Returns
     -------
@@ -104,7 +104,7 @@ def rules_of(contents: Sequence[Content]) -> list[tuple[str, str]]:
     Parameters
     ----------
     contents : sequence of mapping
-        Of `Outcome.as_dict`.
+        Evaluations as `Outcome.as_dict` returns them.
 
     Returns
     -------
@@ -154,7 +154,7 @@ def reproduction_markdown(contents: Sequence[Content], machine: str, figures: st
     Parameters
     ----------
     contents : sequence of mapping
-        Of `Outcome.as_dict`.
+        Evaluations as `Outcome.as_dict` returns them.
     machine : str
         What the times were measured on.
     figures : str

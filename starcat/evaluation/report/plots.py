@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = ("#2c6e9e", "#d1495b", "#3f8f5b", "#8a5fa8", "#c98a1b", "#4fb0ae", "#7a5230", "#5b6770")
-"""Of the curves, in order."""
+"""Colours of the curves, in the order of `series_order`."""
 
 MARKERS = "osD^vP*X"
 
@@ -29,12 +29,12 @@ def curves(content: Mapping[str, Any]) -> Iterator[tuple[str, str, list[Line]]]:
     Parameters
     ----------
     content : mapping
-        Of `Outcome.as_dict`.
+        An evaluation as `Outcome.as_dict` returns it.
 
     Yields
     ------
     name : str
-        Of a file, without a suffix; no two are the same.
+        Name of a file, without a suffix; no two are the same.
     group : str
         The title.
     lines : list of mapping
@@ -69,12 +69,12 @@ def series_order(content: Mapping[str, Any]) -> list[str]:
     Parameters
     ----------
     content : mapping
-        Of `Outcome.as_dict`.
+        An evaluation as `Outcome.as_dict` returns it.
 
     Returns
     -------
     list of str
-        In the order of the rows.
+        Names of the curves, in the order of the rows.
     """
     return list(dict.fromkeys(series_of(x) for _, _, lines in curves(content) for x in lines))
 
@@ -85,7 +85,7 @@ def draw_rates(title: str, lines: Sequence[Line], series: Sequence[str]) -> Figu
     Parameters
     ----------
     title : str
-        Of the group.
+        Title of the group.
     lines : sequence of mapping
         Rows with an abscissa.
     series : sequence of str
@@ -139,7 +139,7 @@ def _draw_curves(
     handles = []
     for number, name in enumerate(shown):
         points = [line for line in lines if series_of(line) == name]
-        # Side by side, so that one bar does not hide another.
+        # The bars are side by side, so that none hides another.
         aside = 0.007 * width * (number - 0.5 * (len(shown) - 1))
         moved = {x: place + aside for x, place in places.items()}
         handles += _draw_curve(axes, points, series.index(name), moved)

@@ -22,7 +22,7 @@ class Table:
     title : str
         Above it.
     heads : tuple of str
-        Of the columns.
+        Headings of the columns.
     rows : tuple of tuple of str
         Cells.
     numbers : tuple of int
@@ -49,7 +49,7 @@ def groups_of(lines: Iterable[Line]) -> dict[str, list[Line]]:
     Returns
     -------
     dict of str to list
-        In the order of the first line of each.
+        Lines by group, in the order of the first line of each.
     """
     groups: dict[str, list[Line]] = {}
     for line in lines:
@@ -63,14 +63,14 @@ def rate_tables(content: Mapping[str, Any], columns: Sequence[Column]) -> list[T
     Parameters
     ----------
     content : mapping
-        Of `Outcome.as_dict`.
+        An evaluation as `Outcome.as_dict` returns it.
     columns : sequence of Column
         `SHORT` or `LONG`; those without content are left out.
 
     Returns
     -------
     list of Table
-        With the rows' notes.
+        Tables with the rows' notes.
     """
     tables = []
     for group, lines in groups_of(content["rows"]).items():
@@ -91,14 +91,14 @@ def statistic_tables(
     Parameters
     ----------
     content : mapping
-        Of `Outcome.as_dict`.
+        An evaluation as `Outcome.as_dict` returns it.
     reached : callable
         Says of a line whether its goal is reached.
 
     Returns
     -------
     list of Table
-        With their notes.
+        Tables with their notes.
     """
     tables = []
     for group, lines in groups_of(content["statistics"]).items():
@@ -138,7 +138,7 @@ def failure_table(content: Mapping[str, Any]) -> Table | None:
     Parameters
     ----------
     content : mapping
-        Of `Outcome.as_dict`.
+        An evaluation as `Outcome.as_dict` returns it.
 
     Returns
     -------
@@ -168,7 +168,7 @@ def summary_table(contents: Sequence[Mapping[str, Any]]) -> Table | None:
     Parameters
     ----------
     contents : sequence of mapping
-        Of `Outcome.as_dict`.
+        Evaluations as `Outcome.as_dict` returns them.
 
     Returns
     -------
