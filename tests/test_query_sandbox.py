@@ -3,14 +3,30 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 
+import duckdb
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
 
-from starcat.errors import QueryError, QueryLimitError
+from starcat.errors import ProductError, QueryError, QueryLimitError, SchemaVersionError
+from starcat.query.engine import Engine
+from starcat.query.messages import Views
+from starcat.query.preamble import preamble_of
 from starcat.query.session import Limits, Session, open_session
+from starcat.query.statement import check_statement
+from starcat.query.worker import BESIDE_BYTES
 
 OUTSIDE = "/etc/passwd"
 
@@ -49,6 +65,13 @@ ATTEMPTS = {
     "(FORMAT parquet, use_tmp_file false)) SELECT 1 FROM c",
     "copy-in-deep-with": "SELECT * FROM (WITH c AS MATERIALIZED (COPY stars TO '{near}/x.csv') "
     "SELECT 1 FROM c)",
+    "copy-after-nested-comments": "EXPLAIN /* /* */ SELECT 1 -- */ ANALYZE COPY (SELECT 42) TO "
+    "'{in}/stars.parquet' (FORMAT parquet, USE_TMP_FILE false)",
+    "copy-after-nested-comments-and-options": "EXPLAIN /* /* */ (FORMAT json) SELECT 1 -- */ "
+    "(ANALYZE) COPY (SELECT 42) TO '{in}/stars.parquet' (FORMAT parquet, USE_TMP_FILE false)",
+    "explain-parenthesis-copy": "EXPLAIN (COPY (SELECT 1) TO '{near}/stolen.csv')",
+    "explain-unknown-option": "EXPLAIN (ANALYZE, FORMAT text, BUFFERS '{near}/x') SELECT 1",
+    "copy-after-nul": "SELECT 1 \0; COPY (SELECT 1) TO '{near}/stolen.csv'",
     "copy-from": "COPY stars FROM '{near}/secret.csv'",
     "explain-analyze-copy": "EXPLAIN ANALYZE COPY stars TO '{near}/stolen.csv'",
     "explain-options-copy": "EXPLAIN (ANALYZE, FORMAT json) COPY stars TO '{near}/stolen.csv'",
@@ -190,26 +213,319 @@ def test_what_is_no_query_is_told(session, text, words):
         answer.rows(1)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "FROM stars LIMIT 2",
-        "WITH a AS (SELECT mag FROM stars) SELECT max(mag) FROM a;",
-        "VALUES (1), (2)",
-        "TABLE stars",
-        "SHOW TABLES",
-        "SUMMARIZE stars",
-        "DESCRIBE stars",
-        "EXPLAIN SELECT 1",
-        "EXPLAIN ANALYZE SELECT count(*) FROM stars",
-        "FROM stars PIVOT (count(*) FOR band IN ('V', 'G'))",
-        "SELECT 'a; COPY b TO c' AS text -- a comment; and more",
-        "WITH RECURSIVE r(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM r WHERE n < 9) FROM r",
-        "SELECT * FROM stars ASOF JOIN boresights USING (ra_deg)",
-        "SELECT comment FROM duckdb_columns() WHERE table_name = 'pairs'",
-    ],
-)
+READS = [
+    "FROM stars LIMIT 2",
+    "WITH a AS (SELECT mag FROM stars) SELECT max(mag) FROM a;",
+    "VALUES (1), (2)",
+    "TABLE stars",
+    "SHOW TABLES",
+    "SUMMARIZE stars",
+    "DESCRIBE stars",
+    "DESCRIBE SELECT $a AS text",
+    "EXPLAIN SELECT 1",
+    "EXPLAIN (SELECT 1)",
+    "EXPLAIN /* why /* so */ */ (FORMAT json) SELECT 1 -- slow",
+    "EXPLAIN ANALYZE SELECT count(*) FROM stars",
+    "FROM stars PIVOT (count(*) FOR band IN ('V', 'G'))",
+    "SELECT 'a; COPY b TO c' AS text -- a comment; and more",
+    'SELECT $$a; \'/* $$ AS text, $é$ $$ $é$ AS "ü /* "";" /* /* */ */ FROM stars',
+    "WITH RECURSIVE r(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM r WHERE n < 9) FROM r",
+    "SELECT * FROM stars ASOF JOIN boresights USING (ra_deg)",
+    "SELECT comment FROM duckdb_columns() WHERE table_name = 'pairs'",
+    "SELECT x LIKE 'a%' ESCAPE '$', x NOT IN (SELECT 'b'), [v || 'c' FOR v IN [x]] FROM (VALUES "
+    "('a')) AS t(x)",
+    "SELECT * EXCLUDE (mag) REPLACE (ra_deg / 15 AS ra_deg) FROM cone(1, 2, 90, of := 'rejected')",
+]
+
+
+@pytest.mark.parametrize("text", READS)
 def test_what_reads_is_allowed(session, text):
-    with session.ask(text) as answer:
+    with session.ask(text, {"a": "b"}) as answer:
         assert answer.columns
         assert answer.rows(5)
+
+
+@pytest.mark.parametrize("text", [text for text in READS if not text.startswith("EXPLAIN")])
+def test_what_duckdb_writes_from_the_tree_means_what_was_asked(folder, text):
+    """Nothing of the sandbox takes part: DuckDB runs the text as given, and as rebuilt."""
+    with duckdb.connect() as connection:
+        connection.execute(preamble_of([str(folder)]))
+        tables = frozenset({"cone", "box", "field"})
+        values = {"a": "b"} if "SELECT $a" in text else None
+        given = connection.execute(text, values)
+        expected = [column[0] for column in given.description], given.fetchall()
+        written = connection.execute(check_statement(text, connection, tables).text, values)
+        assert ([column[0] for column in written.description], written.fetchall()) == expected
+
+
+PIECES = st.sampled_from(
+    [
+        "EXPLAIN", "ANALYZE", "(ANALYZE)", "(FORMAT json)", "SELECT 1", "FROM stars", "COPY",
+        "(SELECT 42)", "TO", "'{in}/stars.parquet'", "(FORMAT parquet, USE_TMP_FILE false)",
+        "COPY (SELECT 42) TO '{in}/stars.parquet' (FORMAT parquet, USE_TMP_FILE false)", "/*", "*/",
+        "--", "\n", ";", "$$", "$é$", "'", '"', "é", "☃ ", "\u2028", "\xa0", "\0", "WITH c AS (",
+        ") FROM c", "LIMIT 1", "WHERE", "= 1", ",", "DESCRIBE", "SUMMARIZE", "VALUES (1)",
+    ]
+)  # fmt: skip
+
+
+@settings(max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(pieces=st.lists(PIECES, min_size=1, max_size=12), glue=st.sampled_from([" ", "", "\t"]))
+@example(
+    pieces=["EXPLAIN", "/*", "/*", "*/", "SELECT 1", "--", "*/", "ANALYZE", "COPY", "(SELECT 42)",
+            "TO", "'{in}/stars.parquet'", "(FORMAT parquet, USE_TMP_FILE false)"],
+    glue=" ",
+)  # fmt: skip
+def test_what_is_accepted_is_one_query_that_changes_no_file(session, folder, pieces, glue):
+    text = glue.join(pieces).replace("{in}", str(folder))
+    before = all_files(folder.parent)
+    try:
+        runs = session.check(text).text
+        with session.ask(text) as answer:
+            answer.rows(3)
+    except QueryError:
+        pass
+    else:
+        kinds = [statement.type for statement in duckdb.extract_statements(runs)]
+        assert kinds in ([duckdb.StatementType.SELECT], [duckdb.StatementType.EXPLAIN])
+        assert "COPY" not in duckdb_words(runs)
+    assert all_files(folder.parent) == before
+
+
+def duckdb_words(text: str) -> list[str]:
+    """Return the words of a text that are neither comments nor texts in quotes."""
+    data = text.encode()
+    tokens = duckdb.tokenize(text)
+    ends = [*(start for start, _ in tokens[1:]), len(data)]
+    return [
+        data[start:end].decode(errors="replace").strip().upper()
+        for (start, kind), end in zip(tokens, ends, strict=True)
+        if kind in (duckdb.token_type.keyword, duckdb.token_type.identifier)
+    ]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has Landlock")
+def test_a_copy_that_came_through_could_write_nothing(folder, tmp_path):
+    """The second wall: what runs is not checked here, and the files are as writable as can be."""
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    if not landlock_is_there():
+        pytest.skip("this kernel has no Landlock")
+    victim = folder / "stars.parquet"
+    mode = victim.stat().st_mode
+    before = all_files(folder.parent)
+    engine = Engine(scratch, 0.5, 0.1)
+    try:
+        victim.chmod(0o666)
+        engine.open(Views("SELECT 1", (str(victim),), frozenset()))
+        for text in (
+            f"COPY (SELECT 1) TO '{victim}' (FORMAT parquet, USE_TMP_FILE false)",
+            f"COPY (SELECT 1) TO '{victim}'",
+        ):
+            with pytest.raises(QueryError, match=r"[Pp]ermission|denied"):
+                engine.ask("rows", text, None, 1)
+    finally:
+        victim.chmod(mode)
+        engine.close()
+    assert all_files(folder.parent) == before
+
+
+def landlock_is_there() -> bool:
+    code = (
+        "import sys, tempfile; from pathlib import Path\n"
+        "from starcat.query.confinement import forbid_writing\n"
+        "print(forbid_writing(Path(tempfile.gettempdir())))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return done.stdout.strip() == "True"
+
+
+# What a single call of a function takes --------------------------------------------------------
+
+ONE_CALL = {
+    "repeat": "SELECT length(repeat('x', 4000000000))",
+    "repeat-of-a-column": "SELECT length(repeat('x', range)) FROM range(3999999990, 4000000000)",
+    "lpad": "SELECT length(lpad('x', 2000000000, 'y'))",
+    "lpad-of-a-column": "SELECT max(length(lpad('x', range::INTEGER, 'y'))) "
+    "FROM range(2000000000, 2000000002)",
+    "printf": "SELECT length(printf('%2000000000d', 1))",
+    "format": "SELECT length(format('{{:>2000000000}}', 1))".replace("{{", "{").replace("}}", "}"),
+    "sleep": "SELECT pg_sleep(100)",
+    "rows": "SELECT repeat('x', 50000000) FROM range(100)",
+}
+
+
+@pytest.mark.parametrize("name", ONE_CALL)
+def test_limits_hold_inside_one_call(session, name):
+    began = time.monotonic()
+    with (
+        pytest.raises(QueryLimitError, match=r"stopped after 1 s|needs more than 0\.2 GB"),
+        session.ask(ONE_CALL[name]) as answer,
+    ):
+        answer.rows(100)
+    assert time.monotonic() - began < 20.0
+    with session.ask("SELECT 7") as answer:
+        assert answer.rows(1) == [(7,)], "the session goes on"
+
+
+MEASURE = """
+import resource, sys
+from starcat.errors import QueryLimitError
+from starcat.query.session import Limits, open_session
+with open_session([sys.argv[1]], Limits(time_s=2.0, memory_gb=0.1)) as session:
+    for text in sys.argv[2:]:
+        try:
+            with session.ask(text) as answer:
+                answer.rows(100)
+        except QueryLimitError:
+            continue
+        raise SystemExit(f"no limit held: {text}")
+print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere memory is counted in other ways")
+def test_a_query_takes_no_more_memory_than_it_may(folder):
+    texts = [ONE_CALL[name] for name in ("repeat", "lpad", "printf", "rows")]
+    command = [sys.executable, "-c", MEASURE, str(folder), *texts]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=100)
+    largest_bytes = 1024 * int(done.stdout)
+    assert largest_bytes < 0.1e9 + BESIDE_BYTES + 0.2e9, "what a process has, and what it may take"
+
+
+@pytest.mark.parametrize("calls", [400, 900])
+def test_calls_within_calls_are_answered(session, calls):
+    with session.ask("SELECT " + "abs(" * calls + "-1" + ")" * calls) as answer:
+        assert answer.rows(1) == [(1,)]
+
+
+@pytest.mark.parametrize(
+    "text", ["(" * 20000 + "1" + ")" * 20000, "[" * 5000 + "1" + "]" * 5000, "1" + "+1" * 5000]
+)
+def test_what_is_nested_too_deeply_is_told(session, text):
+    with pytest.raises(QueryError, match=r"depth|deeply"), session.ask(f"SELECT {text}") as answer:
+        answer.rows(1)
+
+
+def test_half_a_character_is_told(session):
+    with pytest.raises(QueryError, match="character 9 of the query"):
+        session.check("SELECT '\ud800'")
+
+
+def test_a_process_that_dies_is_told_and_started_again(session):
+    before = session._engine._process.pid
+    os.kill(before, signal.SIGABRT)
+    session._engine._process.wait()
+    with session.ask("SELECT 7") as answer:
+        assert answer.rows(1) == [(7,)]
+    assert session._engine._process.pid != before
+
+    def killed(stage: str, done: int, total: int | None) -> None:
+        os.kill(session._engine._process.pid, signal.SIGABRT)
+
+    with (
+        pytest.raises(QueryError, match=r"ended by itself \(SIGABRT.*other queries are answered"),
+        session.ask("SELECT sum(sin(range)) FROM range(10000000000)", progress=killed) as answer,
+    ):
+        answer.rows(1)
+    with session.ask("SELECT 8") as answer:
+        assert answer.rows(1) == [(8,)]
+
+
+def test_a_question_that_is_dropped_is_not_answered_to_the_next(session):
+    def stop(stage: str, done: int, total: int | None) -> None:
+        raise KeyboardInterrupt
+
+    with (
+        pytest.raises(KeyboardInterrupt),
+        session.ask("SELECT sum(sin(range)) FROM range(10000000000)", progress=stop) as answer,
+    ):
+        answer.rows(1)
+    with session.ask("SELECT 9") as answer:
+        assert answer.rows(1) == [(9,)]
+
+
+def test_batches_of_a_dropped_answer_are_told(session):
+    with session.ask("FROM range(1000000)") as answer:
+        batches = answer.batches()
+        with session.ask("SELECT 1") as other:
+            other.rows(1)
+        with pytest.raises(QueryError, match="after another query"):
+            batches.read_all()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="a process outlives its parent until it reads")
+def test_no_process_outlives_the_one_that_asked(folder):
+    code = (
+        "import os, sys; from starcat.query.session import open_session\n"
+        "with open_session([sys.argv[1]]) as session:\n"
+        "    print(session._engine._process.pid, flush=True)\n"
+        "    with session.ask('SELECT sum(sin(range)) FROM range(10000000000)') as answer:\n"
+        "        answer.rows(1)"
+    )
+    asking = subprocess.Popen([sys.executable, "-c", code, str(folder)], stdout=subprocess.PIPE)
+    assert asking.stdout is not None
+    worker = int(asking.stdout.readline())
+    os.kill(worker, 0)
+    time.sleep(0.5)
+    asking.kill()
+    asking.communicate()
+    end = time.monotonic() + 20.0
+    while is_running(worker) and time.monotonic() < end:
+        time.sleep(0.1)
+    assert not is_running(worker)
+
+
+def is_running(process: int) -> bool:
+    """Return whether a process runs; one that waits to be collected does not."""
+    try:
+        os.kill(process, 0)
+        state = Path(f"/proc/{process}/stat").read_text(encoding="ascii").rpartition(") ")[2][0]
+    except OSError:
+        return False
+    return state != "Z"
+
+
+# Parquet files of others -----------------------------------------------------------------------
+
+
+def test_a_column_name_that_is_no_text_is_told(tmp_path):
+    path = tmp_path / "bad.parquet"
+    pq.write_table(pa.table({"abcdefgh": [1, 2]}), path)
+    path.write_bytes(path.read_bytes().replace(b"abcdefgh", b"abc\xff\xfefgh"))
+    with (
+        pytest.raises(ProductError, match=r"bad\.parquet: cannot be read .*unicode"),
+        open_session([str(path)]),
+    ):
+        pass
+
+
+@pytest.mark.parametrize(
+    "schema",
+    ["**-1.0.0", "/etc/*-1.0.0", "../schemas/stars-1.0.0", "manifest-1.0.0", "manifest-1.1.0", "-",
+     "stars-", "stars-١.٠.٠", "stars-1.0", "[a-z]*-1.0.0", "x" * 100_000, "a\nb-1.0.0"],
+)  # fmt: skip
+def test_a_schema_name_in_a_footer_is_no_path(tmp_path, schema):
+    path = tmp_path / "theirs.parquet"
+    table = pa.table({"n": [1]}).replace_schema_metadata({"starcat.schema": schema})
+    pq.write_table(table, path)
+    with (
+        pytest.raises(SchemaVersionError, match="schema version") as raised,
+        open_session([str(path)]),
+    ):
+        pass
+    assert len(str(raised.value)) < 400
+    assert "\n" not in str(raised.value)
+
+
+def test_times_with_a_zone_are_times_in_utc(tmp_path):
+    noon = datetime(2026, 3, 1, 12, tzinfo=timezone(timedelta(hours=2)))
+    path = tmp_path / "times.parquet"
+    pq.write_table(pa.table({"at": [noon, None], "more": [[noon], []], "n": [1, 2]}), path)
+    with open_session([str(path)]) as session, session.ask("FROM times ORDER BY n") as answer:
+        assert answer.rows(5) == [
+            (noon.astimezone(UTC), "['2026-03-01 10:00:00+00']", 1),
+            (None, "[]", 2),
+        ]
+        assert answer.types[0] == "TIMESTAMP WITH TIME ZONE"
+        assert answer.batches().read_all()["at"].to_pylist() == [noon.astimezone(UTC), None]

@@ -20,9 +20,9 @@ from astropy.table import Table
 
 from starcat.artifact.reader import open_artifact
 from starcat.errors import ProductError, QueryError, SchemaVersionError, SourceError
-from starcat.query.gallery import gallery, named_query
+from starcat.query.gallery import gallery, guessed, named_query
+from starcat.query.names import identifier
 from starcat.query.session import Session, open_session
-from starcat.query.targets import identifier
 from starcat.terminal.prompt import prompt, words
 
 Run = Callable[[list[Any]], Any]
@@ -144,11 +144,50 @@ def test_hats_catalogs_are_one_table(starcat, small_artifact, session, tmp_path)
         assert rows(opened, count) == [pytest.approx(row) for row in rows(session, count)]
 
 
-@pytest.mark.parametrize("text", ["2MASS 8x6", "a.b-c", "", "Ä", "select"])
+@pytest.mark.parametrize("text", ["2MASS 8x6", "a.b-c", "", "Ä", "select", "main", "Temp"])
 def test_identifiers_need_no_quotes(text):
     name = identifier(text)
-    assert duckdb.connect().execute(f"CREATE SCHEMA s_{name}") is not None
+    with duckdb.connect() as connection:
+        connection.execute(f"CREATE SCHEMA {name}; CREATE VIEW {name}.{name} AS SELECT 1 AS one")
+        found = connection.execute(f"SELECT {name}.one FROM {name}.{name} WHERE {name}.one = 1")
+        assert found.fetchall() == [(1,)]
     assert name.isidentifier()
+
+
+def test_no_word_of_sql_needs_quotes():
+    with duckdb.connect() as connection:
+        words = connection.execute("SELECT keyword_name FROM duckdb_keywords()").fetchall()
+        assert len(words) > 400
+        for (word,) in words:
+            name = identifier(word)
+            assert name in (word, f"{word}_")
+            connection.execute(f"CREATE SCHEMA {name}; CREATE VIEW {name} AS SELECT 1 AS one")
+            connection.execute(f"CREATE VIEW {name}.{name} AS SELECT 2 AS two")
+            query = f"SELECT {name}.one, b.two FROM {name}, {name}.{name} AS b WHERE {name}.one = 1"
+            assert connection.execute(query).fetchall() == [(1, 2)]
+
+
+def test_files_named_by_words_of_sql_are_targets(tmp_path):
+    for name in ("group", "order", "a"):
+        pq.write_table(pa.table({"n": [len(name)]}), tmp_path / f"{name}.parquet")
+    given = [str(tmp_path / f"{name}.parquet") for name in ("group", "order", "a")]
+    with open_session(given[:1]) as session:
+        assert rows(session, "SELECT n FROM group_") == [(5,)]
+    with open_session(given) as session:
+        joined = "SELECT group_.n, order_.n, a_.n FROM group_.group_, b.order_, a_.a AS a_"
+        assert rows(session, joined) == [(5, 5, 1)]
+        assert rows(session, "SELECT n FROM a.group_") == [(5,)], "a is the first target"
+
+
+def test_more_targets_than_letters(tmp_path):
+    given = []
+    for k in range(30):
+        given.append(str(tmp_path / f"t{k}.parquet"))
+        pq.write_table(pa.table({"n": [k]}), given[-1])
+    with open_session(given) as session:
+        assert rows(session, "SELECT z.t25.n, ad.t29.n, t7.t7.n FROM z.t25, ad.t29, t7.t7") == [
+            (25, 29, 7)
+        ]
 
 
 def damaged(small_artifact: Path, folder: Path, damage: str) -> Path:
@@ -217,6 +256,37 @@ def test_the_values_of_a_named_query_have_its_types():
         query.with_values({"radius": "1"})
     with pytest.raises(QueryError, match="did you mean 'crossmatch'"):
         named_query("crosmatch")
+
+
+@pytest.mark.parametrize(
+    "text", ["007", "1_000", "nan", "inf", "+5", "٧", "７", " 7", "0x1F", "1e9999"]
+)
+def test_what_is_no_plain_number_stays_text(text):
+    assert guessed(text) == text
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("7", 7), ("-0.5", -0.5), ("0", 0), ("1e-3", 0.001), (".5", 0.5)]
+)
+def test_plain_numbers_are_numbers(text, value):
+    assert guessed(text) == value
+    assert type(guessed(text)) is type(value)
+
+
+def test_a_value_keeps_its_zeros(starcat, small_artifact):
+    query = "SELECT $id AS id, typeof($id) AS kind"
+    run = starcat(["sql", small_artifact, query, "--set", "id=007", "--format", "csv"])
+    assert run.out.splitlines()[1] == '"007","VARCHAR"'
+    run = starcat(["sql", small_artifact, query, "--set", "id=7", "--format", "csv"])
+    assert run.out.splitlines()[1] == '7,"INTEGER"'
+
+
+def test_declared_types_decide_for_named_queries():
+    assert named_query("star").with_values({"designation": "007"}) == {"designation": "007"}
+    assert named_query("closest-pairs").with_values({"count": "007"}) == {"count": 7}
+    for text in ("nan", "1_0", "٧"):
+        with pytest.raises(QueryError, match="is not a number"):
+            named_query("crossmatch").with_values({"radius_arcsec": text})
 
 
 def test_emptiest_fields_are_those_of_the_boresights(session, small_artifact):

@@ -20,6 +20,10 @@ FOLDER = Path(__file__).parent / "sql" / "gallery"
 _VALUE = re.compile(r"-- (\w+) = (.+?): (.+)")
 _TARGETS = re.compile(r"-- Targets: (\d+)")
 
+_WHOLE = re.compile(r"[-+]?[0-9]{1,38}")
+_NUMBER = re.compile(r"[-+]?([0-9]{1,38}\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]{1,3})?")
+_LEADING_ZERO = re.compile(r"[-+]?0[0-9]|\+")
+
 Literal = int | float | str
 
 
@@ -94,11 +98,37 @@ class NamedQuery:
 
 
 def _as(kind: type[Literal], text: str, where: str) -> Literal:
-    try:
-        return kind(text)
-    except ValueError as error:
+    """Return a text as a value of the declared type; digits stay text where text is declared."""
+    if kind is str:
+        return text
+    if not (_WHOLE if kind is int else _NUMBER).fullmatch(text):
         wanted = {int: "a whole number", float: "a number"}[kind]
-        raise QueryError(f"{where}: {text!r} is not {wanted}") from error
+        raise QueryError(f"{where}: {text!r} is not {wanted}")
+    return kind(text)
+
+
+def guessed(text: str) -> Literal:
+    """Return the value that a text stands for where nothing declares its type.
+
+    Parameters
+    ----------
+    text : str
+        As somebody wrote it.
+
+    Returns
+    -------
+    int, float or str
+        A number where the text is one as numbers are written, and the text itself otherwise: a
+        name such as ``007`` keeps its zeros.
+
+    Examples
+    --------
+    >>> guessed("7"), guessed("-1.5e3"), guessed("007"), guessed("nan"), guessed("1_000")
+    (7, -1500.0, '007', 'nan', '1_000')
+    """
+    if _NUMBER.fullmatch(text) and not _LEADING_ZERO.match(text):
+        return int(text) if _WHOLE.fullmatch(text) else float(text)
+    return text
 
 
 @cache

@@ -77,6 +77,12 @@ def check_statement(
     QueryError
         If it is no SQL, more than one statement, or does more than read.
     """
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise QueryError(
+            f"character {error.start + 1} of the query is half a character; write it in UTF-8"
+        ) from error
     explain, read = _explained(text)
     tree = _checked_tree(read, connection, macros)
     [(written,)] = connection.execute("SELECT json_deserialize_sql(?)", [tree]).fetchall()

@@ -189,7 +189,7 @@ def _table(path: Path, engine: Engine) -> View:
             f"{path}: cannot be read ({told}); get the file again", path=path
         ) from error
     name, _, version = found.rpartition("-")
-    schema = product_schema(name, version) if name else None
+    schema = product_schema(name, version) if found else None
     return View(schema.product if schema else identifier(path.stem), (path,), schema)
 
 

@@ -125,6 +125,8 @@ class Worker:
 
     def schema_name(self, path: str) -> str:
         """Return the name of the schema in the footer of a Parquet file, or nothing."""
+        # DuckDB fails in the middle of an answer where the name of a column is not UTF-8.
+        self._connection.execute("SELECT max(name) FROM parquet_schema($path)", {"path": path})
         asked = "SELECT decode(value) FROM parquet_kv_metadata($path) WHERE key = encode($key)"
         values = {"path": path, "key": SCHEMA_KEY}
         found = self._connection.execute(asked, values).fetchall()

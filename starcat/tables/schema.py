@@ -7,6 +7,7 @@ rows. Writers, readers and checks are driven by it; a column is described nowher
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -17,6 +18,10 @@ from starcat.resources import resource_folder
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+SHOWN_CHARACTERS = 60
+
+_FILE_NAME = re.compile(r"(?P<product>[a-z0-9_]+)-(?P<version>\d+\.\d+\.\d+)\.json", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -221,23 +226,40 @@ def product_schema(product: str, version: str | None = None) -> ProductSchema:
     >>> product_schema("stars").order
     ('star_id',)
     """
-    folder = resource_folder("schemas")
-    known = {
-        path.stem.rpartition("-")[2]: path
-        for path in folder.glob(f"{product}-*.json")
-        if path.stem.rpartition("-")[0] == product
-    }
-    chosen = version or max(known, key=_version_key, default=None)
+    known = _schema_files().get(product, {})
+    chosen = max(known, key=_version_key, default=None) if version is None else version
     if chosen is None or chosen not in known:
         readable = ", ".join(sorted(known, key=_version_key)) or "none"
+        # Both may come from the footer of somebody's file, of any length.
         raise SchemaVersionError(
-            f"{product}: schema version {version or 'any'} found; this starcat reads: {readable}. "
+            f"{_shown(product)}: schema version {_shown('any' if version is None else version)} found; this starcat "
+            f"reads: {readable}. "
             "Install the starcat that wrote it, or a newer one",
             product=product,
             found=version,
             expected=readable,
         )
     return read_schema(known[chosen])
+
+
+@cache
+def _schema_files() -> dict[str, dict[str, Path]]:
+    """Return the files of schemas by product and version; the manifest's schemas are no table."""
+    found: dict[str, dict[str, Path]] = {}
+    for path in sorted(resource_folder("schemas").iterdir()):
+        name = _FILE_NAME.fullmatch(path.name)
+        if name and name["product"] != "manifest":
+            found.setdefault(name["product"], {})[name["version"]] = path
+    return found
+
+
+def _shown(text: str) -> str:
+    """Return a text that somebody wrote, fit for one line."""
+    return (
+        text
+        if text.isprintable() and len(text) <= SHOWN_CHARACTERS
+        else ascii(text[:SHOWN_CHARACTERS])
+    )
 
 
 def _version_key(version: str) -> tuple[int, ...]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from starcat.errors import QueryError
-from starcat.query.gallery import named_query
+from starcat.query.gallery import guessed, named_query
 from starcat.query.preamble import preamble_of
 from starcat.query.session import Limits, Session, open_session
 from starcat.terminal.console import progress_bars, say
@@ -138,20 +138,11 @@ def _query(wish: Wish, targets: int) -> tuple[str | None, Mapping[str, Any]]:
             'file, such as: starcat sql dist/gaia-12deg-1.0.0 "SELECT count(*) FROM stars"'
         )
     if wish.named is None:
-        return wish.query, {name: _literal(text) for name, text in wish.values.items()}
+        return wish.query, {name: guessed(text) for name, text in wish.values.items()}
     query = named_query(wish.named)
     if query.targets != targets:
         raise QueryError(f"{query.name} is about {query.targets} targets; {targets} given")
     return query.text, query.with_values(wish.values)
-
-
-def _literal(text: str) -> int | float | str:
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return text
 
 
 def _give(
