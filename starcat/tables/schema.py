@@ -231,10 +231,10 @@ def product_schema(product: str, version: str | None = None) -> ProductSchema:
     if chosen is None or chosen not in known:
         readable = ", ".join(sorted(known, key=_version_key)) or "none"
         # Both may come from the footer of somebody's file, of any length.
+        wanted = "any" if version is None else version
         raise SchemaVersionError(
-            f"{_shown(product)}: schema version {_shown('any' if version is None else version)} found; this starcat "
-            f"reads: {readable}. "
-            "Install the starcat that wrote it, or a newer one",
+            f"{_shown(product)}: schema version {_shown(wanted)} found; this starcat reads: "
+            f"{readable}. Install the starcat that wrote it, or a newer one",
             product=product,
             found=version,
             expected=readable,
