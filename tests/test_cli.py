@@ -276,6 +276,55 @@ def test_simulate_depends_on_the_seed(
     assert texts[0] == frame.read_text() != texts[1]
 
 
+def test_simulate_tells_the_truth_as_json(
+    starcat: Run, small_artifact: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "frame.csv"
+    made = ["simulate", small_artifact, "-o", path, "--seed", "7", "--false-stars", "2"]
+    truth = json.loads(starcat([*made, "--json"]).out)
+    assert (truth["file"], truth["false_stars"]) == (str(path), 2)
+    assert truth["centroids"] == truth["guide_stars"] + 2 == len(path.read_text().splitlines()) - 1
+    found = json.loads(starcat(["identify", small_artifact, path, "--json"]).out)
+    assert found["boresight_dec_deg"] == pytest.approx(truth["boresight_dec_deg"], abs=0.05)
+    assert found["q_body_from_icrs"] == pytest.approx(truth["q_body_from_icrs"], abs=1e-3)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_each_command_has_json(name: str) -> None:
+    command = typer.main.get_command(app).commands[name]  # type: ignore[attr-defined]
+    assert "--json" in [option for parameter in command.params for option in parameter.opts]
+
+
+def test_a_frame_of_an_unknown_kind_is_not_written(
+    starcat: Run, small_artifact: Path, tmp_path: Path
+) -> None:
+    for name in ("f.jpg", "f", "f.json", "f.csv.gz"):
+        run = starcat(["simulate", small_artifact, "-o", tmp_path / name])
+        assert (run.code, run.out) == (2, "")
+        assert "end it with one of .csv (centroids), .fits" in run.err
+    assert not list(tmp_path.iterdir())
+    for name in ("F.CSV", "f.TIFF", "f.fts"):
+        assert starcat(["simulate", small_artifact, "-o", tmp_path / name]).code == 0
+
+
+def test_a_build_of_nothing_lists_the_presets(
+    starcat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run = starcat(["build"])
+    assert (run.code, run.out) == (2, "")
+    assert all(name in run.err for name in preset_names())
+    assert not list(tmp_path.iterdir())
+
+
+def test_ingest_takes_its_input_as_the_other_commands_do(
+    starcat: Run, stars: Path, tmp_path: Path
+) -> None:
+    for text in (stars, f"sao={stars}"):
+        out = tmp_path / "out.parquet"
+        assert starcat(["ingest", "sao", "--input", text, "-o", out]).code == 0
+
+
 def test_a_simulated_frame_is_identified(starcat: Run, frame: Path, small_artifact: Path) -> None:
     run = starcat(["identify", small_artifact, frame])
     assert run.code == 0

@@ -36,6 +36,7 @@ WALKED = [
 ]
 
 
+@pytest.mark.timeout(300)
 @pytest.mark.parametrize("name", WALKED)
 def test_every_command_of_a_page_runs(name, catalogs, tmp_path, monkeypatch):
     found = commands(ROOT / name)

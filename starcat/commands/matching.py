@@ -30,6 +30,7 @@ def simulate(
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same frame.")] = 0,
     noise_px: NoisePx = 0.5,
     false_stars: Annotated[int, typer.Option(min=0, help="Spots that are no stars.")] = 0,
+    json: Json = False,
 ) -> None:
     """Write one simulated frame, centroids or image, to try 'starcat identify' with.
 
@@ -38,11 +39,14 @@ def simulate(
     from starcat.images.identification import write_simulated
     from starcat.matcher.database import open_database
     from starcat.simulation.simulate import Noise, simulate_frames
+    from starcat.terminal.matches import print_simulated
 
     database = open_database(artifact)
     noise = Noise(noise_px, false_stars=false_stars)
-    frames = simulate_frames(database.directions, database.camera, 1, noise, seed, mag=database.mag)
-    write_simulated(output, next(frames), database.camera, seed)
+    eye = database.camera
+    frame = next(simulate_frames(database.directions, eye, 1, noise, seed, mag=database.mag))
+    write_simulated(output, frame, eye, seed)
+    print_simulated(frame, output, as_json=json)
 
 
 @app.command()

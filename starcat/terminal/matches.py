@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
+from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.database import Database
 from starcat.matcher.methods.table import METHODS
 from starcat.matcher.result import MatchResult
+from starcat.simulation.simulate import Frame
 from starcat.terminal.console import print_json, print_table
 
 
@@ -120,6 +123,35 @@ def _print_many(
         )
     heads = ("frame", "status", "stars", "RA deg", "Dec deg", "roll deg", "rms arcsec", "chance")
     print_table(f"{len(frames)} frames, {database.name}", heads, rows, numbers=(2, 3, 4, 5, 6, 7))
+
+
+def print_simulated(frame: Frame, output: Path, *, as_json: bool) -> None:
+    """Print the truth about a simulated frame, as JSON; nothing for people, who want to guess.
+
+    Parameters
+    ----------
+    frame : Frame
+        Centroids and the true attitude.
+    output : Path
+        The file that was written.
+    as_json : bool
+        Whether to print JSON, with the names that `print_matches` gives an answer.
+    """
+    if not as_json:
+        return
+    ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(frame.matrix)
+    print_json(
+        {
+            "file": str(output),
+            "centroids": len(frame.centroids_px),
+            "guide_stars": frame.n_stars,
+            "false_stars": int(frame.is_false.sum()),
+            "boresight_ra_deg": float(ra_deg),
+            "boresight_dec_deg": float(dec_deg),
+            "roll_deg": float(roll_deg),
+            "q_body_from_icrs": quaternion_from_matrix(frame.matrix).tolist(),
+        }
+    )
 
 
 def print_methods(*, as_json: bool) -> None:
