@@ -63,8 +63,10 @@ class Place:
         path.write_bytes(content.encode() if isinstance(content, str) else content)
         return path
 
-    def ingest(self, content: bytes | list[bytes], name: str = "sao.dat") -> Call:
-        return self.ingest_file("sao", self.write(name, content))
+    def ingest(
+        self, content: bytes | list[bytes], name: str = "sao.dat", source: str = "sao"
+    ) -> Call:
+        return self.ingest_file(source, self.write(name, content))
 
     def ingest_file(self, source: str, path: Path) -> Call:
         return ["ingest", source, "--input", path, "-o", self.out / "stars.parquet"]
@@ -176,6 +178,34 @@ def _(place: Place) -> Call:
     return place.ingest([*place.lines[:4], wrong, *place.lines[5:]])
 
 
+@case("number that the column cannot hold", 0)
+def _(place: Place) -> Call:
+    wrong = with_text(place.lines[2], 194, b"1.60000000 ")
+    return place.ingest([*place.lines[:2], wrong, *place.lines[3:]])
+
+
+@case("field that is too long to print", 3)
+def _(place: Place) -> Call:
+    return place.ingest_file("2mass", place.write("psc_aaa", b"7" * 19_999 + b"x" + b"|1" * 59))
+
+
+@case("value that no star can have", 0)
+def _(place: Place) -> Call:
+    # 99 seconds of time a year: at the equator that is 1.5 million mas/yr.
+    wrong = with_text(with_text(place.lines[2], 161, b"99.0000"), 194, b" 0.00000000")
+    return place.ingest([*place.lines[:2], wrong, *place.lines[3:]])
+
+
+@case("record of 2MASS without its date", 0)
+def _(place: Place) -> Call:
+    fields = [b"\\N"] * 60
+    fields[:2], fields[5], fields[14] = [b"10.5", b"20.5"], b"00420000+2030000 ", b"4.5"
+    fields[35] = b"2451545.0"
+    second = [b"11.5", *fields[1:35], b"\\N", *fields[36:]]
+    second[5] = b"00460000+2030000 "
+    return place.ingest([b"|".join(each) + b"\n" for each in (fields, second)], "psc_aaa", "2mass")
+
+
 @case("bytes that are no text", 0)
 def _(place: Place) -> Call:
     wrong = with_text(place.lines[4], 115, b"\xff\xfe")
@@ -267,6 +297,12 @@ def _(place: Place) -> Call:
 @case("no input named and none found", 3)
 def _(place: Place) -> Call:
     return ["ingest", "sao", "-o", place.out / "stars.parquet"]
+
+
+@case("no folder has all files", 3)
+def _(place: Place) -> Call:
+    place.write("tyc2.dat.00.gz", b"")
+    return with_counterparts(place, '{ enabled = true, catalogs = ["tycho2"] }')
 
 
 @case("joined catalog missing", 3)

@@ -20,7 +20,7 @@ from starcat.catalog.readers.files import (
     DigestReader,
     InputFile,
     find_files,
-    holds_source,
+    lacking,
     map_in_order,
     read_blocks,
 )
@@ -310,26 +310,29 @@ def test_files_named_one_by_one_keep_their_order(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "expected"),
+    ("names", "expected"),
     [
-        ("many.01", True),
-        ("many.01.gz", True),
-        ("many.dat", True),
-        ("extra.dat.gz", True),
-        ("many.03", False),
-        ("many.dat.zip", False),
-        ("", False),
+        (["many.00", "many.01.gz", "many.02"], ()),
+        (["many.dat"], ()),
+        (["many.dat.gz", "many.01"], ()),
+        (["many.01", "many.00"], ("many.02",)),
+        (["extra.dat.gz"], ("many.00, many.01, many.02",)),
+        (["many.03"], None),
+        (["many.dat.zip"], None),
+        ([], None),
     ],
 )
-def test_whether_a_folder_holds_a_source(tmp_path: Path, name: str, expected: object) -> None:
-    if name:
+def test_what_a_folder_lacks_of_a_source(
+    tmp_path: Path, names: list[str], expected: object
+) -> None:
+    for name in names:
         (tmp_path / name).write_bytes(b"")
-    assert holds_source(SOURCE, tmp_path) is expected
+    assert lacking(SOURCE, tmp_path) == expected
 
 
 def test_a_folder_of_the_name_of_a_file_is_not_the_file(tmp_path: Path) -> None:
     (tmp_path / "many.dat").mkdir()
-    assert not holds_source(SOURCE, tmp_path)
+    assert lacking(SOURCE, tmp_path) is None
 
 
 @pytest.mark.parametrize("workers", [1, 2, 5])

