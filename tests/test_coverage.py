@@ -20,7 +20,7 @@ from starcat.catalog.ingest import count_by_reason, ingest
 from starcat.catalog.selection import Selected, reject_dense, select_guide_stars
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.errors import BuildError, ConfigError
-from starcat.geometry.sphere import saff_kuijlaars, separation
+from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars, separation
 from starcat.pipeline.build import Built, build
 from starcat.pipeline.guide_stars import check_fields
 from starcat.pipeline.recipes import tile_guide_stars
@@ -126,17 +126,58 @@ def test_directions_of_one_side_leave_the_other_uncovered(random_directions: Dra
     assert radius > np.radians(150.0)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3])
-def test_few_directions_cover_nothing(count: int) -> None:
-    radius, direction = covering_radius(saff_kuijlaars(count))
-    assert radius == np.pi
-    assert np.linalg.norm(direction) == pytest.approx(1.0)
+def circle(ra_deg: list[float], dec_deg: float) -> np.ndarray:
+    return directions_from_radec(ra_deg, np.full(len(ra_deg), dec_deg))
 
 
-def test_directions_of_one_circle_cover_nothing() -> None:
-    angle = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
-    equator = np.stack([np.cos(angle), np.sin(angle), np.zeros(8)], axis=-1)
-    assert covering_radius(equator)[0] == np.pi
+FEW = {
+    "one": circle([10.0], 20.0),
+    "one, twice": circle([10.0, 10.0], 20.0),
+    "both poles": np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]),
+    "antipodes": np.array([[0.6, 0.8, 0.0], [-0.6, -0.8, 0.0]]),
+    "two near": circle([10.0, 12.0], 5.0),
+    "two far": circle([10.0, 170.0], 5.0),
+    "spiral of 2": saff_kuijlaars(2),
+    "spiral of 3": saff_kuijlaars(3),
+    "spiral of 4": saff_kuijlaars(4),
+    "spiral of 5": saff_kuijlaars(5),
+    "three of an octant": np.eye(3),
+    "three near": circle([10.0, 12.0, 15.0], 40.0),
+    "equator": circle([0.0, 45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0], 0.0),
+    "half of the equator": circle([0.0, 45.0, 90.0, 135.0], 0.0),
+    "three of the equator": circle([0.0, 120.0, 240.0], 0.0),
+    "parallel": circle([0.0, 100.0, 200.0, 300.0], 50.0),
+    "arc of a parallel": circle([0.0, 10.0, 30.0, 100.0], 50.0),
+    # The farthest direction is opposite to the middle of the two outer ones.
+    "four of one side": np.concatenate([circle([-30.0, 30.0], 0.0), circle([0.0, 1.0], 3.0)]),
+    "a tetrahedron": np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3.0),
+}
+
+
+@pytest.mark.parametrize("name", FEW)
+@pytest.mark.parametrize("rotation", range(3))
+def test_few_directions(name: str, rotation: int, random_directions: Draw) -> None:
+    """The radius is that of brute force over the sphere, refined where it is farthest."""
+    turn, _ = np.linalg.qr(random_directions(3, rotation))
+    directions = FEW[name] @ (turn if rotation else np.eye(3))
+    radius, direction = covering_radius(directions)
+    assert separation(directions, direction).min() == pytest.approx(radius, abs=1e-9)
+    sample = random_directions(100_000, rotation)
+    best = 0.0
+    for width in (0.1, 0.03, 0.01, 0.003, 0.001, 0.0003, 0.0001):
+        reach = np.array([separation(sample, each) for each in directions]).min(axis=0)
+        best = max(best, float(reach.max()))
+        near = sample[np.argmax(reach)] + width * random_directions(5_000, rotation + 9)
+        sample = near / np.linalg.norm(near, axis=1)[:, None]
+    assert best <= radius + 1e-9
+    assert best == pytest.approx(radius, abs=2e-4)
+
+
+def test_two_boresights_at_the_poles_are_90_degrees_from_the_equator() -> None:
+    assert np.degrees(covering_radius(saff_kuijlaars(2))[0]) == pytest.approx(90.0)
+    assert np.degrees(covering_radius(saff_kuijlaars(3))[0]) == pytest.approx(90.0)
+    assert np.degrees(covering_radius(FEW["equator"])[0]) == pytest.approx(90.0)
+    assert np.degrees(covering_radius(FEW["one"])[0]) == pytest.approx(180.0)
 
 
 @pytest.mark.parametrize("count", [1, 10, 100, 500])

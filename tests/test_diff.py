@@ -99,6 +99,26 @@ def test_every_star_is_accounted_for(
     assert not any(p.is_same for p in found.products if p.product != "report")
 
 
+@pytest.mark.parametrize("is_repeated_first", [False, True])
+def test_a_repeated_record_does_not_hide_the_reason(
+    small_artifact: Path, make: Make, sao_lines: list[bytes], is_repeated_first: bool
+) -> None:
+    """A guide star has a companion in the other catalog, and one more record there."""
+    star = int(open_artifact(small_artifact).table("stars")["star_id"][20].as_py())
+    dec = float(sao_lines[star - 1][193:204])
+    near = with_text(sao_lines[star - 1], 193, f"{dec + 1e-4:+11.8f}".encode())
+    companion = with_text(near, 0, b"   601")
+    again = with_text(sao_lines[star - 1], 80, b" 1.1" if is_repeated_first else b" 6.0")
+    lines = [*sao_lines, companion]
+    lines.insert(0 if is_repeated_first else len(lines), again)
+    doubles = {"faint_limit_mag": 6.0, "doubles": {"min_separation_deg": 0.05}}
+    found = diff_artifacts(open_artifact(small_artifact), make("b", lines, selection=doubles))
+    rejected = make("c", lines, selection=doubles).table("rejected").to_pylist()
+    reasons = [row["reason"] for row in rejected if row["star_id"] == star]
+    assert sorted(reasons) == ["double", "duplicate_record"]
+    assert {s.reason for s in found.went if s.star_id == star} == {"double"}
+
+
 def test_products_of_one_side(small_artifact: Path, make: Make) -> None:
     without = make("b", products={"triangles": {"enabled": False}})
     a = open_artifact(small_artifact)

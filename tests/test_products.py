@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
+from collections import Counter
 from dataclasses import fields
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from hypothesis import strategies as st
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions
 from starcat.pipeline.recipes import table_from_result
-from starcat.products.boresights import NominalField, tile_sphere
+from starcat.products.boresights import FieldStars, NominalField, tile_sphere
 from starcat.products.grid import cell_of, grid_patterns
 from starcat.products.hausdorff_angular import angular_reference_sets
 from starcat.products.hausdorff_l2 import planar_reference_sets
@@ -23,7 +24,7 @@ from starcat.products.index import Ragged
 from starcat.products.neighbours import bin_of, find_neighbours, position_angles
 from starcat.products.pairs import find_pairs
 from starcat.products.radial import radial_patterns, ring_of
-from starcat.products.triangles import find_triangles
+from starcat.products.triangles import distinct_triangles, find_triangles
 from starcat.tables.schema import product_schema
 
 RADIUS, BUFFER = 0.6, 0.1
@@ -85,6 +86,27 @@ def arrays_of(name, made):
         values = getattr(made, column.name)
         yield from (values.offsets, values.values) if isinstance(values, Ragged) else (values,)
     yield from made.index.datasets.values()
+
+
+def test_triangles_of_more_stars_than_a_packed_key_holds():
+    """Row numbers above 2**21 give the triangles that a plain loop finds, in the same order."""
+    generator = np.random.default_rng(8)
+    per_field = generator.integers(0, 9, 300)
+    offsets = np.concatenate([[0], np.cumsum(per_field)])
+    few = generator.choice(40, offsets[-1]) + np.where(generator.random(offsets[-1]) < 0.5, 0, 40)
+    small = [np.unique(few[a:b]) for a, b in pairwise(offsets)]
+    count = 5_000_000
+    rows = np.sort(generator.choice(count, 80, replace=False)).astype(np.int32)
+    lengths = np.cumsum([0, *map(len, small)])
+    tiles = [
+        FieldStars(np.zeros((300, 3)), lengths, np.concatenate(of).astype(np.int32))
+        for of in (small, [rows[field] for field in small])
+    ]
+    expected = Counter(t for field in small for t in combinations(field[:5].tolist(), 3))
+    for fields_, star, total in ((tiles[0], np.arange(80), 80), (tiles[1], rows, count)):
+        stars, seen = distinct_triangles(fields_, total, 5)
+        assert [tuple(row) for row in stars] == [tuple(star[list(t)]) for t in sorted(expected)]
+        assert seen.tolist() == [expected[t] for t in sorted(expected)]
 
 
 @pytest.mark.parametrize("kind", SKIES)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from starcat.artifact.reader import Artifact
 from starcat.catalog.stars import directions_of, floats_of
+from starcat.catalog.verdict import Reason
 from starcat.geometry.sphere import separation
 
 MOVED_ARCSEC = 1e-3
@@ -252,7 +253,13 @@ def _one_sided(
     alone[common] = False
     found = stars.filter(pa.array(alone)).select(["star_id", "designation", "mag"])
     known = rejected.filter(pc.is_in(rejected["star_id"], found["star_id"].combine_chunks()))
-    reasons = dict(zip(known["star_id"].to_pylist(), known["reason"].to_pylist(), strict=True))
+    reasons: dict[int, str] = {}
+    for star_id, reason in zip(
+        known["star_id"].to_pylist(), known["reason"].to_pylist(), strict=True
+    ):
+        # A repeated record says nothing of the star: its first record was judged.
+        if reasons.get(star_id, Reason.duplicate_record.name) == Reason.duplicate_record.name:
+            reasons[star_id] = reason
     return tuple(
         OneSided(**star, reason=reasons.get(star["star_id"], NOT_READ))
         for star in found.to_pylist()

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from starcat.geometry.sphere import radec_from_directions, separation
 from starcat.products.boresights import FieldStars
@@ -243,16 +243,17 @@ def covering_radius(directions: Array) -> tuple[float, Array]:
     Returns
     -------
     radius_rad : float
-        Radians; pi for fewer than 4 directions, and for those of one circle.
+        Radians, 0 to pi.
     direction : ndarray of float64, shape (3,)
-        The unit vector that is so far away; away from the first one where nothing better is
-        known.
+        The unit vector that is so far away; of several the first by x, y and z.
 
     Notes
     -----
     The facets of the convex hull are the spherical Delaunay triangles, and the normal of a
-    facet is the centre of its circumcircle, which holds no other direction. The farthest
-    direction of all is the centre of the largest one.
+    facet is the centre of its circumcircle, which holds no other direction. Where the farthest
+    of these centres is less than 90 deg away, it is the farthest direction of all. Otherwise all
+    directions lie in one half of the sphere, and the farthest one may also be opposite to the
+    middle of an edge of the hull.
 
     Examples
     --------
@@ -260,15 +261,49 @@ def covering_radius(directions: Array) -> tuple[float, Array]:
     >>> round(float(np.degrees(covering_radius(octahedron)[0])), 3)
     54.736
     """
-    if len(directions) < 4:
-        return float(np.pi), -directions[0]
     try:
         hull = ConvexHull(directions)
-    except QhullError:
-        return float(np.pi), -directions[0]
+    except QhullError:  # fewer than 4 directions, or all in one plane
+        return _farthest(_opposite_to_circle(directions), directions)
     centres = hull.equations[:, :3]
     radii = separation(centres, directions[hull.simplices[:, 0]])
+    if radii.max() < 0.5 * np.pi:
+        return _widest(centres, radii)
+    edges = hull.simplices[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    candidates = np.concatenate([centres, _opposite_to_middle(*directions[edges.T])])
+    return _farthest(candidates, directions)
+
+
+def _widest(centres: Array, radii: Array) -> tuple[float, Array]:
     # Equal circles go by direction, so that the order of the facets does not matter.
     rounded = [*np.round(centres.T, 9), -np.round(radii, 12)]
     widest = int(np.lexsort(rounded)[0])
     return float(radii[widest]), np.asarray(centres[widest])
+
+
+def _farthest(candidates: Array, directions: Array) -> tuple[float, Array]:
+    """Return the candidate that is farthest from its nearest direction, and how far that is."""
+    _, nearest = cKDTree(directions).query(candidates)
+    return _widest(candidates, separation(candidates, directions[nearest]))
+
+
+def _opposite_to_middle(u: Array, v: Array) -> Array:
+    """Return the directions opposite to the middles of arcs; none for antipodes."""
+    middle = u + v
+    length = np.sqrt(np.einsum("ij,ij->i", middle, middle))
+    is_arc = length > 1e-9
+    return np.asarray(-middle[is_arc] / length[is_arc, None])
+
+
+def _opposite_to_circle(directions: Array) -> Array:
+    """Return where the farthest direction from those of one circle can be.
+
+    That is at a pole of the circle, or opposite to the middle of the directions at the ends of
+    its largest gap.
+    """
+    apart = directions - directions.mean(axis=0)
+    _, _, (along, across, normal) = np.linalg.svd(apart, full_matrices=len(directions) < 3)
+    order = np.argsort(np.arctan2(directions @ across, directions @ along))
+    around = directions[order]
+    middles = _opposite_to_middle(around, np.roll(around, -1, axis=0))
+    return np.concatenate([[normal, -normal], middles])

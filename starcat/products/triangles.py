@@ -6,6 +6,7 @@ the features do not depend on where in a frame it lies.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -18,6 +19,9 @@ from starcat.products.boresights import FieldStars
 from starcat.products.index import Index, kvector_index
 
 Array = NDArray[np.float64]
+
+_PACKED_BITS = 21
+"""Three row numbers of so many bits fit into one int64."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +113,7 @@ def distinct_triangles(
     fields : FieldStars
         The tiling.
     count : int
-        Number of stars in the table, below 2**21.
+        Number of stars in the table.
     brightest : int
         Stars of a field that take part.
 
@@ -119,26 +123,44 @@ def distinct_triangles(
         Rows i < j < k, in order.
     times_seen : ndarray of int64, shape (M,)
         Fields that have the triangle.
-
-    Raises
-    ------
-    ValueError
-        If there are more stars than a packed key can hold.
     """
-    if count > 1 << 21:
-        raise ValueError(f"{count} stars; triangles hold at most {1 << 21}")
+    triples = _triples(fields, brightest)
+    return _distinct_packed(triples) if count <= 1 << _PACKED_BITS else _distinct_rows(triples)
+
+
+def _triples(fields: FieldStars, brightest: int) -> Iterator[NDArray[np.int64]]:
+    """Yield the triangles of all fields, rows i < j < k, those of one number of stars at a time."""
     offsets, star_index = fields.brightest(brightest)
     size = np.diff(offsets)
-    keys = [np.empty(0, dtype=np.int64)]
+    yield np.empty((0, 3), dtype=np.int64)
     for length in range(3, brightest + 1):
         start = offsets[:-1][size == length]
         members = star_index[start[:, None] + np.arange(length)].astype(np.int64)
         choices = np.array(list(combinations(range(length), 3)))
-        triples = np.sort(members[:, choices].reshape(-1, 3), axis=1)
-        keys.append((triples[:, 0] << 42) | (triples[:, 1] << 21) | triples[:, 2])
+        yield np.sort(members[:, choices].reshape(-1, 3), axis=1)
+
+
+def _distinct_packed(
+    triples: Iterable[NDArray[np.int64]],
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return distinct rows and how often each occurs: three numbers in one key sort fastest."""
+    low = (1 << _PACKED_BITS) - 1
+    keys = [(t[:, 0] << 2 * _PACKED_BITS) | (t[:, 1] << _PACKED_BITS) | t[:, 2] for t in triples]
     packed, seen = np.unique(np.concatenate(keys), return_counts=True)
-    low = (1 << 21) - 1
-    return np.stack([packed >> 42, (packed >> 21) & low, packed & low], axis=-1), seen
+    i, j = packed >> 2 * _PACKED_BITS, (packed >> _PACKED_BITS) & low
+    return np.stack([i, j, packed & low], axis=-1), seen
+
+
+def _distinct_rows(
+    triples: Iterable[NDArray[np.int64]],
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the same for numbers of any size."""
+    rows = np.concatenate(list(triples))
+    rows = rows[np.lexsort(rows.T[::-1])]
+    is_first = np.ones(len(rows), dtype=bool)
+    is_first[1:] = (rows[1:] != rows[:-1]).any(axis=1)
+    first = np.flatnonzero(is_first)
+    return rows[first], np.diff(first, append=len(rows))
 
 
 def triangle_area(a: Array, b: Array, c: Array) -> Array:
