@@ -30,7 +30,7 @@ SINGLE_MODULES = {
     "faces": ["cli", "__main__"],
 }
 
-GEOMETRY = ("attitude", "camera", "distortion", "kvector", "sphere")
+GEOMETRY = ("attitude", "camera", "distortion", "kvector", "patterns", "sphere")
 LIGHT = {"starcat.errors", *(f"starcat.geometry.{name}" for name in GEOMETRY)}
 """What a small machine carries along with the matcher."""
 

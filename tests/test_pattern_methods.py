@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
 from starcat.geometry.camera import Camera
+from starcat.geometry.patterns import cell_of, cyclic_shifts
 from starcat.geometry.sphere import radec_from_directions, separation
 from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.matcher import Matcher
@@ -27,10 +28,10 @@ from starcat.matcher.methods.reference import (
 from starcat.matcher.methods.table import METHODS
 from starcat.matcher.methods.triangle_order import DEFAULT
 from starcat.matcher.observation import Observation, observe
-from starcat.products.grid import cell_of, grid_patterns
+from starcat.products.grid import grid_patterns
 from starcat.products.index import Index, Ragged
-from starcat.products.neighbours import bin_of, find_neighbours
-from starcat.products.radial import radial_patterns, ring_of, smallest_shift
+from starcat.products.neighbours import find_neighbours
+from starcat.products.radial import radial_patterns
 from starcat.simulation.simulate import Frame, Noise, simulate_frames
 
 NAMES = ["dynamic_angle", "grid", "radial"]
@@ -505,52 +506,12 @@ def test_a_ring_that_is_only_touched_counts_half(sky, monkeypatch):
     assert (np.diff(scores) <= 0.0).all()
 
 
-@given(
-    st.lists(st.tuples(st.floats(0.0, 7.0), st.floats(0.0, 0.3)), max_size=20),
-    st.floats(1e-3, 8.0),
-    st.floats(1e-4, 0.3),
-    st.integers(1, 400),
-    st.integers(1, 400),
-)
-def test_bins_are_those_of_the_product(pairs, angle_bin, separation_bin, angles, separations):
-    angle_rad, separation_rad = np.array(pairs).reshape(-1, 2).T
-    arguments = angle_rad, separation_rad, angle_bin, separation_bin, angles, separations
-    assert dynamic_angle.bin_of(*arguments).tolist() == bin_of(*arguments).tolist()
-
-
-@given(
-    st.lists(st.tuples(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0)), max_size=20),
-    st.floats(0.01, 1.2),
-    st.integers(1, 200),
-)
-def test_cells_are_those_of_the_product(points, radius_rad, side):
-    edges = np.tan(radius_rad) * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
-    x, y = np.concatenate([np.array(points).reshape(-1, 2), np.stack([edges, edges[::-1]], -1)]).T
-    expected = cell_of(x, y, radius_rad, side).tolist()
-    assert grid.cell_of(x, y, radius_rad, side).tolist() == expected
-
-
-@given(st.lists(st.floats(0.0, 1.0), max_size=20), st.floats(0.01, 1.2), st.integers(1, 200))
-def test_rings_are_those_of_the_product(parts, radius_rad, rings):
-    separation_rad = radius_rad * np.array([*parts, 0.0, 0.5, 1.0])
-    expected = ring_of(separation_rad, radius_rad, rings).tolist()
-    assert radial.ring_of(separation_rad, radius_rad, rings).tolist() == expected
-
-
-@given(st.integers(1, 31), st.data())
-def test_the_smallest_shift_is_that_of_the_product(sectors, data):
-    pattern = data.draw(st.integers(0, 2**sectors - 1))
-    shifts = radial.shifts(pattern, sectors)
-    assert shifts.min() == smallest_shift(np.array([pattern]), sectors)[0]
-    assert {bin(shift).count("1") for shift in shifts.tolist()} == {pattern.bit_count()}
-
-
 def test_sectors_are_those_of_the_product(sky):
     for star in range(0, 2500, 50):
         observation, reference, _ = centred_on(sky, star, 3.0 * star)
         around = surroundings(observation, reference, RADIUS_RAD)
         pattern = radial.sector_pattern(around.position_angle_rad, SECTORS)
-        seen = radial.shifts(pattern, SECTORS).min()
+        seen = cyclic_shifts(pattern, SECTORS).min()
         assert seen == sky.products["radial"]["sector_pattern"][star]
 
 

@@ -14,16 +14,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from starcat.geometry.attitude import matrix_from_radec_roll
+from starcat.geometry.patterns import bin_of, cell_of, ring_of
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions
 from starcat.pipeline.recipes import table_from_result
 from starcat.products.boresights import FieldStars, NominalField, tile_sphere
-from starcat.products.grid import cell_of, grid_patterns
+from starcat.products.grid import grid_patterns
 from starcat.products.hausdorff_angular import angular_reference_sets
 from starcat.products.hausdorff_l2 import planar_reference_sets
 from starcat.products.index import Ragged
-from starcat.products.neighbours import bin_of, find_neighbours, position_angles
+from starcat.products.neighbours import find_neighbours, position_angles
 from starcat.products.pairs import find_pairs
-from starcat.products.radial import radial_patterns, ring_of
+from starcat.products.radial import radial_patterns
 from starcat.products.triangles import distinct_triangles, find_triangles
 from starcat.tables.schema import product_schema
 

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from starcat.geometry.patterns import cell_of
 from starcat.products.hausdorff_angular import angular_reference_sets
 from starcat.products.index import Index, Ragged, row_offsets, sorted_unique, stable_order
 from starcat.products.neighbours import position_angles
@@ -87,62 +88,31 @@ def grid_patterns(
     is_first = np.ones(len(star), dtype=bool)
     np.not_equal(star[1:], star[:-1], out=is_first[1:])
     first = np.flatnonzero(is_first)
-    with_pattern, row = star[first], np.cumsum(is_first) - 1
+    row = np.cumsum(is_first) - 1
     angle = position_angles(directions, star, neighbour)
     turn = angle - angle[first][row]
     distance = np.tan(sets.separation_rad[beyond])
     cell = cell_of(distance * np.cos(turn), distance * np.sin(turn), radius_rad, cells_per_side)
-    count = cells_per_side**2
-    row, cell = np.divmod(sorted_unique(row * count + cell), count)
-    cells = Ragged(row_offsets(row, len(with_pattern)), cell.astype(np.int32))
-    order = stable_order(cell, count)
-    lookup: dict[str, NDArray[Any]] = {
-        "cell_offsets": row_offsets(cell[order], count),
-        "cell_rows": row[order].astype(np.int32),
-    }
+    cells, lookup = _tables(row, cell, len(first), cells_per_side**2)
     parameters = {
         "radius_rad": radius_rad,
         "buffer_rad": buffer_rad,
         "cells_per_side": cells_per_side,
     }
-    return GridPatterns(with_pattern, neighbour[first], cells, Index(lookup, parameters))
+    return GridPatterns(star[first], neighbour[first], cells, Index(lookup, parameters))
 
 
-def cell_of(
-    x: ArrayLike, y: ArrayLike, radius_rad: float, cells_per_side: int
-) -> NDArray[np.int64]:
-    """Return the numbers of the grid's cells.
-
-    Parameters
-    ----------
-    x, y : array_like of float64, shape (M,)
-        Gnomonic coordinates about the star in units of the focal length, x towards the
-        alignment star and y counter-clockwise of it on the sky as seen.
-    radius_rad : float
-        The grid spans ``-tan(radius)`` to ``tan(radius)`` on both axes.
-    cells_per_side : int
-        Rows, and columns, of the grid.
-
-    Returns
-    -------
-    ndarray of int64, shape (M,)
-        ``row * cells_per_side + column``, rows along y and columns along x, both upwards from
-        0. A cell includes its lower edges and not its upper ones, but for the last of a row or
-        column; what lies outside the grid goes to its edge.
-
-    Examples
-    --------
-    >>> cell_of([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], np.pi / 4.0, 2)
-    array([0, 3, 3])
-    """
-    reach = np.tan(radius_rad)
-
-    def step(value: ArrayLike) -> NDArray[np.int64]:
-        part = (np.asarray(value, dtype=np.float64) + reach) / (2.0 * reach)
-        cell = np.floor(part * cells_per_side).astype(np.int64)
-        return np.asarray(np.clip(cell, 0, cells_per_side - 1))
-
-    return step(y) * cells_per_side + step(x)
+def _tables(
+    row: NDArray[np.int64], cell: NDArray[np.int64], rows: int, count: int
+) -> tuple[Ragged, dict[str, NDArray[Any]]]:
+    """Return the cells of every row, each once, and the rows of every cell."""
+    row, cell = np.divmod(sorted_unique(row * count + cell), count)
+    order = stable_order(cell, count)
+    lookup: dict[str, NDArray[Any]] = {
+        "cell_offsets": row_offsets(cell[order], count),
+        "cell_rows": row[order].astype(np.int32),
+    }
+    return Ragged(row_offsets(row, rows), cell.astype(np.int32)), lookup
 
 
 def _check(radius_rad: float, buffer_rad: float, cells_per_side: int) -> None:

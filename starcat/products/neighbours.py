@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from starcat.geometry.patterns import bin_of
 from starcat.geometry.sphere import radec_from_directions, tangent_axes
 from starcat.products.hausdorff_angular import angular_reference_sets
 from starcat.products.index import Index, row_offsets
@@ -41,7 +42,8 @@ class Neighbours:
     index : Index
         Datasets ``star_offsets``, int64, shape (N + 1,): the rows of star n are
         ``star_offsets[n]:star_offsets[n + 1]``; ``lookup_offsets``, int64, shape (bins + 1,)
-        and ``lookup_rows``, int32, shape (M,): the rows in bin b of `bin_of`, ascending, are
+        and ``lookup_rows``, int32, shape (M,): the rows in bin b of
+        `starcat.geometry.patterns.bin_of`, ascending, are
         ``lookup_rows[lookup_offsets[b]:lookup_offsets[b + 1]]``. Attributes
         ``angle_bin_rad``, ``separation_bin_rad``, ``n_angle_bins``, ``n_separation_bins``.
     """
@@ -150,37 +152,6 @@ def position_angles(
     angle = np.where(angle < 0.0, angle + _TURN, angle)
     # A tiny negative angle plus a turn rounds to a turn.
     return np.where(angle >= _TURN, 0.0, angle)
-
-
-def bin_of(
-    angle_rad: ArrayLike,
-    separation_rad: ArrayLike,
-    angle_bin_rad: float,
-    separation_bin_rad: float,
-    n_angle_bins: int,
-    n_separation_bins: int,
-) -> NDArray[np.int64]:
-    """Return the bins of successive angles and separations in the look-up table.
-
-    Parameters
-    ----------
-    angle_rad, separation_rad : array_like of float64, shape (M,)
-        Radians, 0 to 2 pi and 0 to the radius.
-    angle_bin_rad, separation_bin_rad : float
-        Widths of the bins, radians.
-    n_angle_bins, n_separation_bins : int
-        Their numbers.
-
-    Returns
-    -------
-    ndarray of int64, shape (M,)
-        ``angle bin * n_separation_bins + separation bin``. A bin includes its lower end and
-        not its upper one, but for the last, which includes all that lies above.
-    """
-    a = np.floor(np.asarray(angle_rad, dtype=np.float64) / angle_bin_rad)
-    s = np.floor(np.asarray(separation_rad, dtype=np.float64) / separation_bin_rad)
-    a, s = np.minimum(a, n_angle_bins - 1), np.minimum(s, n_separation_bins - 1)
-    return np.asarray(a * n_separation_bins + s).astype(np.int64)
 
 
 def _bin_count(extent: float, width: float, name: str) -> int:

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from starcat.geometry.patterns import cyclic_shifts, ring_of, sector_of
 from starcat.products.hausdorff_angular import AngularReferenceSets, angular_reference_sets
 from starcat.products.index import Index, Ragged, row_offsets, sorted_unique, stable_order
 from starcat.products.neighbours import position_angles
@@ -92,67 +93,13 @@ def radial_patterns(
         "ring_offsets": row_offsets(ring[order], rings),
         "ring_rows": row[order].astype(np.int32),
     }
+    occupied = _sectors(directions, sets, sectors)
     return RadialPatterns(
         np.arange(count, dtype=np.int32),
         Ragged(row_offsets(row, count), ring.astype(np.int32)),
-        smallest_shift(_sectors(directions, sets, sectors), sectors).astype(np.int32),
+        cyclic_shifts(occupied, sectors).min(axis=0).astype(np.int32),
         Index(lookup, {"radius_rad": radius_rad, "rings": rings, "sectors": sectors}),
     )
-
-
-def ring_of(separation_rad: ArrayLike, radius_rad: float, rings: int) -> NDArray[np.int64]:
-    """Return the rings that separations fall in.
-
-    Parameters
-    ----------
-    separation_rad : array_like of float64, shape (M,)
-        Radians, 0 to the radius.
-    radius_rad : float
-        Outer end of the last ring, radians.
-    rings : int
-        Their number.
-
-    Returns
-    -------
-    ndarray of int64, shape (M,)
-        From 0, the innermost. A ring includes its inner end and not its outer one, but for the
-        last, which includes both.
-
-    Examples
-    --------
-    >>> ring_of([0.0, 0.5, 0.99, 1.0], 1.0, 2)
-    array([0, 1, 1, 1])
-    """
-    part = np.asarray(separation_rad, dtype=np.float64) / radius_rad
-    return np.minimum(np.floor(part * rings), rings - 1).astype(np.int64)
-
-
-def smallest_shift(pattern: NDArray[np.int64], sectors: int) -> NDArray[np.int64]:
-    """Return the smallest of all cyclic shifts of bit patterns.
-
-    Parameters
-    ----------
-    pattern : ndarray of int64, shape (N,)
-        Bit s stands for sector s.
-    sectors : int
-        Length of the cycle in bits.
-
-    Returns
-    -------
-    ndarray of int64, shape (N,)
-        Equal for patterns that are turned into each other.
-
-    Examples
-    --------
-    >>> smallest_shift(np.array([0b0000, 0b1001, 0b0110]), 4)
-    array([0, 3, 3])
-    """
-    every = (1 << sectors) - 1
-    smallest = pattern
-    for shift in range(1, sectors):
-        turned = (pattern >> shift) | ((pattern << (sectors - shift)) & every)
-        smallest = np.minimum(smallest, turned)
-    return smallest
 
 
 def _sectors(
@@ -163,8 +110,7 @@ def _sectors(
     star = sets.star[apart]
     _, first, row = np.unique(star, return_index=True, return_inverse=True)
     angle = position_angles(directions, star, sets.neighbour[apart])
-    part = np.mod(angle - angle[first][row], 2.0 * np.pi) / (2.0 * np.pi)
-    sector = np.minimum(np.floor(part * sectors), sectors - 1).astype(np.int64)
+    sector = sector_of(angle - angle[first][row], sectors)
     occupied = np.zeros((len(directions), sectors), dtype=np.bool_)
     occupied[star, sector] = True
     return np.asarray(occupied @ (1 << np.arange(sectors, dtype=np.int64)))

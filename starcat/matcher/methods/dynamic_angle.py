@@ -11,8 +11,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from starcat.geometry.patterns import bin_of
 from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.pairs import side_tolerance_rad
@@ -213,38 +214,3 @@ def _walk(
     turn -= _TURN * np.round(turn / _TURN)
     fits = np.abs(turn) <= tolerance.between(apart[observed], apart[origin])
     return begun[fits], observed[fits], row[fits]
-
-
-def bin_of(
-    angle_rad: ArrayLike,
-    separation_rad: ArrayLike,
-    angle_bin_rad: float,
-    separation_bin_rad: float,
-    n_angle_bins: int,
-    n_separation_bins: int,
-) -> NDArray[np.int64]:
-    """Return the bins of successive angles and separations in the look-up table.
-
-    Parameters
-    ----------
-    angle_rad, separation_rad : array_like of float64, shape (M,)
-        Radians, 0 or more; what lies beyond the last bin goes to it.
-    angle_bin_rad, separation_bin_rad : float
-        Widths of the bins, radians.
-    n_angle_bins, n_separation_bins : int
-        Their numbers.
-
-    Returns
-    -------
-    ndarray of int64, shape (M,)
-        As the schema of the product ``neighbours`` numbers them.
-
-    Examples
-    --------
-    >>> bin_of([0.0, 1.0, 9.0], [0.3, 0.1, 0.9], 1.0, 0.2, 3, 2)
-    array([1, 2, 5])
-    """
-    angle, apart = np.asarray(angle_rad, np.float64), np.asarray(separation_rad, np.float64)
-    a = np.minimum(np.floor(angle / angle_bin_rad), n_angle_bins - 1)
-    s = np.minimum(np.floor(apart / separation_bin_rad), n_separation_bins - 1)
-    return np.asarray(a * n_separation_bins + s).astype(np.int64)

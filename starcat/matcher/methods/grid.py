@@ -11,8 +11,9 @@ from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from starcat.geometry.patterns import cell_of
 from starcat.geometry.sphere import separation
 from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.methods.candidates import Candidates
@@ -160,39 +161,3 @@ def _occupied(
     y[:, alignment] = 0.0
     side = int(product.numbers["cells_per_side"])
     return np.unique(cell_of(x, y, product.numbers["radius_rad"], side))
-
-
-def cell_of(
-    x: ArrayLike, y: ArrayLike, radius_rad: float, cells_per_side: int
-) -> NDArray[np.int64]:
-    """Return the numbers of the grid's cells.
-
-    Parameters
-    ----------
-    x, y : array_like of float64, same shape
-        Gnomonic coordinates about the star in units of the focal length, x towards the
-        alignment star and y counter-clockwise of it on the sky as seen.
-    radius_rad : float
-        The grid spans ``-tan(radius)`` to ``tan(radius)`` on both axes.
-    cells_per_side : int
-        Rows, and columns, of the grid.
-
-    Returns
-    -------
-    ndarray of int64, same shape
-        As the schema of the product ``grid`` numbers them; what lies outside the grid goes to
-        its edge.
-
-    Examples
-    --------
-    >>> cell_of([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], np.pi / 4.0, 2)
-    array([0, 3, 3])
-    """
-    reach = np.tan(radius_rad)
-
-    def step(value: ArrayLike) -> NDArray[np.int64]:
-        part = (np.asarray(value, dtype=np.float64) + reach) / (2.0 * reach)
-        cell = np.floor(part * cells_per_side).astype(np.int64)
-        return np.asarray(np.clip(cell, 0, cells_per_side - 1))
-
-    return step(y) * cells_per_side + step(x)

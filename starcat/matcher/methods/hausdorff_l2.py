@@ -133,22 +133,29 @@ def rank_stars(
     product = database.products["hausdorff_l2"]
     reference = int(references(observation)[0]) if reference is None else reference
     centroids, distance = _around(observation, database, reference, radius_rad)
-    ratio = distance / distance[:1]
-    fainter = np.full(len(ratio), np.nan)
-    fainter_of_star = np.empty(0)
-    if observation.mag is not None and w2 != 0.0:
-        fainter = observation.mag[centroids] - observation.mag[reference]
-        fainter_of_star = database.mag[product["neighbour"]] - database.mag[product["star"]]
-
-    def difference(ratio: float, fainter: float) -> Array:
-        by_ratio = w1 * np.abs(product["ratio"] - ratio) ** m
-        if np.isnan(fainter):
-            return by_ratio
-        return by_ratio + w2 * np.abs(fainter_of_star - fainter) ** m
-
-    differences = map(difference, ratio, fainter)
+    by_ratio = (w1 * np.abs(product["ratio"] - r) ** m for r in distance / distance[:1])
+    by_mag = _magnitude_differences(observation, database, reference, centroids) if w2 else None
+    differences = by_ratio if by_mag is None else map(lambda a, b: a + w2 * b**m, by_ratio, by_mag)
     stars, scores = lowest(means_of_minima(differences, product["star_offsets"])[None, :], count)
     return stars[0], scores[0]
+
+
+def _magnitude_differences(
+    observation: Observation, database: Database, reference: int, centroids: Rows
+) -> Iterator[Array] | None:
+    """Yield for each centroid how its magnitude differs from every neighbour's.
+
+    Both are over that of the reference star. None where the frame has no magnitudes.
+    """
+    if observation.mag is None:
+        return None
+    product = database.products["hausdorff_l2"]
+    fainter_of_star = database.mag[product["neighbour"]] - database.mag[product["star"]]
+    fainter = observation.mag[centroids] - observation.mag[reference]
+    return (
+        np.zeros(len(fainter_of_star)) if np.isnan(each) else np.abs(fainter_of_star - each)
+        for each in fainter
+    )
 
 
 def likely_stars(

@@ -10,8 +10,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from starcat.geometry.patterns import cyclic_shifts, ring_of, sector_of
 from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.consensus import consistent_candidates
@@ -161,65 +162,12 @@ def sector_pattern(position_angle_rad: Array, sectors: int) -> int:
     >>> bin(sector_pattern(np.radians([10.0, 105.0, 5.0]), 4))
     '0b1011'
     """
-    turn = position_angle_rad - position_angle_rad[0]
-    part = np.mod(turn, 2.0 * np.pi) / (2.0 * np.pi)
-    sector = np.minimum(np.floor(part * sectors), sectors - 1).astype(np.int64)
+    sector = sector_of(position_angle_rad - position_angle_rad[0], sectors)
     return int(np.bitwise_or.reduce(1 << sector))
 
 
 def _difference(pattern: int, others: NDArray[np.int32], sectors: int) -> Array:
     """Return the share of the sectors of both that differ, in the position where fewest do."""
-    turned = shifts(pattern, sectors)
+    turned = cyclic_shifts(pattern, sectors)
     differ = np.bitwise_count(turned[:, None] ^ others.astype(np.int64)).min(axis=0)
     return np.asarray(differ / (pattern.bit_count() + np.bitwise_count(others)))
-
-
-def ring_of(separation_rad: ArrayLike, radius_rad: float, rings: int) -> NDArray[np.int64]:
-    """Return the rings that separations fall in.
-
-    Parameters
-    ----------
-    separation_rad : array_like of float64, shape (M,)
-        Radians; what lies beyond the radius goes to the last ring.
-    radius_rad : float
-        Outer end of the last ring, radians.
-    rings : int
-        Their number.
-
-    Returns
-    -------
-    ndarray of int64, shape (M,)
-        As the schema of the product ``radial`` numbers them.
-
-    Examples
-    --------
-    >>> ring_of([0.0, 0.5, 0.99, 1.0], 1.0, 2)
-    array([0, 1, 1, 1])
-    """
-    part = np.asarray(separation_rad, dtype=np.float64) / radius_rad
-    return np.minimum(np.floor(part * rings), rings - 1).astype(np.int64)
-
-
-def shifts(pattern: int, sectors: int) -> NDArray[np.int64]:
-    """Return all cyclic shifts of a bit pattern.
-
-    Parameters
-    ----------
-    pattern : int
-        Bit s stands for sector s.
-    sectors : int
-        Length of the cycle in bits.
-
-    Returns
-    -------
-    ndarray of int64, shape (sectors,)
-        The smallest of them is what the product ``radial`` keeps.
-
-    Examples
-    --------
-    >>> shifts(0b0011, 4).tolist()
-    [3, 9, 12, 6]
-    """
-    shift = np.arange(sectors)
-    every = (1 << sectors) - 1
-    return np.asarray((pattern >> shift) | ((pattern << (sectors - shift)) & every))

@@ -1,0 +1,160 @@
+"""The bins of star patterns: how neighbours about a star are numbered for a look-up.
+
+Products number what the catalog has around every star; the matcher numbers what a frame has
+around a centroid, and the two meet only where both count alike. So each rule stands here once.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Whole = NDArray[np.int64]
+
+
+def bin_of(
+    angle_rad: ArrayLike,
+    separation_rad: ArrayLike,
+    angle_bin_rad: float,
+    separation_bin_rad: float,
+    n_angle_bins: int,
+    n_separation_bins: int,
+) -> Whole:
+    """Return the bins of successive angles and separations in the look-up table.
+
+    Parameters
+    ----------
+    angle_rad, separation_rad : array_like of float64, shape (M,)
+        Radians, 0 or more.
+    angle_bin_rad, separation_bin_rad : float
+        Widths of the bins, radians.
+    n_angle_bins, n_separation_bins : int
+        Their numbers.
+
+    Returns
+    -------
+    ndarray of int64, shape (M,)
+        ``angle bin * n_separation_bins + separation bin``. A bin includes its lower end and
+        not its upper one, but for the last, which includes all that lies above.
+
+    Examples
+    --------
+    >>> bin_of([0.0, 1.0, 9.0], [0.3, 0.1, 0.9], 1.0, 0.2, 3, 2)
+    array([1, 2, 5])
+    """
+    angle, apart = np.asarray(angle_rad, np.float64), np.asarray(separation_rad, np.float64)
+    a = np.minimum(np.floor(angle / angle_bin_rad), n_angle_bins - 1)
+    s = np.minimum(np.floor(apart / separation_bin_rad), n_separation_bins - 1)
+    return np.asarray(a * n_separation_bins + s).astype(np.int64)
+
+
+def cell_of(x: ArrayLike, y: ArrayLike, radius_rad: float, cells_per_side: int) -> Whole:
+    """Return the numbers of the cells of a square grid about a star.
+
+    Parameters
+    ----------
+    x, y : array_like of float64, same shape
+        Gnomonic coordinates about the star in units of the focal length, x towards the
+        alignment star and y counter-clockwise of it on the sky as seen.
+    radius_rad : float
+        The grid spans ``-tan(radius)`` to ``tan(radius)`` on both axes.
+    cells_per_side : int
+        Number of rows, and of columns.
+
+    Returns
+    -------
+    ndarray of int64, same shape
+        ``row * cells_per_side + column``, rows along y and columns along x, both upwards from
+        0. A cell includes its lower edges and not its upper ones, but for the last of a row or
+        column; what lies outside the grid goes to its edge.
+
+    Examples
+    --------
+    >>> cell_of([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], np.pi / 4.0, 2)
+    array([0, 3, 3])
+    """
+    reach = np.tan(radius_rad)
+
+    def step(value: ArrayLike) -> Whole:
+        part = (np.asarray(value, dtype=np.float64) + reach) / (2.0 * reach)
+        cell = np.floor(part * cells_per_side).astype(np.int64)
+        return np.asarray(np.clip(cell, 0, cells_per_side - 1))
+
+    return step(y) * cells_per_side + step(x)
+
+
+def ring_of(separation_rad: ArrayLike, radius_rad: float, rings: int) -> Whole:
+    """Return the rings that separations fall in.
+
+    Parameters
+    ----------
+    separation_rad : array_like of float64, shape (M,)
+        Radians, 0 or more.
+    radius_rad : float
+        Outer end of the last ring, radians.
+    rings : int
+        Number of rings.
+
+    Returns
+    -------
+    ndarray of int64, shape (M,)
+        From 0, the innermost. A ring includes its inner end and not its outer one, but for the
+        last, which includes all that lies beyond.
+
+    Examples
+    --------
+    >>> ring_of([0.0, 0.5, 0.99, 1.0], 1.0, 2)
+    array([0, 1, 1, 1])
+    """
+    part = np.asarray(separation_rad, dtype=np.float64) / radius_rad
+    return np.minimum(np.floor(part * rings), rings - 1).astype(np.int64)
+
+
+def sector_of(turn_rad: ArrayLike, sectors: int) -> Whole:
+    """Return the sectors that angles from the nearest neighbour fall in.
+
+    Parameters
+    ----------
+    turn_rad : array_like of float64, shape (M,)
+        Position angle less that of the nearest neighbour, radians.
+    sectors : int
+        Number of sectors.
+
+    Returns
+    -------
+    ndarray of int64, shape (M,)
+        From 0, which begins at the nearest neighbour, counter-clockwise.
+
+    Examples
+    --------
+    >>> sector_of(np.radians([0.0, 95.0, -5.0]), 4)
+    array([0, 1, 3])
+    """
+    part = np.mod(turn_rad, 2.0 * np.pi) / (2.0 * np.pi)
+    return np.minimum(np.floor(part * sectors), sectors - 1).astype(np.int64)
+
+
+def cyclic_shifts(pattern: Whole | int, sectors: int) -> Whole:
+    """Return all cyclic shifts of bit patterns.
+
+    Parameters
+    ----------
+    pattern : ndarray of int64, shape (N,), or int
+        Bit s stands for sector s.
+    sectors : int
+        Length of the cycle in bits.
+
+    Returns
+    -------
+    ndarray of int64, shape (sectors, N) or (sectors,)
+        The smallest of them is what the product ``radial`` keeps: patterns that are turned into
+        each other have the same.
+
+    Examples
+    --------
+    >>> cyclic_shifts(0b0011, 4).tolist()
+    [3, 9, 12, 6]
+    """
+    shift = np.arange(sectors).reshape(-1, *[1] * np.ndim(pattern))
+    every = (1 << sectors) - 1
+    return np.asarray((pattern >> shift) | ((pattern << (sectors - shift)) & every))
