@@ -140,14 +140,14 @@ def reject_rows(stars: pa.Table, reasons: pa.Array) -> pa.Table:
     Parameters
     ----------
     stars : pyarrow.Table
-        Of the stars schema.
+        Table of the stars schema.
     reasons : pyarrow.Array
-        Of strings, one a row.
+        Strings, one a row.
 
     Returns
     -------
     pyarrow.Table
-        Of the rejected schema.
+        Table of the rejected schema.
     """
     schema = product_schema("rejected").arrow_schema
     verdict = {"reason": reasons, "detail": pa.nulls(len(stars), pa.string())}
@@ -166,9 +166,9 @@ def join_parts(parts: Sequence[Part]) -> tuple[pa.Table, pa.Table]:
     Returns
     -------
     stars : pyarrow.Table
-        Of the stars schema, by star_id.
+        Table of the stars schema, by star_id.
     rejected : pyarrow.Table
-        Of the rejected schema, in its order.
+        Table of the rejected schema, in its order.
     """
     # Chunks stay as they are: joining them would hold the whole catalog in memory twice.
     stars = pa.concat_tables([part.stars for part in parts])

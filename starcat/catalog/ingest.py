@@ -102,7 +102,7 @@ def count_by_reason(rejected: pa.Table) -> dict[str, int]:
     Parameters
     ----------
     rejected : pyarrow.Table
-        Of the rejected schema.
+        Table of the rejected schema.
 
     Returns
     -------

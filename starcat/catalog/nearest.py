@@ -15,7 +15,7 @@ def add_nearest_neighbours(stars: pa.Table, workers: int = 2) -> pa.Table:
     Parameters
     ----------
     stars : pyarrow.Table
-        Of the stars schema, any number of rows.
+        Table of the stars schema, any number of rows.
     workers : int, default 2
         Threads; the result is the same for any number.
 

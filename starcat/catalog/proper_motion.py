@@ -100,11 +100,13 @@ def propagate_directions(motion: Motion, years: ArrayLike) -> tuple[Motion, Arra
     ra_deg = np.where(moved & (ra_deg < 0.0), ra_deg + 360.0, ra_deg)
     ra_deg = np.where(moved & (ra_deg >= 360.0), 0.0, ra_deg)
     dec_deg = np.where(moved, np.degrees(np.arctan2(z, ground)), motion.dec_deg)
-    # East and north there: (-y, x, 0) / ground; at the very pole the right ascension tells.
+    # East is (-y, x, 0) / ground at the end. At a pole, where that is 0 / 0, the right ascension
+    # at the start says which way east is.
     off_pole = ground > 0.0
     cos_end = np.divide(x, ground, out=cos_ra, where=off_pole)
     sin_end = np.divide(y, ground, out=sin_ra, where=off_pole)
-    # d/dt of p/|p| along east and north: the velocity there, slowed by the distance.
+    # The derivative of p / |p| along east and north at the end: as the star moves away on its
+    # straight line, the same speed is a smaller angle a year.
     pm_ra_end = (vy * cos_end - vx * sin_end) / (length * MAS)
     pm_dec_end = (vz * ground - (vx * cos_end + vy * sin_end) * z) / (length * MAS)
     end = Motion(

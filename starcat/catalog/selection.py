@@ -38,7 +38,7 @@ class Step:
     name : str
         What was filtered.
     directions : ndarray of float64, shape (N, 3)
-        Of the stars left.
+        Directions of the stars that are left.
     """
 
     name: str
@@ -52,9 +52,9 @@ class Selected:
     Attributes
     ----------
     guide_stars : pyarrow.Table
-        Of the stars schema, by star_id.
+        Table of the stars schema, by star_id.
     rejected : pyarrow.Table
-        Of the rejected schema, by star_id.
+        Table of the rejected schema, by star_id.
     steps : tuple of Step
         What was left after each filter, in order.
     """
@@ -70,7 +70,7 @@ def select_guide_stars(stars: pa.Table, selection: Selection) -> Selected:
     Parameters
     ----------
     stars : pyarrow.Table
-        Of the stars schema, by star_id.
+        Table of the stars schema, by star_id.
     selection : Selection
         Limits and rules.
 
@@ -115,7 +115,7 @@ def select_guide_stars(stars: pa.Table, selection: Selection) -> Selected:
 
 
 def _companion_pairs(stars: pa.Table, selection: Selection) -> tuple[NDArray[np.int64], Array]:
-    """Close pairs among the stars that count as companions, and the magnitudes of all."""
+    """Return close pairs of the stars that count as companions, and the magnitudes of all stars."""
     doubles = selection.doubles
     limit = doubles.companion_limit_mag
     mag = floats_of(stars, "mag")
@@ -131,7 +131,7 @@ def has_companion(stars: pa.Table, selection: Selection) -> Flags:
     Parameters
     ----------
     stars : pyarrow.Table
-        Of the stars schema.
+        Table of the stars schema.
     selection : Selection
         ``doubles.min_separation_deg``, ``doubles.max_delta_mag`` and the companions' limit.
 
@@ -157,7 +157,7 @@ def merge_doubles(stars: pa.Table, selection: Selection, verdicts: Verdicts) -> 
     Parameters
     ----------
     stars : pyarrow.Table
-        Of the stars schema.
+        Table of the stars schema.
     selection : Selection
         As for `has_companion`; groups are chains of such pairs.
     verdicts : Verdicts
@@ -224,7 +224,7 @@ def is_unresolved_double(stars: pa.Table, doubles: Doubles) -> Flags:
     Parameters
     ----------
     stars : pyarrow.Table
-        Of the stars schema.
+        Table of the stars schema.
     doubles : Doubles
         ``flags``, with the limits that "unresolved" compares with.
 
@@ -254,7 +254,7 @@ def reject_variables(stars: pa.Table, variables: Variables, verdicts: Verdicts) 
     Parameters
     ----------
     stars : pyarrow.Table
-        Of the stars schema, amplitudes joined.
+        Table of the stars schema, amplitudes joined.
     variables : Variables
         Limit and rule.
     verdicts : Verdicts
@@ -276,7 +276,7 @@ def beyond_brightest(stars: pa.Table, kept: Flags, count: int) -> Flags:
     Parameters
     ----------
     stars : pyarrow.Table
-        Of the stars schema.
+        Table of the stars schema.
     kept : ndarray of bool, shape (N,)
         Stars that take part.
     count : int
@@ -300,7 +300,7 @@ def reject_dense(selected: Selected, kept: NDArray[np.integer]) -> Selected:
     Parameters
     ----------
     selected : Selected
-        Of `select_guide_stars`.
+        The result of `select_guide_stars`.
     kept : ndarray of int, shape (K,)
         Rows of the guide stars to keep, in any order, repeats allowed.
 

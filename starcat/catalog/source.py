@@ -61,7 +61,7 @@ _BINARY = re.compile(r"^<[if][1248]$")
 
 
 class _Model(BaseModel):
-    """Frozen, and refuses keys that it does not know."""
+    """A model that cannot be changed and refuses keys that it does not know."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -126,7 +126,7 @@ class Column(_Model):
 
     @property
     def decimals(self) -> int | None:
-        """Digits after the point that the format promises; None where it does not say."""
+        """Number of digits after the point that the format promises; None where it does not say."""
         match = _FORMAT.match(self.format)
         if match is None or match["text"]:
             return None

@@ -1,4 +1,4 @@
-"""Tables as files: whole at their final name, or not there."""
+"""Star tables as files: a file is whole at its final name, or not there."""
 
 from __future__ import annotations
 

@@ -168,11 +168,11 @@ def text_column(values: NDArray[Any]) -> pa.Array:
     Returns
     -------
     pyarrow.Array
-        Of strings.
+        Strings.
     """
     try:
         text = pa.array(values).cast(pa.string())
-    except pa.ArrowInvalid:  # archives are ASCII: a damaged byte is a letter, not an error
+    except pa.ArrowInvalid:  # archives are ASCII, and a damaged byte is read as some letter
         text = pa.array(np.char.decode(values, "latin-1"))
     trimmed = pc.utf8_trim_whitespace(text)
     return pc.if_else(pc.equal(trimmed, ""), pa.scalar(None, pa.string()), trimmed)
@@ -189,7 +189,7 @@ def join_flags(parts: Mapping[str, tuple[NDArray[np.bool_], NDArray[Any] | None]
     Returns
     -------
     pyarrow.Array
-        Of strings; null where no code applies.
+        Strings; null where no code applies.
     """
     is_flagged = np.logical_or.reduce([where for where, _ in parts.values()])
     rows = np.flatnonzero(is_flagged)
@@ -220,7 +220,7 @@ def where_known(values: NDArray[np.float64], text: str) -> pa.Array:
     Returns
     -------
     pyarrow.Array
-        Of strings; null where the value is NaN.
+        Strings; null where the value is NaN.
     """
     return pc.if_else(pa.array(np.isnan(values)), pa.scalar(None, pa.string()), text)
 
@@ -238,7 +238,7 @@ def numbered(prefix: str, number: NDArray[np.int64]) -> pa.Array:
     Returns
     -------
     pyarrow.Array
-        Of strings such as ``SAO 308``.
+        Strings such as ``SAO 308``.
     """
     return pc.binary_join_element_wise(prefix, pa.array(number).cast(pa.string()), " ")
 
@@ -249,7 +249,7 @@ def directions_of(stars: pa.Table) -> NDArray[np.float64]:
     Parameters
     ----------
     stars : pyarrow.Table
-        Of the stars schema.
+        Table of the stars schema.
 
     Returns
     -------

@@ -103,7 +103,7 @@ def join_amplitudes(stars: pa.Table, table: AmplitudeTable) -> tuple[pa.Table, i
     Parameters
     ----------
     stars : pyarrow.Table
-        Of the stars schema.
+        Table of the stars schema.
     table : AmplitudeTable
         What to join.
 

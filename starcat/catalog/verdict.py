@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 
 class Reason(Enum):
-    """Why a record is not a guide star; the value is what it means."""
+    """Why a record is not a guide star; the value of a member says it in words."""
 
     malformed_record = "the record does not follow the archive's layout"
     deleted = "the archive says to ignore the record"
@@ -67,7 +67,7 @@ class Verdicts:
 
     @property
     def is_kept(self) -> NDArray[np.bool_]:
-        """Which records no reason has applied to, shape (N,)."""
+        """Whether each record is kept: no reason has applied to it, shape (N,)."""
         return np.asarray(self._code == 0)
 
     @property

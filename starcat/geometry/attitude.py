@@ -120,7 +120,8 @@ def radec_roll_from_matrix(matrix: Array) -> tuple[float, float, float]:
     right, _, (x, y, z) = matrix.tolist()
     level = math.hypot(x, y)
     if level == 0.0:
-        x, y = 0.0, 0.0  # At the pole itself the right ascension is 0, and not that of -0.
+        # Zeros with a sign would make the right ascension at a pole 180 deg; it is 0 there.
+        x, y = 0.0, 0.0
     c, s = (x / level, y / level) if level > 0.0 else (1.0, 0.0)
     east = c * right[1] - s * right[0]
     north = level * right[2] - z * (c * right[0] + s * right[1])

@@ -21,7 +21,7 @@ from starcat.geometry.sphere import separation
 Array = NDArray[np.float64]
 
 LARGEST_PX = 1_000_000
-"""No detector is larger; a number that is came from somewhere else."""
+"""Largest width and height that is accepted: no detector has more pixels on a side."""
 
 
 @dataclass(frozen=True, init=False)
@@ -39,7 +39,7 @@ class Camera:
     principal_point_px : pair of float, optional
         Where the optical axis meets the detector's plane; the middle by default.
     distortion : Distortion, optional
-        Of the lens; none by default.
+        Distortion of the lens; none by default.
 
     Raises
     ------
@@ -73,7 +73,7 @@ class Camera:
         w, h = _size("width_px", width_px), _size("height_px", height_px)
         if not isinstance(distortion, Distortion):
             raise ValueError(f"distortion is {distortion!r}; expected a Distortion")
-        # The dictionary lies behind the guard of a frozen class.
+        # A frozen dataclass refuses assignments; its dictionary is filled directly.
         vars(self).update(
             width_px=w,
             height_px=h,

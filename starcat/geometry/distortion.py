@@ -18,13 +18,15 @@ Array = NDArray[np.float64]
 Points = NDArray[np.complex128]
 
 HORIZON = 1e8
-"""The x/z of directions that no image is computed for, 2 milliarcsec short of 90 degrees."""
+"""Largest x/z of a direction that has an image: 2 milliarcsec short of 90 degrees."""
 
 LARGEST = 1e14
-"""Of coefficients: a k3 that moves the edge of a field of 0.25 deg by a hundredth of it."""
+"""Largest coefficient that is accepted. A k3 of this size moves the edge of a field of 0.25 deg
+by a hundredth of its distance."""
 
 NEWTON_STEPS = 50
-"""At most; one to three do, but for points that are next to the fold or have no inverse."""
+"""Most steps of Newton's method. Points need one to three, unless they are next to the fold or
+have no inverse."""
 
 
 def checked_number(name: str, value: object, low: float = -np.inf, high: float = np.inf) -> float:
@@ -33,7 +35,7 @@ def checked_number(name: str, value: object, low: float = -np.inf, high: float =
     Parameters
     ----------
     name : str
-        Of the value, for the message.
+        What the value is called in the message.
     value : object
         To check; a bool is not a number.
     low, high : float, optional
@@ -50,7 +52,7 @@ def checked_number(name: str, value: object, low: float = -np.inf, high: float =
         If it is anything else; says what was found and what was expected.
     """
     if isinstance(value, Real) and not isinstance(value, bool):
-        with suppress(OverflowError):  # of a whole number beyond the floats
+        with suppress(OverflowError):  # a whole number may be too large for a float
             number = float(value)
             if low < number < high:
                 return number
@@ -134,9 +136,9 @@ class Distortion:
 
     @cached_property
     def _scales(self) -> tuple[Array, Array]:
-        """Distances of images, rising, and what takes them to the directions; radial part."""
+        """Distances of images, ascending, and factors that make them distances of directions."""
         even = np.tan(np.linspace(0.0, min(np.arctan(self.fold_radius), 1.57), 4097))
-        # A strong lens has bent the image before the first of the even steps is over.
+        # A strong lens bends the image within the first of the even steps: add narrow ones.
         r = np.union1d(even, np.geomspace(1e-12, 1.0, 1025) * even[-1])
         polynomial = self._polynomial(r * r)
         return r * polynomial, 1.0 / polynomial
@@ -185,7 +187,7 @@ class Distortion:
         d short of the fold, images that differ by a rounding are 1e-16/d apart in direction.
         """
         tangential = complex(self.p2, self.p1)
-        with np.errstate(all="ignore"):  # what has no inverse may go anywhere
+        with np.errstate(all="ignore"):  # points without an inverse may overflow
             z = image * np.interp(np.abs(image), *self._scales)
             for _ in range(NEWTON_STEPS):
                 s = z.real * z.real + z.imag * z.imag
@@ -193,7 +195,7 @@ class Distortion:
                 slope = self.k1 + s * (2.0 * self.k2 + 3.0 * self.k3 * s)
                 across = 2.0 * self.p2 * z.real + 2.0 * self.p1 * z.imag
                 miss = z * (factor + across) + s * tangential - image
-                # Derivatives by z, which is real, and by its conjugate.
+                # The derivative by z is a real number; the other one is that by the conjugate of z.
                 by_z = factor + s * slope + 2.0 * across
                 by_conjugate = z * (slope * z + 2.0 * tangential)
                 step = by_z * miss - by_conjugate * miss.conj()
@@ -205,10 +207,11 @@ class Distortion:
                 unsolved = outside | (np.abs(step) > 1e-8 * size)
                 if not unsolved.any():
                     break
-                # The edge of a disc is nearer to all that lies in it than what lies outside.
+                # The solution lies within the fold radius: a step that leaves that disc is taken
+                # back to its edge, which is nearer to the solution.
                 z = np.where(outside, z * (self.fold_radius / size), z)
         return np.where(unsolved, np.nan, z)
 
 
 NO_DISTORTION = Distortion()
-"""Of a lens that is as good as a pinhole."""
+"""The distortion of a lens that is as good as a pinhole: none."""

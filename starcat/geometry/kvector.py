@@ -56,7 +56,8 @@ class KVector:
             return slice(0, 0)
         if self.slope == 0.0:
             return slice(0, n)
-        # The inverse line, clamped to its ends; rounding can put either a step inside.
+        # The inverse of the line, clamped to its ends. Rounding can put either end a step too far
+        # inside.
         first = math.floor(min(max((low - self.intercept) / self.slope, 0.0), n - 1.0))
         last = math.ceil(min(max((high - self.intercept) / self.slope, 0.0), n - 1.0))
         while first >= 0 and self.intercept + self.slope * first >= low:

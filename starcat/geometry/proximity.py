@@ -32,11 +32,11 @@ def nearest_neighbours(
     tree = cKDTree(directions, leafsize=32, balanced_tree=False)
     near = tree.query(directions, k=2, workers=workers)
     chord, found = np.asarray(near[0], dtype=np.float64), np.asarray(near[1], dtype=np.int64)
-    # Of two stars at the same place the tree may name either first.
+    # The tree may name either of two stars at the same place first.
     itself = found[:, 0] == np.arange(len(directions))
     index = np.where(itself, found[:, 1], found[:, 0])
     chord = np.where(itself, chord[:, 1], chord[:, 0])
-    # |u - v| is the chord, and |u + v| the other leg of the right angle over the diameter.
+    # Chord |u - v| and |u + v| are the legs of a right triangle over the diameter.
     # The chord of antipodes may be rounded above the diameter.
     other = np.sqrt(np.maximum(2.0 - chord, 0.0) * (2.0 + chord))
     return 2.0 * np.arctan2(chord, other), index
@@ -63,10 +63,10 @@ def pairs_within(
     """
     if len(directions) < 2:
         return np.empty((0, 2), dtype=np.int64), np.empty(0)
-    # Searched a hair wider than asked, then trimmed by the separation itself.
+    # The search is a little wider than asked, and its result is trimmed by separation.
     radius = chord_from_separation(max_separation_rad) * (1.0 + 1e-9) + 1e-15
     found = cKDTree(directions).query_pairs(radius, output_type="ndarray")
-    # Both rows in one number: sorting numbers is several times faster than sorting rows.
+    # Both rows are packed into one number, as sorting numbers is several times faster.
     key = np.sort((found[:, 0].astype(np.int64) << 32) | found[:, 1])
     pairs = np.stack([key >> 32, key & 0xFFFFFFFF], axis=-1)
     angle = separation(directions[pairs[:, 0]], directions[pairs[:, 1]])

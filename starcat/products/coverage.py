@@ -51,7 +51,7 @@ class Spread:
         Values that occur; at least 1 % and 50 % of the fields have no more than
         ``one_percent`` and ``median``.
     mean : float
-        Of all fields.
+        The numbers over all fields.
     """
 
     minimum: int
@@ -70,7 +70,7 @@ class CoverageSummary:
     fields : int
         Number of boresights.
     stars, pairs, triangles : Spread
-        Of a field.
+        The numbers of a field.
     worst_boresight : int
         The field with the fewest stars; the first along the spiral where several have.
     worst_ra_deg, worst_dec_deg : float
@@ -118,7 +118,7 @@ class TilingGap:
 
     @property
     def boresights_needed(self) -> int:
-        """About how many boresights leave no hole: gaps shrink with the root of the number."""
+        """About how many boresights leave no hole, as gaps shrink with the root of their number."""
         ratio = self.covering_radius_rad / self.tile_radius_rad
         return max(self.boresights, int(np.ceil(1.05 * self.boresights * ratio**2)))
 
@@ -176,7 +176,7 @@ def summarise_coverage(coverage: Coverage) -> CoverageSummary:
     Parameters
     ----------
     coverage : Coverage
-        Of at least one field.
+        What at least one field holds.
 
     Returns
     -------

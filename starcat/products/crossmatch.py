@@ -24,12 +24,12 @@ Rows = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 VERDICTS = ("unique", "best", "ambiguous", "taken", "doubtful", "other")
-"""In words what a candidate is to its star; `Matches.verdict` counts in this order."""
+"""What a candidate is to its star, in words; the numbers of `Matches.verdict` are places here."""
 
 UNIQUE, BEST, AMBIGUOUS, TAKEN, DOUBTFUL, OTHER = range(len(VERDICTS))
 
 CHUNK = 1 << 17
-"""Stars searched at once: bounds the memory, whatever the size of the catalogs."""
+"""Number of stars that are searched at once, which bounds the memory for large catalogs."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class Matches:
     star, counterpart : ndarray of int64
         Rows of the two sets.
     rank, star_rank : ndarray of int64
-        Of the candidate among those of its star, and of the star among those of its candidate;
+        Rank of the candidate among those of its star, and of the star among those of its candidate;
         1 is the likeliest.
     n_candidates, n_stars : ndarray of int64
         Candidates of the star, and stars that the candidate is one of, within the radius.
@@ -269,7 +269,8 @@ def candidate_pairs(stars: MovingStars, counterparts: MovingStars, radius_rad: f
         for near, found in _near(query, radius_rad + drift, counterparts.directions):
             parts.append(_trim(stars, counterparts, moving[near], found, radius_rad))
     if len(still) and len(everyone):
-        # Here it is the candidates that move, so they ask and the stars without motion answer.
+        # These candidates move and these stars do not: each candidate looks for stars as far
+        # as its own motion may have taken it.
         middle, reach = _middle(stars.epoch_jyear[still])
         drift = _speed(counterparts, everyone) * reach
         query = counterparts.at(everyone, middle)
@@ -322,7 +323,10 @@ def _near(query: Array, radii: Array, others: Array) -> Iterator[tuple[Rows, Row
 
 
 def _chord(separation_rad: float) -> float:
-    """Return the radius of a search, a hair wider than asked: the separation itself decides."""
+    """Return the radius of a search as a chord, a little wider than asked.
+
+    The separations are compared with the radius afterwards.
+    """
     return chord_from_separation(separation_rad) * (1.0 + 1e-9) + 1e-14
 
 
@@ -365,9 +369,9 @@ def _verdicts(i: Rows, j: Rows, rank: Rows, star_rank: Rows, odds: Odds, model: 
 
 
 def _gaps(group: Rows, rank: Rows, log_ratio: Array) -> tuple[Array, Array]:
-    """Return how far each pair is behind the first of its group, and how far a first one leads.
+    """Return how far each pair is behind the best of its group, and how far the best one leads.
 
-    The lead of a pair that is not the first, and of one that is alone, is infinite.
+    The lead of a pair that is not the best, and of one that is alone, is infinite.
     """
     behind, lead = np.zeros(len(group)), np.full(len(group), np.inf)
     order = np.lexsort((rank, group))

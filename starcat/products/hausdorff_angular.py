@@ -15,7 +15,7 @@ from starcat.geometry.proximity import pairs_within
 from starcat.products.index import Index, row_offsets, stable_order
 
 STARS_AT_ONCE = 4096
-"""Sorted together: their rows stay in the processor's cache, however large the sky is."""
+"""Number of stars whose rows are sorted together, few enough for the processor's cache."""
 
 
 @dataclass(frozen=True)

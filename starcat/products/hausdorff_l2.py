@@ -83,7 +83,7 @@ def planar_reference_sets(
     # The nearest comes first.
     smallest[np.diff(offsets) > 0] = distance[offsets[:-1][np.diff(offsets) > 0]]
     ratio = distance / smallest[star]
-    # Rounding may make equals of what differed, and equal ratios go by neighbour.
+    # Ratios that differed may be equal after rounding, and equal ratios are in order of neighbour.
     order = np.lexsort((neighbour, ratio, star))
     index = Index(
         {"star_offsets": offsets, "smallest_distance": smallest}, {"radius_rad": radius_rad}

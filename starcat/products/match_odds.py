@@ -22,19 +22,21 @@ Rows = NDArray[np.int64]
 ARCSEC = np.pi / (180.0 * 3600.0)  # rad
 
 TILES = 3072
-"""Pieces of the sky in which the density of the counterparts is counted: 13 square degrees."""
+"""Number of pieces of the sky, 13 square degrees each, in which counterparts are counted."""
 
 TILES_AVERAGED = 9
-"""A tile's density is the mean over as many tiles around it, so that few stars do for it."""
+"""The density of a tile is the mean over so many tiles around it, as one tile has few stars."""
 
 MAG_BIN, MAG_SMOOTHING = 0.1, 0.5
-"""Of the distribution of magnitudes: step, and standard deviation of what smooths it."""
+"""Step of the distribution of magnitudes, and standard deviation of the kernel that smooths
+it; magnitudes."""
 
 MIN_MEASURED = 20
-"""With fewer sure pairs than these nothing is measured from them."""
+"""Least number of sure pairs from which anything is measured."""
 
 LEAST_ERROR_RAD = 0.01 * ARCSEC
-"""No measured error of position is taken to be smaller: equal positions are copied ones."""
+"""Least error of a position that is believed, radians: where measured errors are smaller, one
+catalog has copied the positions of the other."""
 
 
 class PositionsAndMagnitudes(Protocol):
@@ -209,7 +211,7 @@ def match_odds(
     log_ratio = np.log(share) + _log_place(pairs.separation_rad, error, radius_rad, model)
     log_ratio -= np.log(around[i])
     log_ratio += _log_colour(delta, counterparts.mag, j, offset, model)
-    # Stars with a counterpart are as many as counterparts with a star.
+    # As many counterparts have a star as stars have a counterpart.
     shared = min(share * len(around) / max(len(counterparts.mag), 1), 0.999)
     probability, any_probability = pair_probabilities(i, j, log_ratio, share, shared)
     return Odds(log_ratio, probability, any_probability, error, common, offset, share)
@@ -255,10 +257,10 @@ def _offset(sure_delta: Array, model: MatchModel) -> float:
 
 
 def _completeness(i: Rows, expected: Array, model: MatchModel) -> float:
-    """Return the share of stars with a counterpart: those not blank, less what chance fills.
+    """Return the share of stars that have a counterpart.
 
-    One minus the share of blank stars over the share that would be blank at random places
-    (Fleuren et al. 2012, MNRAS 423, 2407).
+    It is one minus the share of stars without any candidate, over the share that would have
+    none at random places (Fleuren et al. 2012, MNRAS 423, 2407).
     """
     if model.completeness is not None:
         return model.completeness
@@ -276,7 +278,7 @@ def _log_place(angle: Array, error: Array, radius_rad: float, model: MatchModel)
     """
     normal = -0.5 * (angle / error) ** 2 - np.log(2.0 * np.pi * error**2)
     scales = 0.5 + np.log(np.maximum(radius_rad / error, 1.0))
-    with np.errstate(divide="ignore"):  # no outliers, if the model says so
+    with np.errstate(divide="ignore"):  # the model may have no outliers
         outlier = np.log(model.outlier_share) - np.log(
             2.0 * np.pi * np.maximum(angle, error) ** 2 * scales
         )
@@ -300,7 +302,7 @@ def magnitude_density(mag: Array, wanted: Array) -> Array:
     Parameters
     ----------
     mag : ndarray of float64, shape (N,)
-        Of the catalog; NaN where unknown.
+        Magnitudes of the catalog; NaN where unknown.
     wanted : ndarray of float64, shape (M,)
         Magnitudes of stars of the catalog.
 
@@ -328,7 +330,7 @@ class _Density:
         self._tree = cKDTree(tiles)
         counts = np.bincount(self._tiles(directions), minlength=TILES).astype(np.float64)
         around = np.asarray(self._tree.query(tiles, k=TILES_AVERAGED)[1])
-        # Where there is a candidate there is at least one star.
+        # At least one star is counted, so that no density is 0.
         total = np.maximum(counts[around].sum(axis=1), 1.0)
         self._density = total / (TILES_AVERAGED * 4.0 * np.pi / TILES)
 

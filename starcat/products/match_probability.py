@@ -19,13 +19,14 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 ROUNDS = 60
-"""Of messages: more than enough where pairs are in no ring."""
+"""Number of rounds of messages; pairs that are in no ring need far fewer."""
 
 MAX_WRITTEN_OUT = 12
-"""Pairs of a cluster whose matchings are written out; larger rings are left to the messages."""
+"""Most pairs of a cluster whose matchings are all listed; messages do for larger clusters."""
 
 MAX_WEIGHT = 50.0
-"""Natural logarithm; surer pairs are not surer for the product of a dozen of them."""
+"""Largest natural logarithm of the weight of a pair. It is as good as certain, and the product
+of a dozen such weights is still a float."""
 
 
 def pair_probabilities(
@@ -81,7 +82,7 @@ def pair_probabilities(
 
 
 def _share(log_odds: Array) -> Array:
-    """Return the probability that odds stand for."""
+    """Return the probabilities that odds are equal to."""
     return np.asarray(np.exp(-np.logaddexp(0.0, -log_odds)))
 
 
@@ -97,7 +98,8 @@ def _in_clusters(star: Rows, candidate: Rows, weight: Array) -> Array:
     own = weight + from_candidate
     whole = np.logaddexp(0.0, np.logaddexp(stars.sum_of_others(own), own))
     probability = np.asarray(np.exp(own - whole))
-    # The messages bound the sums of the stars; in large rings a candidate's may be 1.02.
+    # The messages keep the sum over a star's candidates at 1 at most. The sum over a candidate's
+    # stars may be 1.02 in large rings.
     of_candidate = np.bincount(candidate, weights=probability)[candidate]
     probability /= np.maximum(of_candidate, 1.0)
     for rows in _small_rings(star, candidate):
@@ -106,7 +108,7 @@ def _in_clusters(star: Rows, candidate: Rows, weight: Array) -> Array:
 
 
 def _small_rings(star: Rows, candidate: Rows) -> Iterator[Rows]:
-    """Yield the pairs of each cluster that closes a ring and can be written out."""
+    """Yield the pairs of each cluster that has a ring, and few enough pairs to list matchings."""
     stars, i = np.unique(star, return_inverse=True)
     candidates, j = np.unique(candidate, return_inverse=True)
     nodes = len(stars) + len(candidates)
@@ -115,7 +117,7 @@ def _small_rings(star: Rows, candidate: Rows) -> Iterator[Rows]:
     of_pair = np.asarray(label, dtype=np.int64)[i]
     order = np.argsort(of_pair, kind="stable")
     first, pairs = runs(of_pair[order])
-    # As many edges as nodes, or more, close a ring.
+    # A cluster with as many edges as nodes, or more, has a ring.
     is_ring = pairs >= np.bincount(label)[of_pair[order][first]]
     for start, count in zip(first[is_ring].tolist(), pairs[is_ring].tolist(), strict=True):
         if count <= MAX_WRITTEN_OUT:
@@ -130,7 +132,8 @@ def _written_out(star: Rows, candidate: Rows, weight: Array) -> Array:
     def extend(start: int, used: frozenset[int], product: float) -> float:
         total = product
         for k in range(start, len(w)):
-            ends = {i[k], ~j[k]}  # no row of one catalog is one of the other's, turned around
+            # Inverted, a row of one catalog is never taken for a row of the other.
+            ends = {i[k], ~j[k]}
             if not used & ends:
                 part = extend(k + 1, used | ends, product * w[k])
                 having[k] += part
@@ -142,7 +145,7 @@ def _written_out(star: Rows, candidate: Rows, weight: Array) -> Array:
 
 
 class _Groups:
-    """Rows that belong together, and sums over the others of each group."""
+    """Groups of rows that belong together, and sums over the other rows of each group."""
 
     def __init__(self, group: Rows) -> None:
         self._order = np.argsort(group, kind="stable")

@@ -33,7 +33,8 @@ class Neighbours:
     neighbour : ndarray of int32, shape (M,)
         Rows of the star table.
     position_angle_rad : ndarray of float64, shape (M,)
-        Of the neighbour at the star, radians in [0, 2 pi), ascending within a star.
+        Position angle of the neighbour at the star, radians in [0, 2 pi), ascending within a
+        star.
     successive_angle_rad : ndarray of float64, shape (M,)
         Angle to the star's next neighbour, from the last one to the first; radians, their sum
         over a star is 2 pi.
@@ -112,7 +113,7 @@ def find_neighbours(
         "lookup_offsets": row_offsets(found[rows], angle_bins * separation_bins),
         "lookup_rows": rows.astype(np.int32),
     }
-    # Within a star the order changed; the column of stars did not.
+    # The rows of one star have changed places, so that the column of stars is still the same.
     return Neighbours(
         sets.star, sets.neighbour[order], angle, successive, separation_rad, Index(lookup, bins)
     )
@@ -150,7 +151,7 @@ def position_angles(
     y = np.einsum("ij,ij->i", offset, north[star])
     angle = np.arctan2(x, y)
     angle = np.where(angle < 0.0, angle + _TURN, angle)
-    # A tiny negative angle plus a turn rounds to a turn.
+    # A tiny negative angle plus a turn rounds to a whole turn, which is 0.
     return np.where(angle >= _TURN, 0.0, angle)
 
 
@@ -161,7 +162,7 @@ def _bin_count(extent: float, width: float, name: str) -> int:
 
 
 def _successive_angles(angle: Array, offsets: NDArray[np.int64]) -> Array:
-    """Return the angle from each neighbour to the next of its star, the last one's to the first."""
+    """Return the angle from each neighbour of a star to the next; after the last is the first."""
     step = np.empty_like(angle)
     step[:-1] = angle[1:] - angle[:-1]
     some = np.diff(offsets) > 0

@@ -33,7 +33,7 @@ class Triangles:
     i, j, k : ndarray of int32, shape (M,)
         Rows of the star table, i < j < k.
     area_rad2, circumradius_rad, inradius_rad : ndarray of float32, shape (M,)
-        Of the plane triangle, square radians and radians.
+        Features of the plane triangle, in square radians and radians.
     times_seen : ndarray of int32, shape (M,)
         Number of boresights whose brightest stars include the three.
     index : Index

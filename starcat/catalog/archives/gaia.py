@@ -63,7 +63,7 @@ def stars(records: Records, band: str) -> StarBlock:
             "ra_deg": records["ra_deg"],
             "dec_deg": records["dec_deg"],
             "epoch_jyear": 2016.0,
-            # Four bytes a magnitude: the decimal digits that float32 holds, no more.
+            # A magnitude has four bytes: six decimals are all that a float32 holds.
             "mag": np.round(records["mag_g"].astype(np.float64), 6),
             "band": band,
             "second_mag": bp_mag,
@@ -77,6 +77,6 @@ def stars(records: Records, band: str) -> StarBlock:
 
 
 def _magnitudes(records: Records, name: str) -> NDArray[np.float64]:
-    """Return the magnitudes of a column where 0 means none."""
+    """Return the magnitudes of a column in which 0 stands for a missing one."""
     mag = np.round(records[name].astype(np.float64), 6)
     return np.where(mag == 0.0, np.nan, mag)

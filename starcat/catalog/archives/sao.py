@@ -141,13 +141,13 @@ def icrs_from_fk5(
 
 
 def _positions(records: Records) -> tuple[Array, Array]:
-    """Radians where the record has them (2 mas), else hours and degrees (15 mas)."""
+    """Return positions from the radians, good to 2 mas, or else from hours and degrees (15 mas)."""
     sign = np.where(records["de2000_sign"] == b"-", -1.0, 1.0)
     hours = records["ra2000_h"] + records["ra2000_m"] / 60.0 + records["ra2000_s"] / 3600.0
     degrees = records["de2000_d"] + records["de2000_m"] / 60.0 + records["de2000_s"] / 3600.0
     ra, dec = np.degrees(records["ra2000_rad"]), np.degrees(records["de2000_rad"])
     has_radians = ~(np.isnan(ra) | np.isnan(dec))
-    degrees = np.where(degrees > 90.0, np.nan, degrees)  # 90 deg and some minutes: nowhere
+    degrees = np.where(degrees > 90.0, np.nan, degrees)  # more than 90 deg is nowhere
     return np.where(has_radians, ra, 15.0 * hours), np.where(has_radians, dec, sign * degrees)
 
 

@@ -102,7 +102,7 @@ def stars(records: Records, band: str) -> StarBlock:
 
 
 def _measured(records: Records, band: str) -> NDArray[np.float64]:
-    """Magnitudes that were measured: NaN for upper limits and bands without a source."""
+    """Return the magnitudes that were measured: NaN for upper limits and bands without a source."""
     _, column = _BANDS[band]
     limit = _any_flag(records, "ph_qual", b"UX", {band: 1.0})
     unmeasured = _any_flag(records, "rd_flg", b"069", {band: 1.0})
@@ -125,10 +125,11 @@ def _any_flag(
 
 
 def _identity(records: Records) -> NDArray[np.int64]:
-    """Return pts_key, or the designation packed above all keys; 0 where there is neither.
+    """Return pts_key, or else the designation as a number above all keys; 0 where it has neither.
 
-    ``hhmmssss+ddmmsss`` gives 15 digits, a component letter behind it (A, B …) a sixteenth
-    and seventeenth, the hemisphere a nineteenth: 1 north, 2 south.
+    The digits of ``hhmmssss+ddmmsss`` are the last 15 of the number. A component letter behind
+    them (A is 1) makes the 16th and 17th from the right, and the hemisphere the 19th: 1 for
+    north, 2 for south.
     """
     key = records["pts_key"]
     text = records["designation"]

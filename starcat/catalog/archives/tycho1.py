@@ -45,10 +45,10 @@ COLUMNS = {
 }
 
 _NUMBER_TEXTS = pa.array([str(number) for number in range(100_000)])
-"""Texts of all numbers that TYC2 and TYC3 can be: looking up is faster than formatting."""
+"""Texts of all numbers that TYC2 and TYC3 can be, as looking up is faster than formatting."""
 
 _REGION_TEXTS = pc.binary_join_element_wise("TYC", _NUMBER_TEXTS[:10_000], " ")
-"""The same for TYC1, with the catalog's name before it."""
+"""Texts of all numbers that TYC1 can be, with the name of the catalog before them."""
 
 _MAGNITUDES = {"V": "v_mag", "BT": "bt_mag", "VT": "vt_mag"}
 
@@ -149,7 +149,7 @@ def tycho_identity(records: Records) -> tuple[NDArray[np.int64], pa.Array]:
     number : ndarray of int64, shape (N,)
         ``TYC1 * 1000000 + TYC2 * 10 + TYC3``, unique and in the archive's order.
     designation : pyarrow.Array
-        Of strings such as ``TYC 1-13-1``.
+        Strings such as ``TYC 1-13-1``.
     """
     parts = [records.integers(name) for name in ("tyc1", "tyc2", "tyc3")]
     number = parts[0] * 1_000_000 + parts[1] * 10 + parts[2]

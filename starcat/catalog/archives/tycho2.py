@@ -128,7 +128,7 @@ def place_is_double(parts: dict[str, Any]) -> NDArray[np.bool_]:
 
 
 def _place_tyc2(records: Records) -> dict[str, Any]:
-    """Mean positions at J2000, or observed ones where there is no mean."""
+    """Return the mean positions at J2000, or the observed ones where there is no mean."""
     no_mean = np.isnan(records["ra_mean_deg"]) | np.isnan(records["de_mean_deg"])
     observed_jyear = 1990.0 + 0.5 * (records["ep_ra_1990"] + records["ep_de_1990"])
     photocentre = (records["pflag"] == b"P") | (records["posflg"] == b"P")

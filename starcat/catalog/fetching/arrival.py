@@ -62,7 +62,7 @@ class ExpectedFile:
 
     @property
     def addresses(self) -> tuple[tuple[str, str], ...]:
-        """Name in the folder and address, the preferred first."""
+        """Names in the folder and their addresses, the preferred one first."""
         urls = (url.replace("{part}", self.part) for url in self.file.urls)
         return tuple((self._local_name(url), url) for url in urls)
 
@@ -79,7 +79,7 @@ class ExpectedFile:
 
     @property
     def committed_sha256(self) -> str | None:
-        """The digest in the data-source file; it has none for parts."""
+        """The digest that the data-source file states; None for parts, for which it states none."""
         return None if self.part else self.file.sha256
 
     def _local_name(self, url: str) -> str:
@@ -100,7 +100,7 @@ def expected_files(source: DataSource, parts: Sequence[str] = ()) -> list[Expect
     source : DataSource
         The source.
     parts : sequence of str
-        Of the files in several parts, only these; empty for all. Single files always count.
+        Parts of the files that are in several, if not all of them. Single files always count.
 
     Returns
     -------
@@ -323,7 +323,7 @@ def _check_digest(expected: ExpectedFile, final: Path, found: str, entry: LockEn
 def _check_total(
     expected: ExpectedFile, final: Path, rows: int, lock: Mapping[str, LockEntry]
 ) -> None:
-    """Compare the records with the archive's number; of a file in parts, once all are there."""
+    """Compare the number of records with the archive's; for a file in parts, once all are there."""
     rows_by_name = {}
     for sibling in expected.siblings:
         if sibling.part == expected.part:
@@ -345,7 +345,7 @@ def _check_total(
 
 
 def _count_records(expected: ExpectedFile, path: Path, name: str) -> int:
-    """Count the records, checking the length of each; in blocks, so that memory is flat."""
+    """Count the records and check the length of each, one block of the file after the other."""
     file = expected.file
     if name.endswith(".gz") and not _is_gzip(path):
         raise SourceError(f"{name} is not a gzip file: the address answers with something else.")
@@ -378,13 +378,13 @@ def _count_packed(block: Block, name: str) -> int:
 
 
 def _count_lines(block: Block, name: str) -> int:
-    """Count the records of a block of text; with fixed width, check each."""
+    """Count the records of a block of text, and check the length of those of fixed width."""
     layout = block.file.layout
     text = block.data if block.data.endswith(b"\n") else block.data + b"\n"
     octets = np.frombuffer(text, dtype=np.uint8)
     ends = np.flatnonzero(octets == _LINE_FEED)
     starts = np.concatenate(([0], ends[:-1] + 1))
-    # Before an empty first line, index -1 wraps to a line feed: never a carriage return.
+    # For an empty first line the index is -1, which is the last byte of the text: a line feed.
     lengths = ends - starts - (octets[ends - 1] == _CARRIAGE_RETURN)
     comment = layout.comment.encode("latin-1")
     is_record = (lengths > 0) & ~_begins_with(octets, starts, comment)
@@ -403,11 +403,12 @@ def _count_lines(block: Block, name: str) -> int:
 def _begins_with(
     octets: NDArray[np.uint8], starts: NDArray[np.int64], prefix: bytes
 ) -> NDArray[np.bool_]:
-    """Tell which lines begin with a text; none does with an empty one."""
+    """Return which lines begin with a text; where the text is empty, none does."""
     if not prefix:
         return np.zeros(starts.size, dtype=bool)
     matches = np.ones(starts.size, dtype=bool)
     for offset, character in enumerate(prefix):
-        # A line shorter than the prefix fails at its line feed; the clip guards the last one.
+        # A line that is shorter than the prefix differs from it at its line feed. The minimum keeps
+        # the index within the text for the last line.
         matches &= octets[np.minimum(starts + offset, octets.size - 1)] == character
     return matches

@@ -44,7 +44,7 @@ from starcat.storage.download import (
 from starcat.storage.locks import locked
 
 Status = Literal["downloaded", "resumed", "present"]
-"""Fetched in one go; continued from an earlier part; already in the folder."""
+"""Whether a file was fetched in one go, continued from an earlier part, or already there."""
 
 _logger = logging.getLogger(__name__)
 
@@ -128,7 +128,7 @@ def fetch_source(
     folder : Path
         Where to; made if need be.
     parts : sequence of str
-        Of the files in several parts, only these; empty for all. Single files always come.
+        Parts of the files that are in several, if not all of them. Single files always come.
     retries : int
         Further attempts at an address after the first has failed, before the next address.
     timeout_s : float
@@ -171,7 +171,7 @@ def fetch_source(
 
 
 def _make_writable(folder: Path) -> None:
-    """Make the folder and try it out, before anything is downloaded."""
+    """Make the folder and write to it once, before anything is downloaded."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -224,7 +224,11 @@ def _download(
 def _none_delivered(
     expected: ExpectedFile, failures: Sequence[tuple[str, SourceError]]
 ) -> SourceError:
-    """Sum up why: a file that came and was wrong says more than one that did not come."""
+    """Return the error for a file that no address delivered.
+
+    Where one delivered a file that is wrong, that is the error: it says more than a failed
+    download.
+    """
     wrong = [error for _, error in failures if not isinstance(error, DownloadError)]
     reasons = "\n".join(f"  {url}: {error}" for url, error in failures)
     if not wrong:

@@ -110,7 +110,7 @@ def _array(values: pa.ChunkedArray, column: Column) -> NDArray[Any]:
     if column.is_text:
         return _text_array(values)
     if not pc.all(pc.is_finite(values), min_count=0).as_py():
-        raise pa.ArrowInvalid("nan or inf")  # which pyarrow takes for numbers
+        raise pa.ArrowInvalid("nan or inf")  # pyarrow takes these words for numbers
     numbers: NDArray[np.float64] = pc.fill_null(values, float("nan")).to_numpy().copy()
     apply_nulls(numbers, column)
     return numbers

@@ -27,7 +27,7 @@ from starcat.errors import ParseError, SourceError, SourceMissing
 BLOCK_BYTES = 1 << 22
 
 MAX_LINE_BYTES = 1 << 24
-"""Text without a line end for longer than this is no archive's, and is not read to its end."""
+"""A longer text without a line end is of no archive, and is not read to its end."""
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -396,7 +396,7 @@ def check_magic(header: bytes, file: InputFile, source_name: str) -> None:
 
 
 def _read_size(layout: RecordFile) -> int:
-    """Return a whole number of records, so that a regular file never has to be cut and joined."""
+    """Return the bytes of a whole number of records, so that blocks end where records end."""
     record = (layout.record_bytes or 1) + (layout.layout == "fixed_width")
     return max(1, BLOCK_BYTES // record) * record
 

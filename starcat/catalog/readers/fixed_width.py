@@ -74,7 +74,7 @@ def parse_fixed_width(
 
 
 def _byte_range(column: Column) -> tuple[int, int]:
-    if column.bytes is None:  # the source model refuses this; mypy cannot know
+    if column.bytes is None:  # the model of a source refuses such a column, which mypy cannot know
         raise ValueError(f"column {column.name} has no byte range")
     return column.bytes
 
@@ -165,9 +165,9 @@ def _parse_numbers(
 def _fixed_point(
     chars: NDArray[np.uint8], decimals: int | None
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Read fields whose point, if any, is where the format puts it.
+    """Read fields whose point, if they have one, is where the format puts it.
 
-    Returns the values (NaN where blank) and the fields that need reading one by one.
+    Return the values (NaN where blank), and which fields need reading one by one.
     """
     width, count = chars.shape
     point = width - decimals - 1 if decimals else width
@@ -202,7 +202,7 @@ def _integer_part_is_regular(
     space: NDArray[np.bool_],
     point: int,
 ) -> NDArray[np.bool_]:
-    """Spaces, then at most one sign, then digits up to the point."""
+    """Return which fields have spaces, then at most one sign, then digits up to the point."""
     good = np.ones(chars.shape[1], dtype=bool)
     for k in range(point):
         sign = (chars[k] == _PLUS) | (chars[k] == _MINUS)
@@ -216,7 +216,7 @@ def _integer_part_is_regular(
 def _fraction_is_regular(
     is_digit: NDArray[np.bool_], space: NDArray[np.bool_], point: int
 ) -> NDArray[np.bool_]:
-    """Digits, then blanks for decimals that the archive leaves out."""
+    """Return which fields have digits after the point, then blanks for decimals left out."""
     good = np.ones(is_digit.shape[1], dtype=bool)
     for k in range(point + 1, len(is_digit)):
         good &= is_digit[k] | space[k]

@@ -20,7 +20,7 @@ class Readable(Protocol):
     """A binary file open for reading."""
 
     def read(self, size: int, /) -> bytes:
-        """Return at most so many bytes; none at the end."""
+        """Return at most so many bytes, and none at the end of the file."""
 
     def close(self) -> None:
         """Close it."""
@@ -76,7 +76,7 @@ class GzipReader:
         self._raw.close()
 
     def _begin_member(self) -> bool:
-        """Start the next member, past zeros that pad the file; return whether there is one."""
+        """Start the next member behind zeros that pad the file; return whether there is one."""
         self._pending = self._pending.lstrip(b"\0")
         while len(self._pending) < len(MAGIC):
             more = self._raw.read(STEP_BYTES)

@@ -26,7 +26,7 @@ def malformed_rows(
     Parameters
     ----------
     problems : sequence of Problem
-        Of one file.
+        The problems of one file.
     number : int
         The file's number.
     source_name, band : str
@@ -35,7 +35,7 @@ def malformed_rows(
     Returns
     -------
     pyarrow.Table
-        Of the rejected schema; only place, reason and detail are known.
+        Table of the rejected schema; only place, reason and detail are known.
     """
     return table_from_columns(
         "rejected",
@@ -63,7 +63,7 @@ def not_this_archive(
     source : DataSource
         What it was taken for.
     problems : sequence of Problem
-        Of its first records.
+        The problems of its first records.
 
     Returns
     -------
