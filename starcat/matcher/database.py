@@ -65,7 +65,7 @@ class Database:
     camera : Camera
         The camera that the database was built for.
     epoch_jyear : float
-        Of the directions.
+        Julian year of the directions.
     star_id : ndarray of int64, shape (N,)
         Permanent star numbers.
     directions : ndarray of float64, shape (N, 3)

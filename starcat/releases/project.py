@@ -44,7 +44,7 @@ def pull_wanted(
     Returns
     -------
     Pulled
-        Where it is.
+        The release, and the folder that it is in.
 
     Raises
     ------
@@ -129,9 +129,7 @@ def pull_pinned(
     ------
     ConfigError
         If the lock file is missing, or does not pin what is asked for.
-    ProductError
-        As for `pull_release`.
-    DownloadError
+    ProductError, DownloadError
         As for `pull_release`.
     """
     pins = read_pins(lock)

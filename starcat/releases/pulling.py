@@ -1,8 +1,8 @@
 """Pulling a release: every file checked on arrival, the artifact as a whole, then its name.
 
 What arrives is kept in ``.<name>-<version>.<digest>.partial`` beside the final folder until
-all is there, and a pull that was killed goes on from it. Files are copied, not linked: who
-edits a pulled file must not change the registry.
+all is there, and a pull that was killed goes on from it. Files are copied, not linked: a
+pulled file that is changed must not change the registry.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ class Pulled:
     release : Release
         The release.
     registry : str
-        Where it came from.
+        The folder or address that it came from.
     folder : Path
-        Where it is.
+        The folder of the artifact.
     outcome : {"pulled", "unchanged"}
         ``unchanged`` where it was there already, whole.
     """
@@ -79,9 +79,9 @@ def pull_release(
     Parameters
     ----------
     registry : Registry
-        Where from.
+        The registry to pull from.
     release : Release
-        What; its manifest is taken by its digest.
+        The release; its manifest is taken by its digest.
     output : Path
         Folder to put ``<name>-<version>/`` into.
     progress : Progress
@@ -92,7 +92,7 @@ def pull_release(
     Returns
     -------
     Pulled
-        Where it is.
+        The release, and the folder that it is in.
 
     Raises
     ------
