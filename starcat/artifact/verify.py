@@ -54,7 +54,8 @@ class Finding:
     file : str
         Path within the artifact.
     product : str
-        Product that the file holds; ``database`` for the HDF5 file as a whole, empty where there is none.
+        Product that the file holds; ``database`` for the HDF5 file as a whole, empty where there
+        is none.
     problem : str
         What was found and what was expected.
     """

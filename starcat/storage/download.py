@@ -3,8 +3,8 @@
 Input is an address (http, https, ftp) and a path; output is the body in ``<name>.part``
 beside it, which the caller checks and renames. After an interruption a part is continued. If the
 file may change, that is done only where the server says that it is the same version; content that
-is fixed, such as a blob named by its digest, is always continued. A server that ignores ranges sends the
-whole. This module checks sizes, no digests.
+is fixed, such as a blob named by its digest, is always continued. A server that ignores ranges
+sends the whole. This module checks sizes, no digests.
 """
 
 from __future__ import annotations
