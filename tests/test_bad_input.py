@@ -398,6 +398,11 @@ def _(place: Place) -> Call:
     return place.build("epoch_jyear = 2026.0", "epoch_jyear = 26.0")
 
 
+@case("version with leading zeros", 2)
+def _(place: Place) -> Call:
+    return place.build('version = "1.0.0"', 'version = "01.2.3"')
+
+
 @case("value not finite", 2)
 def _(place: Place) -> Call:
     return place.build("faint_limit_mag = 6.0", "faint_limit_mag = nan")
@@ -629,6 +634,23 @@ def _(place: Place) -> Call:
 def _(place: Place) -> Call:
     folder = place.copy()
     os.truncate(folder / "database.h5", 20_000)
+    return ["selftest", folder]
+
+
+@case("database that points to another file", 5)
+def _(place: Place) -> Call:
+    folder = place.copy()
+    with h5py.File(folder / "database.h5", "r+") as file:
+        del file["stars/mag"]
+        file["stars/mag"] = h5py.ExternalLink(str(place.artifact / "database.h5"), "stars/mag")
+    return ["selftest", folder]
+
+
+@case("database whose index leads out of its table", 5)
+def _(place: Place) -> Call:
+    folder = place.copy()
+    with h5py.File(folder / "database.h5", "r+") as file:
+        file["triangles/j"][7] = 60_000
     return ["selftest", folder]
 
 
@@ -983,15 +1005,34 @@ def _(place: Place) -> Call:
     return pull(place)
 
 
-@case("manifest with a path that leads elsewhere", 5)
-def _(place: Place) -> Call:
-    manifest = listed(registry_of(place))
-    data = manifest.read_bytes().replace(b'"pairs.parquet": {', b'"../../pairs.parquet": {')
+def put_manifest(place: Place, manifest: Path, data: bytes) -> None:
+    """Have the registry list another manifest, under its own digest."""
     digest = hashlib.sha256(data).hexdigest()
     place.write(f"registry/blobs/sha256/{digest[:2]}/{digest}", data)
     index = place.folder / "registry/index.json"
     edit(index, manifest.name, digest)
     edit(index, f'"bytes": {manifest.stat().st_size}', f'"bytes": {len(data)}')
+
+
+@case("larger than --max-bytes", 1)
+def _(place: Place) -> Call:
+    registry_of(place)
+    return pull(place, "small", "--max-bytes", 1000)
+
+
+@case("larger than the disk", 1)
+def _(place: Place) -> Call:
+    manifest = listed(registry_of(place))
+    data = re.sub(rb'("bytes": )(\d+)', rb"\g<1>1000000000000000", manifest.read_bytes(), count=1)
+    put_manifest(place, manifest, data)
+    return pull(place)
+
+
+@case("manifest with a path that leads elsewhere", 5)
+def _(place: Place) -> Call:
+    manifest = listed(registry_of(place))
+    data = manifest.read_bytes().replace(b'"pairs.parquet": {', b'"../../pairs.parquet": {')
+    put_manifest(place, manifest, data)
     return pull(place)
 
 
@@ -1048,6 +1089,20 @@ def _(place: Place) -> Call:
 def _(place: Place) -> Call:
     path = place.folder / "stars.parquet"
     pq.write_table(pa.table({"designation": ["α Centauri"]}), path)
+    return ["export", path, "--format", "fits", "-o", place.out]
+
+
+@case("name that a format has no room for", 4)
+def _(place: Place) -> Call:
+    path = place.folder / "stars.parquet"
+    pq.write_table(pa.table({"x" * 69: [1]}), path)
+    return ["export", path, "--format", "fits", "-o", place.out]
+
+
+@case("column without a name", 4)
+def _(place: Place) -> Call:
+    path = place.folder / "stars.parquet"
+    pq.write_table(pa.table({"": [1]}), path)
     return ["export", path, "--format", "fits", "-o", place.out]
 
 

@@ -350,7 +350,9 @@ def with_values(
             dataset = file[product][name]
             values = VALUES[dataset.dtype.kind]
             first = int(share * len(dataset))
-            dataset[first : first + count] = values[choice % len(values)]
+            with np.errstate(over="ignore", under="ignore"):
+                value = np.array(values[choice % len(values)]).astype(dataset.dtype)
+            dataset[first : first + count] = value
 
     return change
 

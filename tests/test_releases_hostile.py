@@ -220,7 +220,10 @@ def test_what_is_there_already_needs_no_room(
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(0, 0, 1000))
     with pytest.raises(OutputError, match="has room for 1,000;"):
         pull(registry)
-    place = next(Path("out").glob(".small-*.partial"))
+    assert not list(Path("out").iterdir())
+    release = json.loads((registry / "versions/small/1.0.0.json").read_bytes())
+    place = Path("out") / f".small-1.0.0.{release['manifest']['sha256'][:12]}.partial"
+    place.mkdir()
     for blob in registry.glob("blobs/sha256/*/*"):
         (place / "parts").mkdir(exist_ok=True)
         shutil.copyfile(blob, part_of(place / "parts" / blob.name))

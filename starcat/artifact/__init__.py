@@ -1,1 +1,1 @@
-"""Room 3: products become a directory with a manifest, written whole or not at all."""
+"""Artifacts: products become a directory with a manifest; reading, verifying, comparing it."""

@@ -78,14 +78,14 @@ def table_from_matches(found: Matches, counterparts: pa.Table) -> pa.Table:
     Parameters
     ----------
     found : Matches
-        Of one catalog.
+        The matches in one catalog.
     counterparts : pyarrow.Table
         The star table that the rows of ``found.counterpart`` are of.
 
     Returns
     -------
     pyarrow.Table
-        Of the crossmatch schema.
+        Rows of the crossmatch schema.
     """
     other = counterparts.select(NEEDED).take(pa.array(found.counterpart)).combine_chunks()
     columns = {

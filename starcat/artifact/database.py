@@ -119,7 +119,7 @@ def stored_dtype(column: SchemaColumn, star_count: int) -> str:
     Returns
     -------
     str
-        Of a dataset: the schema's own, but ``uint16`` for rows of at most 65,536 stars.
+        The dtype of the dataset: the schema's own, but ``uint16`` for rows of at most 65,536 stars.
     """
     if column.refers_to == "stars" and star_count <= 1 << 16:
         return "uint16"

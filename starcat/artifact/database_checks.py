@@ -27,7 +27,7 @@ def root_problems(file: h5py.File, manifest: Mapping[str, Any]) -> Iterator[str]
     file : h5py.File
         Open for reading.
     manifest : mapping
-        Of the artifact.
+        The manifest of the artifact.
 
     Yields
     ------
@@ -49,7 +49,7 @@ def group_problems(
     Parameters
     ----------
     group : h5py.Group
-        Of the product.
+        The group of the product.
     table : pyarrow.Table
         The product, from its Parquet file.
     schema : ProductSchema
@@ -106,7 +106,7 @@ def index_problems(
     Parameters
     ----------
     group : h5py.Group
-        Of the product.
+        The group of the product.
     table : pyarrow.Table
         The product.
     schema : ProductSchema

@@ -122,7 +122,7 @@ class ProductFacts:
     in_database : bool
         Whether the HDF5 file has it too.
     records : int, optional
-        Of triangles: the sum over all boresights, which the papers count.
+        For triangles, the sum over all boresights, which the papers count.
     """
 
     schema: ProductSchema

@@ -21,7 +21,7 @@ from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.tables.schema import ProductSchema
 
 UNIT_TOLERANCE = 1e-14
-"""Of the length of a direction and of its components: a few roundings of float64."""
+"""The length of a direction and its components are off by less: a few roundings of float64."""
 
 SEPARATION_TOLERANCE_RAD = 1e-12
 """Two ways to compute a separation differ by a few roundings; 1e-12 rad is 0.2 uas."""
@@ -40,7 +40,7 @@ class HeldProduct:
     facts : mapping of str to object
         Its entry in the manifest.
     directions : ndarray of float64, shape (N, 3)
-        Of the artifact's stars, ICRS; no rows where they are not known.
+        Directions of the artifact's stars, ICRS; no rows where they are not known.
     stars : pyarrow.Table, optional
         The artifact's stars; None where they are not known.
     """
@@ -237,11 +237,11 @@ TABLE_CHECKS: tuple[Check, ...] = (
     rows_are_in_order,
     directions_are_units,
 )
-"""Of every product whose columns follow its schema."""
+"""The checks of every product whose columns follow its schema."""
 
 REFERENCE_CHECKS: tuple[Check, ...] = (
     star_rows_exist,
     separations_are_those_of_the_stars,
     counterparts_are_those_of_the_stars,
 )
-"""Where the stars are known; each needs what the one before it found sound."""
+"""The checks where the stars are known; each needs what the one before it found sound."""

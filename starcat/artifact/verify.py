@@ -54,7 +54,8 @@ class Finding:
     file : str
         Path within the artifact.
     product : str
-        Of the file; ``database`` for the HDF5 file as a whole, empty where there is none.
+        Product that the file holds; ``database`` for the HDF5 file as a whole, empty where there
+        is none.
     problem : str
         What was found and what was expected.
     """
@@ -78,7 +79,7 @@ class Verification:
     folder : Path
         The artifact.
     checks : int
-        How many were done.
+        Number of checks that were done.
     findings : tuple of Finding
         Every problem; none for a sound artifact.
     """

@@ -33,7 +33,7 @@ class Product:
     Attributes
     ----------
     name : str
-        Of its schema.
+        Name of the product, which is that of its schema.
     table : pyarrow.Table
         With the columns of the schema, in the schema's order of rows.
     index : Index
@@ -108,9 +108,9 @@ def write_manifest(
     spec : dict
         The whole build spec.
     sources : sequence of SourceFacts
-        What went in.
+        The catalogs that went in.
     products : mapping of str to ProductFacts
-        What came out.
+        The products that came out.
 
     Returns
     -------

@@ -28,7 +28,7 @@ def plain_schema(schema: pa.Schema) -> pa.Schema:
     Parameters
     ----------
     schema : pyarrow.Schema
-        Of any table or query.
+        The schema of any table or query.
 
     Returns
     -------
@@ -59,7 +59,7 @@ def plain_batch(batch: pa.RecordBatch, schema: pa.Schema) -> pa.RecordBatch:
     batch : pyarrow.RecordBatch
         As it came.
     schema : pyarrow.Schema
-        Of `plain_schema`.
+        A schema that `plain_schema` returned.
 
     Returns
     -------
@@ -79,7 +79,7 @@ def is_list(kind: pa.DataType) -> bool:
     Parameters
     ----------
     kind : pyarrow.DataType
-        Of a plain schema.
+        A type of a plain schema.
 
     Returns
     -------

@@ -39,7 +39,7 @@ class ExportedFile:
     Attributes
     ----------
     product, name : str
-        Of the table, and of its file or folder.
+        Name of the table, and that of its file or folder.
     rows, bytes : int
         Written.
     left_out : int
@@ -60,11 +60,11 @@ class Exported:
     Attributes
     ----------
     source : str
-        What was exported.
+        Name of what was exported.
     file_format : str
         One of `EXPORT_FORMATS`.
     folder : Path
-        Where it is.
+        The folder that was written into.
     files : tuple of ExportedFile
         One a product.
     has_columns : bool
@@ -102,7 +102,7 @@ def export_tables(
     Parameters
     ----------
     tables : NamedTables
-        Of an artifact, a file or a peer.
+        The tables of an artifact, a file or a peer.
     file_format : str
         One of `EXPORT_FORMATS`.
     folder : Path
@@ -117,7 +117,7 @@ def export_tables(
     Returns
     -------
     Exported
-        What was written.
+        The files and their sizes.
 
     Raises
     ------

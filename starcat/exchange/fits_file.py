@@ -38,7 +38,7 @@ def write_fits(
     columns : list of NumpyColumn
         With integers that FITS has.
     rows : int
-        How many there are.
+        Number of rows.
     path : Path
         Overwritten if it exists.
     label : Label

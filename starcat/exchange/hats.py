@@ -43,9 +43,9 @@ class HatsCatalog:
     left_out : int
         Rows without a position, which have no place on the sky.
     order : int
-        Of the partitions' pixels.
+        HEALPix order of the partitions' pixels.
     partitions : int
-        How many files there are.
+        Number of files.
     """
 
     rows: int
@@ -64,14 +64,14 @@ def write_hats(stars: pa.Table, folder: Path, name: str, max_rows: int = MAX_ROW
     folder : Path
         Made; it must not exist.
     name : str
-        What the catalog calls itself.
+        The name that the catalog gets.
     max_rows : int
         Rows that a partition may hold at most.
 
     Returns
     -------
     HatsCatalog
-        What was written.
+        The counts of what was written.
 
     Raises
     ------

@@ -30,7 +30,7 @@ class NumpyColumn:
     Attributes
     ----------
     name : str
-        Of the column.
+        Name of the column.
     values : ndarray, shape (N,) or, for a ragged column, all items one after the other
         Numbers, truth values, or texts as objects. Null is NaN, 0, False or an empty text.
     is_null : ndarray of bool, shape (N,)
@@ -65,7 +65,7 @@ def numpy_columns(table: pa.Table, *, signed: bool) -> list[NumpyColumn]:
     Parameters
     ----------
     table : pyarrow.Table
-        Of any types that `plain_schema` accepts.
+        The table; its columns are of any types that `plain_schema` accepts.
     signed : bool
         Whether to widen integers to those that FITS and VOTable have: 8 bits without a sign,
         and 16, 32, 64 with.
@@ -118,7 +118,7 @@ def field_facts(field: pa.Field) -> dict[str, str]:
     Parameters
     ----------
     field : pyarrow.Field
-        Of a product, or of a query.
+        A field of a product, or of a query.
 
     Returns
     -------

@@ -30,7 +30,7 @@ from starcat.geometry.sphere import directions_from_radec
 
 _COLUMNS = 6
 _DIRECTION_TOLERANCE = 1e-6
-"""Of a component: right ascension in 4 bytes is good to 2.4e-7 rad."""
+"""The error of a component: right ascension in 4 bytes is good to 2.4e-7 rad."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def cedar_solve_stars(path: Path) -> pa.Table:
     Returns
     -------
     pyarrow.Table
-        Of the stars schema, by star_id: the HIP, HR or packed TYC number, or the number of the
+        Rows of the stars schema, by star_id: the HIP, HR or packed TYC number, or the number of the
         row where the database has no numbers. Proper motions are null: they were applied.
 
     Raises

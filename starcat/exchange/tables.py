@@ -22,7 +22,7 @@ class NamedTables:
     Attributes
     ----------
     name : str
-        Of all of them together, such as the artifact's name and version.
+        Name of all of them together, such as the artifact's name and version.
     readers : mapping of str to callable
         What returns each table, by product.
     artifact, version : str
@@ -117,7 +117,7 @@ def in_memory(name: str, tables: Mapping[str, pa.Table]) -> NamedTables:
     Parameters
     ----------
     name : str
-        Of all of them together.
+        Name of all of them together.
     tables : mapping of str to pyarrow.Table
         By product.
 

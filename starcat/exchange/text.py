@@ -79,7 +79,7 @@ def json_texts(values: pa.Array) -> pa.Array:
     Parameters
     ----------
     values : pyarrow.Array
-        Of a plain type.
+        Values of a plain type.
 
     Returns
     -------

@@ -39,7 +39,7 @@ def write_votable(
     columns : list of NumpyColumn
         With integers that VOTable has.
     rows : int
-        How many there are.
+        Number of rows.
     path : Path
         Overwritten if it exists.
     label : Label

@@ -65,8 +65,8 @@ class Database:
     camera : Camera
         The camera that the database was built for.
     epoch_jyear : float
-        Epoch of the directions, Julian year.
-    star_id : ndarray of int64, shape (N,)
+            Epoch of the directions, Julian year.
+        star_id : ndarray of int64, shape (N,)
         Permanent star numbers.
     directions : ndarray of float64, shape (N, 3)
         ICRS unit vectors.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from math import isfinite
+from math import inf, isfinite, pi
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,19 @@ Arrays = Mapping[str, NDArray[Any]]
 Numbers = Mapping[str, float]
 
 LARGEST = 1e6
-"""No angle, ratio, magnitude or direction of a database is larger, in its own unit."""
+"""No angle, distance, magnitude or direction of a database is larger, in its own unit."""
+
+RANGES = {
+    "ratio": (1.0, 1e20),
+    "separation_rad": (0.0, pi),
+    "smallest_distance": (0.0, LARGEST),
+    # Infinite where three stars are in a line.
+    "circumradius_rad": (0.0, inf),
+}
+"""Narrower and wider ranges of some real numbers, ends included."""
+
+MAY_BE_UNKNOWN = ("mag", "smallest_distance")
+"""Real numbers that are NaN where a star has none."""
 
 
 @dataclass(frozen=True)
@@ -198,11 +210,12 @@ class _Checks:
     def reals(self, name: str, length: int) -> None:
         self.shape(name, "f", length)
         array = self.arrays[name]
-        # A magnitude may be unknown; a circumradius is infinite where three stars are in a line.
-        if not length or name in ("mag", "circumradius_rad", "smallest_distance"):
-            return
-        if not (array.min() >= -LARGEST and array.max() <= LARGEST):
-            raise _not_so(self.product, name, "holds numbers that none of its stars can have")
+        low, high = RANGES.get(name, (-LARGEST, LARGEST))
+        if name in MAY_BE_UNKNOWN:
+            array = array[~np.isnan(array)]
+        # NaN is neither above nor below anything.
+        if len(array) and not (array.min() >= low and array.max() <= high):
+            raise _not_so(self.product, name, f"holds numbers outside {low:g} to {high:g}, or NaN")
 
     def below(self, name: str, limit: float) -> None:
         """Check that all entries lie in [0, limit)."""

@@ -99,7 +99,7 @@ def copy_to_part(
     source : Path
         The file.
     blob : Blob
-        What it should hold.
+        The content that it should hold.
     part : Path
         Where to; whole and on disk afterwards. Dropped if it is wrong.
     progress : Progress

@@ -111,7 +111,7 @@ def write_pin(path: Path, release: Release, registry: str) -> None:
     path : Path
         The lock file; made if need be. Other entries stay.
     release : Release
-        What to pin.
+        The release to pin.
     registry : str
         A folder or an address.
 
@@ -174,7 +174,7 @@ def pin_of(path: Path, pins: Mapping[str, Pin], name: str, version: str | None) 
     pins : mapping of str to Pin
         Its entries.
     name : str
-        Of the artifact.
+        Name of the artifact.
     version : str, optional
         The one that is asked for, if any.
 

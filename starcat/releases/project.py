@@ -44,7 +44,7 @@ def pull_wanted(
     Returns
     -------
     Pulled
-        Where it is.
+        The release, and the folder that it is in.
 
     Raises
     ------

@@ -1,9 +1,9 @@
 """Publishing an artifact into a registry on disk.
 
-The order is what makes it safe: content first, each blob on disk under its digest; then the
-release, a file that is made once and never changed; the index last, made from the releases
-there are. Killed in between, it leaves content that nothing names yet, and the next run goes
-on. A release that is not in the index yet is put there by whoever publishes next.
+The order of the steps is what makes it safe: content first, each blob on disk under its digest;
+then the release, a file that is made once and never changed; the index last, made from the
+releases there are. Killed in between, it leaves content that nothing names yet, and the next run
+goes on. A release that is not in the index yet is put there by whoever publishes next.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Published:
     release : Listed
         The release.
     registry : Path
-        Where it is.
+        The folder of the registry.
     outcome : {"published", "unchanged"}
         ``unchanged`` where it was there with the same manifest.
     new_blobs, new_bytes : int

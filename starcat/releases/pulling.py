@@ -1,8 +1,8 @@
 """Pulling a release: every file checked on arrival, the artifact as a whole, then its name.
 
 What arrives is kept in ``.<name>-<version>.<digest>.partial`` beside the final folder until
-all is there, and a pull that was killed goes on from it. Files are copied, not linked: who
-edits a pulled file must not change the registry.
+all is there, and a pull that was killed goes on from it. Files are copied, not linked: a
+pulled file that is changed must not change the registry.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ class Pulled:
     release : Release
         The release.
     registry : str
-        Where it came from.
+        The folder or address that it came from.
     folder : Path
-        Where it is.
+        The folder of the artifact.
     outcome : {"pulled", "unchanged"}
         ``unchanged`` where it was there already, whole.
     """
@@ -79,9 +79,9 @@ def pull_release(
     Parameters
     ----------
     registry : Registry
-        Where from.
+        The registry to pull from.
     release : Release
-        What; its manifest is taken by its digest.
+        The release; its manifest is taken by its digest.
     output : Path
         Folder to put ``<name>-<version>/`` into.
     progress : Progress
@@ -92,7 +92,7 @@ def pull_release(
     Returns
     -------
     Pulled
-        Where it is.
+        The release, and the folder that it is in.
 
     Raises
     ------
@@ -145,6 +145,14 @@ def _place_for(final: Path, release: Release) -> Path:
     return final.with_name(f".{final.name}.{release.manifest.sha256[:12]}.partial")
 
 
+class _TooLarge(OutputError):  # noqa: N818 - the name reads as the fact
+    """A release that is larger than it may be, or than the disk has room for."""
+
+
+def _files_in(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob("*") if path.is_file()]
+
+
 @contextmanager
 def _workplace(final: Path, release: Release) -> Iterator[Path]:
     """Give the folder for what has arrived; it stays if going on later makes sense."""
@@ -156,6 +164,10 @@ def _workplace(final: Path, release: Release) -> Iterator[Path]:
             yield place
         except (ProductError, SchemaError):
             shutil.rmtree(place, ignore_errors=True)
+            raise
+        except _TooLarge:
+            if not any(path.name not in ("lock", MANIFEST_NAME) for path in _files_in(place)):
+                shutil.rmtree(place, ignore_errors=True)
             raise
         shutil.rmtree(place, ignore_errors=True)
 
@@ -203,15 +215,15 @@ def _assemble(
 def _check_size(where: str, total: int, place: Path, max_bytes: int | None) -> None:
     """Refuse a release that is larger than it may be, or than the disk has room for."""
     if max_bytes is not None and total > max_bytes:
-        raise OutputError(
+        raise _TooLarge(
             f"{where}: {total:,} bytes; --max-bytes allows {max_bytes:,}. Allow more if you trust "
             "the registry",
             path=place.parent,
         )
-    there = sum(path.stat().st_size for path in place.rglob("*") if path.is_file())
+    there = sum(path.stat().st_size for path in _files_in(place))
     free = shutil.disk_usage(place).free
     if total - there > free:
-        raise OutputError(
+        raise _TooLarge(
             f"{where}: {total - there:,} bytes are still to come, and {place.parent} has room for "
             f"{free:,}; make room, or choose another --output",
             path=place.parent,

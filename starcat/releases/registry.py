@@ -86,17 +86,13 @@ class FolderRegistry:
 
         Parameters
         ----------
-        blob : Blob
-            Which.
-        path : Path
-            Whose part to fill.
-        progress : Progress
-            Called with ("pull", bytes there are, bytes in all).
+        X        progress : Progress
+                Called with ("pull", bytes there are, bytes in all).
 
         Raises
         ------
-        ProductError
-            If the registry lacks it, or holds something else under its digest.
+            ProductError
+                If the registry lacks it, or holds something else under its digest.
         """
         try:
             copy_to_part(self.root / blob.path, blob, part_of(path), progress)
@@ -161,19 +157,15 @@ class HttpRegistry:
 
         Parameters
         ----------
-        blob : Blob
-            Which.
-        path : Path
-            Whose part to fill.
-        progress : Progress
-            Called with (file name, bytes there are, bytes in all).
+        X        progress : Progress
+                Called with (file name, bytes there are, bytes in all).
 
         Raises
         ------
-        DownloadError
-            If it does not come; what has arrived is kept.
-        ProductError
-            If the server has something else under its digest.
+            DownloadError
+                If it does not come; what has arrived is kept.
+            ProductError
+                If the server has something else under its digest.
         """
         url = f"{self.root}/{blob.path}"
         options = replace(self.options, fixed_bytes=blob.bytes, progress=progress)

@@ -64,7 +64,7 @@ class Release(_Model):
     Attributes
     ----------
     name, version : str
-        Of the artifact.
+        Name and version of the artifact.
     manifest : Blob
         Its file ``manifest.json``, which names all the others.
     """
@@ -174,7 +174,7 @@ def check_version(kind: str, found: str, known: str, where: str) -> None:
     Parameters
     ----------
     kind : str
-        Of file.
+        The kind of file, for messages.
     found, known : str
         Version of the file, and the one that this starcat writes.
     where : str
@@ -202,7 +202,7 @@ def parse(model: type[_M], data: bytes, where: str, advice: str = DAMAGED) -> _M
     Parameters
     ----------
     model : type of BaseModel
-        What it should be.
+        The class that says what it should be.
     data : bytes
         The file.
     where, advice : str
@@ -280,7 +280,7 @@ def parse_wanted(text: str) -> tuple[str, str | None]:
     Returns
     -------
     name : str
-        Of the artifact.
+        Name of the artifact.
     version : str or None
         None for the latest.
 
@@ -309,9 +309,9 @@ def choose(releases: Iterable[Listed], name: str, version: str | None, where: st
     Parameters
     ----------
     releases : iterable of Listed
-        Of a registry.
+        The releases that a registry lists.
     name : str
-        Of the artifact.
+        Name of the artifact.
     version : str, optional
         None for the latest, which is the highest and not the newest.
     where : str

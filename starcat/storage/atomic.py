@@ -139,7 +139,7 @@ def writing(folder: Path, advice: str) -> Iterator[None]:
     Parameters
     ----------
     folder : Path
-        Where something is written.
+        The folder that something is written into.
     advice : str
         What to do, or what has become of the work.
 

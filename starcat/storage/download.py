@@ -1,10 +1,10 @@
 """Downloading one file, and going on where an earlier attempt ended.
 
 Input is an address (http, https, ftp) and a path; output is the body in ``<name>.part``
-beside it, which the caller checks and renames. After an interruption a part is continued: of
-a file that may change, if the server says that it is the same version; of content that is
-fixed, such as a blob named by its digest, always. A server that ignores ranges sends the
-whole. This module checks sizes, no digests.
+beside it, which the caller checks and renames. After an interruption a part is continued. If the
+file may change, that is done only where the server says that it is the same version; content that
+is fixed, such as a blob named by its digest, is always continued. A server that ignores ranges
+sends the whole. This module checks sizes, no digests.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def download(url: str, path: Path, options: DownloadOptions) -> Arrival:
     path : Path
         The name that the caller will give to the file.
     options : DownloadOptions
-        How.
+        How to download.
 
     Returns
     -------
@@ -337,7 +337,7 @@ def beside(path: Path, suffix: str) -> Path:
     path : Path
         A file.
     suffix : str
-        What to append to its name.
+        The text to append to its name.
 
     Returns
     -------
