@@ -229,12 +229,12 @@ def product_schema(product: str, version: str | None = None) -> ProductSchema:
     known = _schema_files().get(product, {})
     chosen = max(known, key=_version_key, default=None) if version is None else version
     if chosen is None or chosen not in known:
+        wanted = "any" if version is None else version
         readable = ", ".join(sorted(known, key=_version_key)) or "none"
         # Both may come from the footer of somebody's file, of any length.
         raise SchemaVersionError(
-            f"{_shown(product)}: schema version {_shown('any' if version is None else version)} found; this starcat "
-            f"reads: {readable}. "
-            "Install the starcat that wrote it, or a newer one",
+            f"{_shown(product)}: schema version {_shown(wanted)} found; this starcat reads: "
+            f"{readable}. Install the starcat that wrote it, or a newer one",
             product=product,
             found=version,
             expected=readable,
@@ -242,7 +242,6 @@ def product_schema(product: str, version: str | None = None) -> ProductSchema:
     return read_schema(known[chosen])
 
 
-@cache
 def _schema_files() -> dict[str, dict[str, Path]]:
     """Return the files of schemas by product and version; the manifest's schemas are no table."""
     found: dict[str, dict[str, Path]] = {}
