@@ -800,6 +800,22 @@ def _(place: Place) -> Call:
     return ["sql", place.artifact, endless, "--time-limit-s", 0.2]
 
 
+@case("query that needs too much memory", 1)
+def _(place: Place) -> Call:
+    large = "SELECT length(repeat('x', 4000000000))"
+    return ["sql", place.artifact, large, "--memory-limit-gb", 0.5]
+
+
+@case("query that is nested too deeply", 2)
+def _(place: Place) -> Call:
+    return ["sql", place.artifact, "SELECT 1" + " + 1" * 2000]
+
+
+@case("query with an option of EXPLAIN unknown", 2)
+def _(place: Place) -> Call:
+    return ["sql", place.artifact, "EXPLAIN (FORMAT odd) SELECT 1"]
+
+
 @case("named query unknown", 2)
 def _(place: Place) -> Call:
     return ["sql", place.artifact, "--named", "densest-feilds"]
@@ -820,6 +836,22 @@ def _(place: Place) -> Call:
     path = place.copy() / "pairs.parquet"
     path.write_bytes(path.read_bytes()[:-100])
     return ["sql", path.parent, "SELECT 1"]
+
+
+@case("Parquet file with a name of a column that is no text", 5)
+def _(place: Place) -> Call:
+    path = place.folder / "odd.parquet"
+    pq.write_table(pa.table({"abcdefgh": [1]}), path)
+    path.write_bytes(path.read_bytes().replace(b"abcdefgh", b"abc\xff\xfefgh"))
+    return ["sql", path, "FROM odd"]
+
+
+@case("Parquet file whose footer names an odd schema", 4)
+def _(place: Place) -> Call:
+    path = place.folder / "odd.parquet"
+    schema = {"starcat.schema": "../**-1.0.0"}
+    pq.write_table(pa.table({"n": [1]}).replace_schema_metadata(schema), path)
+    return ["sql", path, "FROM odd"]
 
 
 # Registries --------------------------------------------------------------------------------

@@ -56,14 +56,14 @@ def sql(
 
     Example: starcat sql dist/gaia-12deg-1.0.0 "SELECT designation, mag FROM cone(37.95, 89.26, 5)"
     """
-    from starcat.terminal.queries import print_gallery, print_macros
+    if show_list or show_macros:
+        from starcat.terminal.queries import print_gallery, print_macros
 
-    if show_list:
-        print_gallery(as_json=json)
+        (print_gallery if show_list else print_macros)(as_json=json)
         return
-    if show_macros:
-        print_macros(as_json=json)
-        return
+    from starcat.query.engine import warm_up
+
+    warm_up()  # it starts while the rest is imported
     from starcat.query.session import Limits
     from starcat.terminal.asking import Wish, answer, print_preamble, show
 

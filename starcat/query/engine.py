@@ -6,6 +6,7 @@ question was dropped halfway; the next question starts another.
 
 from __future__ import annotations
 
+import atexit
 import os
 import pickle
 import shutil
@@ -56,6 +57,42 @@ class Allowance:
     left_s: float
 
 
+_waiting: list[subprocess.Popen[bytes]] = []
+"""A process that was started before it is known what for."""
+
+
+def warm_up() -> None:
+    """Start the process of the next `Engine` now, while other modules are still imported."""
+    if not _waiting:
+        _waiting.append(_spawned())
+
+
+def _spawned() -> subprocess.Popen[bytes]:
+    # Arrow's own allocators reserve gigabytes, which count as memory that is used.
+    return subprocess.Popen(
+        [sys.executable, "-c", _PROGRAM, *sys.path],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system"},
+    )
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    process.wait()
+    for pipe in (process.stdin, process.stdout, process.stderr):
+        if pipe is not None:
+            with suppress(OSError):
+                pipe.close()
+
+
+@atexit.register
+def _end_waiting() -> None:
+    while _waiting:
+        _end(_waiting.pop())
+
+
 class WorkerEnded(QueryError):  # noqa: N818 - the name reads as the fact
     """A process that ended by itself while it was asked, with what is known of why."""
 
@@ -66,14 +103,13 @@ class Engine:
     Parameters
     ----------
     scratch : Path
-        Folder for its log, and for what does not fit into its memory.
+        Folder for what does not fit into its memory.
     memory_gb, disk_gb : float
         Gigabytes that it may take of each.
     """
 
     def __init__(self, scratch: Path, memory_gb: float, disk_gb: float) -> None:
         self._opening = Opening(scratch / "spill", memory_gb, disk_gb, os.getpid())
-        self._log = scratch / "worker.log"
         self._views: Views | None = None
         self._asking = threading.RLock()
         self._ending = threading.Lock()
@@ -131,6 +167,7 @@ class Engine:
         """
         with self._asking:
             if self._process.poll() is not None:
+                self.close()
                 self._process = self._started()
                 if self._views is not None:
                     self._answered("open", (self._views,), Allowance(OPENING_S, OPENING_S))
@@ -139,29 +176,14 @@ class Engine:
 
     def close(self) -> None:
         """End the process."""
-        self._process.kill()
-        self._process.wait()
-        for pipe in (self._process.stdin, self._process.stdout):
-            if pipe is not None:
-                with suppress(OSError):
-                    pipe.close()
+        _end(self._process)
 
     def _started(self) -> subprocess.Popen[bytes]:
         shutil.rmtree(self._opening.spill, ignore_errors=True)
         self._opening.spill.mkdir()
-        # Arrow's own allocators reserve gigabytes, which count as memory that is used.
-        environment = {**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system"}
-        with self._log.open("wb") as log:
-            process = subprocess.Popen(
-                [sys.executable, "-c", _PROGRAM, *sys.path],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=log,
-                env=environment,
-            )
-        self._process = process
+        process = _waiting.pop() if _waiting else _spawned()
         with suppress(OSError):
-            self._write(self._opening)
+            _write(process, self._opening)
         return process
 
     def _answered(
@@ -179,7 +201,7 @@ class Engine:
         kind = ""
         try:
             with self._within(allowance):
-                self._write((name, allowance.left_s, content))
+                _write(self._process, (name, allowance.left_s, content))
                 while kind not in ENDINGS:
                     kind, found = self._read()
                     if kind == PROGRESS:
@@ -203,12 +225,6 @@ class Engine:
         told = "DuckDB failed: " if kind == BROKEN else ""
         raise QueryError(f"{told}{found}")
 
-    def _write(self, content: Any) -> None:
-        pipe = self._process.stdin
-        if pipe is not None:
-            pickle.dump(content, pipe, pickle.HIGHEST_PROTOCOL)
-            pipe.flush()
-
     def _read(self) -> tuple[str, Any]:
         kind, found = pickle.load(self._process.stdout)  # type: ignore[arg-type]
         return kind, found
@@ -218,7 +234,7 @@ class Engine:
         """Kill the process when the time is over, and count the time."""
         self._question += 1
         self._is_late = False
-        timer = threading.Timer(max(0.0, allowance.left_s), self._end, (self._question,))
+        timer = threading.Timer(max(0.0, allowance.left_s), self._stop, (self._question,))
         timer.daemon = True
         timer.start()
         began = time.monotonic()
@@ -230,7 +246,7 @@ class Engine:
             timer.cancel()
             allowance.left_s -= time.monotonic() - began
 
-    def _end(self, question: int) -> None:
+    def _stop(self, question: int) -> None:
         with self._ending:
             if question == self._question:
                 self._is_late = True
@@ -241,6 +257,9 @@ class Engine:
         # The pipe is closed a moment before the process is gone.
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(1.0)
+        self._process.kill()
+        pipe = self._process.stderr
+        lines = pipe.read().decode(errors="replace").strip().splitlines() if pipe else []
         self.close()
         code = self._process.returncode
         name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
@@ -254,9 +273,14 @@ class Engine:
                 "the process of the query was killed from outside, as a system does that runs out "
                 "of memory; ask for less, or allow less with --memory-limit-gb"
             )
-        lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         last = f": {lines[-1][:200]}" if lines else ""
         return WorkerEnded(
             f"the process of the query ended by itself ({name}{last}); DuckDB cannot answer it. "
             "Ask in another way; other queries are answered as before"
         )
+
+
+def _write(process: subprocess.Popen[bytes], content: Any) -> None:
+    if process.stdin is not None:
+        pickle.dump(content, process.stdin, pickle.HIGHEST_PROTOCOL)
+        process.stdin.flush()

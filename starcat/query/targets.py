@@ -182,7 +182,7 @@ def _hats(folder: Path, engine: Engine) -> Target:
 def _table(path: Path, engine: Engine) -> View:
     _check_file(path)
     try:
-        [found] = engine.ask("schema_name", str(path))
+        [found] = engine.ask("schema_name", str(path.resolve()))
     except QueryError as error:
         told = str(error).splitlines()[0]
         raise ProductError(

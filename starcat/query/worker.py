@@ -62,7 +62,7 @@ def serve() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     sys.setrecursionlimit(NESTED_CALLS)
     replies = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    # Whatever a library prints goes to the log.
+    # Whatever a library prints goes where nobody reads it, unless the process dies.
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     requests = sys.stdin.buffer
     try:

@@ -229,6 +229,7 @@ def product_schema(product: str, version: str | None = None) -> ProductSchema:
     known = _schema_files().get(product, {})
     chosen = max(known, key=_version_key, default=None) if version is None else version
     if chosen is None or chosen not in known:
+        wanted = "any" if version is None else version
         readable = ", ".join(sorted(known, key=_version_key)) or "none"
         # Both may come from the footer of somebody's file, of any length.
         wanted = "any" if version is None else version
@@ -242,7 +243,6 @@ def product_schema(product: str, version: str | None = None) -> ProductSchema:
     return read_schema(known[chosen])
 
 
-@cache
 def _schema_files() -> dict[str, dict[str, Path]]:
     """Return the files of schemas by product and version; the manifest's schemas are no table."""
     found: dict[str, dict[str, Path]] = {}
