@@ -25,7 +25,7 @@ from starcat.releases.project import pull_pinned, pull_wanted
 from starcat.releases.publishing import publish_artifact
 from starcat.releases.registry import FolderRegistry, open_registry
 from starcat.releases.tree import MAX_INDEX_BYTES, MAX_MANIFEST_BYTES, Blob, parse_wanted
-from starcat.specs.build_spec import spec_from_dict
+from starcat.specs.reading import spec_from_dict
 from starcat.storage.digests import file_sha256, json_bytes
 from starcat.storage.download import DownloadOptions, download, part_of
 
@@ -299,7 +299,8 @@ from pathlib import Path
 from starcat.releases.project import pull_wanted
 from starcat.releases.publishing import publish_artifact
 from starcat.releases import files
-assert files.fcntl is None and not files._WITHOUT_LINKS
+from starcat.storage import locks
+assert locks.fcntl is None and not files._WITHOUT_LINKS
 print(publish_artifact(Path(sys.argv[1]), "registry").outcome)
 print(pull_wanted("small", "registry", Path("out"), Path("starcat.lock")).outcome)
 print(pull_wanted("small", "registry", Path("out"), Path("starcat.lock")).outcome)

@@ -1,7 +1,6 @@
 """Files that several processes may write at once, and that a killed one leaves half done.
 
-A part belongs to who holds its lock, which ends with the process. Not every file system has
-locks, and Windows has no locks of this kind; `locked` says so, and then nothing is shared.
+A part belongs to who holds its lock (`starcat.storage.locks`), which ends with the process.
 """
 
 from __future__ import annotations
@@ -20,73 +19,12 @@ from starcat.progress import Progress, no_progress
 from starcat.releases.tree import Blob
 from starcat.storage.digests import file_sha256
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
-
 _logger = logging.getLogger(__name__)
 _BLOCK_BYTES = 1 << 20
 _WITHOUT_LINKS = getattr(os, "O_NOFOLLOW", 0)
 _WITHOUT_WAITING = getattr(os, "O_NONBLOCK", 0)
 _AS_BYTES = getattr(os, "O_BINARY", 0)
 """What Windows does not have is left out; symbolic links are looked for before opening."""
-
-_WITHOUT_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EBADF}
-
-
-@contextmanager
-def locked(path: Path) -> Iterator[bool]:
-    """Hold a lock that ends with the process, however it ends.
-
-    Parameters
-    ----------
-    path : Path
-        A folder, or a file that is made if need be, with its folder.
-
-    Yields
-    ------
-    bool
-        Whether nobody else holds it; False where the system or the file system has no locks.
-    """
-    if fcntl is None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield False
-        return
-    while True:
-        if not path.is_dir():
-            path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            flags = os.O_RDONLY if path.is_dir() else os.O_RDWR | os.O_CREAT | _WITHOUT_LINKS
-            descriptor = os.open(path, flags, 0o666)
-        except FileNotFoundError:  # the one before has removed the folder
-            continue
-        try:
-            is_real = _wait_for(descriptor, path)
-            if _is_still(descriptor, path):
-                yield is_real
-                return
-        finally:
-            os.close(descriptor)
-
-
-def _wait_for(descriptor: int, path: Path) -> bool:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-    except OSError as error:
-        if error.errno not in _WITHOUT_LOCKS:
-            raise
-        _logger.info("%s: going on without a lock (%s)", path, reason(error))
-        return False
-    return True
-
-
-def _is_still(descriptor: int, path: Path) -> bool:
-    """Return whether the path is the file that was locked, which its last holder may remove."""
-    try:
-        return os.path.samestat(os.fstat(descriptor), path.stat())
-    except FileNotFoundError:
-        return False
 
 
 def copy_to_part(

@@ -14,11 +14,11 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict
 
 from starcat.errors import ConfigError, ProductError
-from starcat.releases.files import locked
 from starcat.releases.registry import is_address
 from starcat.releases.tree import Release, check_version, parse
 from starcat.storage.atomic import make_folder, replace_file, writing
 from starcat.storage.digests import json_bytes
+from starcat.storage.locks import locked
 
 LOCK_NAME = "starcat.lock"
 LOCK_VERSION = "1.0.0"

@@ -18,11 +18,12 @@ from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.artifact.verify import check_artifact
 from starcat.errors import ConfigError, OutputError, ProductError
 from starcat.progress import Progress, no_progress
-from starcat.releases.files import copy_to_part, damaged, locked
+from starcat.releases.files import copy_to_part, damaged
 from starcat.releases.registry import is_address
 from starcat.releases.tree import INDEX_NAME, Blob, Listed, files_of, index_bytes, parse
 from starcat.storage.atomic import make_folder, replace_file, sync, unique, writing
 from starcat.storage.digests import file_sha256, json_bytes
+from starcat.storage.locks import locked
 
 INCOMING = ".incoming"
 """Folder for what is not finished; may be removed while nobody publishes."""

@@ -19,12 +19,12 @@ from starcat.artifact.manifest import MANIFEST_NAME, parse_manifest
 from starcat.artifact.verify import first_of, verify_artifact
 from starcat.errors import OutputError, ProductError, SchemaError
 from starcat.progress import Progress, no_progress
-from starcat.releases.files import locked
 from starcat.releases.registry import Registry
 from starcat.releases.tree import DAMAGED, MAX_MANIFEST_BYTES, Blob, Release, files_of
 from starcat.storage.atomic import move_into_place, sync, writing
 from starcat.storage.digests import file_sha256
 from starcat.storage.download import part_of
+from starcat.storage.locks import locked
 
 
 @dataclass(frozen=True)

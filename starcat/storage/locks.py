@@ -41,6 +41,7 @@ def locked(path: Path) -> Iterator[bool]:
         Whether nobody else holds it; False where the system or the file system has no locks.
     """
     if fcntl is None:
+        path.parent.mkdir(parents=True, exist_ok=True)
         yield False
         return
     while True:
