@@ -269,7 +269,7 @@ PIECES = st.sampled_from(
 )  # fmt: skip
 
 
-@settings(max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(pieces=st.lists(PIECES, min_size=1, max_size=12), glue=st.sampled_from([" ", "", "\t"]))
 @example(
     pieces=["EXPLAIN", "/*", "/*", "*/", "SELECT 1", "--", "*/", "ANALYZE", "COPY", "(SELECT 42)",
@@ -372,7 +372,7 @@ MEASURE = """
 import resource, sys
 from starcat.errors import QueryLimitError
 from starcat.query.session import Limits, open_session
-with open_session([sys.argv[1]], Limits(time_s=2.0, memory_gb=0.1)) as session:
+with open_session([sys.argv[1]], Limits(time_s=1.0, memory_gb=0.1)) as session:
     for text in sys.argv[2:]:
         try:
             with session.ask(text) as answer:
@@ -386,7 +386,7 @@ print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere memory is counted in other ways")
 def test_a_query_takes_no_more_memory_than_it_may(folder):
-    texts = [ONE_CALL[name] for name in ("repeat", "lpad", "printf", "rows")]
+    texts = [ONE_CALL[name] for name in ("repeat", "lpad", "rows")]
     command = [sys.executable, "-c", MEASURE, str(folder), *texts]
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=100)
     largest_bytes = 1024 * int(done.stdout)

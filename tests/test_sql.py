@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import select
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -558,6 +561,43 @@ def test_the_prompt_answers_until_it_ends(session, capsys, monkeypatch, tmp_path
     assert ".macros" in err
     assert "not asked" not in out
     assert (tmp_path / "starcat" / "sql_history").exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a terminal of POSIX")
+def test_ctrl_c_stops_a_query_of_the_prompt_and_the_next_is_answered(small_artifact, tmp_path):
+    import pty
+
+    ours, theirs = pty.openpty()
+    command = [sys.executable, "-m", "starcat", "sql", str(small_artifact)]
+    environment = {**os.environ, "XDG_STATE_HOME": str(tmp_path), "TERM": "xterm"}
+    asking = subprocess.Popen(
+        command, stdin=theirs, stdout=theirs, stderr=theirs, env=environment,
+        start_new_session=True,
+    )  # fmt: skip
+    os.close(theirs)
+    try:
+        read_until(ours, b"starcat> ")
+        os.write(ours, b"SELECT sum(sin(range)) FROM range(100000000000);\n")
+        read_until(ours, b"query")  # the bar
+        os.killpg(asking.pid, signal.SIGINT)
+        read_until(ours, b"stopped", b"starcat> ")
+        os.write(ours, b"SELECT 40 + 2 AS n;\n")
+        read_until(ours, b"42")
+        os.write(ours, b".quit\n")
+        assert asking.wait(20) == 0
+    finally:
+        asking.kill()
+        asking.wait()
+        os.close(ours)
+
+
+def read_until(terminal: int, *words: bytes) -> None:
+    """Read what a terminal shows until some words are there, one after the other."""
+    shown = b""
+    while not re.search(b".*".join(map(re.escape, words)), shown, re.DOTALL):
+        ready, _, _ = select.select([terminal], [], [], 30.0)
+        assert ready, f"{words!r} is not in {shown!r}"
+        shown += os.read(terminal, 4096)
 
 
 def test_the_prompt_completes_what_there_is(session):

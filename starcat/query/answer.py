@@ -21,7 +21,7 @@ class Answer:
     Parameters
     ----------
     engine : Engine
-        Where the query runs.
+        The process that runs the query.
     text : str
         SQL that was checked.
     values : dict of str to object, optional
@@ -75,12 +75,12 @@ class Answer:
         Parameters
         ----------
         count : int
-            How many at most.
+            The largest number of rows to return.
 
         Returns
         -------
         list of tuple
-            Fewer where there are no more.
+            The rows; fewer where there are no more.
 
         Raises
         ------

@@ -1,7 +1,7 @@
 """Units and meanings of the columns of an answer.
 
-A column keeps the unit and the meaning of the product's column whose name it has. Others get
-the unit that their name ends with, as everywhere in starcat: ``x_deg`` is in degrees.
+A column keeps the unit and the meaning of the product's column whose name it has. Any other column
+gets the unit that its name ends with, as everywhere in starcat: ``x_deg`` is in degrees.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def facts_by_name(views: Iterable[View]) -> dict[str, Facts]:
     Returns
     -------
     dict of str to Facts
-        Of names that mean the same in every view that has them; of others the unit, if that is
-        the same.
+        The facts of each name. Where views disagree on what a name means, only the unit is kept,
+        if they agree on that.
     """
     found: dict[str, Facts] = {}
     for view in views:
@@ -81,14 +81,14 @@ def column_facts(name: str, known: Mapping[str, Facts]) -> Facts:
     Parameters
     ----------
     name : str
-        Of the column.
+        The name of the column.
     known : mapping of str to Facts
-        By name, of the columns of the views.
+        What is known of the columns of the views, by name.
 
     Returns
     -------
     Facts
-        Of the column of that name, else the unit that the name ends with.
+        The facts of the view's column of that name, else the unit that the name ends with.
 
     Examples
     --------

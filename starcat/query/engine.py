@@ -147,7 +147,7 @@ class Engine:
         name : str
             A method of `starcat.query.worker.Worker`.
         *arguments : object
-            Of the method.
+            The arguments of the method.
         allowance : Allowance, optional
             Time that it may take; what it took is taken from it.
         progress : Progress

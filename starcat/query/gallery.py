@@ -36,7 +36,7 @@ class Value:
     name : str
         ``$name`` in the query.
     default : int, float or str
-        Where none is given; one that is given has its type.
+        The value where none is given; one that is given has the same type.
     help : str
         What it means.
     """
@@ -53,13 +53,13 @@ class NamedQuery:
     Attributes
     ----------
     name : str
-        Of its file.
+        The name of its file without the suffix.
     help : str
         What it finds.
     targets : int
-        How many it is about.
+        The number of targets that it is about.
     values : tuple of Value
-        What it can be given.
+        The values that it can be given.
     text : str
         SQL.
     """
@@ -81,7 +81,7 @@ class NamedQuery:
         Returns
         -------
         dict of str to int, float or str
-            One for each ``$name``.
+            A value for each ``$name``.
 
         Raises
         ------
@@ -113,7 +113,7 @@ def guessed(text: str) -> Literal:
     Parameters
     ----------
     text : str
-        As somebody wrote it.
+        The text of a value on the command line.
 
     Returns
     -------
@@ -138,7 +138,7 @@ def gallery() -> dict[str, NamedQuery]:
     Returns
     -------
     dict of str to NamedQuery
-        By name.
+        The queries by their names.
 
     Examples
     --------
@@ -154,7 +154,7 @@ def named_query(name: str) -> NamedQuery:
     Parameters
     ----------
     name : str
-        As ``starcat sql --list`` shows it.
+        A name that ``starcat sql --list`` shows.
 
     Returns
     -------

@@ -25,11 +25,11 @@ class Macro:
     Attributes
     ----------
     name, arguments : str
-        As it is called; the arguments without parentheses.
+        The name to call it by, and its arguments without parentheses.
     help, example : str
-        What it gives, and a query that runs on any artifact.
+        What it gives, and a query that shows it and runs on any artifact.
     text : str
-        What makes it, with ``{schema}`` where that matters.
+        The SQL that makes it, with ``{schema}`` where its own schema has to be named.
     """
 
     name: str
@@ -67,7 +67,7 @@ def macros() -> tuple[Macro, ...]:
     Returns
     -------
     tuple of Macro
-        Those that others use first.
+        The macros; those that others use come first.
 
     Examples
     --------

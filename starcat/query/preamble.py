@@ -23,7 +23,7 @@ def schemas_of(targets: Sequence[Target]) -> dict[str, Target]:
     Parameters
     ----------
     targets : sequence of Target
-        In order.
+        The targets in the order in which they were given.
 
     Returns
     -------
@@ -42,12 +42,12 @@ def preamble(targets: Sequence[Target]) -> str:
     Parameters
     ----------
     targets : sequence of Target
-        What the views are of.
+        The targets whose tables the views show.
 
     Returns
     -------
     str
-        One statement a line or more.
+        Statements, each on one line or more.
     """
     lines = [macro.text + ";" for macro in macros() if not macro.is_table]
     for schema, target in schemas_of(targets).items():
@@ -102,7 +102,7 @@ def quoted(text: str) -> str:
     Returns
     -------
     str
-        In quotes, with those inside doubled.
+        The text in single quotes, with single quotes inside it doubled.
     """
     return "'" + text.replace("'", "''") + "'"
 

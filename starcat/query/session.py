@@ -55,7 +55,7 @@ class Session:
     Attributes
     ----------
     targets : tuple of Target
-        What the views are of.
+        The targets whose tables the views show.
     limits : Limits
         What each query may take.
     """
@@ -122,7 +122,7 @@ class Session:
         text : str
             SQL, one statement that reads.
         values : mapping of str to object, optional
-            Of the ``$name`` in it.
+            The values of the ``$name`` in it.
         progress : Progress
             Called with ("query", percent, 100) while it runs.
 
@@ -188,9 +188,9 @@ def open_session(
     Parameters
     ----------
     given : sequence of str
-        As for `open_targets`.
+        What to open; `open_targets` says what it may be.
     limits : Limits, optional
-        Of each query.
+        What each query may take.
     progress : Progress
         Called while archive files are read.
 

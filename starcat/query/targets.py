@@ -24,11 +24,11 @@ class View:
     Attributes
     ----------
     name : str
-        Of the product, or of the file where starcat did not write it.
+        The name of the product, or of the file where starcat did not write it.
     paths : tuple of Path
         Its Parquet files: one, or the partitions of a HATS catalog.
     schema : ProductSchema, optional
-        Of the product: columns with their units and meanings.
+        The schema of the product, with units and meanings of its columns.
     """
 
     name: str
@@ -43,11 +43,11 @@ class Target:
     Attributes
     ----------
     name : str
-        Schema of its views: the artifact's, the source's or the file's name.
+        The schema of its views: the name of the artifact, the source or the file.
     version : str
-        Of an artifact; empty otherwise.
+        The version of an artifact; empty for anything else.
     views : tuple of View
-        One a table.
+        A view for each table.
     """
 
     name: str

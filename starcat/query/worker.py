@@ -82,7 +82,7 @@ class Worker:
     opening : Opening
         Limits, and the folder that may be written in.
     replies : binary file
-        Where the replies go.
+        The pipe for the replies.
     """
 
     def __init__(self, opening: Opening, replies: BinaryIO) -> None:
@@ -104,7 +104,7 @@ class Worker:
         Parameters
         ----------
         name : str
-            One of the methods below.
+            The name of one of the methods below.
         time_s : float
             Seconds after which nobody waits for the answer.
         arguments : bytes

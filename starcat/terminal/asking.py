@@ -28,7 +28,7 @@ class Wish:
     named : str, optional
         A query of the gallery instead.
     values : mapping of str to str
-        Of the ``$name`` in it.
+        The texts of the values of the ``$name`` in it.
     form : str, optional
         ``table`` or one of the formats of `starcat.exchange.formats`.
     output : Path, optional
@@ -48,11 +48,11 @@ def answer(targets: Sequence[str], wish: Wish, limits: Limits, rows: int) -> Non
     Parameters
     ----------
     targets : sequence of str
-        As for `open_session`.
+        What the question is about, as `open_session` takes it.
     wish : Wish
         The question.
     limits : Limits
-        Of each query.
+        What each query may take.
     rows : int
         Rows of a table to show.
 
@@ -86,9 +86,9 @@ def show(targets: Sequence[str], limits: Limits, *, as_json: bool) -> None:
     Parameters
     ----------
     targets : sequence of str
-        As for `open_session`.
+        What the question is about, as `open_session` takes it.
     limits : Limits
-        Of each query.
+        What each query may take.
     as_json : bool
         Whether as JSON, with all columns.
     """

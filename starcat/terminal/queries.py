@@ -20,7 +20,7 @@ FOLDED_CHARACTERS = 28
 """A column of longer texts is folded rather than given all the room it wants."""
 
 SHOWN_ITEMS = 6
-"""Of a list in a cell."""
+"""How many items of a list a cell shows."""
 
 
 def print_first_rows(session: Session, query: str, values: Mapping[str, Any], rows: int) -> None:
@@ -33,7 +33,7 @@ def print_first_rows(session: Session, query: str, values: Mapping[str, Any], ro
     query : str
         SQL.
     values : mapping of str to object
-        Of the ``$name`` in it.
+        The values of the ``$name`` in it.
     rows : int
         How many at most.
     """
@@ -76,7 +76,7 @@ def cell_text(value: Any) -> str:
     Parameters
     ----------
     value : object
-        Of a row.
+        A value of a row.
 
     Returns
     -------

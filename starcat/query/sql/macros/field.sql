@@ -1,6 +1,6 @@
 -- The rows in the field of a camera, degrees: boresight, roll (north turns from up to the left),
 -- full angles right and down. field_x_deg (right) and field_y_deg (down) are the angles from the
--- boresight, at most half the field. Of as for cone.
+-- boresight, at most half the field. As in cone, of := names another table.
 -- Example: SELECT designation, mag, field_x_deg, field_y_deg FROM field(83.6, -5.4, 0, 12, 12)
 CREATE MACRO field(ra, dec, roll, fov_x, fov_y, of := 'stars') AS TABLE
 SELECT * EXCLUDE (_east, _north, _ahead),
