@@ -1,6 +1,6 @@
 """The version of starcat, and the name that pip installs it by."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 DISTRIBUTION = "starcat-guide-stars"
 """On PyPI ``starcat`` is another project, a toolkit for star clusters."""

@@ -19,7 +19,7 @@ from starcat.matcher.result import MatchResult, unidentified
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 Name = Callable[[Observation, Database], Rows]
-Answer = Callable[[Matcher, Array, Camera, "Array | None"], MatchResult]
+Answerer = Callable[[Matcher, Array, Camera, "Array | None"], MatchResult]
 
 CAP_PX = 3.0
 """What a difference counts at the most, in the capped form of S5's distance."""
@@ -49,7 +49,7 @@ def with_matcher(
     return matcher.identify(centroids_px, camera, magnitudes=mag)
 
 
-def bare(name: Name) -> Answer:
+def bare(name: Name) -> Answerer:
     """Return the answer of a method that only names stars.
 
     Parameters
@@ -59,7 +59,7 @@ def bare(name: Name) -> Answer:
 
     Returns
     -------
-    Answer
+    Answerer
         A result that has stars, but no attitude and no false-match probability below 1.
     """
 
@@ -110,7 +110,7 @@ def _reference_alone(observation: Observation, stars: Rows) -> Rows:
     return named
 
 
-ANSWERS: dict[str, Answer] = {
+ANSWERS: dict[str, Answerer] = {
     "matcher": with_matcher,
     "S5 mean of minima": bare(_angular),
     "S5 capped": bare(_angular_capped),

@@ -16,7 +16,7 @@ if TYPE_CHECKING:  # a program that only matches has none of the libraries behin
 
     from starcat.artifact.verify import Verification
     from starcat.matcher.matcher import Matcher
-    from starcat.query.answer_table import AnswerTable
+    from starcat.query.answer import Answer
     from starcat.report.coverage_report import CoverageReport
     from starcat.specs.build_spec import BuildSpec
 
@@ -109,7 +109,7 @@ class Artifact:
 
         return Matcher.open(self.folder, method, **limits)
 
-    def sql(self, text: str, **values: Any) -> AnswerTable:
+    def sql(self, text: str, **values: Any) -> Answer:
         """Ask a query about the products.
 
         Parameters
@@ -122,7 +122,7 @@ class Artifact:
 
         Returns
         -------
-        AnswerTable
+        Answer
             All rows.
 
         Raises

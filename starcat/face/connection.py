@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from starcat.resources import PathLike
 
 if TYPE_CHECKING:  # a program that only matches has none of the libraries behind these
-    from starcat.query.answer_table import AnswerTable
+    from starcat.query.answer import Answer
     from starcat.query.session import Limits
 
 
@@ -32,7 +32,7 @@ class Connection:
         self._open = ExitStack()
         self._session = self._open.enter_context(open_session(targets, limits))
 
-    def sql(self, text: str, **values: Any) -> AnswerTable:
+    def sql(self, text: str, **values: Any) -> Answer:
         """Ask a query.
 
         Parameters
@@ -44,7 +44,7 @@ class Connection:
 
         Returns
         -------
-        AnswerTable
+        Answer
             All rows.
 
         Raises
@@ -54,10 +54,10 @@ class Connection:
         QueryLimitError
             If it takes more time or memory than it may.
         """
-        from starcat.query.answer_table import AnswerTable
+        from starcat.query.answer import Answer
 
         with self._session.ask(text, values) as answer:
-            return AnswerTable(answer.batches().read_all())
+            return Answer(answer.batches().read_all())
 
     def close(self) -> None:
         """Forget the tables, and what was made to read them."""

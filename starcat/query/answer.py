@@ -1,120 +1,108 @@
-"""The answer to a query: its columns with their units, and its rows."""
+"""All rows of an answer in memory: as Arrow, pandas or astropy, or to be looked at."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from functools import cached_property, partial
-from itertools import chain
+from collections.abc import Iterator
+from html import escape
 from typing import TYPE_CHECKING, Any
 
-from starcat.progress import Progress, no_progress
-from starcat.query.columns import Facts, column_facts
-from starcat.query.engine import Allowance, Engine
+from starcat.errors import ConfigError
 
 if TYPE_CHECKING:
+    import pandas as pd  # type: ignore[import-untyped, unused-ignore]
     import pyarrow as pa
+    from astropy.table import Table
+
+SHOWN_ROWS = 20
+"""Rows that a notebook shows."""
 
 
 class Answer:
-    """What a query finds; nothing runs before something is asked for.
+    """What a query found.
 
     Parameters
     ----------
-    engine : Engine
-        The process that runs the query.
-    text : str
-        SQL that was checked.
-    values : dict of str to object, optional
-        The values of the ``$name`` in it.
-    known : mapping of str to Facts
-        What is known of the columns of the views, by name.
-    allowance : Allowance
-        The time that it may take.
-    progress : Progress
-        Called with ("query", percent, 100) while it runs.
+    found : pyarrow.Table
+        All rows; units and meanings in the field metadata.
     """
 
-    def __init__(
-        self,
-        engine: Engine,
-        text: str,
-        values: dict[str, Any] | None,
-        known: Mapping[str, Facts],
-        allowance: Allowance,
-        progress: Progress = no_progress,
-    ) -> None:
-        self._ask = partial(engine.ask, allowance=allowance, progress=progress)
-        self._text = text
-        self._values = values
-        self._known = known
-
-    @cached_property
-    def _described(self) -> list[tuple[str, str]]:
-        """Names and types of the columns."""
-        [found] = self._ask("columns", self._text, self._values)
-        return list(found)
+    def __init__(self, found: pa.Table) -> None:
+        self._found = found
 
     @property
     def columns(self) -> list[str]:
-        """Names, in order."""
-        return [name for name, _ in self._described]
+        """Names of the columns, in order."""
+        return list(self._found.column_names)
 
-    @property
-    def types(self) -> list[str]:
-        """DuckDB's names of their types."""
-        return [kind for _, kind in self._described]
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return int(self._found.num_rows)
 
-    @property
-    def facts(self) -> list[Facts]:
-        """Unit and meaning of each column."""
-        return [column_facts(name, self._known) for name, _ in self._described]
+    def __iter__(self) -> Iterator[tuple[Any, ...]]:
+        """Go through the rows, each a tuple of Python values."""
+        for batch in self._found.to_batches():
+            yield from zip(*(column.to_pylist() for column in batch.columns), strict=True)
 
-    def rows(self, count: int) -> list[tuple[Any, ...]]:
-        """Return the first rows.
-
-        Parameters
-        ----------
-        count : int
-            The largest number of rows to return.
+    def to_arrow(self) -> pa.Table:
+        """Return the rows as an Arrow table.
 
         Returns
         -------
-        list of tuple
-            The rows; fewer where there are no more.
+        pyarrow.Table
+            Units and meanings in the field metadata (``unit``, ``description``).
+        """
+        return self._found
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return the rows as a pandas data frame.
+
+        Returns
+        -------
+        pandas.DataFrame
+            One column each.
 
         Raises
         ------
-        QueryError
-            If the query asks for what is not there.
-        QueryLimitError
-            If it takes longer, or more memory and disk, than it may.
+        ConfigError
+            If pandas is not installed.
         """
-        *parts, (described, last) = self._ask("rows", self._text, self._values, count)
-        # Known now, without looking at the files once more.
-        self._described = described
-        return list(chain(*parts, last))
+        try:
+            import pandas  # noqa: F401 - pyarrow says less clearly that it is missing
+        except ImportError:
+            raise ConfigError("to_pandas needs pandas: python -m pip install pandas") from None
+        return self._found.to_pandas()
 
-    def batches(self) -> pa.RecordBatchReader:
-        """Return all rows as Arrow batches, with units and meanings in the field metadata.
+    def to_table(self) -> Table:
+        """Return the rows as an astropy table.
 
         Returns
         -------
-        pyarrow.RecordBatchReader
-            To be read before the next query. Reading raises what `rows` raises.
+        astropy.table.Table
+            With units and meanings; nulls are masked.
         """
         import pyarrow as pa
 
-        [begun] = self._ask("batches", self._text, self._values)
-        schema = pa.schema(
-            field.with_metadata(column_facts(field.name, self._known).as_metadata())
-            for field in pa.ipc.open_stream(begun).schema
+        from starcat.exchange.column_types import plain_batch, plain_schema
+        from starcat.exchange.ecsv_file import astropy_table
+        from starcat.exchange.numpy_columns import numpy_columns
+
+        schema = plain_schema(self._found.schema)
+        batches = [plain_batch(batch, schema) for batch in self._found.to_batches()]
+        plain = pa.Table.from_batches(batches, schema)
+        return astropy_table(numpy_columns(plain.combine_chunks(), signed=False))
+
+    def __repr__(self) -> str:
+        """Return the size and the first columns in one line."""
+        names = ", ".join(self.columns[:6]) + (", ..." if len(self.columns) > 6 else "")
+        return f"<Answer: {len(self):,} rows of {names}>"
+
+    def _repr_html_(self) -> str:
+        """Return the first rows as a table for a notebook."""
+        heads = "".join(f"<th>{escape(name)}</th>" for name in self.columns)
+        rows = "".join(
+            f"<tr>{''.join(f'<td>{escape(str(cell))}</td>' for cell in row)}</tr>"
+            for row, _ in zip(self, range(SHOWN_ROWS), strict=False)
         )
-        return pa.RecordBatchReader.from_batches(schema, self._batches(schema))
-
-    def _batches(self, schema: pa.Schema) -> Iterator[pa.RecordBatch]:
-        """Give the batches that follow, with a schema that has the metadata."""
-        import pyarrow as pa
-
-        while (found := self._ask("next_batch")[0]) is not None:
-            for batch in pa.ipc.open_stream(found):
-                yield pa.record_batch(batch.columns, schema=schema)
+        more = len(self) - SHOWN_ROWS
+        rest = f"<p>and {more:,} more rows</p>" if more > 0 else ""
+        return f"<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>{rest}"

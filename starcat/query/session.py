@@ -17,12 +17,12 @@ from typing import Any
 
 from starcat.errors import ProductError, QueryError
 from starcat.progress import Progress, no_progress
-from starcat.query.answer import Answer
 from starcat.query.columns import column_facts, facts_by_name
 from starcat.query.engine import Allowance, Engine, WorkerEnded
 from starcat.query.macros import macros
 from starcat.query.messages import Statement, Views
 from starcat.query.preamble import preamble, quoted, schemas_of
+from starcat.query.running_query import RunningQuery
 from starcat.query.targets import Target, View, open_targets
 
 MAX_COLUMNS = 100_000
@@ -114,7 +114,7 @@ class Session:
         text: str,
         values: Mapping[str, Any] | None = None,
         progress: Progress = no_progress,
-    ) -> Iterator[Answer]:
+    ) -> Iterator[RunningQuery]:
         """Ask a query; its rows are read within the context.
 
         Parameters
@@ -128,7 +128,7 @@ class Session:
 
         Yields
         ------
-        Answer
+        RunningQuery
             The columns; the query runs when the rows are asked for.
 
         Raises
@@ -149,7 +149,7 @@ class Session:
         if statement.is_description:
             runs = self._described(statement, used, allowance)
             used = None
-        yield Answer(self._engine, runs, used, facts_by_name(self.views), allowance, progress)
+        yield RunningQuery(self._engine, runs, used, facts_by_name(self.views), allowance, progress)
 
     def _allowance(self) -> Allowance:
         return Allowance(self.limits.time_s, self.limits.time_s)

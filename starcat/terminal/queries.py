@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from starcat.terminal.console import MAX_WIDTH, print_json, print_table, progress_bars, say
 
 if TYPE_CHECKING:
-    from starcat.query.answer import Answer
+    from starcat.query.running_query import RunningQuery
     from starcat.query.session import Session
     from starcat.query.targets import Target, View
 
@@ -42,12 +42,12 @@ def print_first_rows(session: Session, query: str, values: Mapping[str, Any], ro
     print_answer(answer, found, rows)
 
 
-def print_answer(answer: Answer, found: Sequence[tuple[Any, ...]], rows: int) -> None:
+def print_answer(answer: RunningQuery, found: Sequence[tuple[Any, ...]], rows: int) -> None:
     """Print the first rows of an answer: as a table, or one below the other if that is too wide.
 
     Parameters
     ----------
-    answer : Answer
+    answer : RunningQuery
         What a query finds.
     found : sequence of tuple
         Its first rows, one more than to print where there are more.

@@ -23,7 +23,7 @@ from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest
 from starcat.catalog.selection import select_guide_stars
 from starcat.catalog.stars import directions_of
-from starcat.pipeline.recipes import RECIPES, Sky, cook, tile_guide_stars
+from starcat.pipeline.recipes import RECIPES, Ingredients, cook, tile_guide_stars
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset
 from starcat.tables.parquet import write_parquet
@@ -40,7 +40,7 @@ def measure(spec: BuildSpec) -> dict[str, dict[str, float]]:
     stars = select_guide_stars(read.stars, spec.selection).guide_stars
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     start = time.perf_counter()
-    sky = Sky(directions_of(stars), tile_guide_stars(stars, spec), spec)
+    sky = Ingredients(directions_of(stars), tile_guide_stars(stars, spec), spec)
     found = {"tiling": {"seconds": time.perf_counter() - start, "rows": float(len(stars))}}
     with tempfile.TemporaryDirectory() as folder:
         for name in RECIPES:
