@@ -271,7 +271,7 @@ def _understood() -> Iterator[None]:
 
 def _short(text: str) -> str:
     """Return the beginning of a text that somebody else chose."""
-    return text if len(text) <= 200 else f"{text[:200]}..."
+    return text if len(text) <= 500 else f"{text[:500]}..."
 
 
 def _transfer_ftp(url: str, path: Path, options: DownloadOptions) -> None:
