@@ -1,4 +1,4 @@
-"""The answer to a query: its columns with their units, and its rows."""
+"""A query that runs: its columns with their units, and its rows as they come."""
 
 from __future__ import annotations
 
