@@ -47,7 +47,7 @@ CameraFile = Annotated[
     Path | None, typer.Option(help="Camera file (TOML); default: the database's camera.")
 ]
 Frames = Annotated[
-    int | None, typer.Option(min=1, help="Of each trial; default: 500, with --quick 100.")
+    int | None, typer.Option(min=1, help="Frames of each trial; default: 500, with --quick 100.")
 ]
 TolerancePx = Annotated[
     float | None,

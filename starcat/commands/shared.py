@@ -22,7 +22,7 @@ Input = Annotated[
 MethodName = Annotated[
     str | None, typer.Option(help="See 'starcat methods'; default: the best there is.")
 ]
-NoisePx = Annotated[float, typer.Option(min=0, max=50, help="Of a centroid, each axis.")]
+NoisePx = Annotated[float, typer.Option(min=0, max=50, help="Noise of a centroid, each axis.")]
 
 
 def chosen_spec(path: Path | None, name: str | None, changes: list[str] | None = None) -> BuildSpec:

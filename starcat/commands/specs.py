@@ -42,7 +42,9 @@ def presets(
 @app.command()
 def init(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="TOML file to write.")],
-    size: Annotated[str, typer.Option(metavar="WIDTHxHEIGHT", help="Of the detector, pixels.")],
+    size: Annotated[
+        str, typer.Option(metavar="WIDTHxHEIGHT", help="Size of the detector, pixels.")
+    ],
     focal_mm: Annotated[float | None, typer.Option(help="Focal length of the lens.")] = None,
     pixel_um: Annotated[float | None, typer.Option(help="Side of a square pixel.")] = None,
     fov_x_deg: Annotated[

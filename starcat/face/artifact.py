@@ -27,9 +27,9 @@ class Products(Mapping[str, "pa.Table"]):
     Parameters
     ----------
     folder : Path
-        Of the artifact.
+        The artifact's folder.
     manifest : dict
-        Of the artifact.
+        Its manifest.
     """
 
     def __init__(self, folder: Path, manifest: dict[str, Any]) -> None:
@@ -118,7 +118,7 @@ class Artifact:
             SQL, one statement that reads; every product is a table, the macros of
             ``docs/sql.md`` are there.
         **values
-            Of the ``$name`` in it.
+            Values of the ``$name`` in it.
 
         Returns
         -------

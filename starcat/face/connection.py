@@ -40,7 +40,7 @@ class Connection:
         text : str
             SQL, one statement that reads.
         **values
-            Of the ``$name`` in it.
+            Values of the ``$name`` in it.
 
         Returns
         -------

@@ -143,7 +143,7 @@ def check_product(name: str, arrays: Arrays, numbers: Numbers, star_count: int) 
     Parameters
     ----------
     name : str
-        Of the product.
+        The product.
     arrays : mapping of str to ndarray
         Its datasets, all that the layout names.
     numbers : mapping of str to float

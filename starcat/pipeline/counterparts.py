@@ -149,7 +149,7 @@ def match_tables(
     Returns
     -------
     table : pyarrow.Table
-        Of the crossmatch schema.
+        Counterparts, as the schema ``crossmatch`` has them.
     summary : Summary
         Counts and medians.
     """

@@ -26,7 +26,7 @@ def select_stars(stars: pa.Table, spec: BuildSpec) -> tuple[Selected, FieldStars
     Parameters
     ----------
     stars : pyarrow.Table
-        Of the stars schema, amplitudes joined.
+        Star table (schema ``stars``), amplitudes joined.
     spec : BuildSpec
         Limits, rules and the tiling.
 

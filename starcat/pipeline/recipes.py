@@ -158,7 +158,7 @@ def tile_guide_stars(guide_stars: pa.Table, spec: BuildSpec) -> FieldStars:
     Parameters
     ----------
     guide_stars : pyarrow.Table
-        Of the stars schema.
+        Guide stars, as the schema ``stars`` has them.
     spec : BuildSpec
         Number, size and shape of the fields.
 

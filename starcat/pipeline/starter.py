@@ -49,7 +49,7 @@ class LimitRow:
     guide_stars : int
         Stars of the whole sky that pass the selection.
     stars : Spread
-        Of a field.
+        How the stars are spread over the fields.
     """
 
     faint_limit_mag: float
@@ -93,7 +93,7 @@ def starter_spec(
     Parameters
     ----------
     name : str
-        Of the artifact; what no artifact's name may have becomes a hyphen.
+        Name of the artifact; what no artifact's name may have becomes a hyphen.
     camera : CameraSpec
         The camera.
     faint_limit_mag : float, optional

@@ -40,7 +40,7 @@ class SpecKey:
     kind : str
         ``text``, ``whole number``, ``number``, ``true or false``, ``list`` or ``one of``.
     unit : str
-        Of a number; empty where it has none.
+        Unit of a number; empty where it has none.
     range : str
         Smallest and largest value, or the choices; empty where all are allowed.
     default : object

@@ -105,7 +105,7 @@ def what_is_wrong(error: ValidationError, origin: str) -> ConfigError:
     Parameters
     ----------
     error : ValidationError
-        Of pydantic.
+        What pydantic found wrong.
     origin : str
         Where the values are from.
 

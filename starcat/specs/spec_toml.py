@@ -47,7 +47,7 @@ def toml_value(value: Any) -> str:
     Parameters
     ----------
     value : bool, int, float, str or list of these
-        Of a spec.
+        A value that a spec may have.
 
     Returns
     -------
