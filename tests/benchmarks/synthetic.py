@@ -29,19 +29,30 @@ def read_lines(path: Path, length: int) -> np.ndarray:
     return np.frombuffer(data, dtype=np.uint8).reshape(-1, length + 1)
 
 
-def put(records: np.ndarray, first: int, values: np.ndarray, width: int, decimals: int = 0) -> None:
+def put(
+    records: np.ndarray,
+    first: int,
+    values: np.ndarray,
+    width: int,
+    decimals: int = 0,
+    blank: int = ord(" "),
+) -> None:
     """Write numbers into a field, right-aligned, as Fortran would."""
     scaled = np.rint(np.abs(values) * 10.0**decimals).astype(np.int64)
+    if len(scaled) and scaled.max() < 2**31:
+        scaled = scaled.astype(np.int32)
     places = [first - 1 + k for k in range(width)]
     if decimals:
         point = places.pop(width - 1 - decimals)
         records[:, point] = ord(".")
     started = np.zeros(len(values), dtype=bool)
+    rest, is_negative = scaled, values < 0
     for k, place in enumerate(reversed(places)):
-        digit = (scaled // 10**k) % 10
-        is_used = (scaled >= 10**k) | (k <= decimals)
-        sign = (values < 0) & ~is_used & ~started
-        records[:, place] = np.where(is_used, digit + 48, np.where(sign, ord("-"), ord(" ")))
+        is_used = (rest > 0) | (k <= decimals)
+        rest, digit = rest // 10, rest
+        digit = (digit - 10 * rest + 48).astype(np.uint8)
+        sign = is_negative & ~is_used & ~started
+        records[:, place] = np.where(is_used, digit, np.where(sign, ord("-"), blank))
         started |= sign
 
 
