@@ -160,5 +160,7 @@ def test_the_command_prints_some_and_json_has_all(
     assert starcat(["diff", small_artifact, small_artifact, "--json"]).out.count('"is_same": true')
 
 
-def test_a_damaged_artifact_is_an_error(small_artifact: Path, tmp_path: Path, starcat: Any) -> None:
-    assert starcat(["diff", small_artifact, tmp_path]).code == 5
+def test_a_folder_that_is_no_artifact_is_an_error(
+    small_artifact: Path, tmp_path: Path, starcat: Any
+) -> None:
+    assert starcat(["diff", small_artifact, tmp_path]).code == 3

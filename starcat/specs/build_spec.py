@@ -15,12 +15,17 @@ from starcat.specs.product_sections import Products
 from starcat.specs.section import FieldDeg, Mag, Section
 from starcat.specs.version import NAME_PATTERN, VERSION_PATTERN
 
+MOST_BINS = 10_000_000
+"""Bins of a look-up table; each takes 8 bytes, and a tracker has no use for more."""
+
 
 class Catalog(Section):
     """Where the stars come from."""
 
     source: str = Field(
-        description="name of a star catalog, as 'starcat sources' lists them", examples=["gaia"]
+        pattern=r"^[0-9A-Za-z._-]{1,64}$",
+        description="name of a star catalog, as 'starcat sources' lists them",
+        examples=["gaia"],
     )
     band: str | None = Field(
         None, description="band of the magnitudes; default: the source's first", examples=["G"]
@@ -212,6 +217,18 @@ class BuildSpec(Section):
             raise ValueError(
                 f"products.crossmatch.catalogs: {self.catalog.source} is the catalog of the stars "
                 "themselves; name others"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _look_up_table_of_a_size(self) -> BuildSpec:
+        wanted, camera = self.products.neighbours, self.camera.camera()
+        radius_deg = wanted.radius_deg or 0.5 * min(camera.fov_x_deg, camera.fov_y_deg)
+        bins = 360.0 / wanted.angle_bin_deg * radius_deg / wanted.separation_bin_deg
+        if bins > MOST_BINS:
+            raise ValueError(
+                f"products.neighbours: angle_bin_deg and separation_bin_deg make {bins:,.0f} bins; "
+                f"at most {MOST_BINS:,} fit. Make the bins wider or radius_deg smaller"
             )
         return self
 

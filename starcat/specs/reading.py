@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,9 +12,14 @@ from pydantic import (
     ValidationError,
 )
 
-from starcat.errors import ConfigError, suggest
+from starcat.errors import ConfigError, quoted, suggest
 from starcat.resources import PathLike, resource_folder
 from starcat.specs.build_spec import BuildSpec
+
+_SHOWN = reprlib.Repr()
+"""Shows what was found, however long or deep it is."""
+
+_SHOWN.maxstring = _SHOWN.maxlong = _SHOWN.maxother = 100
 
 Changes = Mapping[str, str]
 """Values by dotted key, as somebody types them: ``{"camera.fov_x_deg": "16"}``."""
@@ -47,7 +53,7 @@ def read_spec(path: PathLike, changes: Changes | None = None) -> BuildSpec:
         raise ConfigError(
             f"{path}: no such spec; 'starcat presets' lists those that ship with starcat"
         ) from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not a readable TOML file: {error}") from error
     for key, text in (changes or {}).items():
         _change(content, key, text)
@@ -116,22 +122,25 @@ def what_is_wrong(error: ValidationError, origin: str) -> ConfigError:
     """
     wrong = sorted(error.errors(), key=lambda entry: entry["type"] != "extra_forbidden")
     first = wrong[0]
-    names = (str(part) for part in first["loc"])
-    key = ".".join(name if name.isprintable() else repr(name) for name in names) or "spec"
+    key = ".".join(_shown_key(str(part)) for part in first["loc"]) or "spec"
     return ConfigError(f"{origin}: {key}: {_explain(dict(first))}", key=key, value=first["input"])
+
+
+def _shown_key(name: str) -> str:
+    return name if name.isprintable() and len(name) <= 60 else quoted(name)
 
 
 def _explain(error: dict[str, Any]) -> str:
     kind, context = error["type"], error.get("ctx", {})
     if kind == "extra_forbidden":
         known = _known_keys(error["loc"][:-1])
-        hint = suggest(str(error["loc"][-1]), known)
+        hint = suggest(str(error["loc"][-1])[:100], known)
         return f"unknown key; {hint}known keys here: {', '.join(known)}"
     if kind == "missing":
         return "missing; every spec needs it"
     if kind == "value_error":
         return str(context.get("error", error["msg"]))
-    found = repr(error["input"])
+    found = _SHOWN.repr(error["input"])
     return f"found {found if len(found) < 60 else found[:57] + '...'}; {error['msg']}"
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 Mag = Annotated[float, Field(ge=-30.0, le=40.0)]
 """A magnitude that some star may have."""
@@ -23,3 +23,9 @@ class Section(BaseModel):
     """A part of a spec: frozen; refuses unknown keys, wrong types and numbers not finite."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+    @field_validator("*", mode="after")
+    @classmethod
+    def _no_negative_zero(cls, value: Any) -> Any:
+        """Return 0.0 for -0.0, which passes for a number that is not negative and is none."""
+        return value + 0.0 if isinstance(value, float) else value
