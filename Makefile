@@ -8,7 +8,7 @@ READY := $(VENV)/.ready
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
-.PHONY: help install check format test test-all demo bench reproduction docs pictures golden release clean
+.PHONY: help install check format test test-all test-changed demo bench reproduction docs pictures golden release clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -41,6 +41,12 @@ test: $(READY) ## the fast tests and the docstrings' examples
 
 test-all: $(READY) ## the fast tests and the sky-scale ones
 	$(BIN)/python -m pytest -q -n 2
+
+BASE ?= HEAD~1
+test-changed: $(READY) ## the slow tests in the test files that changed since BASE (HEAD~1)
+	@changed=$$(git diff --name-only --diff-filter=d $(BASE) -- 'tests/test_*.py' || true); \
+	if [ -z "$$changed" ]; then echo "no test file changed since $(BASE)"; exit 0; fi; \
+	$(BIN)/python -m pytest -q -n 2 -m slow $$changed || [ $$? -eq 5 ]
 
 demo: $(RUNS) ## build a database from the embedded sky, check it, identify simulated fields
 	$(BIN)/starcat build --preset gaia-12deg --output dist --replace
