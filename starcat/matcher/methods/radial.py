@@ -148,7 +148,7 @@ def sector_pattern(position_angle_rad: Array, sectors: int) -> int:
     Parameters
     ----------
     position_angle_rad : ndarray of float64, shape (n,)
-        Of the neighbours, counter-clockwise, the nearest one first.
+        Angles of the neighbours, counter-clockwise, the nearest one first.
     sectors : int
         Their number.
 
