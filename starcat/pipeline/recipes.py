@@ -67,8 +67,7 @@ class Ingredients:
         """
         if radius_deg is not None:
             return float(np.radians(radius_deg))
-        camera = self.spec.camera.camera()
-        return factor * 0.5 * float(np.radians(min(camera.fov_x_deg, camera.fov_y_deg)))
+        return factor * float(np.radians(self.spec.camera.half_field_deg))
 
 
 def _pairs(given: Ingredients) -> Any:

@@ -167,9 +167,7 @@ def boresight_count(camera: CameraSpec) -> int:
     10,000 Saff-Kuijlaars points leave no direction farther than 1.50 deg from the nearest, and
     this distance shrinks with the root of their number.
     """
-    field = camera.camera()
-    half_deg = 0.5 * min(field.fov_x_deg, field.fov_y_deg)
-    least = 1.05 * 10_000 * (1.5 / half_deg) ** 2
+    least = 1.05 * 10_000 * (1.5 / camera.half_field_deg) ** 2
     wanted = max(least, min(8.0 * least, 50_000.0))
     return int(np.clip(100 * np.ceil(wanted / 100.0), 2000, 1_000_000))
 

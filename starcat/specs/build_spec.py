@@ -140,6 +140,12 @@ class CameraSpec(Section):
                 )
         return self
 
+    @property
+    def half_field_deg(self) -> float:
+        """Half of the narrower full angle: the radius of the circle inside the field."""
+        camera = self.camera()
+        return 0.5 * min(camera.fov_x_deg, camera.fov_y_deg)
+
     def camera(self) -> Camera:
         """Return the camera.
 
@@ -222,8 +228,8 @@ class BuildSpec(Section):
 
     @model_validator(mode="after")
     def _look_up_table_of_a_size(self) -> BuildSpec:
-        wanted, camera = self.products.neighbours, self.camera.camera()
-        radius_deg = wanted.radius_deg or 0.5 * min(camera.fov_x_deg, camera.fov_y_deg)
+        wanted = self.products.neighbours
+        radius_deg = wanted.radius_deg or self.camera.half_field_deg
         bins = 360.0 / wanted.angle_bin_deg * radius_deg / wanted.separation_bin_deg
         if bins > MOST_BINS:
             raise ValueError(
