@@ -1,0 +1,265 @@
+"""A catalog store on disk: a HATS collection, and what starcat keeps beside it.
+
+::
+
+    DIR/
+      collection.properties     names the catalog and its margin
+      store.json                inputs with digests, counts by reason, partitions with digests
+      NAME/                     HATS catalog: the stars
+        hats.properties  partition_info.csv  skymap.fits
+        dataset/_metadata  _common_metadata  Norder=K/Dir=D/Npix=P.parquet
+      NAME_margin/              HATS margin catalog: each partition's neighbours across its border
+      rejected/                 rejected records, one file for each input that has any
+      repeated/                 records whose star was read before, whole, by partition
+
+Catalogs of others are opened too: a collection, or a HATS catalog by itself.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from starcat.errors import ProductError, TargetMissing
+from starcat.store.pixels import Pixel
+
+COLLECTION_NAME = "collection.properties"
+MANIFEST_NAME = "store.json"
+PROPERTIES_NAMES = ("hats.properties", "properties")
+PARTITIONS_NAME = "partition_info.csv"
+SKYMAP_NAME = "skymap.fits"
+DATASET = "dataset"
+REJECTED = "rejected"
+REPEATED = "repeated"
+
+
+@dataclass(frozen=True)
+class Partition:
+    """A part of the sky and the files that hold its stars.
+
+    Attributes
+    ----------
+    pixel : Pixel
+        The part.
+    paths : tuple of Path
+        One file, in catalogs of others at times several.
+    """
+
+    pixel: Pixel
+    paths: tuple[Path, ...]
+
+
+@dataclass(frozen=True)
+class HatsFolder:
+    """A HATS catalog as it lies on disk.
+
+    Attributes
+    ----------
+    folder : Path
+        The folder with ``hats.properties``.
+    properties : dict of str to str
+        What that file says.
+    partitions : tuple of Partition
+        By the first pixel of order 29.
+    """
+
+    folder: Path
+    properties: dict[str, str]
+    partitions: tuple[Partition, ...]
+
+    @property
+    def name(self) -> str:
+        """The name that the catalog gives itself; else that of its folder."""
+        return self.properties.get("obs_collection", self.folder.name)
+
+
+@dataclass(frozen=True)
+class Store:
+    """A catalog store, or a HATS catalog of others.
+
+    Attributes
+    ----------
+    folder : Path
+        What was given.
+    catalog : HatsFolder
+        The stars.
+    margin : HatsFolder, optional
+        Each partition's neighbours across its border.
+    """
+
+    folder: Path
+    catalog: HatsFolder
+    margin: HatsFolder | None
+
+    @property
+    def margin_arcsec(self) -> float:
+        """How far the margin reaches, arcseconds; 0 where there is none."""
+        return float(self.margin.properties["hats_margin_threshold"]) if self.margin else 0.0
+
+    @cached_property
+    def is_ours(self) -> bool:
+        """Whether starcat made it, and says what it is made from."""
+        return (self.folder / MANIFEST_NAME).is_file()
+
+
+def is_store(folder: Path) -> bool:
+    """Return whether a folder is a HATS collection or catalog.
+
+    Parameters
+    ----------
+    folder : Path
+        Any path.
+
+    Returns
+    -------
+    bool
+        True where one of the files is there that say so.
+    """
+    return any((folder / name).is_file() for name in (COLLECTION_NAME, *PROPERTIES_NAMES))
+
+
+def open_store(folder: Path) -> Store:
+    """Open a catalog store; no star is read.
+
+    Parameters
+    ----------
+    folder : Path
+        A HATS collection or catalog, of starcat or of others.
+
+    Returns
+    -------
+    Store
+        Its partitions.
+
+    Raises
+    ------
+    TargetMissing
+        If the folder does not exist.
+    ProductError
+        If it is no such folder, or a file or partition is missing.
+    """
+    if not folder.exists():
+        raise TargetMissing(f"{folder}: does not exist; give the folder of a HATS catalog")
+    if not (folder / COLLECTION_NAME).is_file():
+        return Store(folder, _read_catalog(folder), None)
+    collection = read_properties(folder / COLLECTION_NAME)
+    primary = collection.get("hats_primary_table_url")
+    if not primary:
+        raise ProductError(
+            f"{folder / COLLECTION_NAME}: has no hats_primary_table_url; expected the name of the "
+            "catalog's folder. Get the collection again",
+            path=folder,
+        )
+    margin = collection.get("default_margin")
+    inner = _within(folder, primary)
+    return Store(
+        folder, _read_catalog(inner), _read_catalog(_within(folder, margin)) if margin else None
+    )
+
+
+def _within(folder: Path, name: str) -> Path:
+    """Return a folder of the collection; one elsewhere is not followed."""
+    if Path(name).is_absolute() or ".." in Path(name).parts or "://" in name:
+        raise ProductError(
+            f"{folder / COLLECTION_NAME}: names {name!r}, which is not in the collection; give "
+            "the folder of the catalog itself",
+            path=folder,
+        )
+    return folder / name
+
+
+def _read_catalog(folder: Path) -> HatsFolder:
+    path = next((folder / name for name in PROPERTIES_NAMES if (folder / name).is_file()), None)
+    if path is None:
+        raise ProductError(
+            f"{folder}: no {' or '.join(PROPERTIES_NAMES)}; expected a HATS catalog, as 'starcat "
+            "ingest SOURCE --to hats -o DIR' writes it",
+            path=folder,
+        )
+    properties = read_properties(path)
+    suffix = properties.get("hats_npix_suffix", ".parquet")
+    partitions = [_partition(folder, pixel, suffix) for pixel in _pixels(folder)]
+    return HatsFolder(
+        folder, properties, tuple(sorted(partitions, key=lambda found: found.pixel.first))
+    )
+
+
+def _pixels(folder: Path) -> list[Pixel]:
+    """Return the pixels that the catalog says it has; those of its files where it says nothing."""
+    path = folder / PARTITIONS_NAME
+    if not path.is_file():
+        found = folder.glob(f"{DATASET}/Norder=*/Dir=*/Npix=*")
+        return [pixel for pixel in map(_pixel_of, sorted(found)) if pixel is not None]
+    try:
+        with path.open(encoding="utf-8", newline="") as stream:
+            return [Pixel(int(row["Norder"]), int(row["Npix"])) for row in csv.DictReader(stream)]
+    except (KeyError, TypeError, ValueError) as error:
+        raise ProductError(
+            f"{path}: cannot be read ({error!r}); expected lines of Norder,Npix. Get the catalog "
+            "again",
+            path=path,
+        ) from error
+
+
+def _pixel_of(path: Path) -> Pixel | None:
+    order = path.parent.parent.name.removeprefix("Norder=")
+    number = path.name.removeprefix("Npix=").partition(".")[0]
+    return Pixel(int(order), int(number)) if order.isdigit() and number.isdigit() else None
+
+
+def _partition(folder: Path, pixel: Pixel, suffix: str) -> Partition:
+    path = folder / DATASET / pixel.path
+    if suffix != ".parquet":
+        path = path.with_name(f"Npix={pixel.number}{suffix.rstrip('/')}")
+    paths = tuple(sorted(path.glob("*.parquet"))) if path.is_dir() else (path,)
+    if not paths or not all(each.is_file() for each in paths):
+        raise ProductError(
+            f"{folder}: partition {pixel.path.as_posix()} is missing; the catalog is not whole. "
+            "Get it again, or make it with 'starcat ingest SOURCE --to hats -o DIR'",
+            path=folder,
+        )
+    return Partition(pixel, paths)
+
+
+def read_properties(path: Path) -> dict[str, str]:
+    """Read a file of properties.
+
+    Parameters
+    ----------
+    path : Path
+        Lines of ``key=value``; empty lines and those that begin with # or ! are comments.
+
+    Returns
+    -------
+    dict of str to str
+        In the order of the file.
+
+    Raises
+    ------
+    ProductError
+        If it cannot be read.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ProductError(f"{path}: cannot be read ({error})", path=path) from error
+    pairs = (line.partition("=") for line in lines if line.strip() and line[0] not in "#!")
+    return {key.strip(): value.strip().replace("\\:", ":") for key, _, value in pairs}
+
+
+def write_properties(path: Path, known: Mapping[str, Any]) -> None:
+    """Write a file of properties, the same bytes for the same content.
+
+    Parameters
+    ----------
+    path : Path
+        Overwritten.
+    known : mapping of str to object
+        Keys and values in their order.
+    """
+    text = "".join(f"{key}={value}\n" for key, value in known.items())
+    path.write_text(text, encoding="utf-8", newline="\n")
