@@ -1,1 +1,1 @@
-"""Catalogs of any size on disk, as HATS collections: written by Dask, read a partition at a time."""
+"""Catalogs of any size on disk, as HATS: written by Dask, read a partition at a time."""

@@ -187,7 +187,7 @@ def _rings(pixel: Pixel, width_rad: float) -> Pixels:
         found = np.union1d(found, edge)
         if not len(edge):
             break
-    return found[found != pixel.number]
+    return np.asarray(found[found != pixel.number])
 
 
 def _valid(edges: Any, corners: Any) -> Pixels:
