@@ -21,8 +21,9 @@ from starcat.geometry.sphere import (
     separation,
     tangent_axes,
 )
+from starcat.products.census import TILES, MagnitudeCounts
 from starcat.products.crossmatch import VERDICTS, Matches, MovingStars, candidate_pairs, crossmatch
-from starcat.products.match_odds import ARCSEC, TILES, MatchModel, magnitude_density
+from starcat.products.match_figures import ARCSEC, MatchModel
 from starcat.products.match_probability import pair_probabilities
 
 Array = NDArray[np.float64]
@@ -234,11 +235,11 @@ def test_magnitudes_are_distributed_as_they_are():
 
     mag = 9.0 - np.random.default_rng(5).exponential(1.0, 20_000)
     wanted = np.linspace(2.0, 9.0, 50)
-    found = magnitude_density(np.append(mag, np.nan), wanted)
+    found = MagnitudeCounts.of(np.append(mag, np.nan)).density(wanted)
     smooth = gaussian_kde(mag, bw_method=0.5 / mag.std(ddof=1))
     assert found == pytest.approx(smooth(wanted), rel=0.05, abs=2e-4)
     everywhere = np.linspace(-8.0, 12.0, 20_001)
-    assert np.trapezoid(magnitude_density(mag, everywhere), everywhere) == pytest.approx(
+    assert np.trapezoid(MagnitudeCounts.of(mag).density(everywhere), everywhere) == pytest.approx(
         1, abs=0.01
     )
 

@@ -36,7 +36,7 @@ from starcat.pipeline.counterparts import (
 )
 from starcat.pipeline.rebuild import rebuild
 from starcat.products.crossmatch import VERDICTS
-from starcat.products.match_odds import ARCSEC
+from starcat.products.match_figures import ARCSEC
 from starcat.resources import resource_folder
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.product_sections import Crossmatch, Products

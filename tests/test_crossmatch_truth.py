@@ -27,7 +27,7 @@ from starcat.pipeline.build import build
 from starcat.pipeline.counterparts import match_tables
 from starcat.pipeline.rebuild import rebuild
 from starcat.products.crossmatch import VERDICTS, crossmatch
-from starcat.products.match_odds import ARCSEC, MatchModel
+from starcat.products.match_figures import ARCSEC, MatchModel
 from starcat.specs.product_sections import Crossmatch
 from starcat.specs.reading import spec_from_dict
 

@@ -7,19 +7,18 @@ a time; only rows that some star may be stay in memory.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from starcat.artifact.crossmatch_table import (
     NEEDED,
     counterparts_of,
-    matched_stars,
     moving_stars,
     table_from_matches,
 )
@@ -31,62 +30,14 @@ from starcat.catalog.selection import Selected
 from starcat.catalog.stars import sort_rows
 from starcat.catalog.verdict import Reason
 from starcat.errors import ParseError, SchemaError, SourceMissing, reason
-from starcat.products.crossmatch import VERDICTS, Matches, candidate_pairs, crossmatch
-from starcat.products.match_odds import ARCSEC, MatchModel
+from starcat.pipeline.match_summary import Summary, summary_of, tally_of
+from starcat.products.crossmatch import candidate_pairs, crossmatch
+from starcat.products.match_figures import ARCSEC, MatchModel
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.product_sections import Crossmatch
 from starcat.tables.parquet import write_table
 from starcat.tables.schema import product_schema
-
-
-@dataclass(frozen=True)
-class Summary:
-    """What a cross-identification of two catalogs found.
-
-    Attributes
-    ----------
-    stars, counterparts : int
-        Rows of the two.
-    radius_arcsec : float
-        Largest separation of a candidate.
-    matched, unmatched : int
-        Stars with a counterpart, be it ambiguous, and all others.
-    verdicts : dict of str to int
-        Stars by the verdict on their likeliest candidate.
-    no_candidate : int
-        Stars with none within the radius.
-    mutual : int
-        Stars that are their likeliest candidate's likeliest star.
-    median_separation_arcsec, median_delta_mag : float or None
-        Over the matched stars; None where there is none.
-    position_error_arcsec, expected_delta_mag, completeness : float
-        The figures behind the odds, given or measured.
-    """
-
-    stars: int
-    counterparts: int
-    radius_arcsec: float
-    matched: int
-    unmatched: int
-    verdicts: dict[str, int]
-    no_candidate: int
-    mutual: int
-    median_separation_arcsec: float | None
-    median_delta_mag: float | None
-    position_error_arcsec: float
-    expected_delta_mag: float
-    completeness: float
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the summary as plain values.
-
-        Returns
-        -------
-        dict
-            For JSON.
-        """
-        return asdict(self)
 
 
 @dataclass(frozen=True)
@@ -157,30 +108,19 @@ def match_tables(
     model = model_from_spec(wanted)
     found = crossmatch(moving_stars(stars), moving_stars(counterparts), radius, model)
     table = table_from_matches(found, counterparts)
-    return table, _summary(found, table, len(stars), len(counterparts), wanted.radius_arcsec)
-
-
-def _summary(found: Matches, table: pa.Table, stars: int, others: int, radius: float) -> Summary:
-    first = found.rank == 1
-    rows = matched_stars(table)
-    delta = found.delta_mag[rows]
-    delta = delta[~np.isnan(delta)]
-    angle = found.separation_rad[rows] / ARCSEC
-    return Summary(
-        stars,
-        others,
-        radius,
-        len(rows),
-        stars - len(rows),
-        {name: found.count(name) for name in VERDICTS if name != "other"},
-        stars - int(first.sum()),
-        int((first & (found.star_rank == 1)).sum()),
-        round(float(np.median(angle)), 6) if len(angle) else None,
-        round(float(np.median(delta)), 6) if len(delta) else None,
-        round(found.odds.position_error_rad / ARCSEC, 6),
-        round(found.odds.delta_mag, 6),
-        round(found.odds.completeness, 6),
+    tally = tally_of(found, table)
+    return table, summary_of(
+        tally,
+        (len(stars), len(counterparts)),
+        wanted.radius_arcsec,
+        found.odds,
+        _median(tally.separation_arcsec),
+        _median(tally.delta_mag),
     )
+
+
+def _median(values: NDArray[np.float64]) -> float | None:
+    return float(np.median(values)) if len(values) else None
 
 
 def with_rivals(stars: pa.Table, selected: Selected, radius_rad: float) -> pa.Table:
@@ -324,6 +264,25 @@ def match_files(a: Path, b: Path, output: Path, wanted: Crossmatch) -> Summary:
     """
     stars, counterparts = read_star_table(a), read_star_table(b)
     table, summary = match_tables(stars, counterparts, wanted)
+    write_table(with_own_names(table, stars), output)
+    return summary
+
+
+def with_own_names(table: pa.Table, stars: pa.Table) -> pa.Table:
+    """Return counterparts with the number and the name of their star in front.
+
+    Parameters
+    ----------
+    table : pyarrow.Table
+        As the schema ``crossmatch`` has them.
+    stars : pyarrow.Table
+        The star table that the rows of ``star`` are of.
+
+    Returns
+    -------
+    pyarrow.Table
+        With ``star_id`` and ``star_designation``.
+    """
     own = stars.select(["star_id", "designation"]).take(table["star"].combine_chunks())
     schema = table.schema.remove_metadata()
     known = product_schema("stars").arrow_schema
@@ -332,8 +291,7 @@ def match_files(a: Path, b: Path, output: Path, wanted: Crossmatch) -> Summary:
         field = known.field(column).with_name(name)
         table = table.add_column(place, field, own[column].combine_chunks())
         schema = schema.insert(place, field)
-    write_table(table.cast(schema), output)
-    return summary
+    return table.cast(schema)
 
 
 def read_star_table(path: Path) -> pa.Table:
@@ -376,14 +334,27 @@ def read_star_table(path: Path) -> pa.Table:
     except (OSError, pa.ArrowException) as error:
         why = reason(error) if isinstance(error, OSError) else str(error)
         raise ParseError(f"{path}: cannot be read as Parquet ({why}); {hint}", path=path) from error
-    _check_columns(table, path)
+    check_star_columns(table, path)
     return table
 
 
-def _check_columns(table: pa.Table, path: Path) -> None:
-    """Check types, and that every star has what places it."""
+def check_star_columns(table: pa.Table, path: Path) -> None:
+    """Check types, and that every star has what places it.
+
+    Parameters
+    ----------
+    table : pyarrow.Table
+        Columns of a star table, all or some.
+    path : Path
+        Where they are from, for the message.
+
+    Raises
+    ------
+    SchemaError
+        If a column is of another type, or a star lacks a value that every star has.
+    """
     for column in product_schema("stars").columns:
-        if column.name not in NEEDED:
+        if column.name not in NEEDED or column.name not in table.column_names:
             continue
         values, kind = table[column.name], column.arrow_field.type
         blank = values.null_count

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from starcat.geometry.sphere import chord_from_separation, separation
-from starcat.products.match_odds import MatchModel, Odds, match_odds
+from starcat.products.census import Census
+from starcat.products.match_figures import Figures, MatchModel, figures_of, measure
+from starcat.products.match_odds import Odds, match_odds
 from starcat.products.match_probability import runs
 
 Array = NDArray[np.float64]
@@ -176,6 +178,22 @@ class Matches:
         """
         return int(((self.rank == 1) & (self.verdict == VERDICTS.index(verdict))).sum())
 
+    def take(self, order: Rows) -> Matches:
+        """Return some of the matches.
+
+        Parameters
+        ----------
+        order : ndarray of int64, shape (K,)
+            Rows.
+
+        Returns
+        -------
+        Matches
+            In that order.
+        """
+        arrays = {name: value[order] for name, value in vars(self).items() if name != "odds"}
+        return Matches(**arrays, odds=self.odds.take(order))
+
 
 def crossmatch(
     stars: MovingStars, counterparts: MovingStars, radius_rad: float, model: MatchModel
@@ -209,7 +227,42 @@ def crossmatch(
     if not radius_rad > 0.0:
         raise ValueError(f"radius_rad is {radius_rad}; expected a positive angle")
     pairs = candidate_pairs(stars, counterparts, radius_rad)
-    odds = match_odds(stars, counterparts, pairs, radius_rad, model)
+    measured = measure(stars, counterparts, pairs)
+    figures = figures_of(Census.of(stars), Census.of(counterparts), measured, radius_rad, model)
+    return judged(stars, counterparts, pairs, radius_rad, figures, model)
+
+
+def judged(
+    stars: MovingStars,
+    counterparts: MovingStars,
+    pairs: Pairs,
+    radius_rad: float,
+    figures: Figures,
+    model: MatchModel,
+) -> Matches:
+    """Give every pair its odds, ranks and verdict.
+
+    Parameters
+    ----------
+    stars, counterparts : MovingStars
+        The two catalogs, or parts of them.
+    pairs : Pairs
+        All candidates within the radius, by star and counterpart. Where the catalogs are parts,
+        only pairs whose star and candidate have all their other pairs here are judged rightly,
+        and their probabilities are right where that is so of their whole cluster.
+    radius_rad : float
+        Largest separation of a candidate.
+    figures : Figures
+        What is known of the two whole catalogs.
+    model : MatchModel
+        Errors of positions and magnitudes, and what the verdicts ask for.
+
+    Returns
+    -------
+    Matches
+        In order of (star, rank).
+    """
+    odds = match_odds(stars, counterparts, pairs, radius_rad, figures, model)
     i, j = pairs.star, pairs.counterpart
     star_rank, n_stars = _rank(j, odds.log_ratio, pairs.separation_rad, i)
     rank, n_candidates = _rank(i, odds.log_ratio, pairs.separation_rad, j)
@@ -228,13 +281,7 @@ def crossmatch(
         odds,
         verdict,
     )
-    return _taken(found, order)
-
-
-def _taken(found: Matches, order: Rows) -> Matches:
-    """Return the matches in another order."""
-    arrays = {name: value[order] for name, value in vars(found).items() if name != "odds"}
-    return Matches(**arrays, odds=found.odds.take(order))
+    return found.take(order)
 
 
 def candidate_pairs(stars: MovingStars, counterparts: MovingStars, radius_rad: float) -> Pairs:

@@ -142,6 +142,25 @@ def border_of(pixel: Pixel, width_rad: float) -> tuple[int, Pixels]:
     return pixel.order, _rings(pixel, width_rad)
 
 
+def neighbours_of(pixels: Pixels, order: int) -> Pixels:
+    """Return the pixels that touch others, at an edge or a corner.
+
+    Parameters
+    ----------
+    pixels : ndarray of int64, shape (N,)
+        Pixels of one order.
+    order : int
+        That order.
+
+    Returns
+    -------
+    ndarray of int64, shape (M,)
+        Ascending; pixels given are among them where they touch each other.
+    """
+    around = np.unique(np.asarray(_nested().neighbours(pixels, order), dtype=np.int64))
+    return around[around >= 0]
+
+
 def border_order(width_rad: float) -> int:
     """Return the highest order of which no pixel is narrower than a width.
 
@@ -182,8 +201,7 @@ def _rings(pixel: Pixel, width_rad: float) -> Pixels:
     found = np.array([pixel.number], dtype=np.int64)
     edge = found
     for _ in range(count):
-        around = np.asarray(_nested().neighbours(edge, pixel.order), dtype=np.int64).ravel()
-        edge = np.setdiff1d(around[around >= 0], found)
+        edge = np.setdiff1d(neighbours_of(edge, pixel.order), found)
         found = np.union1d(found, edge)
         if not len(edge):
             break

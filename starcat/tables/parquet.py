@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pyarrow as pa
@@ -24,6 +26,42 @@ def write_parquet(table: pa.Table, path: Path) -> None:
     path : Path
         Overwritten if it exists.
     """
+    with _writer(table, path) as writer:
+        writer.write_table(table.replace_schema_metadata(None), row_group_size=ROW_GROUP_ROWS)
+
+
+def write_parts(parts: Iterable[pa.Table], example: pa.Table, path: Path) -> None:
+    """Write a table that is there part by part, the same bytes however it is divided.
+
+    Parameters
+    ----------
+    parts : iterable of pyarrow.Table
+        The rows, in order.
+    example : pyarrow.Table
+        Of the same columns, with texts as long as the longest of each: the footer says how long
+        they are.
+    path : Path
+        Overwritten if it exists.
+    """
+    waiting = example.schema.empty_table()
+    with _writer(example, path) as writer:
+        for part in parts:
+            waiting = pa.concat_tables([waiting, part.cast(example.schema)])
+            while len(waiting) >= ROW_GROUP_ROWS:
+                _write_group(writer, waiting.slice(0, ROW_GROUP_ROWS))
+                waiting = waiting.slice(ROW_GROUP_ROWS)
+        if len(waiting):
+            _write_group(writer, waiting)
+
+
+def _write_group(writer: pq.ParquetWriter, rows: pa.Table) -> None:
+    """Write a row group; where its pages end depends on nothing but its rows."""
+    writer.write_table(rows.combine_chunks(), row_group_size=ROW_GROUP_ROWS)
+
+
+@contextmanager
+def _writer(table: pa.Table, path: Path) -> Iterator[pq.ParquetWriter]:
+    """Open a file for the rows of a table, and describe its columns in the footer."""
     floating = [field.name for field in table.schema if pa.types.is_floating(field.type)]
     # Names differ in every row: a dictionary of them would be the column again.
     dictionary = [
@@ -32,17 +70,16 @@ def write_parquet(table: pa.Table, path: Path) -> None:
         if pa.types.is_string(field.type) and field.name != "designation"
     ]
     known = {**(table.schema.metadata or {}), **astropy_metadata(table)}
-    table = table.replace_schema_metadata(known)
     with pq.ParquetWriter(
         path,
-        table.schema,
+        table.schema.with_metadata(known),
         compression="zstd",
         compression_level=1,
         use_dictionary=dictionary or False,
         column_encoding=dict.fromkeys(floating, "BYTE_STREAM_SPLIT") or None,
         write_statistics=True,
     ) as writer:
-        writer.write_table(table, row_group_size=ROW_GROUP_ROWS)
+        yield writer
         writer.add_key_value_metadata(votable_metadata(table))
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from starcat.terminal.console import print_json, print_table, say
 
 if TYPE_CHECKING:
-    from starcat.pipeline.counterparts import Summary
+    from starcat.pipeline.match_summary import Summary
 
 MEANINGS = {
     "unique": "the only candidate, and no other star's",

@@ -1,0 +1,185 @@
+"""What a cross-identification found, in counts that parts add up to and in words for people."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from starcat.artifact.crossmatch_table import matched_stars
+from starcat.products.crossmatch import VERDICTS, Matches
+from starcat.products.match_figures import ARCSEC
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a cross-identification of two catalogs found.
+
+    Attributes
+    ----------
+    stars, counterparts : int
+        Rows of the two.
+    radius_arcsec : float
+        Largest separation of a candidate.
+    matched, unmatched : int
+        Stars with a counterpart, be it ambiguous, and all others.
+    verdicts : dict of str to int
+        Stars by the verdict on their likeliest candidate.
+    no_candidate : int
+        Stars with none within the radius.
+    mutual : int
+        Stars that are their likeliest candidate's likeliest star.
+    median_separation_arcsec, median_delta_mag : float or None
+        Over the matched stars; None where there is none.
+    position_error_arcsec, expected_delta_mag, completeness : float
+        The figures behind the odds, given or measured.
+    """
+
+    stars: int
+    counterparts: int
+    radius_arcsec: float
+    matched: int
+    unmatched: int
+    verdicts: dict[str, int]
+    no_candidate: int
+    mutual: int
+    median_separation_arcsec: float | None
+    median_delta_mag: float | None
+    position_error_arcsec: float
+    expected_delta_mag: float
+    completeness: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the summary as plain values.
+
+        Returns
+        -------
+        dict
+            For JSON.
+        """
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Tally:
+    """What was found of some stars.
+
+    Attributes
+    ----------
+    rows : int
+        Candidates of all of them.
+    matched : int
+        Stars with a counterpart, be it ambiguous.
+    with_candidates : int
+        Stars with any candidate.
+    mutual : int
+        Stars that are their likeliest candidate's likeliest star.
+    verdicts : dict of str to int
+        Stars by the verdict on their likeliest candidate.
+    separation_arcsec, delta_mag : ndarray of float64
+        Of the matched stars and their counterparts, the latter where both are known.
+    """
+
+    rows: int
+    matched: int
+    with_candidates: int
+    mutual: int
+    verdicts: dict[str, int]
+    separation_arcsec: Array
+    delta_mag: Array
+
+
+class MeasuredFigures(Protocol):
+    """The figures behind the odds."""
+
+    @property
+    def position_error_rad(self) -> float:
+        """Standard deviation of the difference of two positions, each axis."""
+
+    @property
+    def delta_mag(self) -> float:
+        """Magnitude of the counterpart minus that of the star."""
+
+    @property
+    def completeness(self) -> float:
+        """Share of the stars that have a counterpart."""
+
+
+def tally_of(found: Matches, table: pa.Table) -> Tally:
+    """Count what was found.
+
+    Parameters
+    ----------
+    found : Matches
+        All candidates of some stars.
+    table : pyarrow.Table
+        The same, as rows of the crossmatch product.
+
+    Returns
+    -------
+    Tally
+        The counts.
+    """
+    first = found.rank == 1
+    rows = matched_stars(table)
+    delta = found.delta_mag[rows]
+    return Tally(
+        len(found.rank),
+        len(rows),
+        int(first.sum()),
+        int((first & (found.star_rank == 1)).sum()),
+        {name: found.count(name) for name in VERDICTS if name != "other"},
+        found.separation_rad[rows] / ARCSEC,
+        delta[~np.isnan(delta)],
+    )
+
+
+def summary_of(
+    tally: Tally,
+    rows: tuple[int, int],
+    radius_arcsec: float,
+    figures: MeasuredFigures,
+    median_separation_arcsec: float | None,
+    median_delta_mag: float | None,
+) -> Summary:
+    """Return the summary of a tally of all stars.
+
+    Parameters
+    ----------
+    tally : Tally
+        Its arrays are not read.
+    rows : tuple of int
+        Stars of the two catalogs.
+    radius_arcsec : float
+        Largest separation of a candidate.
+    figures : Odds or Figures
+        What the odds assume.
+    median_separation_arcsec, median_delta_mag : float, optional
+        Over the matched stars; None where there is none.
+
+    Returns
+    -------
+    Summary
+        Rounded.
+    """
+    stars, counterparts = rows
+    return Summary(
+        stars,
+        counterparts,
+        radius_arcsec,
+        tally.matched,
+        stars - tally.matched,
+        tally.verdicts,
+        stars - tally.with_candidates,
+        tally.mutual,
+        None if median_separation_arcsec is None else round(median_separation_arcsec, 6),
+        None if median_delta_mag is None else round(median_delta_mag, 6),
+        round(figures.position_error_rad / ARCSEC, 6),
+        round(figures.delta_mag, 6),
+        round(figures.completeness, 6),
+    )

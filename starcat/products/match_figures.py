@@ -1,0 +1,250 @@
+"""What the odds of a cross-identification need to know of two whole catalogs.
+
+The density on the sky, the distribution of magnitudes, the errors, and how complete a catalog is,
+from counts and medians: the same bits whether a catalog is in one piece or read in parts.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.products.census import Census, MagnitudeCounts, PositionsAndMagnitudes
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+ARCSEC = np.pi / (180.0 * 3600.0)  # rad
+
+MIN_MEASURED = 20
+"""Least number of sure pairs from which anything is measured."""
+
+LEAST_ERROR_RAD = 0.01 * ARCSEC
+"""Least error of a position that is believed, radians: where measured errors are smaller, one
+catalog has copied the positions of the other."""
+
+
+class CandidatePairs(Protocol):
+    """What the odds need to know of pairs."""
+
+    @property
+    def star(self) -> Rows:
+        """Rows of the stars, ascending."""
+
+    @property
+    def counterpart(self) -> Rows:
+        """Rows of the candidates."""
+
+    @property
+    def separation_rad(self) -> Array:
+        """Separations at the epoch of comparison."""
+
+    @property
+    def unmoved_years(self) -> Array:
+        """Years between positions that neither proper motion could bridge."""
+
+
+@dataclass(frozen=True)
+class MatchModel:
+    """How far a star may be from its own counterpart, and what the verdicts ask for.
+
+    Attributes
+    ----------
+    position_error_rad : float, optional
+        Standard deviation of the difference of two positions of a star, each axis, where the
+        catalogs state none; measured if not given.
+    unknown_motion_rad_yr : float
+        Standard deviation of the proper motion of stars that have none in either catalog.
+    outlier_share : float
+        Share of the stars that are off by more than errors explain, up to the radius: double
+        stars of which the catalogs measured different parts, wrong proper motions.
+    expected_delta_mag : float, optional
+        Magnitude of the counterpart minus that of the star, on average; measured if not given.
+    colour_spread_mag : float
+        Standard deviation of that difference: colours, variability, poor magnitudes.
+    completeness : float, optional
+        Share of the stars that have a counterpart at all; measured if not given.
+    ambiguous_odds : float
+        Two candidates whose odds differ by this factor or less cannot be told apart.
+    min_probability : float
+        A star whose candidates together are less probable has but doubtful ones.
+    """
+
+    position_error_rad: float | None = None
+    unknown_motion_rad_yr: float = 0.02 * ARCSEC
+    outlier_share: float = 0.02
+    expected_delta_mag: float | None = None
+    colour_spread_mag: float = 1.0
+    completeness: float | None = None
+    ambiguous_odds: float = 10.0
+    min_probability: float = 0.5
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What all candidate pairs of two catalogs say of them.
+
+    Attributes
+    ----------
+    with_candidates : int
+        Stars that have any.
+    sure, sure_with_mag : int
+        Pairs whose star and candidate have no other, and those with both magnitudes.
+    median_separation_rad, median_delta_mag : float
+        Over these; NaN where there is none.
+    """
+
+    with_candidates: int
+    sure: int
+    sure_with_mag: int
+    median_separation_rad: float
+    median_delta_mag: float
+
+
+def is_sure(star: Rows, counterpart: Rows) -> Flags:
+    """Return which pairs are sure: neither the star nor the candidate has another.
+
+    Parameters
+    ----------
+    star, counterpart : ndarray of int64, shape (M,)
+        Rows of all pairs.
+
+    Returns
+    -------
+    ndarray of bool, shape (M,)
+        True where it is.
+    """
+    if not len(star):
+        return np.empty(0, dtype=bool)
+    alone = np.bincount(star)[star] == 1
+    return np.asarray(alone & (np.bincount(counterpart)[counterpart] == 1))
+
+
+def measure(
+    stars: PositionsAndMagnitudes, counterparts: PositionsAndMagnitudes, pairs: CandidatePairs
+) -> Measured:
+    """Return what the pairs of two whole catalogs say of them.
+
+    Parameters
+    ----------
+    stars, counterparts : MovingStars
+        The two catalogs.
+    pairs : Pairs
+        All candidates within the radius, by star.
+
+    Returns
+    -------
+    Measured
+        Counts and medians.
+    """
+    sure = is_sure(pairs.star, pairs.counterpart)
+    angle = pairs.separation_rad[sure]
+    delta = counterparts.mag[pairs.counterpart[sure]] - stars.mag[pairs.star[sure]]
+    known = delta[~np.isnan(delta)]
+    return Measured(
+        len(np.unique(pairs.star)),
+        len(angle),
+        len(known),
+        float(np.median(angle)) if len(angle) else float("nan"),
+        float(np.median(known)) if len(known) else float("nan"),
+    )
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What all pairs of two catalogs have in common.
+
+    Attributes
+    ----------
+    position_error_rad : float
+        Standard deviation of the difference of two positions of a star, each axis, unless the
+        catalogs state their errors themselves.
+    delta_mag : float
+        Magnitude of the counterpart minus that of the star, on average.
+    completeness, shared : float
+        Share of the stars that have a counterpart, and of the counterparts that have a star.
+    density : ndarray of float64, shape (TILES,)
+        Counterparts per steradian around each tile of the sky.
+    magnitudes : MagnitudeCounts
+        Of the counterparts.
+    """
+
+    position_error_rad: float
+    delta_mag: float
+    completeness: float
+    shared: float
+    density: Array
+    magnitudes: MagnitudeCounts
+
+
+def figures_of(
+    stars: Census, counterparts: Census, measured: Measured, radius_rad: float, model: MatchModel
+) -> Figures:
+    """Return the figures of two catalogs, given by the model or measured.
+
+    Parameters
+    ----------
+    stars, counterparts : Census
+        Counts of the two.
+    measured : Measured
+        What all their pairs say.
+    radius_rad : float
+        Largest separation of a candidate.
+    model : MatchModel
+        What is not to be measured.
+
+    Returns
+    -------
+    Figures
+        The figures.
+    """
+    density = counterparts.density()
+    share = _completeness(stars, measured, density * np.pi * radius_rad**2, model)
+    # As many counterparts have a star as stars have a counterpart.
+    shared = min(share * stars.stars / max(counterparts.stars, 1), 0.999)
+    return Figures(
+        _position_error(measured, radius_rad, model),
+        _offset(measured, model),
+        share,
+        shared,
+        density,
+        counterparts.magnitudes,
+    )
+
+
+def _position_error(measured: Measured, radius_rad: float, model: MatchModel) -> float:
+    """Return the error that all pairs share."""
+    if model.position_error_rad is not None:
+        return model.position_error_rad
+    if measured.sure < MIN_MEASURED:
+        return min(float(ARCSEC), 0.2 * radius_rad)
+    # Separations have Rayleigh's distribution, whose median is sqrt(2 ln 2) standard deviations.
+    error = measured.median_separation_rad / float(np.sqrt(2.0 * np.log(2.0)))
+    return max(error, LEAST_ERROR_RAD)
+
+
+def _offset(measured: Measured, model: MatchModel) -> float:
+    if model.expected_delta_mag is not None:
+        return model.expected_delta_mag
+    return measured.median_delta_mag if measured.sure_with_mag >= MIN_MEASURED else 0.0
+
+
+def _completeness(stars: Census, measured: Measured, expected: Array, model: MatchModel) -> float:
+    """Return the share of stars that have a counterpart.
+
+    It is one minus the share of stars without any candidate, over the share that would have
+    none at random places (Fleuren et al. 2012, MNRAS 423, 2407). The latter is a sum over tiles
+    that is rounded once, so that the order of the stars does not matter.
+    """
+    if model.completeness is not None:
+        return model.completeness
+    if not stars.stars:
+        return 0.5
+    blank = 1.0 - measured.with_candidates / stars.stars
+    by_chance = math.fsum((stars.tiles * np.exp(-expected)).tolist()) / stars.stars
+    return float(np.clip(1.0 - blank / by_chance, 0.001, 0.999))
