@@ -1,0 +1,286 @@
+"""Stars of a catalog store by place: those of a partition, or of any region of the sky.
+
+The store is one of starcat's, or any HATS catalog that has the columns of a star table and the
+pixel of order 29 of each star. Row groups whose statistics say that they have nothing of the
+region are not read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from starcat.artifact.crossmatch_table import NEEDED
+from starcat.errors import ParseError, ProductError, SchemaError, reason
+from starcat.pipeline.counterparts import check_star_columns
+from starcat.store.layout import Partition, Store, open_store
+from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, Pixels, healpix_29
+from starcat.store.region import WHOLE_SKY, Region
+from starcat.tables.schema import product_schema
+
+_HINT = "give a catalog store, as 'starcat ingest SOURCE --to hats -o DIR' writes it"
+
+
+@lru_cache(maxsize=4)
+def opened(folder: Path, run: Path) -> Store:
+    """Open a store once in each process and run.
+
+    Parameters
+    ----------
+    folder : Path
+        The store.
+    run : Path
+        What no other run has, such as its folder for unfinished work.
+
+    Returns
+    -------
+    Store
+        Checked to have the columns of a star table.
+
+    Raises
+    ------
+    SchemaError
+        If it lacks one.
+    ProductError
+        If it is no store.
+    """
+    store = open_store(folder)
+    order = store.catalog.properties.get("hats_col_healpix_order", str(MAX_ORDER))
+    if order != str(MAX_ORDER):
+        raise ProductError(
+            f"{folder}: hats_col_healpix_order is {order}; expected pixels of order {MAX_ORDER}",
+            path=folder,
+        )
+    for partition in store.catalog.partitions[:1]:
+        with _parquet(partition.paths[0]) as file:
+            names = set(file.schema_arrow.names)
+        lacking = [name for name in (*NEEDED, _pixel_column(store)) if name not in names]
+        if lacking:
+            raise SchemaError(
+                f"{folder}: no column {', '.join(lacking)}; {_HINT}",
+                product="stars",
+                field=lacking[0],
+                found=sorted(names),
+                expected=NEEDED,
+            )
+    return store
+
+
+def rows_of_partition(
+    store: Store, partition: Partition, columns: Sequence[str]
+) -> Iterator[pa.Table]:
+    """Yield the stars of a partition, a row group at a time.
+
+    Parameters
+    ----------
+    store : Store
+        The catalog.
+    partition : Partition
+        One of its partitions.
+    columns : sequence of str
+        Columns of a star table.
+
+    Yields
+    ------
+    pyarrow.Table
+        With these columns and ``_healpix_29``.
+
+    Raises
+    ------
+    SchemaError
+        If a star lacks what places it, or a column is of another type.
+    ProductError
+        If a star is not in the pixel of the partition.
+    ParseError
+        If a file is damaged.
+    """
+    first, end = partition.pixel.first, partition.pixel.end
+    for path in partition.paths:
+        with _parquet(path) as file:
+            for group in range(file.num_row_groups):
+                table = _read(file, group, store, columns, path)
+                pixels = table[HEALPIX_COLUMN].to_numpy()
+                if len(pixels) and not (pixels.min() >= first and pixels.max() < end):
+                    raise ProductError(
+                        f"{path}: has stars that are not in pixel {partition.pixel.number} of "
+                        f"order {partition.pixel.order}; make the store again",
+                        path=path,
+                    )
+                yield table
+
+
+def rows_of_region(store: Store, region: Region, columns: Sequence[str]) -> pa.Table:
+    """Return the stars of a region.
+
+    Parameters
+    ----------
+    store : Store
+        The catalog.
+    region : Region
+        Any part of the sky.
+    columns : sequence of str
+        Columns of a star table, ``star_id`` among them.
+
+    Returns
+    -------
+    pyarrow.Table
+        With these columns and ``_healpix_29``, in order of ``star_id`` and pixel.
+
+    Raises
+    ------
+    SchemaError, ParseError
+        As `rows_of_partition` does.
+    """
+    schema = _schema(columns)
+    parts = [schema.empty_table()]
+    bounds = np.array(region.ranges, dtype=np.int64)
+    for partition in store.catalog.partitions:
+        if not _touches(bounds, partition.pixel.first, partition.pixel.end - 1):
+            continue
+        for path in partition.paths:
+            with _parquet(path) as file:
+                parts += _parts(file, store, region, bounds, columns, path)
+    keys = [("star_id", "ascending"), (HEALPIX_COLUMN, "ascending")]
+    return pa.concat_tables(parts).sort_by(keys).combine_chunks()
+
+
+def _parts(
+    file: pq.ParquetFile,
+    store: Store,
+    region: Region,
+    bounds: Pixels,
+    columns: Sequence[str],
+    path: Path,
+) -> Iterator[pa.Table]:
+    """Yield what the row groups of a file have of a region."""
+    column = _pixel_column(store)
+    place = file.schema_arrow.names.index(column)
+    for group in range(file.num_row_groups):
+        known = _extent(file.metadata.row_group(group), column)
+        if known is not None and not _touches(bounds, *known):
+            continue
+        pixels = file.read_row_group(group, [column])[column].to_numpy()
+        inside = region.level_of(np.asarray(pixels, dtype=np.int64)) >= 0
+        if inside.any():
+            yield _read(file, group, store, columns, path).filter(pa.array(inside))
+    del place
+
+
+def _extent(group: Any, column: str) -> tuple[int, int] | None:
+    """Return the lowest and the highest pixel of a row group; None where it does not say."""
+    for number in range(group.num_columns):
+        chunk = group.column(number)
+        if chunk.path_in_schema == column:
+            known = chunk.statistics
+            return (known.min, known.max) if known is not None and known.has_min_max else None
+    return None
+
+
+def _touches(bounds: Pixels, lowest: int, highest: int) -> bool:
+    """Return whether any range reaches into the pixels from the lowest to the highest."""
+    place = int(np.searchsorted(bounds[:, 1], lowest, side="right"))
+    return place < len(bounds) and bool(bounds[place, 0] <= highest)
+
+
+def _read(
+    file: pq.ParquetFile, group: int, store: Store, columns: Sequence[str], path: Path
+) -> pa.Table:
+    """Read a row group with the types of a star table; checked."""
+    column = _pixel_column(store)
+    table = file.read_row_group(group, [*columns, column])
+    schema = _schema(columns)
+    arrays = []
+    for field in schema:
+        values = table[column if field.name == HEALPIX_COLUMN else field.name]
+        is_text = pa.types.is_string(field.type) or field.name == HEALPIX_COLUMN
+        # Other writers have larger texts and dictionaries of them, which mean the same.
+        arrays.append(values.cast(field.type) if is_text else values)
+    read = pa.table(dict(zip(schema.names, arrays, strict=True)))
+    check_star_columns(read, path)
+    if read[HEALPIX_COLUMN].null_count:
+        raise SchemaError(
+            f"{path}: {column}: found {read[HEALPIX_COLUMN].null_count} rows without a value; "
+            "a catalog store has a pixel in every row",
+            product="stars",
+            field=column,
+        )
+    return read.cast(schema)
+
+
+def _schema(columns: Sequence[str]) -> pa.Schema:
+    known = product_schema("stars").arrow_schema
+    fields = [known.field(name) for name in columns]
+    return pa.schema([*fields, pa.field(HEALPIX_COLUMN, pa.int64(), nullable=False)])
+
+
+def _pixel_column(store: Store) -> str:
+    return store.catalog.properties.get("hats_col_healpix", HEALPIX_COLUMN)
+
+
+@contextmanager
+def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
+    """Open a file of a store; what the library says of a damaged one is said as starcat does."""
+    try:
+        with pq.ParquetFile(path) as file:
+            yield file
+    except (OSError, pa.ArrowException, KeyError) as error:
+        why = reason(error) if isinstance(error, OSError) else str(error)
+        raise ParseError(
+            f"{path}: cannot be read as Parquet ({why}); the store is damaged, make or get it "
+            "again",
+            path=path,
+        ) from error
+
+
+def store_of_file(stars: pa.Table, path: Path, folder: Path) -> None:
+    """Write a star table as a HATS catalog of twelve partitions, to be read by place.
+
+    Parameters
+    ----------
+    stars : pyarrow.Table
+        As `read_star_table` gives it.
+    path : Path
+        Where it is from, for the message.
+    folder : Path
+        Made.
+
+    Raises
+    ------
+    SchemaError
+        If a declination is none.
+    """
+    dec_deg = stars["dec_deg"].to_numpy()
+    if len(dec_deg) and np.abs(dec_deg).max() > 90.0:
+        raise SchemaError(
+            f"{path}: dec_deg: found {dec_deg[np.abs(dec_deg).argmax()]}; a declination is from "
+            "-90 to 90. Make the table with 'starcat ingest'",
+            product="stars",
+            field="dec_deg",
+        )
+    pixels = healpix_29(stars["ra_deg"].to_numpy(), dec_deg)
+    order = np.argsort(pixels, kind="stable")
+    table = stars.append_column(HEALPIX_COLUMN, pa.array(pixels)).take(pa.array(order))
+    widths = WHOLE_SKY[0][1] // 12
+    bounds = np.searchsorted(pixels[order], [number * widths for number in range(13)])
+    lines = ["Norder,Npix"]
+    for number in range(12):
+        rows = table.slice(bounds[number], bounds[number + 1] - bounds[number])
+        if len(rows):
+            lines.append(f"0,{number}")
+            place = folder / "dataset" / "Norder=0" / "Dir=0" / f"Npix={number}.parquet"
+            place.parent.mkdir(parents=True, exist_ok=True)
+            pq.write_table(rows, place, row_group_size=_SMALL_GROUP)
+    folder.mkdir(exist_ok=True)
+    (folder / "partition_info.csv").write_text("\n".join(lines) + "\n")
+    (folder / "hats.properties").write_text(f"hats_col_healpix={HEALPIX_COLUMN}\n")
+
+
+_SMALL_GROUP = 1 << 15
+"""Rows of a row group in these, so that a region reads little beside its own."""
