@@ -8,9 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from genuine_records import PSC as RECORD
+from hypothesis import given
+from hypothesis import strategies as st
 
+from starcat.catalog.readers import delimited
 from starcat.catalog.readers.delimited import parse_delimited
-from starcat.catalog.readers.records import Problem
+from starcat.catalog.readers.records import Problem, Records
 from starcat.catalog.source import Column, RecordFile, data_source
 
 PSC = data_source("2mass").files[0]
@@ -177,3 +180,56 @@ def test_blocks_do_not_matter(catalogs: Path) -> None:
     assert [*first.line, *second.line] == whole.line.tolist()
     for name in names:
         np.testing.assert_array_equal(np.concatenate([first[name], second[name]]), whole[name])
+
+
+FIELDS = st.sampled_from(
+    [b"", b"a", b" b ", b"ccc", b"7.5", b"-1", b"99.99", b"none", b"?", b"#", b'"', b"\0", b"\xb7"]
+)
+LINES = st.one_of(
+    st.lists(FIELDS, min_size=3, max_size=3),
+    st.tuples(FIELDS, st.sampled_from([b"7.5", b"1e3", b"99.99"]), FIELDS),
+    st.lists(FIELDS, min_size=0, max_size=5),
+).map(b",".join)
+ENDS = st.sampled_from([b"\n", b"\n", b"\n", b"\n", b"\r\n", b"\n\n", b"\n#", b"\r"])
+
+
+def same(one: Records, other: Records) -> None:
+    assert one.line.dtype == other.line.dtype
+    assert one.line.tolist() == other.line.tolist()
+    assert one.problems == other.problems
+    for name, values in one.columns.items():
+        assert values.dtype == other[name].dtype
+        assert values.tobytes() == other[name].tobytes(), name
+
+
+@given(st.lists(st.tuples(LINES, ENDS), max_size=6), st.booleans(), st.integers(1, 99))
+def test_a_block_read_at_once_is_as_if_read_by_lines(
+    parts: list[tuple[bytes, bytes]], is_cut: bool, first_line: int
+) -> None:
+    data = b"".join(line + end for line, end in parts)
+    data = data.removesuffix(b"\n") if is_cut else data
+    chosen = list(TINY.columns)
+    at_once = delimited._parse_regular(data, TINY, chosen, first_line)
+    by_lines = delimited._parse_lines(data, TINY, chosen, first_line)
+    if at_once is not None:
+        same(at_once, by_lines)
+    elif data and not by_lines.problems:
+        # Only what must be gone through line by line is.
+        assert b"\r" in data or b"\n\n" in data or data[:1] in b"\n#" or b"\n#" in data
+
+
+def test_a_regular_block_is_read_at_once() -> None:
+    data = (RECORD + b"\n") * 3
+    names = [column.name for column in PSC.columns]
+    at_once = delimited._parse_regular(data, PSC, [PSC.column(name) for name in names], 5)
+    assert at_once is not None
+    same(at_once, delimited._parse_lines(data, PSC, list(PSC.columns), 5))
+    assert at_once.line.tolist() == [5, 6, 7]
+
+
+def test_text_of_one_length_and_of_several_is_padded_alike() -> None:
+    even = parse_delimited(b"abc,1,x\ndef,2,y\n", TINY, ["name"])["name"]
+    uneven = parse_delimited(b"abc,1,x\nd,2,y\n\xb7\xb7\xb7,3,\n", TINY, ["name", "code"])
+    assert even.tobytes() == b"abcdef"
+    assert uneven["name"].tobytes() == b"abcd  \xb7\xb7\xb7"
+    assert uneven["code"].tobytes() == b"xy "

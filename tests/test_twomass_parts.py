@@ -10,9 +10,11 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 
-from twomass_parts import FAINTEST_KS_MAG, PARTS, part_bytes, write_parts
+from twomass_parts import FAINTEST_KS_MAG, KINDS, PARTS, part_bytes, write_parts
 
 from starcat.catalog.ingest import ingest
+from starcat.catalog.quality import Quality
+from starcat.catalog.stars import floats_of
 from starcat.geometry.sphere import directions_from_radec, separation
 
 ROWS = 92 * 300
@@ -25,10 +27,24 @@ def read(tmp_path_factory):
     return ingest("2mass", [folder / f"psc_{part}.gz" for part in PARTS])
 
 
-def test_every_record_is_a_star(read):
-    assert read.rows_read == len(read.stars) == ROWS
+def test_every_record_is_a_star_or_rejected_for_what_it_is(read):
+    assert read.rows_read == len(read.stars) + len(read.rejected) == ROWS
     assert read.problems == ()
-    assert sorted(read.stars["star_id"].to_pylist()) == list(range(1, ROWS + 1))
+    numbers = [*read.stars["star_id"].to_pylist(), *read.rejected["star_id"].to_pylist()]
+    assert sorted(numbers) == list(range(1, ROWS + 1))
+    share = {name: share for name, share, _ in KINDS}
+    found = read.rejected_by_reason
+    assert set(found) >= {"duplicate_record", "extended", "artifact"}
+    assert found["duplicate_record"] == pytest.approx(share["repeated"] * ROWS, rel=0.15)
+    assert found["extended"] == pytest.approx(share["extended"] * ROWS, rel=0.3)
+
+
+def test_faint_records_have_upper_limits_for_magnitudes(read):
+    mag = read.stars["mag"]
+    assert 0.02 < mag.null_count / ROWS < 0.08
+    flags = read.stars["quality_flags"].to_numpy()
+    for bit in (Quality.SATURATED, Quality.BLENDED, Quality.POOR_PHOTOMETRY, Quality.CONTAMINATED):
+        assert (flags & bit).any(), bit
 
 
 def test_stars_crowd_along_the_galactic_plane(read):
@@ -40,8 +56,8 @@ def test_stars_crowd_along_the_galactic_plane(read):
 
 
 def test_counts_grow_tenfold_in_two_and_a_half_magnitudes(read):
-    mag = read.stars["mag"].to_numpy()
-    assert mag.max() <= FAINTEST_KS_MAG
+    mag = floats_of(read.stars, "mag")
+    assert np.nanmax(mag) <= FAINTEST_KS_MAG
     counts = [int(np.sum(mag < FAINTEST_KS_MAG - step)) for step in (0.0, 2.5)]
     assert 8.0 < counts[0] / counts[1] < 12.5
 

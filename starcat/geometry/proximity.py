@@ -26,20 +26,79 @@ def nearest_neighbours(
     separation_rad : ndarray of float64, shape (N,)
         Great-circle separation.
     index : ndarray of int64, shape (N,)
-        Row of the neighbour.
+        Row of the neighbour; of several at the same separation the first.
+    """
+    rows = np.arange(len(directions))
+    chord, index = nearest_chords(directions, directions, rows, rows, workers)
+    return separation_from_chord(chord), index
+
+
+def nearest_chords(
+    points: NDArray[np.float64],
+    stars: NDArray[np.float64],
+    itself: NDArray[np.int64],
+    rank: NDArray[np.int64],
+    workers: int = 1,
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the nearest star of each point that is not the point itself.
+
+    Parameters
+    ----------
+    points : ndarray of float64, shape (M, 3)
+        ICRS unit vectors.
+    stars : ndarray of float64, shape (N, 3)
+        Where the neighbours are looked for.
+    itself : ndarray of int64, shape (M,)
+        Row of ``stars`` that is the point; -1 where none is.
+    rank : ndarray of int64, shape (N,)
+        Of several stars at the same distance, that of the lowest rank is taken.
+    workers : int, default 1
+        Threads.
+
+    Returns
+    -------
+    chord : ndarray of float64, shape (M,)
+        Length of the chord between the two; infinite where there is no other star.
+    index : ndarray of int64, shape (M,)
+        Row of ``stars``; their number where there is none.
     """
     # A plain split by midpoints builds far faster and searches no slower on a sky of stars.
-    tree = cKDTree(directions, leafsize=32, balanced_tree=False)
-    near = tree.query(directions, k=2, workers=workers)
-    chord, found = np.asarray(near[0], dtype=np.float64), np.asarray(near[1], dtype=np.int64)
-    # The tree may name either of two stars at the same place first.
-    itself = found[:, 0] == np.arange(len(directions))
-    index = np.where(itself, found[:, 1], found[:, 0])
-    chord = np.where(itself, chord[:, 1], chord[:, 0])
+    tree = cKDTree(stars, leafsize=16, balanced_tree=False)
+    best, index = np.full(len(points), np.inf), np.full(len(points), len(stars))
+    rows, count = np.arange(len(points)), 3
+    while len(rows):
+        near = tree.query(points[rows], k=count, workers=workers)
+        chord, found = np.asarray(near[0]), np.asarray(near[1], dtype=np.int64)
+        furthest = chord[:, -1].copy()
+        chord[found == itself[rows, None]] = np.inf
+        least = chord.min(axis=1)
+        found = np.where(chord == least[:, None], found, len(stars))
+        ranked = np.where(found < len(stars), np.append(rank, 0)[found], np.iinfo(np.int64).max)
+        first = ranked.argmin(axis=1)
+        best[rows], index[rows] = least, found[np.arange(len(rows)), first]
+        # Where the last of those found is as near as the first, more may be.
+        rows = rows[(furthest == least) & np.isfinite(furthest)]
+        count = min(4 * count, len(stars) + 1)
+    return best, index
+
+
+def separation_from_chord(chord: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the separation of directions whose tips are a chord apart.
+
+    Parameters
+    ----------
+    chord : ndarray of float64, shape (N,)
+        0 to 2.
+
+    Returns
+    -------
+    ndarray of float64, shape (N,)
+        Radians.
+    """
     # Chord |u - v| and |u + v| are the legs of a right triangle over the diameter.
     # The chord of antipodes may be rounded above the diameter.
     other = np.sqrt(np.maximum(2.0 - chord, 0.0) * (2.0 + chord))
-    return 2.0 * np.arctan2(chord, other), index
+    return 2.0 * np.arctan2(chord, other)
 
 
 def pairs_within(

@@ -25,6 +25,8 @@ MAX_ORDER = 29
 HEALPIX_COLUMN = "_healpix_29"
 _PIXELS_A_FOLDER = 10_000
 
+_FIRST_WIDTH_RAD = 0.45 * np.sqrt(np.pi / 3.0)
+
 Pixels = NDArray[np.int64]
 
 
@@ -113,7 +115,7 @@ def healpix_29(ra_deg: NDArray[np.float64], dec_deg: NDArray[np.float64]) -> Pix
 
 
 def border_of(pixel: Pixel, width_rad: float) -> tuple[int, Pixels]:
-    """Return small pixels around a pixel that hold everything within a distance of it.
+    """Return pixels that hold everything within a distance of a pixel.
 
     Parameters
     ----------
@@ -125,21 +127,21 @@ def border_of(pixel: Pixel, width_rad: float) -> tuple[int, Pixels]:
     Returns
     -------
     order : int
-        Order of the small pixels, at least that of the pixel.
+        Their order: the highest of which no pixel is narrower than the distance.
     pixels : ndarray of int64, shape (N,)
-        Ascending; none is part of the pixel.
-
-    Notes
-    -----
-    A ring of pixels no narrower than the distance. Where the pixel itself is narrower than that,
-    rings of pixels of its own order are laid around it until they are wide enough.
+        Ascending. The ring of them around the pixel, where they are no larger than it; else the
+        one that it lies in and those around that one.
     """
     order = border_order(width_rad)
+    if width_rad > _FIRST_WIDTH_RAD:
+        return 0, np.arange(12, dtype=np.int64)
     if order >= pixel.order:
         depth = order - pixel.order
-        ring = _nested().external_neighbours(np.array([pixel.number]), pixel.order, depth)
-        return order, _valid(*ring)
-    return pixel.order, _rings(pixel, width_rad)
+        return order, _valid(
+            *_nested().external_neighbours(np.array([pixel.number]), pixel.order, depth)
+        )
+    around = _nested().neighbours(pixel.at(order), order)
+    return order, _valid(pixel.at(order), around)
 
 
 def neighbours_of(pixels: Pixels, order: int) -> Pixels:
@@ -192,25 +194,13 @@ def least_width_rad(order: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
         Radians: 0.45 times the square root of a pixel's area. The narrowest pixels, near the
         poles, have 0.480 of it between opposite edges (all pixels of orders 0 to 8 measured).
     """
-    side = np.sqrt(np.pi / 3.0) / 2.0 ** np.asarray(order, dtype=np.float64)
-    return np.asarray(0.45 * side)
+    return np.asarray(_FIRST_WIDTH_RAD / 2.0 ** np.asarray(order, dtype=np.float64))
 
 
-def _rings(pixel: Pixel, width_rad: float) -> Pixels:
-    count = int(np.ceil(width_rad / least_width_rad(np.array([pixel.order]))[0]))
-    found = np.array([pixel.number], dtype=np.int64)
-    edge = found
-    for _ in range(count):
-        edge = np.setdiff1d(neighbours_of(edge, pixel.order), found)
-        found = np.union1d(found, edge)
-        if not len(edge):
-            break
-    return np.asarray(found[found != pixel.number])
-
-
-def _valid(edges: Any, corners: Any) -> Pixels:
-    both = np.concatenate([np.ravel(edges), np.ravel(corners)]).astype(np.int64)
-    return np.unique(both[both >= 0])
+def _valid(*parts: Any) -> Pixels:
+    """Return pixels in order, each once; the library has -1 where a pixel has no neighbour."""
+    together = np.concatenate([np.ravel(part) for part in parts]).astype(np.int64)
+    return np.unique(together[together >= 0])
 
 
 @cache

@@ -115,12 +115,13 @@ def _any_flag(
     """Return where a flag column has one of the codes in any of the bands."""
     text = records[column]
     chars = text.view(np.uint8).reshape(len(text), text.dtype.itemsize)
-    wanted = np.frombuffer(codes, dtype=np.uint8)
+    is_wanted = np.zeros(256, dtype=bool)
+    is_wanted[list(codes)] = True
     found = np.zeros(len(text), dtype=bool)
     for band in bands:
         place = _BANDS[band][0]
         if place < chars.shape[1]:
-            found |= np.isin(chars[:, place], wanted)
+            found |= is_wanted[chars[:, place]]
     return found
 
 
@@ -132,7 +133,15 @@ def _identity(records: Records) -> NDArray[np.int64]:
     north, 2 for south.
     """
     key = records["pts_key"]
-    text = records["designation"]
+    number: NDArray[np.int64] = np.nan_to_num(key).astype(np.int64)
+    unknown = np.isnan(key)
+    if unknown.any():
+        number[unknown] = _packed(records["designation"][unknown])
+    return number
+
+
+def _packed(text: NDArray[np.bytes_]) -> NDArray[np.int64]:
+    """Return designations as numbers; 0 for a text that is none."""
     chars = np.zeros((len(text), 20), dtype=np.uint8)
     given = text.view(np.uint8).reshape(len(text), text.dtype.itemsize)[:, :20]
     chars[:, : given.shape[1]] = given
@@ -142,6 +151,4 @@ def _identity(records: Records) -> NDArray[np.int64]:
     packed = digits @ (10 ** np.arange(14, -1, -1, dtype=np.int64)) + component * 10**15
     packed += np.where(sign == ord("-"), 2, 1) * 10**18
     is_regular = ((digits >= 0) & (digits <= 9)).all(axis=1) & np.isin(sign, [ord("+"), ord("-")])
-    return np.where(
-        np.isnan(key), np.where(is_regular, packed, 0), np.nan_to_num(key).astype(np.int64)
-    )
+    return np.where(is_regular, packed, 0)

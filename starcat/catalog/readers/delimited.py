@@ -1,7 +1,8 @@
 """The reader of delimited records, driven by a source's column table.
 
-pyarrow's CSV reader parses whole blocks. Only when a block holds a field that is not of its
-column's kind is the block read again as text, to find the line and to keep the other records.
+pyarrow's CSV reader parses whole blocks. A block with comments, empty lines or lines that are no
+records is gone through line by line first; one with a field that is not of its column's kind is
+read as text, to find the line and to keep the other records.
 """
 
 from __future__ import annotations
@@ -48,10 +49,39 @@ def parse_delimited(
     Records
         The good records and the problems of the others.
     """
-    lines = data.splitlines()
+    chosen = [layout.column(name) for name in names]
+    records = _parse_regular(data, layout, chosen, first_line)
+    if records is None:
+        records = _parse_lines(data, layout, chosen, first_line)
+    return reject_impossible_numbers(reject_required_blanks(records, layout), layout)
+
+
+def _parse_regular(
+    data: bytes, layout: RecordFile, chosen: Sequence[Column], first_line: int
+) -> Records | None:
+    """Parse a block in which every line is a good record; return None for any other block."""
+    comment = layout.comment.encode()
+    has_comment = comment and (data.startswith(comment) or b"\n" + comment in data)
+    if not data or has_comment or b"\r" in data:
+        return None
+    try:
+        table = _read_csv(data, layout, chosen, as_text=False)
+        if len(table) != data.count(b"\n") + (not data.endswith(b"\n")):
+            return None  # pyarrow passes over empty lines
+        columns = {column.name: _array(table[column.name], column) for column in chosen}
+    except (pa.ArrowInvalid, pa.ArrowKeyError):
+        return None
+    line = np.arange(first_line, first_line + len(table), dtype=np.int64)
+    return Records(layout.name, line, columns)
+
+
+def _parse_lines(
+    data: bytes, layout: RecordFile, chosen: Sequence[Column], first_line: int
+) -> Records:
+    """Parse a block line by line, and list the lines that are no records."""
     delimiter, comment = layout.delimiter.encode(), layout.comment.encode()
     number, kept, problems = [], [], []
-    for offset, text in enumerate(lines):
+    for offset, text in enumerate(data.splitlines()):
         if not text or (comment and text.startswith(comment)):
             continue
         fields = text.count(delimiter) + 1
@@ -66,21 +96,18 @@ def parse_delimited(
     line = np.array(number, dtype=np.int64)
     if not kept:
         empty: dict[str, NDArray[Any]] = {
-            name: np.empty(0, "S1" if layout.column(name).is_text else float) for name in names
+            column.name: np.empty(0, "S1" if column.is_text else float) for column in chosen
         }
         return Records(layout.name, line, empty, problems)
     clean = b"\n".join(kept)
-    chosen = [layout.column(name) for name in names]
+    bad = np.zeros(len(line), dtype=bool)
     try:
         table = _read_csv(clean, layout, chosen, as_text=False)
         columns = {column.name: _array(table[column.name], column) for column in chosen}
-        bad = np.zeros(len(line), dtype=bool)
     except (pa.ArrowInvalid, pa.ArrowKeyError):
         table = _read_csv(clean, layout, chosen, as_text=True)
-        bad = np.zeros(len(line), dtype=bool)
         columns = {c.name: _array_by_field(table[c.name], c, line, bad, problems) for c in chosen}
-    records = Records(layout.name, line, columns).without(bad, problems)
-    return reject_impossible_numbers(reject_required_blanks(records, layout), layout)
+    return Records(layout.name, line, columns).without(bad, problems)
 
 
 def _read_csv(
@@ -118,9 +145,13 @@ def _array(values: pa.ChunkedArray, column: Column) -> NDArray[Any]:
 
 def _text_array(values: pa.ChunkedArray) -> NDArray[Any]:
     """Return text as fixed-width bytes padded with blanks, as the fixed-width reader does."""
-    filled = pc.fill_null(values.cast(pa.binary()), b"")
+    filled = pc.fill_null(values.combine_chunks(), b"")
     width = max(1, pc.max(pc.binary_length(filled)).as_py() or 1)
-    return np.array([text.ljust(width) for text in filled.to_pylist()], dtype=f"S{width}")
+    # The kernel pads bytes of any kind; the view does not ask whether they are letters.
+    padded = pc.ascii_rpad(filled.view(pa.string()), width)
+    _, offsets, content = padded.buffers()
+    first = int(np.frombuffer(offsets, dtype=np.int32, count=padded.offset + 1)[padded.offset])
+    return np.frombuffer(content, dtype=f"S{width}", count=len(padded), offset=first)
 
 
 def _array_by_field(

@@ -1,0 +1,267 @@
+"""Runs: the stars of one input, sorted by pixel, in files that a partition reads its share of.
+
+Splitting an archive writes runs; finishing a partition reads from every run the batches of its
+pixels. A run has one Arrow batch for each coarse pixel, and beside it the numbers of its stars in
+buckets, by which records of the same star are found wherever on the sky they are.
+
+Columns that are the same all through a run, such as those that an archive does not have, are kept
+as one value in the run's metadata: half of the bytes of 2MASS.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from starcat.catalog.stars import floats_of
+from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, Pixels, healpix_29
+from starcat.tables.schema import product_schema
+
+BUCKETS = 64
+HISTOGRAM_ORDER = 9
+"""Order at which stars are counted (7 arcmin): no partition is smaller than such a pixel."""
+
+_CONSTANTS = b"starcat.constants"
+_SPREAD = np.uint64(0x9E3779B97F4A7C15)
+_PLACE_BITS = np.int64(40)
+
+PLACES = np.dtype([("star_id", np.int64), ("place", np.int64)])
+"""A record: the number of its star, and its file and line as one number (`places_of`)."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run on disk.
+
+    Attributes
+    ----------
+    stars, places : Path
+        Arrow file of the stars; file of `PLACES`, by bucket.
+    pixels, rows : ndarray of int64, shape (B,)
+        Coarse pixel and number of stars of each batch.
+    buckets : ndarray of int64, shape (BUCKETS + 1,)
+        Where each bucket begins in ``places``.
+    """
+
+    stars: Path
+    places: Path
+    pixels: Pixels
+    rows: NDArray[np.int64]
+    buckets: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Share:
+    """The batches of a run that a partition reads.
+
+    Attributes
+    ----------
+    stars : Path
+        Arrow file of the run.
+    batches : tuple of int
+        Their numbers, ascending.
+    """
+
+    stars: Path
+    batches: tuple[int, ...]
+
+
+def places_of(stars: pa.Table) -> NDArray[np.int64]:
+    """Return file and line of every star as one number, in reading order.
+
+    Parameters
+    ----------
+    stars : pyarrow.Table
+        With ``source_file`` and ``source_line``.
+
+    Returns
+    -------
+    ndarray of int64, shape (N,)
+        The number of the file above 40 bits of the line's.
+    """
+    file = stars["source_file"].to_numpy().astype(np.int64)
+    return np.asarray((file << _PLACE_BITS) | stars["source_line"].to_numpy())
+
+
+def write_run(stars: pa.Table, order: int, folder: Path, name: str) -> tuple[Run, Pixels]:
+    """Write stars as a run.
+
+    Parameters
+    ----------
+    stars : pyarrow.Table
+        Table of the stars schema, in reading order.
+    order : int
+        Order of the coarse pixels.
+    folder, name : Path, str
+        Where, and what its files are called.
+
+    Returns
+    -------
+    run : Run
+        As written.
+    pixels : ndarray of int64, shape (N,)
+        Pixel of order 29 of every star, ascending.
+    """
+    pixels = healpix_29(floats_of(stars, "ra_deg"), floats_of(stars, "dec_deg"))
+    ascending = np.argsort(pixels, kind="stable")
+    pixels = pixels[ascending]
+    stars = stars.combine_chunks()
+    varying, constants = _without_constants(stars)
+    table = varying.take(pa.array(ascending))
+    table = table.add_column(0, HEALPIX_COLUMN, pa.array(pixels))
+    table = table.replace_schema_metadata({_CONSTANTS: json.dumps(constants).encode()})
+    coarse, begins = np.unique(pixels >> 2 * (MAX_ORDER - order), return_index=True)
+    rows = np.diff([*begins, len(pixels)]).astype(np.int64)
+    path = folder / f"{name}.arrow"
+    with pa.OSFile(str(path), "wb") as sink, pa.ipc.new_file(sink, table.schema) as writer:
+        for begin, count in zip(begins.tolist(), rows.tolist(), strict=True):
+            for batch in table.slice(begin, count).combine_chunks().to_batches():
+                writer.write_batch(batch)
+    places, buckets = _by_bucket(stars)
+    beside = folder / f"{name}.places"
+    places.tofile(beside)
+    return Run(path, beside, coarse.astype(np.int64), rows, buckets), pixels
+
+
+def _without_constants(stars: pa.Table) -> tuple[pa.Table, dict[str, Any]]:
+    """Take out the columns that have one value in all rows; say which."""
+    constants: dict[str, Any] = {}
+    for name in stars.column_names:
+        column = stars[name]
+        kind = column.type
+        if column.null_count == len(stars):
+            constants[name] = None
+        elif column.null_count or not (
+            pa.types.is_string(kind) or pa.types.is_boolean(kind) or pa.types.is_int32(kind)
+        ):
+            continue
+        elif pc.all(pc.equal(column, column[0])).as_py():
+            constants[name] = column[0].as_py()
+    return stars.drop_columns(list(constants)), constants
+
+
+def _by_bucket(stars: pa.Table) -> tuple[NDArray[Any], NDArray[np.int64]]:
+    numbers = stars["star_id"].to_numpy()
+    bucket = (numbers.view(np.uint64) * _SPREAD >> np.uint64(58)).astype(np.int8)
+    order = np.argsort(bucket, kind="stable")
+    places = np.empty(len(numbers), dtype=PLACES)
+    places["star_id"] = numbers[order]
+    places["place"] = places_of(stars)[order]
+    counts = np.bincount(bucket, minlength=BUCKETS)
+    return places, np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+
+
+def repeated_places(runs: Sequence[Run], bucket: int) -> NDArray[np.int64]:
+    """Return the records of a bucket whose star was read before.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+        All runs of the catalog.
+    bucket : int
+        Number of the bucket.
+
+    Returns
+    -------
+    ndarray of int64, shape (N,)
+        Places, ascending: of each star all records but the first in reading order.
+    """
+    parts = []
+    for run in runs:
+        begin, end = run.buckets[bucket : bucket + 2].tolist()
+        offset = begin * PLACES.itemsize
+        parts.append(np.fromfile(run.places, PLACES, end - begin, offset=offset))
+    all_places = np.concatenate(parts) if parts else np.empty(0, PLACES)
+    numbers = np.sort(all_places["star_id"])
+    twice = np.unique(numbers[1:][numbers[1:] == numbers[:-1]])
+    if not len(twice):
+        return np.empty(0, dtype=np.int64)
+    some = all_places[np.isin(all_places["star_id"], twice)]
+    some = some[np.lexsort((some["place"], some["star_id"]))]
+    again = some["star_id"][1:] == some["star_id"][:-1]
+    return np.sort(some["place"][1:][again])
+
+
+def read_shares(
+    shares: Sequence[Share], first: int, end: int, names: Sequence[str] | None = None
+) -> pa.Table:
+    """Read the stars of some pixels from their runs.
+
+    Parameters
+    ----------
+    shares : sequence of Share
+        Batches to read.
+    first, end : int
+        Stars below the first or from the second pixel of order 29 on are left out.
+    names : sequence of str, optional
+        Columns of the stars schema to read; all by default.
+
+    Returns
+    -------
+    pyarrow.Table
+        ``_healpix_29`` and the columns, in the order of the shares.
+    """
+    schema = product_schema("stars").arrow_schema
+    wanted = list(schema.names if names is None else names)
+    parts: list[pa.Table] = []
+    told: list[dict[str, Any]] = []
+    for share in shares:
+        for table, constants in _batches(share, wanted):
+            begin, stop = np.searchsorted(table[HEALPIX_COLUMN].to_numpy(), [first, end])
+            parts.append(table.slice(begin, stop - begin))
+            told.append(constants)
+    return _joined(parts, told, [schema.field(name) for name in wanted])
+
+
+def _batches(share: Share, names: Sequence[str]) -> Iterator[tuple[pa.Table, dict[str, Any]]]:
+    with pa.OSFile(str(share.stars)) as source:
+        schema = pa.ipc.open_file(source).schema
+        places = [k for k, name in enumerate(schema.names) if name in (HEALPIX_COLUMN, *names)]
+        options = pa.ipc.IpcReadOptions(included_fields=places)
+        reader = pa.ipc.open_file(source, options=options)
+        constants = json.loads(schema.metadata[_CONSTANTS])
+        for number in share.batches:
+            yield pa.Table.from_batches([reader.get_batch(number)]), constants
+
+
+def _joined(
+    parts: Sequence[pa.Table], told: Sequence[Mapping[str, Any]], fields: Sequence[pa.Field]
+) -> pa.Table:
+    """Join batches of which each may have other columns as constants."""
+    pixel = pa.field(HEALPIX_COLUMN, pa.int64(), nullable=False)
+    columns = [pa.chunked_array([part[HEALPIX_COLUMN].chunk(0) for part in parts], pa.int64())]
+    for field in fields:
+        chunks = []
+        for part, constants in zip(parts, told, strict=True):
+            if field.name in part.column_names:
+                chunks += part[field.name].chunks
+            else:
+                chunks.append(constant(constants[field.name], len(part), field.type))
+        columns.append(pa.chunked_array(chunks, field.type))
+    return pa.Table.from_arrays(columns, schema=pa.schema([pixel, *fields])).combine_chunks()
+
+
+def constant(value: Any, count: int, kind: pa.DataType) -> pa.Array:
+    """Return a column of one value.
+
+    Parameters
+    ----------
+    value : object
+        None for a column without values.
+    count, kind : int, pyarrow.DataType
+        Length and type.
+
+    Returns
+    -------
+    pyarrow.Array
+        The value in every row.
+    """
+    return pa.nulls(count, kind) if value is None else pa.repeat(pa.scalar(value, kind), count)

@@ -1,0 +1,186 @@
+"""Splitting: one archive file in, its stars out as runs and its rejected records as a table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from starcat.catalog.blocks import Part, Reading
+from starcat.catalog.file_parts import FileReading
+from starcat.catalog.ingest import count_by_reason
+from starcat.catalog.readers.files import InputFile
+from starcat.catalog.source import data_source
+from starcat.catalog.verdict import Reason
+from starcat.store.pixels import MAX_ORDER
+from starcat.store.runs import HISTOGRAM_ORDER, Run, write_run
+from starcat.tables.schema import product_schema
+
+TOLD_PROBLEMS = 20
+
+
+@dataclass(frozen=True)
+class Split:
+    """What is asked of a worker that splits a file.
+
+    Attributes
+    ----------
+    number : int
+        Number of the file among the inputs.
+    file : InputFile
+        The file.
+    how : Reading
+        Which catalog, band, epoch and limit.
+    order : int
+        Order of the coarse pixels of the runs.
+    run_rows : int
+        Stars of a run: what is held in memory.
+    runs, rejected : Path
+        Folders for the runs, and for the rejected records.
+    """
+
+    number: int
+    file: InputFile
+    how: Reading
+    order: int
+    run_rows: int
+    runs: Path
+    rejected: Path
+
+    @property
+    def name(self) -> str:
+        """What its files are called."""
+        return f"file-{self.number:05}"
+
+
+@dataclass
+class _Written:
+    """What has been written of a file so far."""
+
+    asked: Split
+    runs: list[Run] = field(default_factory=list)
+    pixels: list[Any] = field(default_factory=list)
+    files: list[Path] = field(default_factory=list)
+    writer: pq.ParquetWriter | None = None
+
+    def stars(self, stars: pa.Table) -> None:
+        """Write a run, and count its stars by pixel."""
+        name = f"{self.asked.name}-{len(self.runs):04}"
+        run, pixels = write_run(stars, self.asked.order, self.asked.runs, name)
+        self.runs.append(run)
+        fine = pixels >> 2 * (MAX_ORDER - HISTOGRAM_ORDER)
+        self.pixels.append(np.unique(fine, return_counts=True))
+        self.files += [run.stars, run.places]
+
+    def rejected(self, rejected: pa.Table) -> None:
+        """Append to the file's rejected records, in the order of their lines."""
+        path = self.asked.rejected / f"{self.asked.name}.parquet"
+        if self.writer is None:
+            schema = product_schema("rejected").arrow_schema
+            self.writer = pq.ParquetWriter(
+                path, schema, compression="zstd", compression_level=1
+            )
+            self.files.append(path)
+        self.writer.write_table(rejected.sort_by("source_line"))
+
+    def index(self) -> Path:
+        """Write what the runs hold: batches, buckets and counts by pixel."""
+        path = self.asked.runs / f"{self.asked.name}.npz"
+        pixels = np.concatenate([found for found, _ in self.pixels] or [np.empty(0, np.int64)])
+        counts = np.concatenate([count for _, count in self.pixels] or [np.empty(0, np.int64)])
+        fine, place = np.unique(pixels, return_inverse=True)
+        arrays = {
+            "pixels": fine,
+            "counts": np.bincount(place, counts, len(fine)).astype(np.int64),
+        }
+        for k, run in enumerate(self.runs):
+            arrays |= {f"batches{k}": run.pixels, f"rows{k}": run.rows, f"buckets{k}": run.buckets}
+        np.savez(path, **arrays)
+        self.files.append(path)
+        return path
+
+
+def split(asked: Split) -> tuple[dict[str, Any], list[Path]]:
+    """Split a file.
+
+    Parameters
+    ----------
+    asked : Split
+        The file and what to make of it.
+
+    Returns
+    -------
+    result : dict
+        What was read, as plain values: the file's facts, counts by reason, the first malformed
+        records, and how many runs there are.
+    files : list of Path
+        All that was written.
+
+    Raises
+    ------
+    SourceError
+        If the file is damaged, or not of this archive.
+    """
+    written = _Written(asked)
+    reading = FileReading(
+        asked.file, asked.number, data_source(asked.how.source_name), asked.how
+    )
+    counts: dict[str, int] = {}
+    try:
+        for stars, rejected in _joined(_counted(reading, counts), asked.run_rows):
+            if len(stars):
+                written.stars(stars)
+            if len(rejected):
+                written.rejected(rejected)
+    finally:
+        if written.writer is not None:
+            written.writer.close()
+    kept = sum(int(run.rows.sum()) for run in written.runs)
+    facts = reading.facts
+    result = {
+        "file": {
+            "name": facts.name,
+            "sha256": facts.sha256,
+            "bytes": facts.bytes,
+            "rows": facts.rows,
+        },
+        "kept": kept,
+        "rejected": {r.name: counts[r.name] for r in Reason if counts.get(r.name)},
+        "problems": [str(problem) for problem in reading.problems[:TOLD_PROBLEMS]],
+        "runs": len(written.runs),
+    }
+    written.index()
+    return result, written.files
+
+
+def _counted(parts: Iterable[Part], counts: dict[str, int]) -> Iterator[Part]:
+    """Count rejected records by reason as they come."""
+    for part in parts:
+        for known in (count_by_reason(part.rejected), part.counted):
+            for name, count in known.items():
+                counts[name] = counts.get(name, 0) + count
+        yield part
+
+
+def _joined(parts: Iterable[Part], rows: int) -> Iterator[tuple[pa.Table, pa.Table]]:
+    """Join blocks until there are about so many rows."""
+    held: list[Part] = []
+    for part in parts:
+        held.append(replace(part, problems=[]))
+        if sum(len(each.stars) + len(each.rejected) for each in held) >= rows:
+            yield _tables(held)
+            held = []
+    if held:
+        yield _tables(held)
+
+
+def _tables(parts: list[Part]) -> tuple[pa.Table, pa.Table]:
+    return (
+        pa.concat_tables([part.stars for part in parts]),
+        pa.concat_tables([part.rejected for part in parts]),
+    )
