@@ -30,7 +30,7 @@ from starcat.catalog.selection import Selected
 from starcat.catalog.stars import sort_rows
 from starcat.catalog.verdict import Reason
 from starcat.errors import ParseError, SchemaError, SourceMissing, reason
-from starcat.pipeline.match_summary import Summary, summary_of, tally_of
+from starcat.pipeline.match_summary import Summary, differences_of, summary_of, tally_of
 from starcat.products.crossmatch import candidate_pairs, crossmatch
 from starcat.products.match_figures import ARCSEC, MatchModel
 from starcat.progress import Progress, no_progress
@@ -108,14 +108,14 @@ def match_tables(
     model = model_from_spec(wanted)
     found = crossmatch(moving_stars(stars), moving_stars(counterparts), radius, model)
     table = table_from_matches(found, counterparts)
-    tally = tally_of(found, table)
+    separation_arcsec, delta_mag = differences_of(found, table)
     return table, summary_of(
-        tally,
+        tally_of(found, table),
         (len(stars), len(counterparts)),
         wanted.radius_arcsec,
         found.odds,
-        _median(tally.separation_arcsec),
-        _median(tally.delta_mag),
+        _median(separation_arcsec),
+        _median(delta_mag),
     )
 
 
@@ -284,14 +284,21 @@ def with_own_names(table: pa.Table, stars: pa.Table) -> pa.Table:
         With ``star_id`` and ``star_designation``.
     """
     own = stars.select(["star_id", "designation"]).take(table["star"].combine_chunks())
-    schema = table.schema.remove_metadata()
+    columns = [own["star_id"], own["designation"], *table.columns]
+    return pa.Table.from_arrays(columns, schema=schema_with_own_names())
+
+
+def schema_with_own_names() -> pa.Schema:
+    """Return the schema ``crossmatch`` with the number and the name of the star in front.
+
+    Returns
+    -------
+    pyarrow.Schema
+        With ``star_id`` and ``star_designation``.
+    """
     known = product_schema("stars").arrow_schema
-    names = {"star_id": "star_id", "designation": "star_designation"}
-    for place, (column, name) in enumerate(names.items()):
-        field = known.field(column).with_name(name)
-        table = table.add_column(place, field, own[column].combine_chunks())
-        schema = schema.insert(place, field)
-    return table.cast(schema)
+    own = [known.field("star_id"), known.field("designation").with_name("star_designation")]
+    return pa.schema([*own, *product_schema("crossmatch").arrow_schema])
 
 
 def read_star_table(path: Path) -> pa.Table:

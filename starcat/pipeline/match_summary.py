@@ -81,8 +81,6 @@ class Tally:
         Stars that are their likeliest candidate's likeliest star.
     verdicts : dict of str to int
         Stars by the verdict on their likeliest candidate.
-    separation_arcsec, delta_mag : ndarray of float64
-        Of the matched stars and their counterparts, the latter where both are known.
     """
 
     rows: int
@@ -90,8 +88,27 @@ class Tally:
     with_candidates: int
     mutual: int
     verdicts: dict[str, int]
-    separation_arcsec: Array
-    delta_mag: Array
+
+    @classmethod
+    def of_none(cls) -> Tally:
+        """Return the tally of no stars.
+
+        Returns
+        -------
+        Tally
+            Zeros.
+        """
+        return cls(0, 0, 0, 0, {name: 0 for name in VERDICTS if name != "other"})
+
+    def __add__(self, other: Tally) -> Tally:
+        """Return what was found of both."""
+        return Tally(
+            self.rows + other.rows,
+            self.matched + other.matched,
+            self.with_candidates + other.with_candidates,
+            self.mutual + other.mutual,
+            {name: count + other.verdicts[name] for name, count in self.verdicts.items()},
+        )
 
 
 class MeasuredFigures(Protocol):
@@ -126,17 +143,35 @@ def tally_of(found: Matches, table: pa.Table) -> Tally:
         The counts.
     """
     first = found.rank == 1
-    rows = matched_stars(table)
-    delta = found.delta_mag[rows]
     return Tally(
         len(found.rank),
-        len(rows),
+        len(matched_stars(table)),
         int(first.sum()),
         int((first & (found.star_rank == 1)).sum()),
         {name: found.count(name) for name in VERDICTS if name != "other"},
-        found.separation_rad[rows] / ARCSEC,
-        delta[~np.isnan(delta)],
     )
+
+
+def differences_of(found: Matches, table: pa.Table) -> tuple[Array, Array]:
+    """Return by how much the matched stars and their counterparts differ.
+
+    Parameters
+    ----------
+    found : Matches
+        All candidates of some stars.
+    table : pyarrow.Table
+        The same, as rows of the crossmatch product.
+
+    Returns
+    -------
+    separation_arcsec : ndarray of float64, shape (M,)
+        Of each matched star and its counterpart.
+    delta_mag : ndarray of float64, shape (K,)
+        Of those whose magnitudes are both known.
+    """
+    rows = matched_stars(table)
+    delta = found.delta_mag[rows]
+    return found.separation_rad[rows] / ARCSEC, delta[~np.isnan(delta)]
 
 
 def summary_of(
@@ -152,7 +187,7 @@ def summary_of(
     Parameters
     ----------
     tally : Tally
-        Its arrays are not read.
+        What was found of them.
     rows : tuple of int
         Stars of the two catalogs.
     radius_arcsec : float

@@ -25,6 +25,15 @@ from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, Pixels, healpix_29
 from starcat.store.region import WHOLE_SKY, Region
 from starcat.tables.schema import product_schema
 
+_ALIKE = {
+    "string": (
+        "large_string",
+        "string_view",
+        "dictionary<values=string, indices=int32, ordered=0>",
+    ),
+    "int64": ("uint64",),
+}
+
 _HINT = "give a catalog store, as 'starcat ingest SOURCE --to hats -o DIR' writes it"
 
 
@@ -161,7 +170,6 @@ def _parts(
 ) -> Iterator[pa.Table]:
     """Yield what the row groups of a file have of a region."""
     column = _pixel_column(store)
-    place = file.schema_arrow.names.index(column)
     for group in range(file.num_row_groups):
         known = _extent(file.metadata.row_group(group), column)
         if known is not None and not _touches(bounds, *known):
@@ -170,7 +178,6 @@ def _parts(
         inside = region.level_of(np.asarray(pixels, dtype=np.int64)) >= 0
         if inside.any():
             yield _read(file, group, store, columns, path).filter(pa.array(inside))
-    del place
 
 
 def _extent(group: Any, column: str) -> tuple[int, int] | None:
@@ -199,9 +206,9 @@ def _read(
     arrays = []
     for field in schema:
         values = table[column if field.name == HEALPIX_COLUMN else field.name]
-        is_text = pa.types.is_string(field.type) or field.name == HEALPIX_COLUMN
-        # Other writers have larger texts and dictionaries of them, which mean the same.
-        arrays.append(values.cast(field.type) if is_text else values)
+        # Other writers have larger texts, and pixels without a sign, which mean the same.
+        is_alike = str(values.type) in _ALIKE.get(str(field.type), ())
+        arrays.append(values.cast(field.type) if is_alike else values)
     read = pa.table(dict(zip(schema.names, arrays, strict=True)))
     check_star_columns(read, path)
     if read[HEALPIX_COLUMN].null_count:

@@ -159,8 +159,7 @@ def neighbours_of(pixels: Pixels, order: int) -> Pixels:
     ndarray of int64, shape (M,)
         Ascending; pixels given are among them where they touch each other.
     """
-    around = np.unique(np.asarray(_nested().neighbours(pixels, order), dtype=np.int64))
-    return around[around >= 0]
+    return _valid(_nested().neighbours(pixels, order))
 
 
 def border_order(width_rad: float) -> int:

@@ -82,9 +82,7 @@ class _Written:
         path = self.asked.rejected / f"{self.asked.name}.parquet"
         if self.writer is None:
             schema = product_schema("rejected").arrow_schema
-            self.writer = pq.ParquetWriter(
-                path, schema, compression="zstd", compression_level=1
-            )
+            self.writer = pq.ParquetWriter(path, schema, compression="zstd", compression_level=1)
             self.files.append(path)
         self.writer.write_table(rejected.sort_by("source_line"))
 
@@ -127,9 +125,7 @@ def split(asked: Split) -> tuple[dict[str, Any], list[Path]]:
         If the file is damaged, or not of this archive.
     """
     written = _Written(asked)
-    reading = FileReading(
-        asked.file, asked.number, data_source(asked.how.source_name), asked.how
-    )
+    reading = FileReading(asked.file, asked.number, data_source(asked.how.source_name), asked.how)
     counts: dict[str, int] = {}
     try:
         for stars, rejected in _joined(_counted(reading, counts), asked.run_rows):

@@ -1,0 +1,187 @@
+"""Cross-identification of one piece of the sky, from two catalog stores.
+
+A piece is a pixel. Its stars are matched with all that has a say in it: their candidates, the
+other stars of these, and for the probabilities the whole cluster of pairs, however far it
+reaches across the borders of partitions. So the result of a star does not depend on the pieces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from starcat.artifact.crossmatch_table import NEEDED, moving_stars, table_from_matches
+from starcat.pipeline.counterparts import with_own_names
+from starcat.pipeline.match_plan import PLACED, Job, Piece, numbers_path, rows_path
+from starcat.pipeline.match_summary import Tally, differences_of, tally_of
+from starcat.pipeline.medians import write_numbers
+from starcat.pipeline.star_rows import opened, rows_of_region
+from starcat.products.crossmatch import MovingStars, Pairs, candidate_pairs, judged
+from starcat.products.match_figures import is_sure
+from starcat.products.match_probability import ROUNDS
+from starcat.storage.atomic import whole_file
+from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, Pixels, border_order
+from starcat.store.region import region_around
+
+MOST_RINGS = 2 * ROUNDS + 8
+"""Messages of a cluster go no farther than two pairs in a round: with so many rings a piece has
+all that its probabilities depend on."""
+
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Counted:
+    """The stars of a piece, and those of them that have candidates."""
+
+    stars: int
+    with_candidates: int
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What was found of the stars of a piece: a tally, and the longest text of each column."""
+
+    tally: Tally
+    longest: dict[str, int]
+
+
+@dataclass(frozen=True)
+class _Local:
+    """Stars of a piece and of the rings around it, their candidates, and all pairs of these."""
+
+    piece: Piece
+    rings: int
+    star_rows: pa.Table
+    other_rows: pa.Table
+    stars: MovingStars
+    others: MovingStars
+    pairs: Pairs
+    levels: NDArray[np.int64]
+    other_levels: NDArray[np.int64]
+
+    @cached_property
+    def pixels(self) -> Pixels:
+        return np.asarray(self.star_rows[HEALPIX_COLUMN].to_numpy(), dtype=np.int64)
+
+    @cached_property
+    def is_own(self) -> Flags:
+        """Which stars are of the piece itself."""
+        first, end = self.piece.pixel.first, self.piece.pixel.end
+        return (self.pixels >= first) & (self.pixels < end)
+
+    def linked(self) -> tuple[Flags, bool]:
+        """Return which pairs are in a cluster with a star of the piece, and if these are whole.
+
+        A cluster is whole where all its stars are before the last ring: whatever they are pairs
+        with is here then.
+        """
+        i, j = self.pairs.star, self.pairs.counterpart
+        count = len(self.levels) + len(self.other_levels)
+        edges = (np.ones(len(i), dtype=np.int8), (i, len(self.levels) + j))
+        labels = connected_components(coo_array(edges, shape=(count, count)), directed=False)[1]
+        has_own = np.zeros(count + 1, dtype=bool)
+        has_own[labels[i[self.is_own[i]]]] = True
+        kept = has_own[labels[i]]
+        farthest = max(
+            self.levels[i[kept]].max(initial=0), self.other_levels[j[kept]].max(initial=0)
+        )
+        return kept, bool(farthest < self.rings)
+
+
+def _local(job: Job, piece: Piece, rings: int, columns: Sequence[str]) -> _Local:
+    """Read a piece and so many rings around it, and find all pairs there."""
+    region = region_around(piece.pixel, job.hop_rad, rings)
+    own = (*PLACED, "designation") if "designation" in columns else PLACED
+    star_rows = rows_of_region(opened(job.a, job.scratch), region, own)
+    other_rows = rows_of_region(opened(job.b, job.scratch), region, columns)
+    stars, others = moving_stars(star_rows), moving_stars(other_rows)
+    levels, other_levels = (
+        region.level_of(rows[HEALPIX_COLUMN].to_numpy()) for rows in (star_rows, other_rows)
+    )
+    pairs = candidate_pairs(stars, others, job.radius_rad)
+    return _Local(piece, rings, star_rows, other_rows, stars, others, pairs, levels, other_levels)
+
+
+def measure_piece(job: Job, piece: Piece) -> Counted:
+    """Find the sure pairs of a piece, whose separations and magnitudes go to the scratch folder.
+
+    Parameters
+    ----------
+    job : Job
+        What all tasks need.
+    piece : Piece
+        The piece.
+
+    Returns
+    -------
+    Counted
+        How many there are.
+    """
+    here = _local(job, piece, 2, PLACED)
+    i, j = here.pairs.star, here.pairs.counterpart
+    own = here.is_own[i]
+    sure = is_sure(i, j) & own
+    delta = here.others.mag[j[sure]] - here.stars.mag[i[sure]]
+    known = delta[~np.isnan(delta)]
+    write_numbers(here.pairs.separation_rad[sure], numbers_path(job, "sure", piece))
+    write_numbers(known, numbers_path(job, "sure-delta", piece))
+    return Counted(int(here.is_own.sum()), len(np.unique(i[own])))
+
+
+def judge_piece(job: Job, piece: Piece) -> Judged:
+    """Judge the candidates of the stars of a piece; they go to the scratch folder.
+
+    Parameters
+    ----------
+    job : Job
+        With the figures of both catalogs.
+    piece : Piece
+        The piece.
+
+    Returns
+    -------
+    Judged
+        What was found.
+    """
+    if job.figures is None:
+        raise ValueError("figures are missing; both catalogs have to be measured first")
+    # Clusters mostly end within three rings, which cost nothing where these are narrow.
+    rings = 4 if border_order(job.hop_rad) >= min(piece.pixel.order + 4, MAX_ORDER) else 2
+    here = _local(job, piece, rings, NEEDED)
+    kept, is_whole = here.linked()
+    while not is_whole and rings < MOST_RINGS:
+        rings = min(2 * rings, MOST_RINGS)
+        here = _local(job, piece, rings, NEEDED)
+        kept, is_whole = here.linked()
+    found = judged(
+        here.stars, here.others, here.pairs.take(kept), job.radius_rad, job.figures, job.model
+    )
+    own = np.flatnonzero(here.is_own[found.star])
+    star = found.star[own]
+    found = found.take(own[np.lexsort((found.rank[own], star, here.pixels[star]))])
+    table = table_from_matches(found, here.other_rows)
+    tally, differences = tally_of(found, table), differences_of(found, table)
+    table = with_own_names(table, here.star_rows).drop_columns("star")
+    write_numbers(differences[0], numbers_path(job, "matched", piece))
+    write_numbers(differences[1], numbers_path(job, "matched-delta", piece))
+    with whole_file(rows_path(job, piece)) as partial:
+        pq.write_table(table, partial, compression="zstd")
+    return Judged(tally, _longest(table))
+
+
+def _longest(table: pa.Table) -> dict[str, int]:
+    return {
+        field.name: pc.max(pc.utf8_length(table[field.name])).as_py() or 0
+        for field in table.schema
+        if pa.types.is_string(field.type)
+    }

@@ -1,0 +1,242 @@
+"""Cross-identification of two catalogs of any size, partition by partition.
+
+Three passes on the workers of a cluster: counts of both catalogs, the sure pairs from which
+errors are measured, and the verdicts. The results are those of `match_files` on the same stars
+in order of ``star_id``, bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial, reduce
+from operator import add
+from pathlib import Path
+from typing import Any, Protocol
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from starcat.errors import OutputError, ProductError
+from starcat.pipeline.counterparts import (
+    model_from_spec,
+    read_star_table,
+    schema_with_own_names,
+)
+from starcat.pipeline.match_pieces import Judged, judge_piece, measure_piece
+from starcat.pipeline.match_plan import (
+    Extent,
+    Job,
+    Piece,
+    extent_of_partition,
+    hop_of,
+    numbers_path,
+    pieces_of,
+    rows_path,
+)
+from starcat.pipeline.match_summary import Summary, Tally, summary_of
+from starcat.pipeline.medians import median_of
+from starcat.pipeline.star_rows import opened, store_of_file
+from starcat.products.match_figures import ARCSEC, Measured, figures_of
+from starcat.progress import Progress, no_progress
+from starcat.specs.product_sections import Crossmatch
+from starcat.storage.atomic import whole_file, whole_folder
+from starcat.store.layout import is_store
+from starcat.tables.parquet import write_parts
+
+
+class RunTasks(Protocol):
+    """What calls a function with each of some items, wherever that is."""
+
+    def __call__(
+        self,
+        function: Callable[[Any], Any],
+        items: Sequence[Any],
+        report: Callable[[int], None] | None = None,
+    ) -> list[Any]:
+        """Return the results in the order of the items."""
+
+
+def run_here(
+    function: Callable[[Any], Any],
+    items: Sequence[Any],
+    report: Callable[[int], None] | None = None,
+) -> list[Any]:
+    """Call a function with each of some items, in this process.
+
+    Parameters
+    ----------
+    function : callable
+        Of one argument.
+    items : sequence of object
+        What to call it with.
+    report : callable, optional
+        Called with the number of an item when that is done.
+
+    Returns
+    -------
+    list of object
+        Results in the order of the items.
+    """
+    results = []
+    for number, item in enumerate(items):
+        results.append(function(item))
+        if report is not None:
+            report(number)
+    return results
+
+
+def match_stores(
+    a: Path,
+    b: Path,
+    output: Path,
+    wanted: Crossmatch,
+    run: RunTasks = run_here,
+    progress: Progress = no_progress,
+) -> Summary:
+    """Find the counterparts of the stars of one catalog in another; neither need fit in memory.
+
+    Parameters
+    ----------
+    a, b : Path
+        Catalog stores or Parquet files of star tables: the stars, and where their counterparts
+        are looked for. A Parquet file is held in memory while it is divided.
+    output : Path
+        Parquet file: what `match_files` writes without ``star``, as a store has no numbers of
+        rows; in order of the stars' pixel of order 29, ``star_id`` and rank. Replaced when the
+        new one is whole.
+    wanted : Crossmatch
+        Radius and model.
+    run : callable
+        Runs tasks, such as `starcat.store.cluster.run_tasks` of a client; the result is the same
+        for any number of workers. They need the same paths.
+    progress : Progress
+        Called with (stage, done, total).
+
+    Returns
+    -------
+    Summary
+        Counts and medians.
+
+    Raises
+    ------
+    SourceError
+        If a file cannot be read.
+    SchemaError
+        If a catalog is no star table.
+    ProductError
+        If a store is not whole.
+    OutputError
+        If the output cannot be written.
+    """
+    if output.is_dir():
+        raise OutputError(
+            f"{output}: cannot be written (Is a directory); choose another --output", path=output
+        )
+    with whole_folder(output) as scratch:
+        stores = [_as_store(path, scratch / name) for path, name in ((a, "a"), (b, "b"))]
+        radius_rad = wanted.radius_arcsec * ARCSEC
+        job = Job(stores[0], stores[1], scratch, radius_rad, model_from_spec(wanted))
+        tasks = _Tasks(run, progress)
+        (of_a, parts_a), (of_b, parts_b) = (tasks.extent(job, store) for store in stores)
+        hop_rad = hop_of(of_a, of_b, radius_rad)
+        job = replace(job, hop_rad=hop_rad)
+        pieces = pieces_of(parts_a, parts_b, hop_rad, radius_rad)
+        measured = tasks.measured(job, pieces, of_a.census.stars)
+        figures = figures_of(of_a.census, of_b.census, measured, radius_rad, job.model)
+        job = replace(job, figures=figures)
+        results: list[Judged] = tasks("crossmatch verdicts", judge_piece, job, pieces)
+        with whole_file(output) as unfinished:
+            write_parts(_rows(job, pieces), _example(results), unfinished)
+        return summary_of(
+            reduce(add, (result.tally for result in results), Tally.of_none()),
+            (of_a.census.stars, of_b.census.stars),
+            wanted.radius_arcsec,
+            figures,
+            median_of([numbers_path(job, "matched", piece) for piece in pieces])[1],
+            median_of([numbers_path(job, "matched-delta", piece) for piece in pieces])[1],
+        )
+
+
+def _as_store(path: Path, folder: Path) -> Path:
+    """Return a store; a Parquet file becomes one."""
+    if is_store(path):
+        return path
+    store_of_file(read_star_table(path), path, folder)
+    return folder
+
+
+class _Tasks:
+    """Runs the passes, and tells how far they are."""
+
+    def __init__(self, run: RunTasks, progress: Progress) -> None:
+        self._run = run
+        self._progress = progress
+
+    def __call__(
+        self, stage: str, function: Callable[[Job, Any], Any], job: Job, items: Sequence[Any]
+    ) -> list[Any]:
+        done = [0]
+
+        def report(_: int) -> None:
+            done[0] += 1
+            self._progress(stage, done[0], len(items))
+
+        self._progress(stage, 0, len(items))
+        return self._run(partial(function, job), items, report)
+
+    def extent(self, job: Job, folder: Path) -> tuple[Extent, list[tuple[Any, int]]]:
+        """Count the stars of a store, and of each partition."""
+        partitions = opened(folder, job.scratch).catalog.partitions
+        items = [(folder, number) for number in range(len(partitions))]
+        extents: list[Extent] = self("crossmatch counts", extent_of_partition, job, items)
+        parts = [
+            (partition.pixel, extent.census.stars)
+            for partition, extent in zip(partitions, extents, strict=True)
+        ]
+        return reduce(add, extents, Extent.of_none()), parts
+
+    def measured(self, job: Job, pieces: Sequence[Piece], stars: int) -> Measured:
+        """Return what all pairs say of the two catalogs."""
+        counted = self("crossmatch pairs", measure_piece, job, pieces)
+        found = sum(each.stars for each in counted)
+        if found != stars:
+            raise ProductError(
+                f"{job.a}: has {stars:,} stars, of which {found:,} are where their pixels say; "
+                "partitions overlap or the store has changed meanwhile, make it again",
+                path=job.a,
+            )
+        sure, angle = median_of([numbers_path(job, "sure", piece) for piece in pieces])
+        known, delta = median_of([numbers_path(job, "sure-delta", piece) for piece in pieces])
+        with_candidates = sum(each.with_candidates for each in counted)
+        return Measured(
+            with_candidates,
+            sure,
+            known,
+            float("nan") if angle is None else angle,
+            float("nan") if delta is None else delta,
+        )
+
+
+def _rows(job: Job, pieces: Sequence[Piece]) -> Iterator[pa.Table]:
+    for piece in pieces:
+        path = rows_path(job, piece)
+        with pq.ParquetFile(path) as file:
+            yield file.read()
+        path.unlink()
+
+
+def _example(results: Sequence[Judged]) -> pa.Table:
+    """Return a row with texts as long as the longest of each column."""
+    schema = schema_with_own_names()
+    schema = schema.remove(schema.get_field_index("star"))
+    longest = {
+        field.name: max((result.longest[field.name] for result in results), default=0)
+        for field in schema
+        if pa.types.is_string(field.type)
+    }
+    blank = {name: "x" * length for name, length in longest.items()}
+    fields = [(field, blank.get(field.name, 0)) for field in schema]
+    return pa.Table.from_arrays(
+        [pa.array([value], field.type) for field, value in fields], schema=schema
+    )
