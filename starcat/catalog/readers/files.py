@@ -12,7 +12,6 @@ import gzip
 import hashlib
 import io
 import re
-import zlib
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -341,7 +340,7 @@ def read_blocks(
                 path=file.path,
             )
         on_end(raw)
-    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+    except (EOFError, gzip.BadGzipFile) as error:
         what = "cut off" if isinstance(error, EOFError) else "damaged"
         where = f" after line {line - 1}" if line > 1 else ""
         raise ParseError(
