@@ -1,7 +1,7 @@
 """Reading gzip files in large steps, with Intel's ISA-L in place of zlib.
 
 The standard library's gzip reader asks its file for 8 KiB at a time (Python 3.11), which costs
-as much as the decompression; the library is given a mebibyte at once here. Checksums, members
+as much as the decompression; the library is given 256 KiB at once here. Checksums, members
 one behind the other and padding are treated as the gzip module treats them.
 """
 
@@ -12,7 +12,8 @@ from typing import Protocol, cast
 
 from isal import isal_zlib
 
-STEP_BYTES = 1 << 20
+STEP_BYTES = 1 << 18
+_PIECE_BYTES = 1 << 20
 MAGIC = b"\x1f\x8b"
 _GZIP_FORMAT = 31
 _Damage = cast(type[Exception], isal_zlib.error)
@@ -98,7 +99,7 @@ class GzipReader:
             return b""
         at_end = not self._pending
         try:
-            data = member.decompress(self._pending, size)
+            data = member.decompress(self._pending, min(size, _PIECE_BYTES))
         except _Damage as error:
             raise BadGzipFile(str(error)) from error
         self._pending = member.unconsumed_tail
