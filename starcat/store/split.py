@@ -82,9 +82,7 @@ class _Written:
         path = self.asked.rejected / f"{self.asked.name}.parquet"
         if self.writer is None:
             schema = product_schema("rejected").arrow_schema
-            self.writer = pq.ParquetWriter(
-                path, schema, compression="zstd", compression_level=1
-            )
+            self.writer = pq.ParquetWriter(path, schema, compression="zstd", compression_level=1)
             self.files.append(path)
         self.writer.write_table(rejected.sort_by("source_line"))
 
@@ -100,7 +98,7 @@ class _Written:
         }
         for k, run in enumerate(self.runs):
             arrays |= {f"batches{k}": run.pixels, f"rows{k}": run.rows, f"buckets{k}": run.buckets}
-        np.savez(path, **arrays)
+        np.savez(path, allow_pickle=False, **arrays)
         self.files.append(path)
         return path
 
@@ -127,9 +125,7 @@ def split(asked: Split) -> tuple[dict[str, Any], list[Path]]:
         If the file is damaged, or not of this archive.
     """
     written = _Written(asked)
-    reading = FileReading(
-        asked.file, asked.number, data_source(asked.how.source_name), asked.how
-    )
+    reading = FileReading(asked.file, asked.number, data_source(asked.how.source_name), asked.how)
     counts: dict[str, int] = {}
     try:
         for stars, rejected in _joined(_counted(reading, counts), asked.run_rows):
@@ -161,7 +157,7 @@ def split(asked: Split) -> tuple[dict[str, Any], list[Path]]:
 def _counted(parts: Iterable[Part], counts: dict[str, int]) -> Iterator[Part]:
     """Count rejected records by reason as they come."""
     for part in parts:
-        for known in (count_by_reason(part.rejected), part.counted):
+        for known in (count_by_reason(part.rejected), getattr(part, "counted", {})):
             for name, count in known.items():
                 counts[name] = counts.get(name, 0) + count
         yield part
