@@ -17,6 +17,9 @@ count what they work on.
 
 BYTE_STAGES = ("fetch", "publish", "pull", "read")
 
+ROW_STAGE = "rows"
+"""First word of the stages that count rows of a catalog, where people ask how fast it goes."""
+
 
 def no_progress(stage: str, done: int, total: int | None) -> None:
     """Ignore the event: the default of every function that reports progress."""

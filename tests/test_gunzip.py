@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import io
-import zlib
 
 import pytest
 from hypothesis import given
@@ -53,7 +52,7 @@ def test_a_changed_byte_never_passes_unseen() -> None:
     for place in range(10, len(data)):  # the ten before hold the magic and facts without effect
         changed = bytearray(data)
         changed[place] ^= 1
-        with pytest.raises((EOFError, zlib.error, gzip.BadGzipFile)):
+        with pytest.raises((EOFError, gzip.BadGzipFile)):
             read_all(bytes(changed), 1000)
 
 

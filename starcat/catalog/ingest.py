@@ -168,9 +168,9 @@ def ingest(
     SourceError
         If a file is missing, damaged, or not of this archive.
     """
-    source = _star_catalog(source_name)
+    source = star_catalog(source_name)
     how = Reading(source_name, check_band(source, band), epoch_jyear, read_limit_mag)
-    files = _given_files(source, paths)
+    files = given_files(source, paths)
     facts, parts, problems = _read_parts(files, source, how, workers, progress)
     stars, rejected = join_parts(parts)
     stars = add_nearest_neighbours(stars, workers) if neighbours else stars
@@ -180,7 +180,24 @@ def ingest(
     return Ingested(source_name, how.band, stars, rejected, facts, problems, notes)
 
 
-def _star_catalog(source_name: str) -> DataSource:
+def star_catalog(source_name: str) -> DataSource:
+    """Return a data source that is a star catalog.
+
+    Parameters
+    ----------
+    source_name : str
+        Name of a source.
+
+    Returns
+    -------
+    DataSource
+        The source.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such source, or it has no stars.
+    """
     source = data_source(source_name)
     if source_name not in CATALOGS:
         raise ConfigError(
@@ -191,7 +208,26 @@ def _star_catalog(source_name: str) -> DataSource:
     return source
 
 
-def _given_files(source: DataSource, paths: Sequence[Path]) -> list[InputFile]:
+def given_files(source: DataSource, paths: Sequence[Path]) -> list[InputFile]:
+    """Return the files of a source.
+
+    Parameters
+    ----------
+    source : DataSource
+        What is read.
+    paths : sequence of Path
+        Files, or folders that hold them.
+
+    Returns
+    -------
+    list of InputFile
+        At least one, in reading order.
+
+    Raises
+    ------
+    SourceMissing
+        If there is none, or one is missing.
+    """
     files = find_files(source, paths)
     if not files:
         raise SourceMissing(f"{source.name}: no input files given", source=source.name)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from starcat.commands.shared import Json, inputs_by_source
+from starcat.commands.shared import Json, Scheduler, Workers, inputs_by_source
 
 app = typer.Typer()
 
@@ -58,7 +58,9 @@ def fetch(
 @app.command()
 def ingest(
     source: Annotated[str, typer.Argument(help="A star catalog, such as sao.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Parquet file to write.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Parquet file to write; for hats the folder.")
+    ],
     inputs: Annotated[
         list[str] | None,
         typer.Option(
@@ -67,6 +69,9 @@ def ingest(
             help="File or folder of the catalog. Repeatable.",
         ),
     ] = None,
+    to: Annotated[
+        str, typer.Option(help="parquet: one file; hats: a store of any size, by Dask.")
+    ] = "parquet",
     epoch_jyear: Annotated[
         float | None,
         typer.Option(
@@ -78,29 +83,74 @@ def ingest(
         float | None,
         typer.Option(min=-30, max=40, help="Leave out fainter records while reading."),
     ] = None,
+    workers: Workers = 2,
+    scheduler: Scheduler = None,
+    memory_gib: Annotated[
+        float,
+        typer.Option("--memory", min=0.1, help="GiB of all processes together (hats)."),
+    ] = 2.0,
+    max_partition_rows: Annotated[
+        int, typer.Option(min=1, help="Stars of a partition at most (hats).")
+    ] = 500_000,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with a run that was ended (hats).")
+    ] = False,
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Replace a store that differs (hats).")
+    ] = False,
     json: Json = False,
 ) -> None:
-    """Read an archive file into a star table (Parquet), with a reason for every row left out.
+    """Read an archive into a star table (Parquet) or a store (HATS), with a reason for every row.
 
     Example: starcat ingest sao --input sao.dat.gz -o sao.parquet --epoch-jyear 2026.0
     """
     from starcat.catalog.fetching.locate import locate
     from starcat.catalog.ingest import ingest as read_catalog
     from starcat.catalog.star_files import write_star_tables
-    from starcat.terminal.builds import print_ingested
+    from starcat.errors import ConfigError
+    from starcat.terminal.builds import print_ingested, print_stored
     from starcat.terminal.console import progress_bars
 
+    if to not in ("parquet", "hats"):
+        raise ConfigError(f"--to {to}: choose parquet or hats", key="to", value=to)
+    paths = locate(source, inputs_by_source(inputs, source))
     with progress_bars() as progress:
-        read = read_catalog(
-            source,
-            locate(source, inputs_by_source(inputs, source)),
-            band=band,
-            epoch_jyear=epoch_jyear,
-            read_limit_mag=read_limit_mag,
-            progress=progress,
-        )
-        write_star_tables(read, output)
-    print_ingested(read, output, as_json=json)
+        if to == "hats":
+            from starcat.store.ingest import ingest_to_store
+            from starcat.store.options import StoreOptions
+
+            stored = ingest_to_store(
+                source,
+                paths,
+                output,
+                band=band,
+                epoch_jyear=epoch_jyear,
+                read_limit_mag=read_limit_mag,
+                options=StoreOptions(
+                    max_partition_rows=max_partition_rows,
+                    memory_bytes=int(memory_gib * 2**30),
+                    workers=workers,
+                    scheduler=scheduler,
+                    resume=resume,
+                    replace=replace,
+                ),
+                progress=progress,
+            )
+        else:
+            read = read_catalog(
+                source,
+                paths,
+                band=band,
+                epoch_jyear=epoch_jyear,
+                read_limit_mag=read_limit_mag,
+                workers=workers,
+                progress=progress,
+            )
+            write_star_tables(read, output)
+    if to == "hats":
+        print_stored(stored, as_json=json)
+    else:
+        print_ingested(read, output, as_json=json)
 
 
 @app.command()

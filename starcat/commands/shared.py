@@ -22,6 +22,13 @@ Input = Annotated[
 MethodName = Annotated[
     str | None, typer.Option(help="See 'starcat methods'; default: the best there is.")
 ]
+Workers = Annotated[
+    int, typer.Option(min=1, max=1024, help="Processes or threads; any number gives the same.")
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(metavar="tcp://HOST:PORT", help="A Dask cluster to use instead of this machine."),
+]
 NoisePx = Annotated[float, typer.Option(min=0, max=50, help="Noise of a centroid, each axis.")]
 
 

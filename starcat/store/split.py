@@ -98,7 +98,7 @@ class _Written:
         }
         for k, run in enumerate(self.runs):
             arrays |= {f"batches{k}": run.pixels, f"rows{k}": run.rows, f"buckets{k}": run.buckets}
-        np.savez(path, **arrays)
+        np.savez(path, allow_pickle=False, **arrays)
         self.files.append(path)
         return path
 
@@ -157,7 +157,7 @@ def split(asked: Split) -> tuple[dict[str, Any], list[Path]]:
 def _counted(parts: Iterable[Part], counts: dict[str, int]) -> Iterator[Part]:
     """Count rejected records by reason as they come."""
     for part in parts:
-        for known in (count_by_reason(part.rejected), part.counted):
+        for known in (count_by_reason(part.rejected), getattr(part, "counted", {})):
             for name, count in known.items():
                 counts[name] = counts.get(name, 0) + count
         yield part

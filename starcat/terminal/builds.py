@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from starcat.catalog.ingest import Ingested
     from starcat.pipeline.build import Built
     from starcat.simulation.selftest import Rates
+    from starcat.store.ingest import Stored
 
 
 def print_sources(*, as_json: bool) -> None:
@@ -131,6 +132,40 @@ def print_ingested(read: Ingested, output: Path, *, as_json: bool) -> None:
     print_table("", ("records", "rows"), _balance(facts), numbers=(1,))
     print_problems(read.problems)
     say(f"wrote {output}" + (f" and {rejected_path(output).name}" if len(read.rejected) else ""))
+
+
+def print_stored(made: Stored, *, as_json: bool) -> None:
+    """Print what became of the records of a catalog that was read into a store.
+
+    Parameters
+    ----------
+    made : Stored
+        What `ingest_to_store` returned.
+    as_json : bool
+        Whether to print JSON.
+    """
+    manifest = made.manifest
+    facts = {
+        "source": manifest["source"],
+        "band": manifest["band"],
+        "rows_read": manifest["rows_read"],
+        "kept": manifest["kept"],
+        "rejected": manifest["rejected"],
+        "files": manifest["files"],
+        "store": str(made.folder),
+        "outcome": made.outcome,
+        "partitions": len(manifest["partitions"]),
+        "problems": list(made.problems),
+        "notes": list(made.notes),
+    }
+    for note in made.notes:
+        say(f"note: {note}")
+    if as_json:
+        print_json(facts)
+        return
+    print_table("", ("records", "rows"), _balance(facts), numbers=(1,))
+    print_problems(made.problems)
+    say(f"{made.outcome} {made.folder}: {len(manifest['partitions'])} partitions")
 
 
 def print_problems(problems: Sequence[str]) -> None:

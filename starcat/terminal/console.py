@@ -22,7 +22,7 @@ from rich.progress import Progress as Bars
 from rich.table import Table
 from rich.text import Text
 
-from starcat.progress import BYTE_STAGES, Progress
+from starcat.progress import BYTE_STAGES, ROW_STAGE, Progress
 from starcat.terminal.failures import AT_STAGE
 
 MAX_WIDTH = 100
@@ -132,6 +132,7 @@ class StageBars(Bars):
             BarColumn(),
             AmountColumn(),
             TimeElapsedColumn(),
+            RateColumn(),
         )
         super().__init__(*columns, console=console, transient=True)
         self.stages: dict[str, TaskID] = {}
@@ -183,3 +184,28 @@ class AmountColumn(ProgressColumn):
         if task.description.split(" ")[0] in BYTE_STAGES:
             return Text(f"{decimal(done)} / {decimal(int(total))}")
         return Text(f"{done:,} / {int(total):,}")
+
+
+class RateColumn(ProgressColumn):
+    """How fast rows go, and the time that is left; empty for other stages."""
+
+    def render(self, task: Task) -> Text:
+        """Return rate and time.
+
+        Parameters
+        ----------
+        task : rich.progress.Task
+            Task of a stage.
+
+        Returns
+        -------
+        rich.text.Text
+            Such as ``310,000/s, 2:10 left``.
+        """
+        elapsed, total = task.finished_time or task.elapsed, task.total
+        if task.description.split(" ")[0] != ROW_STAGE or not elapsed or not task.completed:
+            return Text("")
+        rate = task.completed / elapsed
+        left = 0 if total is None else round(max(0.0, total - task.completed) / rate)
+        ending = f", {left // 60}:{left % 60:02} left" if left else ""
+        return Text(f"{rate:,.0f}/s{ending}")

@@ -20,6 +20,7 @@ from starcat.catalog.readers.records import (
     Problem,
     Records,
     apply_nulls,
+    line_ends,
     number_from_text,
     reject_impossible_numbers,
     reject_required_blanks,
@@ -66,7 +67,7 @@ def _parse_regular(
         return None
     try:
         table = _read_csv(data, layout, chosen, as_text=False)
-        if len(table) != data.count(b"\n") + (not data.endswith(b"\n")):
+        if len(table) != line_ends(data) + (not data.endswith(b"\n")):
             return None  # pyarrow passes over empty lines
         columns = {column.name: _array(table[column.name], column) for column in chosen}
     except (pa.ArrowInvalid, pa.ArrowKeyError):

@@ -12,7 +12,6 @@ import gzip
 import hashlib
 import io
 import re
-import zlib
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -21,6 +20,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from starcat.catalog.readers.gunzip import MAGIC, GzipReader, Readable
+from starcat.catalog.readers.records import line_ends
 from starcat.catalog.source import DataSource, RecordFile, data_source, source_names
 from starcat.errors import ParseError, SourceError, SourceMissing
 
@@ -324,14 +324,14 @@ def read_blocks(
             check_magic(stream.read(file.layout.header_bytes), file, source_name)
         size = _read_size(file.layout)
         while chunk := stream.read(size):
-            data = tail + chunk
-            cut = _last_whole(data, file.layout)
-            tail = data[cut:]
+            cut = _last_whole(tail, chunk, file.layout)
+            data, tail = (tail + chunk[:cut], chunk[cut:]) if cut else (b"", tail + chunk)
+            del chunk
             if len(tail) > MAX_LINE_BYTES:
                 raise _endless_line(file, source_name, line)
-            if cut:
-                yield Block(file, data[:cut], line, raw.bytes_read)
-                line += _count(data[:cut], file.layout)
+            if data:
+                yield Block(file, data, line, raw.bytes_read)
+                line += _count(data, file.layout)
         if tail:
             yield Block(file, tail, line, raw.bytes_read)
         elif line == 1:
@@ -341,7 +341,7 @@ def read_blocks(
                 path=file.path,
             )
         on_end(raw)
-    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+    except (EOFError, gzip.BadGzipFile) as error:
         what = "cut off" if isinstance(error, EOFError) else "damaged"
         where = f" after line {line - 1}" if line > 1 else ""
         raise ParseError(
@@ -401,16 +401,17 @@ def _read_size(layout: RecordFile) -> int:
     return max(1, BLOCK_BYTES // record) * record
 
 
-def _last_whole(data: bytes, layout: RecordFile) -> int:
+def _last_whole(tail: bytes, chunk: bytes, layout: RecordFile) -> int:
+    """Return how much of a chunk belongs to records that are whole with what was left before."""
     if layout.layout == "binary":
-        return len(data) - len(data) % (layout.record_bytes or 1)
-    return data.rfind(b"\n") + 1
+        return max(0, len(chunk) - (len(tail) + len(chunk)) % (layout.record_bytes or 1))
+    return chunk.rfind(b"\n") + 1
 
 
 def _count(data: bytes, layout: RecordFile) -> int:
     if layout.layout == "binary":
         return len(data) // (layout.record_bytes or 1)
-    return data.count(b"\n")
+    return line_ends(data)
 
 
 def map_in_order(

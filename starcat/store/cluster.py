@@ -1,0 +1,172 @@
+"""Dask clusters: of this machine, or one that is there; and tasks that run on them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+from starcat.errors import BuildError, ConfigError
+from starcat.version import __version__, install_command
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+ALLOWED_DEATHS = 10
+"""Workers that may die over one task before it is taken for the cause."""
+
+_CONNECT_S = 20
+
+
+@contextmanager
+def cluster(
+    workers: int = 2, scheduler: str | None = None, *, is_small: bool = False
+) -> Iterator[Client]:
+    """Give a client of a Dask cluster.
+
+    Parameters
+    ----------
+    workers : int, default 2
+        Processes of a cluster of this machine, which is made here and ended afterwards.
+    scheduler : str, optional
+        Address of a cluster that is there, such as ``tcp://10.0.0.1:8786``. Its workers need the
+        same starcat, and the inputs and the output under the same paths.
+    is_small : bool, default False
+        Whether the work is done before processes would have started: the workers are threads.
+
+    Yields
+    ------
+    distributed.Client
+        Connected.
+
+    Raises
+    ------
+    ConfigError
+        If Dask is not installed, nobody answers at the address, or its workers run another
+        version of starcat.
+    """
+    try:
+        import dask
+        import distributed
+    except ImportError as error:
+        raise ConfigError(
+            f"this needs the packages dask and distributed, which are not installed; "
+            f"{install_command('hats')}"
+        ) from error
+    settings = {"distributed.scheduler.allowed-failures": ALLOWED_DEATHS}
+    if scheduler is not None:
+        with _connected(distributed.Client, scheduler) as client:
+            _check_versions(client)
+            yield client
+        return
+    with (
+        dask.config.set(settings),
+        distributed.LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=not is_small,
+            memory_limit=0,  # what a task may hold is decided by what it is asked to do
+            dashboard_address=None,
+            silence_logs=logging.CRITICAL,
+        ) as local,
+        distributed.Client(local) as client,
+    ):
+        yield client
+
+
+@contextmanager
+def _connected(client_class: Any, scheduler: str) -> Iterator[Client]:
+    try:
+        client = client_class(scheduler, timeout=_CONNECT_S)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise ConfigError(
+            f"--scheduler {scheduler}: nobody answers there ({error}); start one with 'dask "
+            "scheduler' and workers with 'dask worker', or leave it out to use this machine",
+            key="scheduler",
+            value=scheduler,
+        ) from error
+    with client:
+        yield client
+
+
+def _check_versions(client: Client) -> None:
+    """Check that the workers run what this process runs."""
+    here = versions()
+    for worker, there in client.run(versions).items():
+        if there != here:
+            raise ConfigError(
+                f"--scheduler: the worker {worker} has {_told(there)}, this process has "
+                f"{_told(here)}; install the same on both, as the bytes of a store depend on it",
+                key="scheduler",
+                value=worker,
+            )
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what decides about the bytes of a store.
+
+    Returns
+    -------
+    dict of str to str
+        By package.
+    """
+    found = {name: version(name) for name in ("cdshealpix", "numpy", "pyarrow", "scipy")}
+    return {"starcat": __version__, **found}
+
+
+def _told(known: dict[str, str]) -> str:
+    return ", ".join(f"{name} {version}" for name, version in known.items())
+
+
+def run_tasks(
+    client: Client,
+    function: Callable[[Any], Any],
+    items: Sequence[Any],
+    report: Callable[[int, Any], None] | None = None,
+) -> list[Any]:
+    """Call a function with each of some items on the workers of a cluster.
+
+    Parameters
+    ----------
+    client : distributed.Client
+        The cluster.
+    function : callable
+        Of a module; called again for an item whose worker died, so it must bear that.
+    items : sequence of object
+        What to call it with.
+    report : callable, optional
+        Called with the number of an item and its result when that is done.
+
+    Returns
+    -------
+    list of object
+        Results in the order of the items, whatever order they arrived in.
+
+    Raises
+    ------
+    BuildError
+        If an item killed its worker again and again.
+    Exception
+        What the function raised: of the first item that failed. The others are dropped.
+    """
+    from distributed import KilledWorker, as_completed
+
+    futures = client.map(function, list(items), pure=False, retries=0)
+    place = {future.key: number for number, future in enumerate(futures)}
+    results: list[Any] = [None] * len(futures)
+    try:
+        for future in as_completed(futures):
+            number = place[future.key]
+            results[number] = future.result()
+            if report is not None:
+                report(number, results[number])
+    except KilledWorker as error:
+        raise BuildError(
+            f"workers died again and again ({error}); give each more memory, with fewer --workers "
+            "or a smaller --max-partition-rows, then go on with --resume"
+        ) from error
+    finally:
+        client.cancel(futures, force=True)
+    return results

@@ -1,0 +1,160 @@
+"""The index of the runs: which batches of which runs hold the stars of a pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.store.pixels import Pixel, Pixels
+from starcat.store.runs import Run, Share
+
+
+@dataclass(frozen=True)
+class RunIndex:
+    """Batches by coarse pixel.
+
+    Attributes
+    ----------
+    order : int
+        Order of the coarse pixels.
+    paths : tuple of Path
+        Arrow files of the runs.
+    pixels : ndarray of int64, shape (B,)
+        Coarse pixel of each batch, ascending.
+    runs, batches : ndarray of int64, shape (B,)
+        Number of its run, and its number in the run.
+    """
+
+    order: int
+    paths: tuple[Path, ...]
+    pixels: Pixels
+    runs: NDArray[np.int64]
+    batches: NDArray[np.int64]
+
+    def shares(self, pixel: Pixel) -> list[Share]:
+        """Return the batches that hold the stars of a pixel.
+
+        Parameters
+        ----------
+        pixel : Pixel
+            Of any order.
+
+        Returns
+        -------
+        list of Share
+            One for each run that has any.
+        """
+        return self._of(pixel.at(self.order))
+
+    def shares_of(self, order: int, pixels: Pixels) -> list[Share]:
+        """Return the batches that hold the stars of several pixels.
+
+        Parameters
+        ----------
+        order : int
+            Order of the pixels.
+        pixels : ndarray of int64, shape (N,)
+            Their numbers.
+
+        Returns
+        -------
+        list of Share
+            One for each run that has any.
+        """
+        if order >= self.order:
+            return self._of(np.unique(pixels >> 2 * (order - self.order)))
+        shift = 2 * (self.order - order)
+        within = (pixels[:, None] << shift) + np.arange(1 << shift)
+        return self._of(np.unique(within))
+
+    def _of(self, coarse: Pixels) -> list[Share]:
+        begins = np.searchsorted(self.pixels, coarse)
+        ends = np.searchsorted(self.pixels, coarse, side="right")
+        ranges = [np.arange(b, e) for b, e in zip(begins, ends, strict=True) if e > b]
+        if not ranges:
+            return []
+        rows = np.concatenate(ranges)
+        shares: list[Share] = []
+        for run in np.unique(self.runs[rows]).tolist():
+            batches = np.sort(self.batches[rows[self.runs[rows] == run]])
+            shares.append(Share(self.paths[run], tuple(batches.tolist())))
+        return shares
+
+
+def read_runs(path: Path, count: int) -> list[Run]:
+    """Read what the runs of a file hold.
+
+    Parameters
+    ----------
+    path : Path
+        As splitting wrote it, beside the runs.
+    count : int
+        Number of runs.
+
+    Returns
+    -------
+    list of Run
+        In reading order.
+    """
+    with np.load(path) as held:
+        return [
+            Run(
+                path.with_name(f"{path.stem}-{k:04}.arrow"),
+                path.with_name(f"{path.stem}-{k:04}.places"),
+                held[f"batches{k}"],
+                held[f"rows{k}"],
+                held[f"buckets{k}"],
+            )
+            for k in range(count)
+        ]
+
+
+def write_index(path: Path, order: int, runs: Sequence[Run]) -> None:
+    """Write the index of all runs.
+
+    Parameters
+    ----------
+    path : Path
+        Overwritten.
+    order : int
+        Order of the coarse pixels.
+    runs : sequence of Run
+        In reading order.
+    """
+    empty = np.empty(0, dtype=np.int64)
+    pixels = np.concatenate([empty, *(run.pixels for run in runs)])
+    number = np.repeat(np.arange(len(runs)), [len(run.pixels) for run in runs])
+    batch = np.concatenate([empty, *(np.arange(len(run.pixels)) for run in runs)])
+    ascending = np.argsort(pixels, kind="stable")
+    np.savez(
+        path,
+        order=order,
+        paths=np.array([str(run.stars) for run in runs], dtype=np.str_),
+        pixels=pixels[ascending],
+        runs=number[ascending],
+        batches=batch[ascending],
+    )
+
+
+@lru_cache(maxsize=2)
+def read_index(path: Path) -> RunIndex:
+    """Read the index of all runs; a worker does so once.
+
+    Parameters
+    ----------
+    path : Path
+        As `write_index` wrote it.
+
+    Returns
+    -------
+    RunIndex
+        The index.
+    """
+    with np.load(path) as held:
+        paths = tuple(Path(text) for text in held["paths"].tolist())
+        return RunIndex(int(held["order"]), paths, held["pixels"], held["runs"], held["batches"])

@@ -1,0 +1,213 @@
+"""The ledger of a run: which of its tasks are done, and the digests of what they wrote.
+
+A store is made in a hidden folder beside its final name. Each task writes its files there and
+then, as its last step, one line of facts that says so. A run that was killed goes on from these:
+a task counts as done if its files are there and have their digests.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from starcat.errors import ConfigError, OutputError
+from starcat.storage.atomic import writing
+from starcat.storage.digests import file_sha256, json_bytes
+
+OPTIONS_NAME = "options.json"
+_DONE = "done"
+
+Task = Callable[[Any], tuple[dict[str, Any], list[Path]]]
+"""Does something and returns its result as plain values, and the files that it wrote."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """The hidden folder of a run.
+
+    Attributes
+    ----------
+    folder : Path
+        ``.<name>.work`` beside the final name.
+    """
+
+    folder: Path
+
+    @classmethod
+    def of(cls, final: Path) -> Work:
+        """Return the folder for a store.
+
+        Parameters
+        ----------
+        final : Path
+            Where the store will be.
+
+        Returns
+        -------
+        Work
+            Not made yet.
+        """
+        return cls(final.absolute().parent / f".{final.name}.work")
+
+    def __truediv__(self, name: str) -> Path:
+        """Return a path in the folder."""
+        return self.folder / name
+
+    def begin(self, options: Mapping[str, Any], *, resume: bool) -> None:
+        """Make the folder, or take up the run that was begun in it.
+
+        Parameters
+        ----------
+        options : mapping of str to object
+            All that the result depends on, as plain values.
+        resume : bool
+            Whether to go on where a run was.
+
+        Raises
+        ------
+        OutputError
+            If a run was begun and is not to be resumed.
+        ConfigError
+            If it was begun with other options.
+        """
+        path = self / OPTIONS_NAME
+        if path.is_file() and not resume:
+            raise OutputError(
+                f"{self.folder}: an unfinished run is there; go on with it by --resume, or remove "
+                "the folder to start anew",
+                path=self.folder,
+            )
+        if path.is_file():
+            self._check_options(json.loads(path.read_text(encoding="utf-8")), options)
+            return
+        with writing(self.folder.parent, "choose another --output"):
+            shutil.rmtree(self.folder, ignore_errors=True)
+            (self / _DONE).mkdir(parents=True)
+            path.write_bytes(json_bytes(dict(options)))
+
+    def _check_options(self, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+        for key, value in now.items():
+            if before.get(key) != value:
+                raise ConfigError(
+                    f"{self.folder}: the unfinished run has {key} {_short(before.get(key))}, this "
+                    f"one {_short(value)}; resume it with the same, or remove the folder to start "
+                    "anew",
+                    key=key,
+                    value=value,
+                )
+
+    def done(self, name: str) -> dict[str, Any] | None:
+        """Return the result of a task that is done.
+
+        Parameters
+        ----------
+        name : str
+            Name of the task.
+
+        Returns
+        -------
+        dict or None
+            None where it has to be done, for the first time or again: a file that it wrote is
+            missing, or is not what it wrote.
+        """
+        path = self._record(name)
+        try:
+            record = json.loads(path.read_bytes())
+            files: dict[str, str] = record["files"]
+            if all(file_sha256(self / file) == digest for file, digest in files.items()):
+                result: dict[str, Any] = record["result"]
+                return result
+        except (OSError, ValueError, KeyError, TypeError):
+            pass
+        return None
+
+    def is_recorded(self, name: str) -> bool:
+        """Return whether a task was done once, whatever has become of its files.
+
+        Parameters
+        ----------
+        name : str
+            Name of the task.
+
+        Returns
+        -------
+        bool
+            Whether there is a record of it.
+        """
+        return self._record(name).is_file()
+
+    def record(self, name: str, result: Mapping[str, Any], files: Sequence[Path]) -> None:
+        """Record that a task is done.
+
+        Parameters
+        ----------
+        name : str
+            Name of the task.
+        result : mapping of str to object
+            Plain values.
+        files : sequence of Path
+            All that it wrote.
+        """
+        digests = {file.relative_to(self.folder).as_posix(): file_sha256(file) for file in files}
+        path = self._record(name)
+        # Two workers may do the same task when one of them was thought dead: both write the same.
+        partial = path.with_name(f".{path.name}.{os.getpid()}")
+        partial.write_bytes(json_bytes({"files": digests, "result": dict(result)}))
+        partial.replace(path)
+
+    def _record(self, name: str) -> Path:
+        return self.folder / _DONE / f"{name}.json"
+
+
+@dataclass(frozen=True)
+class Job:
+    """A task with a name, which does not do what the ledger says is done.
+
+    Attributes
+    ----------
+    work : Work
+        The run that it is a part of.
+    name : str
+        Unique in the run.
+    task : callable
+        What to do.
+    asked : object
+        What to call it with.
+    """
+
+    work: Work
+    name: str
+    task: Task
+    asked: Any
+
+    def run(self) -> dict[str, Any]:
+        """Do the task and record it, if it is not done.
+
+        Returns
+        -------
+        dict
+            Its result.
+
+        Raises
+        ------
+        OutputError
+            If its files cannot be written, as on a full disk.
+        """
+        before = self.work.done(self.name)
+        if before is not None:
+            return before
+        advice = "what is done is kept: make room, then go on with --resume"
+        with writing(self.work.folder.parent, advice):
+            result, files = self.task(self.asked)
+            self.work.record(self.name, result, files)
+        return result
+
+
+def _short(value: object) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:60]}…"
