@@ -155,25 +155,38 @@ def ingest(
 
 @app.command()
 def crossmatch(
-    a: Annotated[Path, typer.Argument(metavar="A", help="Star table (Parquet) of the stars.")],
+    a: Annotated[
+        Path, typer.Argument(metavar="A", help="Star table (Parquet) or catalog store (HATS).")
+    ],
     b: Annotated[
-        Path, typer.Argument(metavar="B", help="Star table to look for their counterparts in.")
+        Path, typer.Argument(metavar="B", help="The same, to look for their counterparts in.")
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Parquet file to write.")],
     radius_arcsec: Annotated[
         float, typer.Option(min=0.001, max=600, help="Largest separation.")
     ] = 10.0,
+    workers: Workers = 2,
+    scheduler: Scheduler = None,
     json: Json = False,
 ) -> None:
     """Find the counterparts of stars in another catalog by position, epoch and magnitude.
 
     Every candidate is written with its odds; the verdicts say how sure the likeliest one is.
+    Catalog stores are matched partition by partition, whatever their size.
 
     Example: starcat crossmatch sao.parquet gaia.parquet -o both.parquet
     """
     from starcat.pipeline.counterparts import match_files
+    from starcat.pipeline.match_stores import match_on_cluster
     from starcat.specs.product_sections import Crossmatch
+    from starcat.store.layout import is_store
+    from starcat.terminal.console import progress_bars
     from starcat.terminal.crossmatches import print_crossmatch
 
-    found = match_files(a, b, output, Crossmatch(radius_arcsec=radius_arcsec))
+    wanted = Crossmatch(radius_arcsec=radius_arcsec)
+    if is_store(a) or is_store(b):
+        with progress_bars() as progress:
+            found = match_on_cluster(a, b, output, wanted, workers, scheduler, progress)
+    else:
+        found = match_files(a, b, output, wanted)
     print_crossmatch(found, (a.stem, b.stem), output, as_json=json)

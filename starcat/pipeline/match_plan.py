@@ -157,8 +157,8 @@ def hop_of(a: Extent, b: Extent, radius_rad: float) -> float:
 def pieces_of(
     a: Sequence[tuple[Pixel, int]],
     b: Sequence[tuple[Pixel, int]],
-    hop_rad: float,
-    radius_rad: float,
+    job: Job,
+    piece_load: int = PIECE_LOAD,
 ) -> list[Piece]:
     """Divide the sky into pieces that one worker at a time can hold.
 
@@ -166,16 +166,18 @@ def pieces_of(
     ----------
     a, b : sequence of (Pixel, int)
         Partitions of the two catalogs, and their stars.
-    hop_rad, radius_rad : float
-        As a `Job` has them.
+    job : Job
+        With the hop, which no piece is narrower than.
+    piece_load : int
+        Stars and pairs that a piece should have at most.
 
     Returns
     -------
     list of Piece
         In order of the sky; together they have all stars of A.
     """
-    finest = border_order(hop_rad)
-    share = np.pi * radius_rad**2 / (4.0 * np.pi / 12.0)
+    finest = border_order(job.hop_rad)
+    share = np.pi * job.radius_rad**2 / (4.0 * np.pi / 12.0)
     chosen: list[Pixel] = []
     waiting = [(Pixel(0, number), a, b) for number in range(12)]
     while waiting:
@@ -185,7 +187,7 @@ def pieces_of(
         pairs = stars * others * share * 4.0**pixel.order
         if not stars:
             continue
-        if pixel.order >= finest or stars + others + pairs <= PIECE_LOAD:
+        if pixel.order >= finest or stars + others + pairs <= piece_load:
             chosen.append(pixel)
         else:
             children = range(4 * pixel.number, 4 * pixel.number + 4)

@@ -25,6 +25,7 @@ from starcat.pipeline.counterparts import (
 )
 from starcat.pipeline.match_pieces import Judged, judge_piece, measure_piece
 from starcat.pipeline.match_plan import (
+    PIECE_LOAD,
     Extent,
     Job,
     Piece,
@@ -41,8 +42,12 @@ from starcat.products.match_figures import ARCSEC, Measured, figures_of
 from starcat.progress import Progress, no_progress
 from starcat.specs.product_sections import Crossmatch
 from starcat.storage.atomic import whole_file, whole_folder
-from starcat.store.layout import is_store
+from starcat.store.cluster import cluster, run_tasks
+from starcat.store.layout import is_store, open_store
 from starcat.tables.parquet import write_parts
+
+_SMALL_BYTES = 32 << 20
+"""Catalogs that are done before processes would have started."""
 
 
 class RunTasks(Protocol):
@@ -52,7 +57,7 @@ class RunTasks(Protocol):
         self,
         function: Callable[[Any], Any],
         items: Sequence[Any],
-        report: Callable[[int], None] | None = None,
+        report: Callable[[int, Any], None] | None = None,
     ) -> list[Any]:
         """Return the results in the order of the items."""
 
@@ -60,7 +65,7 @@ class RunTasks(Protocol):
 def run_here(
     function: Callable[[Any], Any],
     items: Sequence[Any],
-    report: Callable[[int], None] | None = None,
+    report: Callable[[int, Any], None] | None = None,
 ) -> list[Any]:
     """Call a function with each of some items, in this process.
 
@@ -71,7 +76,7 @@ def run_here(
     items : sequence of object
         What to call it with.
     report : callable, optional
-        Called with the number of an item when that is done.
+        Called with the number of an item and its result when that is done.
 
     Returns
     -------
@@ -82,8 +87,56 @@ def run_here(
     for number, item in enumerate(items):
         results.append(function(item))
         if report is not None:
-            report(number)
+            report(number, results[-1])
     return results
+
+
+def match_on_cluster(
+    a: Path,
+    b: Path,
+    output: Path,
+    wanted: Crossmatch,
+    workers: int = 2,
+    scheduler: str | None = None,
+    progress: Progress = no_progress,
+) -> Summary:
+    """Find the counterparts of the stars of one catalog in another, on a Dask cluster.
+
+    Parameters
+    ----------
+    a, b, output : Path
+        As `match_stores` takes them.
+    wanted : Crossmatch
+        Radius and model.
+    workers : int, default 2
+        Processes on this machine; threads where the stores are small.
+    scheduler : str, optional
+        Address of a cluster to use instead.
+    progress : Progress
+        Called with (stage, done, total).
+
+    Returns
+    -------
+    Summary
+        Counts and medians.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such cluster.
+    StarcatError
+        As `match_stores` does.
+    """
+    is_small = _bytes_of(a) + _bytes_of(b) < _SMALL_BYTES
+    with cluster(workers, scheduler, is_small=is_small) as client:
+        return match_stores(a, b, output, wanted, partial(run_tasks, client), progress)
+
+
+def _bytes_of(path: Path) -> int:
+    if not is_store(path):
+        return path.stat().st_size if path.is_file() else 0
+    partitions = open_store(path).catalog.partitions
+    return sum(each.stat().st_size for partition in partitions for each in partition.paths)
 
 
 def match_stores(
@@ -93,6 +146,7 @@ def match_stores(
     wanted: Crossmatch,
     run: RunTasks = run_here,
     progress: Progress = no_progress,
+    piece_load: int = PIECE_LOAD,
 ) -> Summary:
     """Find the counterparts of the stars of one catalog in another; neither need fit in memory.
 
@@ -112,6 +166,8 @@ def match_stores(
         for any number of workers. They need the same paths.
     progress : Progress
         Called with (stage, done, total).
+    piece_load : int
+        Stars and pairs that a task should hold at most; the result is the same for any.
 
     Returns
     -------
@@ -133,7 +189,7 @@ def match_stores(
         raise OutputError(
             f"{output}: cannot be written (Is a directory); choose another --output", path=output
         )
-    with whole_folder(output) as scratch:
+    with whole_folder(output.absolute()) as scratch:
         stores = [_as_store(path, scratch / name) for path, name in ((a, "a"), (b, "b"))]
         radius_rad = wanted.radius_arcsec * ARCSEC
         job = Job(stores[0], stores[1], scratch, radius_rad, model_from_spec(wanted))
@@ -141,7 +197,7 @@ def match_stores(
         (of_a, parts_a), (of_b, parts_b) = (tasks.extent(job, store) for store in stores)
         hop_rad = hop_of(of_a, of_b, radius_rad)
         job = replace(job, hop_rad=hop_rad)
-        pieces = pieces_of(parts_a, parts_b, hop_rad, radius_rad)
+        pieces = pieces_of(parts_a, parts_b, job, piece_load)
         measured = tasks.measured(job, pieces, of_a.census.stars)
         figures = figures_of(of_a.census, of_b.census, measured, radius_rad, job.model)
         job = replace(job, figures=figures)
@@ -161,7 +217,7 @@ def match_stores(
 def _as_store(path: Path, folder: Path) -> Path:
     """Return a store; a Parquet file becomes one."""
     if is_store(path):
-        return path
+        return path.absolute()
     store_of_file(read_star_table(path), path, folder)
     return folder
 
@@ -178,7 +234,7 @@ class _Tasks:
     ) -> list[Any]:
         done = [0]
 
-        def report(_: int) -> None:
+        def report(_: int, __: Any) -> None:
             done[0] += 1
             self._progress(stage, done[0], len(items))
 
