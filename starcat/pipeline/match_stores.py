@@ -258,8 +258,8 @@ class _Tasks:
         found = sum(each.stars for each in counted)
         if found != stars:
             raise ProductError(
-                f"{job.a}: has {stars:,} stars, of which {found:,} are where their pixels say; "
-                "partitions overlap or the store has changed meanwhile, make it again",
+                f"{job.a}: had {stars:,} stars when they were counted and {found:,} when they were "
+                "matched; the store has changed meanwhile, run it again",
                 path=job.a,
             )
         sure, angle = median_of([numbers_path(job, "sure", piece) for piece in pieces])

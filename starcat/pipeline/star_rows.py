@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import cache, lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +68,7 @@ def opened(folder: Path, run: Path) -> Store:
             f"{folder}: hats_col_healpix_order is {order}; expected pixels of order {MAX_ORDER}",
             path=folder,
         )
+    _check_partitions(store)
     for partition in store.catalog.partitions[:1]:
         with _parquet(partition.paths[0]) as file:
             names = set(file.schema_arrow.names)
@@ -80,6 +82,17 @@ def opened(folder: Path, run: Path) -> Store:
                 expected=NEEDED,
             )
     return store
+
+
+def _check_partitions(store: Store) -> None:
+    """Check that no part of the sky is in two partitions, whose stars would count twice."""
+    for before, after in pairwise(store.catalog.partitions):
+        if after.pixel.first < before.pixel.end:
+            raise ProductError(
+                f"{store.folder}: partitions {before.pixel.path.as_posix()} and "
+                f"{after.pixel.path.as_posix()} overlap; make the store again",
+                path=store.folder,
+            )
 
 
 def rows_of_partition(
@@ -147,7 +160,7 @@ def rows_of_region(store: Store, region: Region, columns: Sequence[str]) -> pa.T
     SchemaError, ParseError
         As `rows_of_partition` does.
     """
-    schema = _schema(columns)
+    schema = _schema(tuple(columns))
     parts = [schema.empty_table()]
     bounds = np.array(region.ranges, dtype=np.int64)
     for partition in store.catalog.partitions:
@@ -202,7 +215,7 @@ def _read(
     """Read a row group with the types of a star table; checked."""
     column = _pixel_column(store)
     table = file.read_row_group(group, [*columns, column])
-    schema = _schema(columns)
+    schema = _schema(tuple(columns))
     arrays = []
     for field in schema:
         values = table[column if field.name == HEALPIX_COLUMN else field.name]
@@ -221,7 +234,8 @@ def _read(
     return read.cast(schema)
 
 
-def _schema(columns: Sequence[str]) -> pa.Schema:
+@cache
+def _schema(columns: tuple[str, ...]) -> pa.Schema:
     known = product_schema("stars").arrow_schema
     fields = [known.field(name) for name in columns]
     return pa.schema([*fields, pa.field(HEALPIX_COLUMN, pa.int64(), nullable=False)])

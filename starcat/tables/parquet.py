@@ -44,13 +44,15 @@ def write_parts(parts: Iterable[pa.Table], example: pa.Table, path: Path) -> Non
         Overwritten if it exists.
     """
     waiting = example.schema.empty_table()
+    groups = 0
     with _writer(example, path) as writer:
         for part in parts:
             waiting = pa.concat_tables([waiting, part.cast(example.schema)])
             while len(waiting) >= ROW_GROUP_ROWS:
                 _write_group(writer, waiting.slice(0, ROW_GROUP_ROWS))
                 waiting = waiting.slice(ROW_GROUP_ROWS)
-        if len(waiting):
+                groups += 1
+        if len(waiting) or not groups:
             _write_group(writer, waiting)
 
 
