@@ -34,9 +34,9 @@ def stars_of(folder: Path) -> pa.Table:
 
 
 CASES = [
-    ("sao", "sao.dat.gz", 900),
-    ("tycho2", "tyc2.dat.gz", 100),
-    ("2mass", "psc_measured.gz", 50),
+    ("sao", "sao.dat.gz", 2000),
+    ("tycho2", "tyc2.dat.gz", 4000),
+    ("2mass", "psc_measured.gz", 300),
 ]
 
 

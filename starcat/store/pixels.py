@@ -25,6 +25,9 @@ MAX_ORDER = 29
 HEALPIX_COLUMN = "_healpix_29"
 _PIXELS_A_FOLDER = 10_000
 
+_DEEPEST = 12
+"""A border is made of pixels at most so many orders below: 16,388 of them."""
+
 _FIRST_WIDTH_RAD = 0.45 * np.sqrt(np.pi / 3.0)
 
 Pixels = NDArray[np.int64]
@@ -127,12 +130,12 @@ def border_of(pixel: Pixel, width_rad: float) -> tuple[int, Pixels]:
     Returns
     -------
     order : int
-        Their order: the highest of which no pixel is narrower than the distance.
+        Their order: the highest of which no pixel is narrower than the distance, or somewhat lower.
     pixels : ndarray of int64, shape (N,)
         Ascending. The ring of them around the pixel, where they are no larger than it; else the
         one that it lies in and those around that one.
     """
-    order = border_order(width_rad)
+    order = min(border_order(width_rad), pixel.order + _DEEPEST)
     if width_rad > _FIRST_WIDTH_RAD:
         return 0, np.arange(12, dtype=np.int64)
     if order >= pixel.order:
