@@ -98,7 +98,17 @@ def stars(records: Records, band: str) -> StarBlock:
             ),
         },
         verdicts,
+        np.sum([weight * _brightest(records, mags[n], n) for n, weight in weights.items()], axis=0),
     )
+
+
+def _brightest(records: Records, measured: NDArray[np.float64], band: str) -> NDArray[np.float64]:
+    """Return the brightest that a star can be in a band: NaN where the archive sets no limit.
+
+    Quality U says that the magnitude is a limit: the star is fainter at a confidence of 95 %.
+    """
+    is_limit = _any_flag(records, "ph_qual", b"U", {band: 1.0})
+    return np.where(is_limit, records[_BANDS[band][1]], measured)
 
 
 def _measured(records: Records, band: str) -> NDArray[np.float64]:
