@@ -322,14 +322,15 @@ def _count_problems(manifest: dict[str, Any], held: dict[str, HeldProduct]) -> I
             yield f"{source['source']}: {kept} kept, but {products['stars']['rows']} stars"
         if source["role"] == "stars" and "rejected" in held:
             counts = pc.value_counts(held["rejected"].table["reason"]).to_pylist()
-            found = {entry["values"]: entry["counts"] for entry in counts}
+            held_rows = {entry["values"]: entry["counts"] for entry in counts}
             listed = dict(source["rejected"])
             # Records beyond a read limit are counted and not listed; no other spec counts any.
             if spec["catalog"].get("read_limit_mag") is not None:
                 listed.pop(Reason.beyond_read_limit.name, None)
-            if found != listed:
+            if held_rows != listed:
                 yield (
-                    f"{source['source']}: rejected {listed}, but the product rejected holds {found}"
+                    f"{source['source']}: rejected {listed}, but the product rejected holds "
+                    f"{held_rows}"
                 )
         if source["role"] == "crossmatch" and "crossmatch" in held:
             found = counterparts_of(held["crossmatch"].table, source["source"])
