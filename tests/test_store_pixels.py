@@ -20,6 +20,7 @@ from starcat.store.pixels import (
 )
 from starcat.store.plan import partition_pixels, spill_order
 
+
 def points_near(pixel: Pixel, width_rad: float, rng: np.random.Generator) -> np.ndarray:
     """Return pixels of order 29 of points within a distance of a pixel's edge."""
     ra, dec = vertices(np.array([pixel.number]), pixel.order, step=25)

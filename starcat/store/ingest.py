@@ -20,8 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.catalog.blocks import Reading
+from starcat.catalog.file_parts import NAMED_PROBLEMS, FileFacts
 from starcat.catalog.ingest import check_band, given_files, missing_files, star_catalog
 from starcat.catalog.readers.files import InputFile
+from starcat.catalog.repeats import check_contents
+from starcat.catalog.source import data_source
 from starcat.errors import OutputError
 from starcat.progress import Progress, no_progress
 from starcat.storage.atomic import Outcome, move_into_place, writing
@@ -37,7 +40,7 @@ from starcat.store.options import StoreOptions, rows_of_a_run
 from starcat.store.pixels import MAX_ORDER, Pixel, border_of
 from starcat.store.plan import partition_pixels, spill_order
 from starcat.store.runs import BUCKETS, HISTOGRAM_ORDER, Run, repeated_places
-from starcat.store.split import TOLD_PROBLEMS, Split, split
+from starcat.store.split import Split, split
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -211,6 +214,8 @@ def _make(run: _Ingest) -> tuple[dict[str, Any], tuple[str, ...]]:
         folder.mkdir(parents=True, exist_ok=True)
     order = _order(run.files)
     parts = _split_all(run, order)
+    facts = [FileFacts(**part["file"]) for part in parts]
+    check_contents(run.files, facts, data_source(run.how.source_name))
     indexes = [run.work / f"runs/file-{number:05}.npz" for number in range(len(run.files))]
     runs = [
         one
@@ -228,10 +233,8 @@ def _make(run: _Ingest) -> tuple[dict[str, Any], tuple[str, ...]]:
     written = Written(parts, len(places), partitions, margins)
     manifest = make_manifest(run.name, run.how, written)
     describe_store(run.store, run.name, manifest, written, run.options)
-    problems = [
-        f"{part['file']['name']} {problem}" for part in parts for problem in part["problems"]
-    ]
-    return manifest, tuple(problems[:TOLD_PROBLEMS])
+    problems = tuple(problem for part in parts for problem in part["problems"])
+    return manifest, problems[:NAMED_PROBLEMS]
 
 
 def _order(files: Sequence[InputFile]) -> int:

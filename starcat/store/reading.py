@@ -19,12 +19,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from starcat.catalog.blocks import Part, Reading, join_parts
+from starcat.catalog.blocks import Reading, join_parts
+from starcat.catalog.file_parts import NAMED_PROBLEMS, FileFacts
 from starcat.catalog.ingest import (
-    FileFacts,
     Ingested,
     check_band,
-    count_by_reason,
     ingest,
     star_catalog,
     unmoved_stars,
@@ -42,8 +41,6 @@ from starcat.tables.schema import product_schema
 
 NEEDED = ("star_id", "ra_deg", "dec_deg", "epoch_jyear", "mag")
 """Columns that a catalog of others must have; ``band`` is taken for the one asked for."""
-
-_TOLD_PROBLEMS = 20
 
 
 def read_catalog(
@@ -116,12 +113,7 @@ class _Found:
 
     stars: list[pa.Table] = field(default_factory=list)
     rejected: list[pa.Table] = field(default_factory=list)
-    counts: dict[str, int] = field(default_factory=dict)
-
-    def count(self, reason: str, rows: int) -> None:
-        """Count records that are not held."""
-        if rows:
-            self.counts[reason] = self.counts.get(reason, 0) + rows
+    beyond: int = 0
 
 
 def _read_store(store: Store, how: Reading, workers: int, progress: Progress) -> Ingested:
@@ -132,18 +124,17 @@ def _read_store(store: Store, how: Reading, workers: int, progress: Progress) ->
     partitions = [(number, path) for number, path in enumerate(_paths(store))]
     found = _Found()
 
-    def read(numbered: tuple[int, Path]) -> tuple[pa.Table, int, int]:
+    def read(numbered: tuple[int, Path]) -> tuple[pa.Table, int]:
         return _bright_rows(*numbered, how, is_ours=manifest is not None)
 
     done = 0
     rows = [0] * len(partitions)
-    for (number, _), (stars, faint, unknown) in zip(
+    for (number, _), (stars, beyond) in zip(
         partitions, map_in_order(read, iter(partitions), workers), strict=True
     ):
         found.stars.append(stars)
-        found.count(Reason.beyond_read_limit.name, faint)
-        found.count(Reason.no_magnitude.name, unknown)
-        rows[number] = len(stars) + faint + unknown
+        found.beyond += beyond
+        rows[number] = len(stars) + beyond
         done += rows[number]
         progress(stage, done, None if manifest is None else manifest["kept"])
     if manifest is not None:
@@ -162,10 +153,7 @@ def _joined(
 ) -> Ingested:
     """Return what was read as reading the archive's files returns it."""
     rejected = product_schema("rejected").arrow_schema.empty_table()
-    part = Part(
-        0, 0, pa.concat_tables(found.stars), pa.concat_tables([rejected, *found.rejected]), []
-    )
-    stars, left_out = join_parts([part])
+    stars, left_out = join_parts(found.stars, [rejected, *found.rejected])
     if manifest is None or manifest["epoch_jyear"] is None:
         stars = _moved(stars, how.epoch_jyear)
     product_schema("stars").check(stars)
@@ -173,11 +161,14 @@ def _joined(
     malformed = malformed.sort_by([("source_file", "ascending"), ("source_line", "ascending")])
     problems = tuple(
         f"{files[row['source_file']].name} {row['detail']}"
-        for row in malformed.slice(0, _TOLD_PROBLEMS).to_pylist()
+        for row in malformed.slice(0, NAMED_PROBLEMS).to_pylist()
     )
-    notes = (*(manifest or {}).get("notes", ()), *unmoved_stars(how.source_name, stars, how.epoch_jyear))
+    notes = (
+        *(manifest or {}).get("notes", ()),
+        *unmoved_stars(how.source_name, stars, how.epoch_jyear),
+    )
     return Ingested(
-        how.source_name, how.band, stars, left_out, files, problems, notes, found.counts
+        how.source_name, how.band, stars, left_out, files, problems, notes, found.beyond
     )
 
 
@@ -261,17 +252,15 @@ def _paths(store: Store) -> list[Path]:
     return [path for partition in store.catalog.partitions for path in partition.paths]
 
 
-def _bright_rows(
-    number: int, path: Path, how: Reading, *, is_ours: bool
-) -> tuple[pa.Table, int, int]:
-    """Return a file's stars within the limit, and how many are fainter or have no magnitude."""
+def _bright_rows(number: int, path: Path, how: Reading, *, is_ours: bool) -> tuple[pa.Table, int]:
+    """Return a file's stars within the limit, and how many are beyond it."""
     names = product_schema("stars").arrow_schema.names
     try:
         with pq.ParquetFile(path) as file:
             has = file.schema_arrow.names
             _check_columns(path, has)
             columns = [name for name in names if name in has and not name.startswith("nearest_")]
-            groups, faint, unknown = _groups_within(file, how.read_limit_mag)
+            groups = _groups_within(file, how.read_limit_mag)
             table = file.read_row_groups(groups, columns, use_threads=False)
             table = table.replace_schema_metadata(None)
             total = file.metadata.num_rows
@@ -280,34 +269,23 @@ def _bright_rows(
             f"{path}: cannot be read as Parquet ({error}); get the catalog again", path=path
         ) from error
     if how.read_limit_mag is not None:
-        within = pc.fill_null(pc.less_equal(table["mag"], how.read_limit_mag), False)
-        blank = table["mag"].null_count
-        unknown += blank
-        faint += len(table) - blank - (pc.sum(within).as_py() or 0)
-        table = table.filter(within)
-    elif len(table) != total:
-        raise ProductError(f"{path}: {len(table)} of {total} rows could be read", path=path)
-    return _as_stars(table, number, how, is_ours=is_ours), faint, unknown
+        table = table.filter(pc.less_equal(table["mag"], how.read_limit_mag))
+    return _as_stars(table, number, how, is_ours=is_ours), total - len(table)
 
 
-def _groups_within(file: pq.ParquetFile, limit: float | None) -> tuple[list[int], int, int]:
-    """Return the row groups that may have stars within a limit, and the rows of the others."""
-    footer = file.metadata
+def _groups_within(file: pq.ParquetFile, limit: float | None) -> list[int]:
+    """Return the row groups that may have stars within a limit."""
     place = file.schema_arrow.names.index("mag")
-    groups, faint, unknown = [], 0, 0
-    for k in range(footer.num_row_groups):
-        group = footer.row_group(k)
+    groups = []
+    for k in range(file.metadata.num_row_groups):
+        group = file.metadata.row_group(k)
         known = group.column(place).statistics
-        if limit is None or known is None or not known.has_null_count:
+        is_known = limit is not None and known is not None
+        is_blank = is_known and known.has_null_count and known.null_count == group.num_rows
+        is_faint = is_known and known.has_min_max and known.min > limit
+        if not (is_blank or is_faint):
             groups.append(k)
-        elif known.null_count == group.num_rows:
-            unknown += group.num_rows
-        elif known.has_min_max and known.min > limit:
-            unknown += known.null_count
-            faint += group.num_rows - known.null_count
-        else:
-            groups.append(k)
-    return groups, faint, unknown
+    return groups
 
 
 def _check_columns(path: Path, has: Sequence[str]) -> None:
@@ -338,7 +316,11 @@ def _as_stars(table: pa.Table, number: int, how: Reading, *, is_ours: bool) -> p
     }
     if not is_ours:
         table = table.drop_columns(
-            [n for n in ("catalog", "band", "source_file", "source_line") if n in table.column_names]
+            [
+                n
+                for n in ("catalog", "band", "source_file", "source_line")
+                if n in table.column_names
+            ]
         )
     columns = []
     for wanted in schema:
@@ -368,10 +350,9 @@ def _read_beside(store: Store, how: Reading, found: _Found) -> None:
     for path in sorted((store.folder / REPEATED).glob("*.parquet")):
         again = pq.read_table(path)
         if limit is not None:
-            mag = floats_of(again, "mag")
-            found.count(Reason.no_magnitude.name, int(np.isnan(mag).sum()))
-            found.count(Reason.beyond_read_limit.name, int((mag > limit).sum()))
-            again = again.filter(pa.array(mag <= limit))
+            within = again.filter(pc.less_equal(again["mag"], limit))
+            found.beyond += len(again) - len(within)
+            again = within
         found.stars.append(_as_stars(again, 0, how, is_ours=True))
     for path in sorted((store.folder / REJECTED).glob("*.parquet")):
         rejected = pq.read_table(path, schema=product_schema("rejected").arrow_schema)
@@ -380,9 +361,9 @@ def _read_beside(store: Store, how: Reading, found: _Found) -> None:
                 pc.fill_null(pc.less_equal(rejected["mag"], limit), False),
                 pc.equal(rejected["reason"], Reason.malformed_record.name),
             )
-            for name, rows in count_by_reason(rejected.filter(pc.invert(listed))).items():
-                found.count(name, rows)
+            found.beyond += len(rejected)
             rejected = rejected.filter(listed)
+            found.beyond -= len(rejected)
         found.rejected.append(rejected)
 
 

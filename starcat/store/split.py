@@ -21,8 +21,6 @@ from starcat.store.pixels import MAX_ORDER
 from starcat.store.runs import HISTOGRAM_ORDER, Run, write_run
 from starcat.tables.schema import product_schema
 
-TOLD_PROBLEMS = 20
-
 
 @dataclass(frozen=True)
 class Split:
@@ -147,7 +145,7 @@ def split(asked: Split) -> tuple[dict[str, Any], list[Path]]:
         },
         "kept": kept,
         "rejected": {r.name: counts[r.name] for r in Reason if counts.get(r.name)},
-        "problems": [str(problem) for problem in reading.problems[:TOLD_PROBLEMS]],
+        "problems": list(reading.problems),
         "runs": len(written.runs),
     }
     written.index()
@@ -157,9 +155,8 @@ def split(asked: Split) -> tuple[dict[str, Any], list[Path]]:
 def _counted(parts: Iterable[Part], counts: dict[str, int]) -> Iterator[Part]:
     """Count rejected records by reason as they come."""
     for part in parts:
-        for known in (count_by_reason(part.rejected), getattr(part, "counted", {})):
-            for name, count in known.items():
-                counts[name] = counts.get(name, 0) + count
+        for name, count in count_by_reason(part.rejected, part.counted).items():
+            counts[name] = counts.get(name, 0) + count
         yield part
 
 
