@@ -32,9 +32,7 @@ def points_near(pixel: Pixel, width_rad: float, rng: np.random.Generator) -> np.
     return healpix_29(*radec_from_directions(np.cos(angle) * edge + np.sin(angle) * across))
 
 
-@given(
-    st.integers(0, 12), st.integers(0, 12 * 4**12 - 1), st.floats(-7.0, 0.3), st.integers(0, 99)
-)
+@given(st.integers(0, 12), st.integers(0, 12 * 4**12 - 1), st.floats(-7.0, 0.3), st.integers(0, 99))
 def test_the_border_holds_all_within_the_distance(order, number, exponent, seed):
     pixel = Pixel(order, number % (12 * 4**order))
     width = 10.0**exponent

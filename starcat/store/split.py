@@ -17,6 +17,7 @@ from starcat.catalog.ingest import count_by_reason
 from starcat.catalog.readers.files import InputFile
 from starcat.catalog.source import data_source
 from starcat.catalog.verdict import Reason
+from starcat.storage.digests import file_sha256
 from starcat.store.pixels import MAX_ORDER
 from starcat.store.runs import HISTOGRAM_ORDER, Run, write_run
 from starcat.tables.schema import product_schema
@@ -122,6 +123,7 @@ def split(asked: Split) -> tuple[dict[str, Any], list[Path]]:
     SourceError
         If the file is damaged, or not of this archive.
     """
+    (asked.rejected / f"{asked.name}.parquet").unlink(missing_ok=True)
     written = _Written(asked)
     reading = FileReading(asked.file, asked.number, data_source(asked.how.source_name), asked.how)
     counts: dict[str, int] = {}
@@ -150,6 +152,24 @@ def split(asked: Split) -> tuple[dict[str, Any], list[Path]]:
     }
     written.index()
     return result, written.files
+
+
+def is_unchanged(asked: Split, result: dict[str, Any]) -> bool:
+    """Return whether a file is still what it was when it was split.
+
+    Parameters
+    ----------
+    asked : Split
+        The file.
+    result : dict
+        What splitting it gave.
+
+    Returns
+    -------
+    bool
+        By the digest of the file.
+    """
+    return bool(file_sha256(asked.file.path) == result["file"]["sha256"])
 
 
 def _counted(parts: Iterable[Part], counts: dict[str, int]) -> Iterator[Part]:
