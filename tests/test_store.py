@@ -16,14 +16,6 @@ from starcat.store.pixels import HEALPIX_COLUMN, healpix_29
 from starcat.store.reading import read_catalog
 
 
-def files_of(folder: Path) -> dict[str, bytes]:
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
-
-
 def stars_of(folder: Path) -> pa.Table:
     """Return all stars of a store by star_id, as ingest returns them."""
     paths = [path for part in open_store(folder).catalog.partitions for path in part.paths]

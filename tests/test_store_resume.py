@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 
+from folder_bytes import bytes_of
 from twomass_parts import write_part
 
 from starcat.errors import BuildError, ConfigError, OutputError, ParseError, SourceError
@@ -35,14 +37,6 @@ def whole(parts, tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole") / "store"
     ingest_to_store("2mass", parts, folder, options=StoreOptions(**SMALL))
     return bytes_of(folder)
-
-
-def bytes_of(folder: Path) -> dict[str, bytes]:
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
 
 
 def make(parts, folder: Path, **options):
@@ -190,3 +184,29 @@ def test_a_part_that_is_there_twice_is_told(parts, tmp_path):
     again = Path(shutil.copy(parts[0], tmp_path / "psc_zzz.gz"))
     with pytest.raises(SourceError, match="same content"):
         make([*parts, again], tmp_path / "store")
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 2 MB, and a function that makes it larger."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+
+    def mount(*options: str) -> bool:
+        arguments = ["mount", "-t", "tmpfs", "-o", ",".join(options), "tmpfs", str(folder)]
+        return subprocess.run(arguments, capture_output=True, check=False).returncode == 0
+
+    if not mount("size=2m"):
+        pytest.skip("a small file system is wanted, and this user may not mount one")
+    yield folder, lambda: mount("remount", "size=200m")
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_a_full_disk_is_told_and_the_run_goes_on_when_there_is_room(parts, whole, small_disk):
+    folder, make_room = small_disk
+    with pytest.raises(OutputError, match=r"No space left on device.*make room.*--resume"):
+        make(parts, folder / "store")
+    assert not (folder / "store").exists()
+    assert make_room()
+    make(parts, folder / "store", resume=True)
+    assert bytes_of(folder / "store") == whole

@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from starcat.storage.atomic import placed
 from starcat.storage.digests import file_sha256
 from starcat.store.brightness import bright_first, write_partition
 from starcat.store.index import RunIndex, read_index
@@ -85,7 +86,8 @@ def finish(asked: Finish) -> tuple[dict[str, Any], list[Path]]:
     if len(again):
         path = asked.collection / REPEATED / f"{pixel.order}-{pixel.number}.parquet"
         path.parent.mkdir(exist_ok=True)
-        pq.write_table(again.drop_columns(HEALPIX_COLUMN), path, compression="zstd")
+        with placed(path) as partial:
+            pq.write_table(again.drop_columns(HEALPIX_COLUMN), partial, compression="zstd")
         files.append(path)
     result: dict[str, Any] = {"rows": len(stars), "repeated": len(again)}
     if not len(stars):
@@ -182,7 +184,11 @@ def _write_borders(stars: pa.Table, asked: Finish) -> list[Path]:
         return []
     path = border_path(asked.borders, asked.pixel)
     pixels = stars[HEALPIX_COLUMN].to_numpy()
-    with pa.OSFile(str(path), "wb") as sink, pa.ipc.new_file(sink, stars.schema) as writer:
+    with (
+        placed(path) as partial,
+        pa.OSFile(str(partial), "wb") as sink,
+        pa.ipc.new_file(sink, stars.schema) as writer,
+    ):
         for other in asked.beside:
             order, border = border_of(other, asked.margin_rad)
             rows = rows_within(pixels, order, border, other)

@@ -28,7 +28,7 @@ from starcat.catalog.repeats import check_contents
 from starcat.catalog.source import data_source
 from starcat.errors import OutputError
 from starcat.progress import Progress, no_progress
-from starcat.storage.atomic import Outcome, move_into_place, writing
+from starcat.storage.atomic import Outcome, move_into_place, remove_partial, writing
 from starcat.storage.digests import file_sha256
 from starcat.store.account import Written, describe_store, make_manifest
 from starcat.store.cluster import cluster, run_tasks, versions
@@ -36,7 +36,7 @@ from starcat.store.finish import Finish, Margin, border_path, finish
 from starcat.store.finish import write_margin as make_margin
 from starcat.store.index import read_runs, write_index
 from starcat.store.layout import REJECTED, REPEATED
-from starcat.store.ledger import Job, Work
+from starcat.store.ledger import RESUME_ADVICE, Job, Work
 from starcat.store.options import StoreOptions, rows_of_a_run
 from starcat.store.pixels import MAX_ORDER, Pixel, border_of
 from starcat.store.plan import partition_pixels, spill_order
@@ -180,9 +180,11 @@ def ingest_to_store(
     is_small = size < _SMALL_BYTES
     with cluster(options.workers, options.scheduler, is_small=is_small) as client:
         run = _Ingest(work, output.name, files, how, options, client, progress)
-        manifest, problems = _make(run)
+        with writing(output.absolute().parent, RESUME_ADVICE):
+            manifest, problems = _make(run)
     progress("store", 0, None)
-    with writing(output.absolute().parent, "what is done is kept; go on with --resume"):
+    remove_partial(run.store)
+    with writing(output.absolute().parent, RESUME_ADVICE):
         outcome = move_into_place(run.store, output.absolute(), replace=options.replace)
     shutil.rmtree(work.folder, ignore_errors=True)
     return Stored(output, outcome, manifest, problems, tuple(manifest["notes"]))

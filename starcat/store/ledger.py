@@ -20,6 +20,7 @@ from starcat.storage.atomic import writing
 from starcat.storage.digests import file_sha256, json_bytes
 
 OPTIONS_NAME = "options.json"
+RESUME_ADVICE = "what is done is kept: make room, then go on with --resume"
 _DONE = "done"
 
 Task = Callable[[Any], tuple[dict[str, Any], list[Path]]]
@@ -193,8 +194,7 @@ class Job:
         before = self.work.done(self.name)
         if before is not None and self.is_valid(self.asked, before):
             return before
-        advice = "what is done is kept: make room, then go on with --resume"
-        with writing(self.work.folder.parent, advice):
+        with writing(self.work.folder.parent, RESUME_ADVICE):
             result, files = self.task(self.asked)
             self.work.record(self.name, result, files)
         return result
