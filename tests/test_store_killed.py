@@ -95,11 +95,13 @@ def test_a_worker_of_a_cluster_may_be_killed_at_any_moment(parts, whole, tmp_pat
     for attempt in range(5):
         folder = tmp_path / str(attempt)
         folder.mkdir()
-        with dask_cluster(folder) as (address, workers):
-            with running(command(parts, folder / "store", "--scheduler", address)) as process:
-                time.sleep(draw.uniform(0.2, 0.8) * took_s)
-                os.killpg(workers[attempt % 2].pid, signal.SIGKILL)
-                _, told = process.communicate(timeout=300)
+        with ExitStack() as stack:
+            address, workers = stack.enter_context(dask_cluster(folder))
+            asked = command(parts, folder / "store", "--scheduler", address)
+            process = stack.enter_context(running(asked))
+            time.sleep(draw.uniform(0.2, 0.8) * took_s)
+            os.killpg(workers[attempt % 2].pid, signal.SIGKILL)
+            _, told = process.communicate(timeout=300)
         assert process.returncode == 0, told.decode()
         assert bytes_of(folder / "store") == expected
 

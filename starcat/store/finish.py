@@ -19,7 +19,7 @@ from starcat.store.brightness import bright_first, write_partition
 from starcat.store.index import RunIndex, read_index
 from starcat.store.layout import DATASET, REPEATED
 from starcat.store.neighbours import COLUMNS, add_neighbours
-from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, Pixel, Pixels, border_of
+from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, Pixel, Pixels, border_of, pixel_field
 from starcat.store.runs import places_of, read_shares
 from starcat.tables.schema import product_schema
 
@@ -132,13 +132,7 @@ def store_schema() -> pa.Schema:
         ``_healpix_29`` in front of the released stars schema, which it names.
     """
     schema = product_schema("stars").arrow_schema
-    pixel = pa.field(
-        HEALPIX_COLUMN,
-        pa.int64(),
-        nullable=False,
-        metadata={"description": "Nested HEALPix pixel of order 29, ICRS", "ucd": "pos.healpix"},
-    )
-    return pa.schema([pixel, *schema], metadata=schema.metadata)
+    return pa.schema([pixel_field(), *schema], metadata=schema.metadata)
 
 
 def _in_order(stars: pa.Table) -> pa.Table:

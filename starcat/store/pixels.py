@@ -11,11 +11,11 @@ Gorski et al. 2005, ApJ 622, 759 (HEALPix); HATS 1.0, IVOA Note.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from starcat.errors import ConfigError
@@ -86,6 +86,18 @@ class Pixel:
             return np.array([self.number >> 2 * (self.order - order)], dtype=np.int64)
         shift = 2 * (order - self.order)
         return np.arange(self.number << shift, (self.number + 1) << shift, dtype=np.int64)
+
+
+def pixel_field() -> pa.Field:
+    """Return the column of the stars' pixels.
+
+    Returns
+    -------
+    pyarrow.Field
+        With its meaning.
+    """
+    meaning = {"description": "Nested HEALPix pixel of order 29, ICRS", "ucd": "pos.healpix"}
+    return pa.field(HEALPIX_COLUMN, pa.int64(), nullable=False, metadata=meaning)
 
 
 def healpix_29(ra_deg: NDArray[np.float64], dec_deg: NDArray[np.float64]) -> Pixels:
@@ -187,7 +199,6 @@ def _valid(*parts: Any) -> Pixels:
     return np.unique(together[together >= 0])
 
 
-@cache
 def _nested() -> Any:
     try:
         from cdshealpix import nested
