@@ -201,7 +201,7 @@ def _valid(*parts: Any) -> Pixels:
 
 def _nested() -> Any:
     try:
-        from cdshealpix import nested
+        import cdshealpix.nested as nested
     except ImportError as error:
         raise ConfigError(
             f"HATS needs the package cdshealpix, which is not installed; {install_command('hats')}"
