@@ -21,7 +21,7 @@ from starcat.catalog.proper_motion import Motion, propagate
 from starcat.catalog.quality import Quality
 from starcat.catalog.source import data_source
 from starcat.catalog.stars import directions_of, floats_of
-from starcat.errors import ConfigError, ParseError, SourceMissing
+from starcat.errors import BuildError, ConfigError, ParseError, SourceMissing
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.tables.schema import product_schema
 
@@ -1099,9 +1099,10 @@ def test_rows_are_sorted_and_remember_their_line(read: Callable[..., Ingested]) 
 
 
 @pytest.mark.parametrize(
-    ("limit", "kept", "reasons"), [(6.4, [1, 3], {"too_faint": 1}), (6.3, [3], {"too_faint": 2})]
+    ("limit", "kept", "reasons"),
+    [(6.4, [1], {"beyond_read_limit": 2}), (6.3, [], {"beyond_read_limit": 3})],
 )
-def test_read_limit_keeps_the_limit_itself_and_stars_without_magnitude(
+def test_read_limit_keeps_the_limit_itself_but_no_star_without_magnitude(
     read: Callable[..., Ingested], limit: float, kept: list[int], reasons: dict[str, int]
 ) -> None:
     mags = {1: " 6.4", 2: " 6.5", 3: "99.9"}
@@ -1109,6 +1110,49 @@ def test_read_limit_keeps_the_limit_itself_and_stars_without_magnitude(
     found = read("sao", *lines, read_limit_mag=limit)
     assert found.stars["star_id"].to_pylist() == kept
     assert found.rejected_by_reason == reasons
+    assert found.beyond_read_limit == sum(reasons.values())
+    assert len(found.rejected) == 0
+
+
+def test_a_record_beyond_the_read_limit_is_only_counted_whatever_else_it_is(
+    read: Callable[..., Ingested],
+) -> None:
+    doubtful = {"mp_flg": "1", "k_m": "9.0"}
+    lines = [psc(pts_key="1", **doubtful), psc(pts_key="2", k_m="7.9"), b"not a record"]
+    found = read("2mass", *lines, psc(pts_key="3", k_m="7.9", mp_flg="1"), read_limit_mag=8.0)
+    assert found.stars["star_id"].to_pylist() == [2]
+    assert found.rejected["reason"].to_pylist() == ["minor_planet", "malformed_record"]
+    assert found.rejected_by_reason == {
+        "malformed_record": 1, "beyond_read_limit": 1, "minor_planet": 1
+    }  # fmt: skip
+    assert found.rows_read == 4
+
+
+@pytest.mark.parametrize(
+    ("fields", "is_beyond"),
+    [
+        ({"k_m": "8.0"}, False),
+        ({"k_m": "8.1"}, True),
+        ({"ph_qual": "AAU", "k_m": "7.9"}, True),
+        ({"ph_qual": "UAA", "j_m": "8.1"}, False),
+    ],
+)
+def test_an_upper_limit_of_the_brightness_is_no_magnitude_within_the_read_limit(
+    read: Callable[..., Ingested], fields: dict[str, str], is_beyond: bool
+) -> None:
+    found = read("2mass", psc(**{"k_m": "7.0", **fields}), read_limit_mag=8.0)
+    assert found.beyond_read_limit == int(is_beyond)
+
+
+def test_records_that_get_lost_are_a_fault_of_starcat(
+    read: Callable[..., Ingested], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "starcat.catalog.ingest.join_parts",
+        lambda stars, rejected: (stars[0].slice(1), rejected[0]),
+    )
+    with pytest.raises(BuildError, match="2 records read, but 1 kept and 0 rejected"):
+        read("sao", sao(sao="     1"), sao(sao="     2"))
 
 
 def test_nearest_neighbours_are_those_of_all_that_was_read(read: Callable[..., Ingested]) -> None:

@@ -67,6 +67,22 @@ def test_a_brighter_limit_lets_stars_go(small_artifact: Path, make: Make) -> Non
     assert not back.went
 
 
+def test_a_star_beyond_the_read_limit_of_the_other_is_said_to_be(
+    small_artifact: Path, make: Make
+) -> None:
+    a = open_artifact(small_artifact)
+    b = make("b", catalog={"source": "sao", "read_limit_mag": 5.5})
+    found = diff_artifacts(a, b)
+    # A merged star is brighter than each of its records.
+    assert {star.reason for star in found.went} == {"beyond_read_limit"}
+    assert all(star.mag is not None and star.mag > 5.5 for star in found.went)
+    [source] = b.manifest["sources"]
+    beyond = source["rejected"]["beyond_read_limit"]
+    assert beyond > len(found.went) > 20
+    assert source["rows_read"] == source["kept"] + sum(source["rejected"].values())
+    assert len(b.table("rejected")) == sum(source["rejected"].values()) - beyond
+
+
 def test_every_star_is_accounted_for(
     small_artifact: Path, make: Make, sao_lines: list[bytes]
 ) -> None:

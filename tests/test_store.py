@@ -13,14 +13,7 @@ from starcat.store.ingest import ingest_to_store
 from starcat.store.layout import open_store
 from starcat.store.options import StoreOptions
 from starcat.store.pixels import HEALPIX_COLUMN, healpix_29
-
-
-def files_of(folder: Path) -> dict[str, bytes]:
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
+from starcat.store.reading import read_catalog
 
 
 def stars_of(folder: Path) -> pa.Table:
@@ -31,9 +24,9 @@ def stars_of(folder: Path) -> pa.Table:
 
 
 CASES = [
-    ("sao", "sao.dat.gz", 900),
-    ("tycho2", "tyc2.dat.gz", 100),
-    ("2mass", "psc_measured.gz", 50),
+    ("sao", "sao.dat.gz", 2000),
+    ("tycho2", "tyc2.dat.gz", 4000),
+    ("2mass", "psc_measured.gz", 300),
 ]
 
 
@@ -51,3 +44,20 @@ def test_a_store_holds_what_ingest_returns(source, name, max_rows, catalogs, tmp
     assert made.manifest["rejected"] == read.rejected_by_reason
     assert made.manifest["rows_read"] == read.rows_read
     assert len(made.manifest["partitions"]) > 3
+
+
+@pytest.mark.parametrize("limit", [None, 9.0])
+@pytest.mark.parametrize(("source", "name", "max_rows"), CASES)
+def test_a_build_reads_from_a_store_what_it_reads_from_files(
+    source, name, max_rows, limit, catalogs, tmp_path
+):
+    paths = [catalogs / name]
+    options = StoreOptions(max_partition_rows=max_rows)
+    ingest_to_store(source, paths, tmp_path / "store", options=options)
+    how = {"epoch_jyear": 2026.5, "read_limit_mag": limit}
+    files, store = ingest(source, paths, **how), read_catalog(source, [tmp_path / "store"], **how)
+    assert store.stars.equals(files.stars)
+    assert store.rejected.equals(files.rejected)
+    assert store.rejected_by_reason == files.rejected_by_reason
+    assert (store.files, store.problems) == (files.files, files.problems)
+    assert store.notes == files.notes

@@ -313,6 +313,7 @@ def manifest_case(words: str, change: Change) -> Any:
         manifest_case("kept, but", lambda m: m["sources"][0].update(kept=600, rejected={})),
         manifest_case("in its files", lambda m: m["sources"][0]["files"][0].update(rows=5)),
         manifest_case("product rejected holds", lambda m: swap_reason(m["sources"][0]["rejected"])),
+        manifest_case("'beyond_read_limit'", lambda m: uncount(m["sources"][0]["rejected"])),
         manifest_case("the spec says 201", lambda m: m["spec"]["boresights"].update(count=201)),
         manifest_case("its spec says", lambda m: m.update(epoch_jyear=2000.0)),
         manifest_case("not among the files", lambda m: m["files"].pop("pairs.parquet")),
@@ -325,6 +326,11 @@ def test_counts_that_do_not_add_up(words: str, change: Change, copy: Path) -> No
 
 def swap_reason(rejected: dict[str, int]) -> None:
     rejected["too_bright"] = rejected.pop("too_faint")
+
+
+def uncount(rejected: dict[str, int]) -> None:
+    """Claim that records are only counted, where no read limit counts any."""
+    rejected["beyond_read_limit"] = rejected.pop("too_faint")
 
 
 # Products whose files are whole but whose content is not right -------------------------------

@@ -179,11 +179,19 @@ def diff_artifacts(a: Artifact, b: Artifact) -> Difference:
         spec=changes_between(_dotted(a.manifest["spec"]), _dotted(b.manifest["spec"])),
         sources=changes_between(_source_facts(a), _source_facts(b)),
         software=changes_between(a.manifest["software"], b.manifest["software"]),
-        came=_one_sided(stars_b, rows_b, known_a),
-        went=_one_sided(stars_a, rows_a, known_b),
+        came=_one_sided(stars_b, rows_b, known_a, _read_limit_mag(a, b)),
+        went=_one_sided(stars_a, rows_a, known_b, _read_limit_mag(b, a)),
         moved=_moved(stars_a.take(rows_a), stars_b.take(rows_b)),
         products=_products(a.manifest["products"], b.manifest["products"]),
     )
+
+
+def _read_limit_mag(artifact: Artifact, other: Artifact) -> float:
+    """Return the magnitude beyond which an artifact lists no star of the other's catalog."""
+    mine, theirs = (side.manifest["spec"]["catalog"] for side in (artifact, other))
+    limit_mag = mine.get("read_limit_mag")
+    is_same = all(mine.get(key) == theirs.get(key) for key in ("source", "band"))
+    return float("inf") if limit_mag is None or not is_same else float(limit_mag)
 
 
 def _catalog(artifact: Artifact) -> str:
@@ -247,7 +255,7 @@ def changes_between(a: Mapping[str, Any], b: Mapping[str, Any]) -> tuple[Change,
 
 
 def _one_sided(
-    stars: pa.Table, common: NDArray[np.intp], rejected: pa.Table
+    stars: pa.Table, common: NDArray[np.intp], rejected: pa.Table, read_limit_mag: float
 ) -> tuple[OneSided, ...]:
     alone = np.ones(len(stars), dtype=bool)
     alone[common] = False
@@ -260,6 +268,10 @@ def _one_sided(
         # A repeated record says nothing of the star: its first record was judged.
         if reasons.get(star_id, Reason.duplicate_record.name) == Reason.duplicate_record.name:
             reasons[star_id] = reason
+    beyond = Reason.beyond_read_limit.name
+    for star_id, mag in zip(found["star_id"].to_pylist(), found["mag"].to_pylist(), strict=True):
+        if mag is not None and mag > read_limit_mag:
+            reasons.setdefault(star_id, beyond)
     return tuple(
         OneSided(**star, reason=reasons.get(star["star_id"], NOT_READ))
         for star in found.to_pylist()

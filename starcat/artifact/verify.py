@@ -33,6 +33,7 @@ from starcat.artifact.table_checks import (
     columns_follow_the_schema,
 )
 from starcat.catalog.stars import directions_of
+from starcat.catalog.verdict import Reason
 from starcat.errors import ArtifactMissing, ProductError, StarcatError
 from starcat.storage.digests import file_sha256, json_bytes
 from starcat.storage.hdf5 import own_group
@@ -321,11 +322,15 @@ def _count_problems(manifest: dict[str, Any], held: dict[str, HeldProduct]) -> I
             yield f"{source['source']}: {kept} kept, but {products['stars']['rows']} stars"
         if source["role"] == "stars" and "rejected" in held:
             counts = pc.value_counts(held["rejected"].table["reason"]).to_pylist()
-            counted = {entry["values"]: entry["counts"] for entry in counts}
-            if counted != source["rejected"]:
+            held_rows = {entry["values"]: entry["counts"] for entry in counts}
+            listed = dict(source["rejected"])
+            # Records beyond a read limit are counted and not listed; no other spec counts any.
+            if spec["catalog"].get("read_limit_mag") is not None:
+                listed.pop(Reason.beyond_read_limit.name, None)
+            if held_rows != listed:
                 yield (
-                    f"{source['source']}: rejected {source['rejected']}, but the product rejected "
-                    f"holds {counted}"
+                    f"{source['source']}: rejected {listed}, but the product rejected holds "
+                    f"{held_rows}"
                 )
         if source["role"] == "crossmatch" and "crossmatch" in held:
             found = counterparts_of(held["crossmatch"].table, source["source"])

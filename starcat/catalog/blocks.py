@@ -59,7 +59,7 @@ class Reading:
     epoch_jyear : float, optional
         Julian year to move positions to; None leaves every star at its own epoch.
     read_limit_mag : float, optional
-        Fainter records are rejected.
+        Fainter records are counted and not held.
     """
 
     source_name: str
@@ -79,9 +79,11 @@ class Part:
     rows : int
         Records in it, good and malformed.
     stars, rejected : pyarrow.Table
-        Its records, each in one of the two.
+        Its records, each in one of the two, but those that are only counted.
     problems : list of Problem
         Why records are malformed.
+    counted : int
+        Records beyond the read limit, which are in neither table.
     """
 
     file_number: int
@@ -89,6 +91,7 @@ class Part:
     stars: pa.Table
     rejected: pa.Table
     problems: list[Problem]
+    counted: int = 0
 
 
 def parse_block(file_number: int, block: Block, how: Reading) -> Part:
@@ -106,20 +109,23 @@ def parse_block(file_number: int, block: Block, how: Reading) -> Part:
     Returns
     -------
     Part
-        Every record of the block, in the one table or the other.
+        Every record of the block, in the one table or the other, or counted.
     """
     layout = block.file.layout
     module = CATALOGS[how.source_name]
     names = list(module.columns[layout.name])
     records = _PARSERS[layout.layout](block.data, layout, names, block.first_line)
-    made = without_impossible(module.stars(records, how.band))
+    made, line, counted = module.stars(records, how.band), records.line, 0
     if how.read_limit_mag is not None:
-        mag = np.asarray(made.columns["mag"], dtype=np.float64)
-        made.verdicts.reject(mag > how.read_limit_mag, Reason.too_faint)
+        # Nearly all records of a large catalog leave here, before anything is made of them.
+        is_held = made.is_within(how.read_limit_mag)
+        made, line = made.where(is_held), line[is_held]
+        counted = len(records) - len(line)
+    made = without_impossible(made)
     columns = move_to_epoch(made.columns, how.epoch_jyear)
     columns |= {"catalog": how.source_name, "source_file": file_number}
-    columns |= {"source_line": records.line}
-    table = table_from_columns("stars", columns, len(records))
+    columns |= {"source_line": line}
+    table = table_from_columns("stars", columns, len(line))
     kept = made.verdicts.is_kept
     if kept.all():
         stars, rejected = table, []
@@ -131,7 +137,7 @@ def parse_block(file_number: int, block: Block, how: Reading) -> Part:
         rejected.append(malformed_rows(problems, file_number, how.source_name, how.band))
     empty = product_schema("rejected").arrow_schema.empty_table()
     left_out = pa.concat_tables(rejected) if rejected else empty
-    return Part(file_number, len(records) + len(problems), stars, left_out, problems)
+    return Part(file_number, len(records) + len(problems), stars, left_out, problems, counted)
 
 
 def reject_rows(stars: pa.Table, reasons: pa.Array) -> pa.Table:
@@ -155,13 +161,57 @@ def reject_rows(stars: pa.Table, reasons: pa.Array) -> pa.Table:
     return pa.Table.from_arrays(columns, schema=schema)
 
 
-def join_parts(parts: Sequence[Part]) -> tuple[pa.Table, pa.Table]:
-    """Join the blocks of a catalog, and reject the records whose star was read before.
+class TablePile:
+    """Tables that are to be joined; many small ones are joined as they come, to save memory.
 
     Parameters
     ----------
-    parts : sequence of Part
-        At least one.
+    product : {"stars", "rejected"}
+        Whose schema they follow.
+    """
+
+    def __init__(self, product: str) -> None:
+        self._schema = product_schema(product).arrow_schema
+        self._done: list[pa.Table] = []
+        self._small: list[pa.Table] = []
+
+    def add(self, table: pa.Table) -> None:
+        """Put a table on the pile.
+
+        Parameters
+        ----------
+        table : pyarrow.Table
+            The next rows.
+        """
+        self._small += [table] if len(table) else []
+        if len(self._small) >= 256 or sum(map(len, self._small)) >= _SMALL_ROWS:
+            self._join_small()
+
+    def _join_small(self) -> None:
+        if len(self._small) > 1:
+            self._small = [pa.concat_tables(self._small).combine_chunks()]
+        self._done += self._small
+        self._small = []
+
+    @property
+    def tables(self) -> list[pa.Table]:
+        """What is on the pile, in order: at least one table."""
+        self._join_small()
+        return self._done or [self._schema.empty_table()]
+
+
+_SMALL_ROWS = 8192
+
+
+def join_parts(
+    stars: Sequence[pa.Table], rejected: Sequence[pa.Table]
+) -> tuple[pa.Table, pa.Table]:
+    """Join the parts of a catalog, and reject the records whose star was read before.
+
+    Parameters
+    ----------
+    stars, rejected : sequence of pyarrow.Table
+        At least one of each.
 
     Returns
     -------
@@ -171,15 +221,14 @@ def join_parts(parts: Sequence[Part]) -> tuple[pa.Table, pa.Table]:
         Table of the rejected schema, in its order.
     """
     # Chunks stay as they are: joining them would hold the whole catalog in memory twice.
-    stars = pa.concat_tables([part.stars for part in parts])
     keys = ["star_id", "source_file", "source_line"]
-    stars = sort_rows(stars, keys)
-    rejected = [part.rejected for part in parts]
-    number = stars["star_id"].to_numpy()
+    joined = sort_rows(pa.concat_tables(stars), keys)
+    left_out = list(rejected)
+    number = joined["star_id"].to_numpy()
     repeated = np.concatenate([[False], number[1:] == number[:-1]])[: len(number)]
     if repeated.any():
-        again = stars.filter(pa.array(repeated))
+        again = joined.filter(pa.array(repeated))
         reasons = pa.repeat(Reason.duplicate_record.name, len(again))
-        rejected.append(reject_rows(again, reasons))
-        stars = stars.filter(pa.array(~repeated)).combine_chunks()
-    return stars, sort_rows(pa.concat_tables(rejected).combine_chunks(), keys)
+        left_out.append(reject_rows(again, reasons))
+        joined = joined.filter(pa.array(~repeated)).combine_chunks()
+    return joined, sort_rows(pa.concat_tables(left_out).combine_chunks(), keys)

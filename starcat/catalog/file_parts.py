@@ -1,35 +1,243 @@
-"""Shim."""
+"""One archive file in, its parts out: blocks parsed in order, with the checks of a whole file.
+
+A file is read by itself, in the calling thread, so that a task of any scheduler can do it: what
+it holds at a time is a few blocks. The joining of files is `starcat.catalog.ingest`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
 
 from starcat.catalog.blocks import Part, Reading, parse_block
-from starcat.catalog.ingest import FileFacts
-from starcat.catalog.readers.files import InputFile, read_blocks
+from starcat.catalog.readers.files import Block, DigestReader, InputFile, map_in_order, read_blocks
 from starcat.catalog.readers.malformed import check_malformed, not_this_archive
+from starcat.catalog.readers.records import Problem
+from starcat.catalog.source import DataSource
+from starcat.errors import SourceError
+from starcat.progress import Progress
+
+NAMED_PROBLEMS = 20
+"""Malformed records of a file that are kept to be told; the others are counted."""
+
+
+@dataclass(frozen=True)
+class FileFacts:
+    """One input file as the manifest records it.
+
+    Attributes
+    ----------
+    name : str
+        File name without its folder.
+    sha256 : str
+        Digest of the file as it lies on disk.
+    bytes, rows : int
+        Its size and the records read from it.
+    """
+
+    name: str
+    sha256: str
+    bytes: int
+    rows: int
+
+
+class BytesRead:
+    """How much of the files of a source has been read.
+
+    Parameters
+    ----------
+    files : sequence of InputFile
+        All that will be read.
+    source_name : str
+        What they are.
+    progress : Progress
+        Called with ("read <source>", bytes done, bytes in all): bytes as they lie on disk.
+    """
+
+    def __init__(self, files: Sequence[InputFile], source_name: str, progress: Progress) -> None:
+        self._stage, self._progress = f"read {source_name}", progress
+        self._total = sum(file.path.stat().st_size for file in files)
+        self._read = [0] * len(files)
+
+    def note(self, number: int, count: int) -> None:
+        """Remember how much of a file has been read; any thread may.
+
+        Parameters
+        ----------
+        number : int
+            Number of the file.
+        count : int
+            Bytes of it.
+        """
+        self._read[number] = count
+
+    def tell(self) -> None:
+        """Call the progress with what has been noted."""
+        self._progress(self._stage, sum(self._read), self._total)
+
+    def teller(self, number: int) -> Callable[[int], None]:
+        """Return a function that notes how much of a file has been read, and tells it.
+
+        Parameters
+        ----------
+        number : int
+            Number of the file.
+
+        Returns
+        -------
+        callable
+            As `FileBlocks` takes it.
+        """
+
+        def note_and_tell(count: int) -> None:
+            self.note(number, count)
+            self.tell()
+
+        return note_and_tell
+
+
+class FileBlocks:
+    """The blocks of one file, and what is known of the file once it has been read.
+
+    Parameters
+    ----------
+    file : InputFile
+        The file.
+    source : DataSource
+        What it is.
+    on_bytes : callable, optional
+        Called with the bytes of the file, as it lies on disk, that have been read so far.
+
+    Attributes
+    ----------
+    rows, malformed : int
+        Records so far, and how many of them are malformed.
+    problems : list of Problem
+        The first `NAMED_PROBLEMS` malformed records.
+    """
+
+    def __init__(
+        self, file: InputFile, source: DataSource, on_bytes: Callable[[int], None] | None = None
+    ) -> None:
+        self.file, self.source = file, source
+        self.rows = self.malformed = 0
+        self.problems: list[Problem] = []
+        self._on_bytes = on_bytes or (lambda _: None)
+        self._digest: DigestReader | None = None
+
+    def __iter__(self) -> Iterator[Block]:
+        """Read the file from its beginning to its end."""
+        for block in read_blocks(self.file, self.source.name, self._end):
+            self._on_bytes(block.bytes_read)
+            yield block
+
+    def _end(self, digest: DigestReader) -> None:
+        self._digest = digest
+        self._on_bytes(digest.bytes_read)
+
+    def add(self, rows: int, problems: Sequence[Problem]) -> None:
+        """Count the records of the next block.
+
+        Parameters
+        ----------
+        rows : int
+            Records in it, malformed ones included.
+        problems : sequence of Problem
+            Its malformed records.
+
+        Raises
+        ------
+        ParseError
+            If it is the first block with records and none of them is good.
+        """
+        if problems and not self.rows and rows == len(problems):
+            raise not_this_archive(self.file, self.source, problems)
+        self.rows += rows
+        self.malformed += len(problems)
+        self.problems += problems[: NAMED_PROBLEMS - len(self.problems)]
+
+    @property
+    def facts(self) -> FileFacts:
+        """What the manifest says of the file, which has been read to its end.
+
+        Raises
+        ------
+        ParseError
+            If it has no record, or more than 10 of them and 1 % are malformed.
+        SourceError
+            If it has not been read to its end.
+        """
+        if self._digest is None:
+            raise SourceError(f"{self.file.path}: not read to its end", path=self.file.path)
+        check_malformed(self.file, self.rows, self.malformed, self.problems, self.source)
+        digest = self._digest
+        return FileFacts(self.file.path.name, digest.sha256, digest.bytes_read, self.rows)
 
 
 class FileReading:
-    """Shim."""
+    """The parts of one file of a star catalog, in file order.
 
-    def __init__(self, file: InputFile, number: int, source: Any, how: Reading) -> None:
-        self.file, self.number, self.source, self.how = file, number, source, how
-        self.problems: list[Any] = []
-        self.facts: Any = None
+    Parameters
+    ----------
+    file : InputFile
+        The file.
+    number : int
+        Its number among the inputs, which becomes ``source_file``.
+    source : DataSource
+        What it is.
+    how : Reading
+        Band, epoch and read limit.
+    workers : int, default 0
+        Threads that parse blocks while this one reads; with none, the calling thread does both.
+    on_bytes : callable, optional
+        Called with the bytes of the file, as it lies on disk, that have been read so far.
+
+    Attributes
+    ----------
+    facts : FileFacts
+        What the manifest says of the file: there when all parts have been taken.
+    blocks : FileBlocks
+        Counts of its records so far.
+    """
+
+    def __init__(
+        self,
+        file: InputFile,
+        number: int,
+        source: DataSource,
+        how: Reading,
+        *,
+        workers: int = 0,
+        on_bytes: Callable[[int], None] | None = None,
+    ) -> None:
+        self.blocks = FileBlocks(file, source, on_bytes)
+        self.facts: FileFacts
+        self._parse = partial(parse_block, number, how=how)
+        self._workers = workers
 
     def __iter__(self) -> Iterator[Part]:
-        """Shim."""
-        rows = 0
-        seen: list[Any] = []
-        for block in read_blocks(self.file, self.source.name, seen.append):
-            part = parse_block(self.number, block, self.how)
-            if part.problems and not rows and part.rows == len(part.problems):
-                raise not_this_archive(self.file, self.source, part.problems)
-            rows += part.rows
-            self.problems += part.problems
+        """Read the file.
+
+        Yields
+        ------
+        Part
+            Parts of one block each.
+
+        Raises
+        ------
+        ParseError
+            If the file is empty, damaged, or not of the archive: none of the records of its first
+            block is good, or too many of all.
+        SourceError
+            If it cannot be opened.
+        """
+        for part in map_in_order(self._parse, iter(self.blocks), self._workers):
+            self.blocks.add(part.rows, part.problems)
             yield part
-        raw = seen[0]
-        check_malformed([self.file], [rows], [(0, p) for p in self.problems], self.source)
-        self.facts = FileFacts(self.file.path.name, raw.sha256, raw.bytes_read, rows)
+        self.facts = self.blocks.facts
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """The first malformed records, each with file, line and bytes."""
+        return tuple(f"{self.blocks.file.path.name} {each}" for each in self.blocks.problems)

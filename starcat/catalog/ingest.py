@@ -7,52 +7,29 @@ or in the rejected table, with one reason.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from concurrent.futures import CancelledError, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from threading import Event
 
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from starcat.catalog.blocks import CATALOGS, Part, Reading, join_parts, parse_block
+from starcat.catalog.blocks import CATALOGS, Reading, TablePile, join_parts
+from starcat.catalog.file_parts import NAMED_PROBLEMS, BytesRead, FileFacts, FileReading
 from starcat.catalog.nearest import add_nearest_neighbours
 from starcat.catalog.photometry import blend_weights
-from starcat.catalog.readers.files import (
-    Block,
-    DigestReader,
-    InputFile,
-    find_files,
-    map_in_order,
-    read_blocks,
-)
-from starcat.catalog.readers.malformed import check_malformed, not_this_archive
-from starcat.catalog.readers.records import Problem
+from starcat.catalog.readers.files import InputFile, find_files
+from starcat.catalog.repeats import check_contents, check_names
 from starcat.catalog.source import DataSource, data_source
 from starcat.catalog.stars import floats_of
 from starcat.catalog.verdict import Reason
-from starcat.errors import ConfigError, SourceMissing
+from starcat.errors import BuildError, ConfigError, SourceMissing
 from starcat.progress import Progress, no_progress
 from starcat.tables.schema import product_schema
-
-
-@dataclass(frozen=True)
-class FileFacts:
-    """One input file as the manifest records it.
-
-    Attributes
-    ----------
-    name : str
-        File name without its folder.
-    sha256 : str
-        Digest of the file as it lies on disk.
-    bytes, rows : int
-        Its size and the records read from it.
-    """
-
-    name: str
-    sha256: str
-    bytes: int
-    rows: int
 
 
 @dataclass(frozen=True)
@@ -68,13 +45,15 @@ class Ingested:
     stars : pyarrow.Table
         Records with a position, by star_id; schema ``stars``.
     rejected : pyarrow.Table
-        All other records; schema ``rejected``.
+        All other records but those beyond the read limit; schema ``rejected``.
     files : tuple of FileFacts
         What was read, in order.
     problems : tuple of str
         The first malformed records, each with file, line and bytes.
     notes : tuple of str
         What a user should know of the inputs: optional files that are missing.
+    beyond_read_limit : int
+        Records fainter than the read limit, which are in neither table.
     """
 
     source: str
@@ -84,12 +63,13 @@ class Ingested:
     files: tuple[FileFacts, ...]
     problems: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    beyond_read_limit: int = 0
 
     def __repr__(self) -> str:
         """Return source and counts in one line."""
         return (
             f"<Ingested {self.source} ({self.band}): {self.rows_read:,} records read, "
-            f"{len(self.stars):,} kept, {len(self.rejected):,} rejected>"
+            f"{len(self.stars):,} kept, {sum(self.rejected_by_reason.values()):,} rejected>"
         )
 
     @property
@@ -100,16 +80,18 @@ class Ingested:
     @property
     def rejected_by_reason(self) -> dict[str, int]:
         """Number of rejected records by reason, in the order of the reasons."""
-        return count_by_reason(self.rejected)
+        return count_by_reason(self.rejected, self.beyond_read_limit)
 
 
-def count_by_reason(rejected: pa.Table) -> dict[str, int]:
+def count_by_reason(rejected: pa.Table, beyond_read_limit: int = 0) -> dict[str, int]:
     """Return how many rows of a rejected table each reason has.
 
     Parameters
     ----------
     rejected : pyarrow.Table
         Table of the rejected schema.
+    beyond_read_limit : int, default 0
+        Records beyond the read limit, which no table lists.
 
     Returns
     -------
@@ -120,6 +102,8 @@ def count_by_reason(rejected: pa.Table) -> dict[str, int]:
         entry["values"]: entry["counts"]
         for entry in pc.value_counts(rejected["reason"]).to_pylist()
     }
+    if beyond_read_limit:
+        counted[Reason.beyond_read_limit.name] = beyond_read_limit
     return {reason.name: counted[reason.name] for reason in Reason if reason.name in counted}
 
 
@@ -147,8 +131,8 @@ def ingest(
     epoch_jyear : float, optional
         Julian year to move positions to; by default every star stays at its own epoch.
     read_limit_mag : float, optional
-        Records fainter than this are rejected while reading and are nobody's neighbour: for
-        catalogs that do not fit into memory.
+        Records fainter than this are counted while reading and never held; they are nobody's
+        neighbour. For catalogs that do not fit into memory.
     neighbours : bool, default True
         Whether to find each star's nearest neighbour.
     workers : int, default 2
@@ -166,18 +150,46 @@ def ingest(
     ConfigError
         If the source is not a star catalog or has no such band.
     SourceError
-        If a file is missing, damaged, or not of this archive.
+        If a file is missing, damaged, given twice, or not of this archive.
+    BuildError
+        If the records read are not all kept or rejected, which is a fault of starcat's own.
     """
     source = star_catalog(source_name)
     how = Reading(source_name, check_band(source, band), epoch_jyear, read_limit_mag)
     files = given_files(source, paths)
-    facts, parts, problems = _read_parts(files, source, how, workers, progress)
-    stars, rejected = join_parts(parts)
+    gathered = list(_read_files(files, source, how, workers, progress))
+    check_contents(files, [each.facts for each in gathered], source)
+    stars, rejected = join_parts(
+        [table for each in gathered for table in each.stars],
+        [table for each in gathered for table in each.rejected],
+    )
     stars = add_nearest_neighbours(stars, workers) if neighbours else stars
     product_schema("stars").check(stars)
     product_schema("rejected").check(rejected)
     notes = (*missing_files(source, files), *unmoved_stars(source_name, stars, epoch_jyear))
-    return Ingested(source_name, how.band, stars, rejected, facts, problems, notes)
+    read = Ingested(
+        source_name,
+        how.band,
+        stars,
+        rejected,
+        tuple(each.facts for each in gathered),
+        tuple(problem for each in gathered for problem in each.problems)[:NAMED_PROBLEMS],
+        notes,
+        sum(each.counted for each in gathered),
+    )
+    _check_balance(read)
+    return read
+
+
+def _check_balance(read: Ingested) -> None:
+    """Check that every record read is kept or rejected."""
+    rejected = sum(read.rejected_by_reason.values())
+    if read.rows_read != len(read.stars) + rejected:
+        raise BuildError(
+            f"{read.source}: {read.rows_read} records read, but {len(read.stars)} kept and "
+            f"{rejected} rejected by reason; expected as many. This is a fault of starcat: report "
+            "it with the command and the files"
+        )
 
 
 def star_catalog(source_name: str) -> DataSource:
@@ -227,10 +239,13 @@ def given_files(source: DataSource, paths: Sequence[Path]) -> list[InputFile]:
     ------
     SourceMissing
         If there is none, or one is missing.
+    SourceError
+        If one is given twice.
     """
     files = find_files(source, paths)
     if not files:
         raise SourceMissing(f"{source.name}: no input files given", source=source.name)
+    check_names(files, source)
     return files
 
 
@@ -285,32 +300,64 @@ def missing_files(source: DataSource, files: Sequence[InputFile]) -> tuple[str, 
     )
 
 
-def _read_parts(
+@dataclass(frozen=True)
+class _Gathered:
+    """What one file has given."""
+
+    facts: FileFacts
+    stars: list[pa.Table]
+    rejected: list[pa.Table]
+    counted: int
+    problems: tuple[str, ...]
+
+
+def _gather(reading: FileReading, stop: Event | None = None) -> _Gathered:
+    """Read a file; give up between two blocks when asked to stop."""
+    stars, rejected, counted = TablePile("stars"), TablePile("rejected"), 0
+    for part in reading:
+        stars.add(part.stars)
+        rejected.add(part.rejected)
+        counted += part.counted
+        if stop is not None and stop.is_set():
+            raise CancelledError
+    return _Gathered(reading.facts, stars.tables, rejected.tables, counted, reading.problems)
+
+
+def _read_files(
     files: Sequence[InputFile],
     source: DataSource,
     how: Reading,
     workers: int,
     progress: Progress,
-) -> tuple[tuple[FileFacts, ...], list[Part], tuple[str, ...]]:
-    """Read all files; return their facts, their parsed blocks and what is malformed in them."""
-    facts: list[FileFacts] = []
-    parts: list[Part] = []
-    rows = [0] * len(files)
-    problems: list[tuple[int, Problem]] = []
+) -> Iterator[_Gathered]:
+    """Read all files, in order: side by side where each is small beside all of them."""
+    read = BytesRead(files, source.name, progress)
+    sizes = [file.path.stat().st_size for file in files]
+    if workers < 2 or max(sizes) * workers > sum(sizes):
+        for n, file in enumerate(files):
+            tell = read.teller(n)
+            yield _gather(FileReading(file, n, source, how, workers=workers, on_bytes=tell))
+        return
+    stop = Event()
+    with ThreadPoolExecutor(workers) as pool:
+        readings = (
+            FileReading(file, n, source, how, on_bytes=partial(read.note, n))
+            for n, file in enumerate(files)
+        )
+        pending = deque(pool.submit(_gather, reading, stop) for reading in readings)
+        try:
+            while pending:
+                while not wait([pending[0]], timeout=_TELL_EVERY_S).done:
+                    read.tell()
+                read.tell()
+                yield pending.popleft().result()
+        finally:
+            stop.set()
+            for future in pending:
+                future.cancel()
 
-    def parse(numbered: tuple[int, Block]) -> Part:
-        return parse_block(*numbered, how)
 
-    for part in map_in_order(parse, numbered_blocks(files, source, facts, progress), workers):
-        if part.problems and not rows[part.file_number] and part.rows == len(part.problems):
-            raise not_this_archive(files[part.file_number], source, part.problems)
-        rows[part.file_number] += part.rows
-        problems += [(part.file_number, problem) for problem in part.problems]
-        parts.append(part)
-    check_malformed(files, rows, problems, source)
-    counted = (replace(fact, rows=count) for fact, count in zip(facts, rows, strict=True))
-    first = tuple(f"{files[n].path.name} {problem}" for n, problem in problems[:20])
-    return tuple(counted), parts, first
+_TELL_EVERY_S = 0.1
 
 
 def check_band(source: DataSource, band: str | None) -> str:
@@ -344,40 +391,3 @@ def check_band(source: DataSource, band: str | None) -> str:
             value=band,
         )
     return band
-
-
-def numbered_blocks(
-    files: Sequence[InputFile], source: DataSource, facts: list[FileFacts], progress: Progress
-) -> Iterator[tuple[int, Block]]:
-    """Read the blocks of all files of a source, and report how far that is.
-
-    Parameters
-    ----------
-    files : sequence of InputFile
-        In reading order.
-    source : DataSource
-        What they are.
-    facts : list of FileFacts
-        Each file is appended when it has been read to its end, with 0 for its rows.
-    progress : Progress
-        Called with ("read <source>", bytes done, bytes in all): bytes as they lie on disk.
-
-    Yields
-    ------
-    file_number : int
-        Number of the file.
-    block : Block
-        Its next records.
-    """
-    stage = f"read {source.name}"
-    sizes = [file.path.stat().st_size for file in files]
-    for number, file in enumerate(files):
-        before = sum(sizes[:number])
-
-        def note(raw: DigestReader, name: str = file.path.name) -> None:
-            facts.append(FileFacts(name, raw.sha256, raw.bytes_read, 0))
-
-        for block in read_blocks(file, source.name, note):
-            progress(stage, before + block.bytes_read, sum(sizes))
-            yield number, block
-        progress(stage, before + sizes[number], sum(sizes))

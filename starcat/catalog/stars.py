@@ -40,6 +40,43 @@ class StarBlock:
     columns: dict[str, Values]
     verdicts: Verdicts
 
+    def where(self, chosen: NDArray[np.bool_]) -> StarBlock:
+        """Return some of the records.
+
+        Parameters
+        ----------
+        chosen : ndarray of bool, shape (N,)
+            Which records.
+
+        Returns
+        -------
+        StarBlock
+            Their columns and verdicts, in the same order.
+        """
+        columns = {name: _values_where(values, chosen) for name, values in self.columns.items()}
+        return StarBlock(columns, self.verdicts.where(chosen))
+
+    def is_within(self, limit_mag: float) -> NDArray[np.bool_]:
+        """Return which stars are no fainter than a magnitude, whatever they are otherwise.
+
+        Parameters
+        ----------
+        limit_mag : float
+            The limit itself is within.
+
+        Returns
+        -------
+        ndarray of bool, shape (N,)
+            False where there is no magnitude.
+        """
+        return np.asarray(np.asarray(self.columns["mag"], dtype=np.float64) <= limit_mag)
+
+
+def _values_where(values: Values, chosen: NDArray[np.bool_]) -> Values:
+    if isinstance(values, pa.Array | pa.ChunkedArray):
+        return values.filter(pa.array(chosen))
+    return values[chosen] if isinstance(values, np.ndarray) else values
+
 
 def move_to_epoch(columns: Mapping[str, Values], epoch_jyear: float | None) -> dict[str, Values]:
     """Return the columns with positions at an epoch, and their directions.

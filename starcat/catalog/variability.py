@@ -12,7 +12,8 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from starcat.catalog.archives.gcvs import read_gcvs
-from starcat.catalog.ingest import FileFacts, ingest
+from starcat.catalog.file_parts import FileFacts
+from starcat.catalog.ingest import ingest
 from starcat.catalog.stars import floats_of, with_columns
 from starcat.progress import Progress, no_progress
 

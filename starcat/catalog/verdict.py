@@ -16,6 +16,7 @@ class Reason(Enum):
     """Why a record is not a guide star; the value of a member says it in words."""
 
     malformed_record = "the record does not follow the archive's layout"
+    beyond_read_limit = "fainter than read_limit_mag, or without magnitude: counted, not listed"
     deleted = "the archive says to ignore the record"
     no_identity = "neither a number nor a designation names the star"
     no_position = "the archive has no position, or none with an epoch"
@@ -64,6 +65,23 @@ class Verdicts:
             Why.
         """
         self._code[where & (self._code == 0)] = _CODES[reason]
+
+    def where(self, chosen: NDArray[np.bool_]) -> Verdicts:
+        """Return the verdicts on some of the records.
+
+        Parameters
+        ----------
+        chosen : ndarray of bool, shape (N,)
+            Which records.
+
+        Returns
+        -------
+        Verdicts
+            Verdicts of their own, in the same order.
+        """
+        verdicts = Verdicts(0)
+        verdicts._code = self._code[chosen]
+        return verdicts
 
     @property
     def is_kept(self) -> NDArray[np.bool_]:

@@ -81,7 +81,7 @@ def ingest(
     band: Annotated[str | None, typer.Option(help="Band of the magnitudes.")] = None,
     read_limit_mag: Annotated[
         float | None,
-        typer.Option(min=-30, max=40, help="Leave out fainter records while reading."),
+        typer.Option(min=-30, max=40, help="Count fainter records, without listing them."),
     ] = None,
     workers: Workers = 2,
     scheduler: Scheduler = None,

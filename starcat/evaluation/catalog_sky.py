@@ -56,7 +56,7 @@ def catalog_of_artifact(folder: Path) -> Sky:
     -------
     Sky
         Guide stars, and rejected ones with a position and a magnitude, at the artifact's epoch,
-        by star number.
+        by star number. Records beyond the read limit of its spec are in no artifact.
 
     Raises
     ------

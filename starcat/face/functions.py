@@ -96,7 +96,7 @@ def ingest(
     epoch_jyear : float, optional
         Julian year to move positions to; the catalog's own by default.
     read_limit_mag : float, optional
-        Fainter records are rejected.
+        Fainter records are counted and not held: ``beyond_read_limit`` of what is returned.
     progress : callable, optional
         Called with (stage, done, total).
 

@@ -19,7 +19,7 @@ import pyarrow as pa
 from starcat.artifact.verify import check_artifact
 from starcat.artifact.writer import Product, write_manifest, write_products
 from starcat.catalog.fetching.locate import locate
-from starcat.catalog.ingest import Ingested, ingest
+from starcat.catalog.ingest import Ingested
 from starcat.catalog.selection import Selected
 from starcat.catalog.stars import directions_of, sort_rows
 from starcat.catalog.variability import AmplitudeTable, join_amplitudes, read_amplitudes
@@ -43,6 +43,7 @@ from starcat.report.report import write_report
 from starcat.simulation.selftest import Rates, self_test
 from starcat.specs.build_spec import BuildSpec
 from starcat.storage.atomic import Outcome, move_into_place, whole_folder
+from starcat.store.reading import read_catalog
 from starcat.tables.schema import product_schema
 
 Inputs = Mapping[str, Sequence[Path]]
@@ -215,7 +216,7 @@ def read_sources(
     check_inputs(spec, inputs)
     # All inputs are found before any is read: a missing one is known at once.
     paths = {name: locate(name, inputs) for name in spec.sources}
-    catalog = ingest(
+    catalog = read_catalog(
         spec.catalog.source,
         paths[spec.catalog.source],
         band=spec.catalog.band,

@@ -25,7 +25,7 @@ from starcat.artifact.crossmatch_table import (
 from starcat.artifact.manifest import SourceFacts
 from starcat.artifact.writer import Product
 from starcat.catalog.fetching.locate import locate
-from starcat.catalog.ingest import Ingested, ingest
+from starcat.catalog.ingest import Ingested
 from starcat.catalog.selection import Selected
 from starcat.catalog.stars import sort_rows
 from starcat.catalog.verdict import Reason
@@ -36,6 +36,7 @@ from starcat.products.match_figures import ARCSEC, MatchModel
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.product_sections import Crossmatch
+from starcat.store.reading import read_catalog
 from starcat.tables.parquet import write_table
 from starcat.tables.schema import product_schema
 
@@ -198,7 +199,7 @@ def match_catalogs(
     sources: list[SourceFacts] = []
     notes: list[str] = []
     for name in wanted.catalogs:
-        read = ingest(
+        read = read_catalog(
             name,
             locate(name, inputs),
             read_limit_mag=wanted.read_limit_mag,

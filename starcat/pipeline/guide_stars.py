@@ -72,10 +72,13 @@ def check_guide_stars(selected: Selected, spec: BuildSpec) -> None:
     left = len(selected.guide_stars)
     if left < MIN_GUIDE_STARS:
         counts = count_by_reason(selected.rejected)
+        limits = "[selection]"
+        if spec.catalog.read_limit_mag is not None:
+            limits += f" and read_limit_mag {spec.catalog.read_limit_mag:g}"
         reasons = ", ".join(f"{name} {count}" for name, count in counts.items()) or "none read"
         raise BuildError(
             f"{spec.name}: {left} guide stars left of {len(selected.rejected) + left}; at least "
-            f"{MIN_GUIDE_STARS} are needed. Rejected: {reasons}. Check the limits of [selection]"
+            f"{MIN_GUIDE_STARS} are needed. Rejected: {reasons}. Check the limits of {limits}"
         )
 
 

@@ -31,7 +31,8 @@ class Catalog(Section):
         None, description="band of the magnitudes; default: the source's first", examples=["G"]
     )
     read_limit_mag: Mag | None = Field(
-        None, description="fainter records are rejected while reading and are nobody's neighbour"
+        None,
+        description="fainter records, and those without magnitude, are counted and left out",
     )
 
 

@@ -142,7 +142,7 @@ class Crossmatch(Product):
         0.5, ge=0.0, le=1.0, description="candidates that together have less are doubtful"
     )
     read_limit_mag: Mag | None = Field(
-        None, description="fainter counterparts are rejected while reading"
+        None, description="fainter counterparts are counted while reading, not listed"
     )
 
     @model_validator(mode="after")

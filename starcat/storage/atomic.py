@@ -67,6 +67,37 @@ def whole_file(path: Path) -> Iterator[Path]:
         ) from error
 
 
+@contextmanager
+def placed(path: Path) -> Iterator[Path]:
+    """Give a file to write to, which gets its name at the end; the system's errors pass.
+
+    Parameters
+    ----------
+    path : Path
+        The final name. Two processes that write the same file do not disturb each other, nor who
+        reads it.
+
+    Yields
+    ------
+    Path
+        ``.<name>.*.partial`` in the same folder; removed if the writing fails.
+    """
+    with _renamed(unique(path.parent, path.name), path) as partial:
+        yield partial
+
+
+def remove_partial(folder: Path) -> None:
+    """Remove what processes that were killed have not finished in a folder and those below it.
+
+    Parameters
+    ----------
+    folder : Path
+        Nobody writes in it any more.
+    """
+    for path in sorted(folder.rglob(".*.partial")):
+        path.unlink()
+
+
 def replace_file(path: Path, data: bytes, beside: Path) -> None:
     """Give a file other content, at once and for good.
 

@@ -43,7 +43,7 @@ class Written:
     margins: Sequence[tuple[Pixel, Facts]]
 
 
-def make_manifest(name: str, how: Reading, written: Written) -> Facts:
+def make_manifest(name: str, how: Reading, written: Written, notes: Sequence[str] = ()) -> Facts:
     """Return what a store says of itself, after checking that no record is missing.
 
     Parameters
@@ -54,6 +54,8 @@ def make_manifest(name: str, how: Reading, written: Written) -> Facts:
         What was read, and how.
     written : Written
         Results of all tasks.
+    notes : sequence of str
+        What a user should know of the inputs.
 
     Returns
     -------
@@ -87,6 +89,7 @@ def make_manifest(name: str, how: Reading, written: Written) -> Facts:
         "read_limit_mag": how.read_limit_mag,
         "schema": store_schema().metadata[b"starcat.schema"].decode(),
         "files": [part["file"] for part in written.parts],
+        "notes": list(notes),
         "rows_read": rows_read,
         "kept": kept,
         "rejected": {r.name: rejected[r.name] for r in Reason if rejected.get(r.name)},

@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from starcat.catalog.stars import floats_of
+from starcat.storage.atomic import placed
 from starcat.store.pixels import HEALPIX_COLUMN
 
 ROW_GROUP_ROWS = 1 << 16
@@ -72,7 +73,8 @@ def write_partition(stars: pa.Table, rows: tuple[int, ...], path: Path) -> None:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     begin = 0
-    with pq.ParquetWriter(path, stars.schema, **_encodings(stars.schema)) as writer:
+    encodings = _encodings(stars.schema)
+    with placed(path) as partial, pq.ParquetWriter(partial, stars.schema, **encodings) as writer:
         for count in rows:
             writer.write_table(stars.slice(begin, count), row_group_size=ROW_GROUP_ROWS)
             begin += count

@@ -13,12 +13,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from starcat.storage.atomic import placed
 from starcat.storage.digests import file_sha256
 from starcat.store.brightness import bright_first, write_partition
 from starcat.store.index import RunIndex, read_index
 from starcat.store.layout import DATASET, REPEATED
 from starcat.store.neighbours import COLUMNS, add_neighbours
-from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, Pixel, Pixels, border_of
+from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, Pixel, Pixels, border_of, pixel_field
 from starcat.store.runs import places_of, read_shares
 from starcat.tables.schema import product_schema
 
@@ -85,7 +86,8 @@ def finish(asked: Finish) -> tuple[dict[str, Any], list[Path]]:
     if len(again):
         path = asked.collection / REPEATED / f"{pixel.order}-{pixel.number}.parquet"
         path.parent.mkdir(exist_ok=True)
-        pq.write_table(again.drop_columns(HEALPIX_COLUMN), path, compression="zstd")
+        with placed(path) as partial:
+            pq.write_table(again.drop_columns(HEALPIX_COLUMN), partial, compression="zstd")
         files.append(path)
     result: dict[str, Any] = {"rows": len(stars), "repeated": len(again)}
     if not len(stars):
@@ -130,13 +132,7 @@ def store_schema() -> pa.Schema:
         ``_healpix_29`` in front of the released stars schema, which it names.
     """
     schema = product_schema("stars").arrow_schema
-    pixel = pa.field(
-        HEALPIX_COLUMN,
-        pa.int64(),
-        nullable=False,
-        metadata={"description": "Nested HEALPix pixel of order 29, ICRS", "ucd": "pos.healpix"},
-    )
-    return pa.schema([pixel, *schema], metadata=schema.metadata)
+    return pa.schema([pixel_field(), *schema], metadata=schema.metadata)
 
 
 def _in_order(stars: pa.Table) -> pa.Table:
@@ -182,7 +178,11 @@ def _write_borders(stars: pa.Table, asked: Finish) -> list[Path]:
         return []
     path = border_path(asked.borders, asked.pixel)
     pixels = stars[HEALPIX_COLUMN].to_numpy()
-    with pa.OSFile(str(path), "wb") as sink, pa.ipc.new_file(sink, stars.schema) as writer:
+    with (
+        placed(path) as partial,
+        pa.OSFile(str(partial), "wb") as sink,
+        pa.ipc.new_file(sink, stars.schema) as writer,
+    ):
         for other in asked.beside:
             order, border = border_of(other, asked.margin_rad)
             rows = rows_within(pixels, order, border, other)

@@ -9,6 +9,7 @@ of a cluster; the order in which they are done leaves no trace in what they writ
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,24 +21,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.catalog.blocks import Reading
+from starcat.catalog.file_parts import NAMED_PROBLEMS, FileFacts
 from starcat.catalog.ingest import check_band, given_files, missing_files, star_catalog
 from starcat.catalog.readers.files import InputFile
+from starcat.catalog.repeats import check_contents
+from starcat.catalog.source import data_source
 from starcat.errors import OutputError
 from starcat.progress import Progress, no_progress
-from starcat.storage.atomic import Outcome, move_into_place, writing
+from starcat.storage.atomic import Outcome, move_into_place, remove_partial, writing
 from starcat.storage.digests import file_sha256
 from starcat.store.account import Written, describe_store, make_manifest
 from starcat.store.cluster import cluster, run_tasks, versions
 from starcat.store.finish import Finish, Margin, border_path, finish
 from starcat.store.finish import write_margin as make_margin
 from starcat.store.index import read_runs, write_index
-from starcat.store.layout import REJECTED
-from starcat.store.ledger import Job, Work
+from starcat.store.layout import REJECTED, REPEATED
+from starcat.store.ledger import RESUME_ADVICE, Job, Work
 from starcat.store.options import StoreOptions, rows_of_a_run
 from starcat.store.pixels import MAX_ORDER, Pixel, border_of
 from starcat.store.plan import partition_pixels, spill_order
 from starcat.store.runs import BUCKETS, HISTOGRAM_ORDER, Run, repeated_places
-from starcat.store.split import TOLD_PROBLEMS, Split, split
+from starcat.store.split import Split, is_unchanged, split
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -176,12 +180,14 @@ def ingest_to_store(
     is_small = size < _SMALL_BYTES
     with cluster(options.workers, options.scheduler, is_small=is_small) as client:
         run = _Ingest(work, output.name, files, how, options, client, progress)
-        manifest, problems = _make(run)
+        with writing(output.absolute().parent, RESUME_ADVICE):
+            manifest, problems = _make(run)
     progress("store", 0, None)
-    with writing(output.absolute().parent, "what is done is kept; go on with --resume"):
+    remove_partial(run.store)
+    with writing(output.absolute().parent, RESUME_ADVICE):
         outcome = move_into_place(run.store, output.absolute(), replace=options.replace)
     shutil.rmtree(work.folder, ignore_errors=True)
-    return Stored(output, outcome, manifest, problems, missing_files(source, files))
+    return Stored(output, outcome, manifest, problems, tuple(manifest["notes"]))
 
 
 def _check_output(output: Path, options: StoreOptions) -> None:
@@ -198,7 +204,7 @@ def _all_options(files: Sequence[InputFile], how: Reading, options: StoreOptions
         "band": how.band,
         "epoch_jyear": how.epoch_jyear,
         "read_limit_mag": how.read_limit_mag,
-        "inputs": [[str(file.path.absolute()), file.path.stat().st_size] for file in files],
+        "inputs": [str(file.path.absolute()) for file in files],
         "max_partition_rows": options.max_partition_rows,
         "margin_arcsec": options.margin_arcsec,
         "versions": versions(),
@@ -207,10 +213,14 @@ def _all_options(files: Sequence[InputFile], how: Reading, options: StoreOptions
 
 def _make(run: _Ingest) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Go through all steps, in the hidden folder."""
-    for folder in (run.store / REJECTED, run.catalog, run.work / "runs", run.work / "borders"):
+    for folder in (run.store / REJECTED, run.work / "runs"):
         folder.mkdir(parents=True, exist_ok=True)
     order = _order(run.files)
     parts = _split_all(run, order)
+    facts = [FileFacts(**part["file"]) for part in parts]
+    source = data_source(run.how.source_name)
+    check_contents(run.files, facts, source)
+    content = _begin_partitions(run, facts)
     indexes = [run.work / f"runs/file-{number:05}.npz" for number in range(len(run.files))]
     runs = [
         one
@@ -222,16 +232,14 @@ def _make(run: _Ingest) -> tuple[dict[str, Any], tuple[str, ...]]:
     repeated = _kept(run.work / "repeated.npy", lambda path: np.save(path, places))
     pixels = _plan(run, indexes)
     left = int(sum(run.rows.sum() for run in runs)) - len(places)
-    finished = _finish_all(run, pixels, index, repeated, left)
-    margins = _margins_all(run, pixels, finished)
+    finished = _finish_all(run, pixels, index, repeated, left, content)
+    margins = _margins_all(run, pixels, finished, content)
     partitions = list(zip(pixels, finished, strict=True))
     written = Written(parts, len(places), partitions, margins)
-    manifest = make_manifest(run.name, run.how, written)
+    manifest = make_manifest(run.name, run.how, written, missing_files(source, run.files))
     describe_store(run.store, run.name, manifest, written, run.options)
-    problems = [
-        f"{part['file']['name']} {problem}" for part in parts for problem in part["problems"]
-    ]
-    return manifest, tuple(problems[:TOLD_PROBLEMS])
+    problems = tuple(problem for part in parts for problem in part["problems"])
+    return manifest, problems[:NAMED_PROBLEMS]
 
 
 def _order(files: Sequence[InputFile]) -> int:
@@ -244,7 +252,7 @@ def _split_all(run: _Ingest, order: int) -> list[dict[str, Any]]:
     jobs = []
     for number, file in enumerate(run.files):
         asked = Split(number, file, run.how, order, rows, run.work / "runs", run.store / REJECTED)
-        jobs.append(Job(run.work, asked.name, split, asked))
+        jobs.append(Job(run.work, asked.name, split, asked, is_unchanged))
     sizes = [file.path.stat().st_size for file in run.files]
     return run.run(jobs, f"rows {run.how.source_name}", sizes)
 
@@ -255,6 +263,20 @@ def _kept(path: Path, write: Callable[[Path], None]) -> Path:
     named = path.with_stem(f"{path.stem}-{file_sha256(path)[:16]}")
     path.replace(named)
     return named
+
+
+def _begin_partitions(run: _Ingest, facts: Sequence[FileFacts]) -> str:
+    """Return a name for the content of the inputs, and remove what was made of another."""
+    names = " ".join(fact.sha256 for fact in facts)
+    content = hashlib.sha256(names.encode()).hexdigest()[:12]
+    note = run.work / "content"
+    if not note.is_file() or note.read_text() != content:
+        for folder in (run.catalog, run.margin, run.store / REPEATED, run.work / "borders"):
+            shutil.rmtree(folder, ignore_errors=True)
+        note.write_text(content)
+    for folder in (run.catalog, run.work / "borders"):
+        folder.mkdir(exist_ok=True)
+    return content
 
 
 def _repeated(run: _Ingest, runs: Sequence[Run]) -> NDArray[np.int64]:
@@ -274,7 +296,7 @@ def _plan(run: _Ingest, indexes: Sequence[Path]) -> tuple[Pixel, ...]:
 
 
 def _finish_all(
-    run: _Ingest, pixels: Sequence[Pixel], index: Path, repeated: Path, rows: int
+    run: _Ingest, pixels: Sequence[Pixel], index: Path, repeated: Path, rows: int, content: str
 ) -> list[dict[str, Any]]:
     beside = bordering(pixels, run.margin_rad)
     jobs = []
@@ -290,7 +312,8 @@ def _finish_all(
             run.store,
             is_alone=rows == 1,
         )
-        jobs.append(Job(run.work, f"finish-{pixel.order}-{pixel.number}", finish, asked))
+        name = f"finish-{content}-{pixel.order}-{pixel.number}"
+        jobs.append(Job(run.work, name, finish, asked))
     return run.run(jobs, "rows by partition", [1] * len(jobs), rows)
 
 
@@ -327,7 +350,7 @@ def bordering(pixels: Sequence[Pixel], margin_rad: float) -> dict[Pixel, tuple[P
 
 
 def _margins_all(
-    run: _Ingest, pixels: Sequence[Pixel], finished: Sequence[dict[str, Any]]
+    run: _Ingest, pixels: Sequence[Pixel], finished: Sequence[dict[str, Any]], content: str
 ) -> list[tuple[Pixel, dict[str, Any]]]:
     """Write the margins, and return those that have stars."""
     has_stars = {pixel for pixel, facts in zip(pixels, finished, strict=True) if facts["rows"]}
@@ -339,7 +362,8 @@ def _margins_all(
     asked_of = [pixel for pixel in pixels if batches[pixel] and pixel in has_stars]
     for pixel in asked_of:
         asked = Margin(pixel, tuple(batches[pixel]), run.margin)
-        jobs.append(Job(run.work, f"margin-{pixel.order}-{pixel.number}", make_margin, asked))
+        name = f"margin-{content}-{pixel.order}-{pixel.number}"
+        jobs.append(Job(run.work, name, make_margin, asked))
     run.progress("margins", 0, None)
     results = run_tasks(run.client, Job.run, jobs)
     made = zip(asked_of, results, strict=True)

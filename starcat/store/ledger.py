@@ -20,6 +20,7 @@ from starcat.storage.atomic import writing
 from starcat.storage.digests import file_sha256, json_bytes
 
 OPTIONS_NAME = "options.json"
+RESUME_ADVICE = "what is done is kept: make room, then go on with --resume"
 _DONE = "done"
 
 Task = Callable[[Any], tuple[dict[str, Any], list[Path]]]
@@ -126,21 +127,6 @@ class Work:
             pass
         return None
 
-    def is_recorded(self, name: str) -> bool:
-        """Return whether a task was done once, whatever has become of its files.
-
-        Parameters
-        ----------
-        name : str
-            Name of the task.
-
-        Returns
-        -------
-        bool
-            Whether there is a record of it.
-        """
-        return self._record(name).is_file()
-
     def record(self, name: str, result: Mapping[str, Any], files: Sequence[Path]) -> None:
         """Record that a task is done.
 
@@ -164,6 +150,10 @@ class Work:
         return self.folder / _DONE / f"{name}.json"
 
 
+def _always(_: Any, __: dict[str, Any]) -> bool:
+    return True
+
+
 @dataclass(frozen=True)
 class Job:
     """A task with a name, which does not do what the ledger says is done.
@@ -178,12 +168,15 @@ class Job:
         What to do.
     asked : object
         What to call it with.
+    is_valid : callable, optional
+        Whether the result of an earlier run still holds, of what is asked and that result.
     """
 
     work: Work
     name: str
     task: Task
     asked: Any
+    is_valid: Callable[[Any, dict[str, Any]], bool] = _always
 
     def run(self) -> dict[str, Any]:
         """Do the task and record it, if it is not done.
@@ -199,10 +192,9 @@ class Job:
             If its files cannot be written, as on a full disk.
         """
         before = self.work.done(self.name)
-        if before is not None:
+        if before is not None and self.is_valid(self.asked, before):
             return before
-        advice = "what is done is kept: make room, then go on with --resume"
-        with writing(self.work.folder.parent, advice):
+        with writing(self.work.folder.parent, RESUME_ADVICE):
             result, files = self.task(self.asked)
             self.work.record(self.name, result, files)
         return result

@@ -11,11 +11,11 @@ Gorski et al. 2005, ApJ 622, 759 (HEALPix); HATS 1.0, IVOA Note.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from starcat.errors import ConfigError
@@ -24,6 +24,9 @@ from starcat.version import install_command
 MAX_ORDER = 29
 HEALPIX_COLUMN = "_healpix_29"
 _PIXELS_A_FOLDER = 10_000
+
+_DEEPEST = 12
+"""A border is made of pixels at most so many orders below: 16,388 of them."""
 
 _FIRST_WIDTH_RAD = 0.45 * np.sqrt(np.pi / 3.0)
 
@@ -85,6 +88,18 @@ class Pixel:
         return np.arange(self.number << shift, (self.number + 1) << shift, dtype=np.int64)
 
 
+def pixel_field() -> pa.Field:
+    """Return the column of the stars' pixels.
+
+    Returns
+    -------
+    pyarrow.Field
+        With its meaning.
+    """
+    meaning = {"description": "Nested HEALPix pixel of order 29, ICRS", "ucd": "pos.healpix"}
+    return pa.field(HEALPIX_COLUMN, pa.int64(), nullable=False, metadata=meaning)
+
+
 def healpix_29(ra_deg: NDArray[np.float64], dec_deg: NDArray[np.float64]) -> Pixels:
     """Return the nested HEALPix pixels of order 29 that positions lie in.
 
@@ -127,12 +142,12 @@ def border_of(pixel: Pixel, width_rad: float) -> tuple[int, Pixels]:
     Returns
     -------
     order : int
-        Their order: the highest of which no pixel is narrower than the distance.
+        Their order: the highest of which no pixel is narrower than the distance, or somewhat lower.
     pixels : ndarray of int64, shape (N,)
         Ascending. The ring of them around the pixel, where they are no larger than it; else the
         one that it lies in and those around that one.
     """
-    order = border_order(width_rad)
+    order = min(border_order(width_rad), pixel.order + _DEEPEST)
     if width_rad > _FIRST_WIDTH_RAD:
         return 0, np.arange(12, dtype=np.int64)
     if order >= pixel.order:
@@ -202,10 +217,9 @@ def _valid(*parts: Any) -> Pixels:
     return np.unique(together[together >= 0])
 
 
-@cache
 def _nested() -> Any:
     try:
-        from cdshealpix import nested
+        import cdshealpix.nested as nested
     except ImportError as error:
         raise ConfigError(
             f"HATS needs the package cdshealpix, which is not installed; {install_command('hats')}"

@@ -22,6 +22,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from starcat.catalog.stars import floats_of
+from starcat.storage.atomic import placed
 from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, Pixels, healpix_29
 from starcat.tables.schema import product_schema
 
@@ -121,13 +122,18 @@ def write_run(stars: pa.Table, order: int, folder: Path, name: str) -> tuple[Run
     coarse, begins = np.unique(pixels >> 2 * (MAX_ORDER - order), return_index=True)
     rows = np.diff([*begins, len(pixels)]).astype(np.int64)
     path = folder / f"{name}.arrow"
-    with pa.OSFile(str(path), "wb") as sink, pa.ipc.new_file(sink, table.schema) as writer:
+    with (
+        placed(path) as partial,
+        pa.OSFile(str(partial), "wb") as sink,
+        pa.ipc.new_file(sink, table.schema) as writer,
+    ):
         for begin, count in zip(begins.tolist(), rows.tolist(), strict=True):
             for batch in table.slice(begin, count).combine_chunks().to_batches():
                 writer.write_batch(batch)
     places, buckets = _by_bucket(stars)
     beside = folder / f"{name}.places"
-    places.tofile(beside)
+    with placed(beside) as partial:
+        partial.write_bytes(places.tobytes())
     return Run(path, beside, coarse.astype(np.int64), rows, buckets), pixels
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,11 @@ from starcat.catalog.ingest import count_by_reason
 from starcat.catalog.readers.files import InputFile
 from starcat.catalog.source import data_source
 from starcat.catalog.verdict import Reason
+from starcat.storage.atomic import placed
+from starcat.storage.digests import file_sha256
 from starcat.store.pixels import MAX_ORDER
 from starcat.store.runs import HISTOGRAM_ORDER, Run, write_run
 from starcat.tables.schema import product_schema
-
-TOLD_PROBLEMS = 20
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,7 @@ class _Written:
     pixels: list[Any] = field(default_factory=list)
     files: list[Path] = field(default_factory=list)
     writer: pq.ParquetWriter | None = None
+    closing: ExitStack = field(default_factory=ExitStack)
 
     def stars(self, stars: pa.Table) -> None:
         """Write a run, and count its stars by pixel."""
@@ -82,7 +84,9 @@ class _Written:
         path = self.asked.rejected / f"{self.asked.name}.parquet"
         if self.writer is None:
             schema = product_schema("rejected").arrow_schema
-            self.writer = pq.ParquetWriter(path, schema, compression="zstd", compression_level=1)
+            partial = self.closing.enter_context(placed(path))
+            writer = pq.ParquetWriter(partial, schema, compression="zstd", compression_level=1)
+            self.writer = self.closing.enter_context(writer)
             self.files.append(path)
         self.writer.write_table(rejected.sort_by("source_line"))
 
@@ -98,7 +102,8 @@ class _Written:
         }
         for k, run in enumerate(self.runs):
             arrays |= {f"batches{k}": run.pixels, f"rows{k}": run.rows, f"buckets{k}": run.buckets}
-        np.savez(path, allow_pickle=False, **arrays)
+        with placed(path) as partial, partial.open("wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
         self.files.append(path)
         return path
 
@@ -124,18 +129,16 @@ def split(asked: Split) -> tuple[dict[str, Any], list[Path]]:
     SourceError
         If the file is damaged, or not of this archive.
     """
+    (asked.rejected / f"{asked.name}.parquet").unlink(missing_ok=True)
     written = _Written(asked)
     reading = FileReading(asked.file, asked.number, data_source(asked.how.source_name), asked.how)
     counts: dict[str, int] = {}
-    try:
+    with written.closing:
         for stars, rejected in _joined(_counted(reading, counts), asked.run_rows):
             if len(stars):
                 written.stars(stars)
             if len(rejected):
                 written.rejected(rejected)
-    finally:
-        if written.writer is not None:
-            written.writer.close()
     kept = sum(int(run.rows.sum()) for run in written.runs)
     facts = reading.facts
     result = {
@@ -147,19 +150,36 @@ def split(asked: Split) -> tuple[dict[str, Any], list[Path]]:
         },
         "kept": kept,
         "rejected": {r.name: counts[r.name] for r in Reason if counts.get(r.name)},
-        "problems": [str(problem) for problem in reading.problems[:TOLD_PROBLEMS]],
+        "problems": list(reading.problems),
         "runs": len(written.runs),
     }
     written.index()
     return result, written.files
 
 
+def is_unchanged(asked: Split, result: dict[str, Any]) -> bool:
+    """Return whether a file is still what it was when it was split.
+
+    Parameters
+    ----------
+    asked : Split
+        The file.
+    result : dict
+        What splitting it gave.
+
+    Returns
+    -------
+    bool
+        By the digest of the file.
+    """
+    return bool(file_sha256(asked.file.path) == result["file"]["sha256"])
+
+
 def _counted(parts: Iterable[Part], counts: dict[str, int]) -> Iterator[Part]:
     """Count rejected records by reason as they come."""
     for part in parts:
-        for known in (count_by_reason(part.rejected), getattr(part, "counted", {})):
-            for name, count in known.items():
-                counts[name] = counts.get(name, 0) + count
+        for name, count in count_by_reason(part.rejected, part.counted).items():
+            counts[name] = counts.get(name, 0) + count
         yield part
 
 

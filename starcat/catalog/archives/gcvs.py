@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.catalog.ingest import FileFacts, numbered_blocks
+from starcat.catalog.file_parts import BytesRead, FileBlocks, FileFacts
 from starcat.catalog.readers.delimited import parse_delimited
 from starcat.catalog.readers.files import find_files
-from starcat.catalog.readers.malformed import check_malformed, not_this_archive
-from starcat.catalog.readers.records import Problem, Records, number_from_text
+from starcat.catalog.readers.records import Records, number_from_text
+from starcat.catalog.repeats import check_contents, check_names
 from starcat.catalog.source import RANGES, data_source
 from starcat.catalog.verdict import Reason
 from starcat.progress import Progress, no_progress
@@ -77,21 +77,20 @@ def read_gcvs(paths: Sequence[Path], progress: Progress = no_progress) -> Gcvs:
     """
     source = data_source("gcvs")
     files = find_files(source, paths)
-    facts: list[FileFacts] = []
+    check_names(files, source)
+    read = BytesRead(files, source.name, progress)
     parts: list[Records] = []
-    problems: list[tuple[int, Problem]] = []
-    rows = [0] * len(files)
-    for number, block in numbered_blocks(files, source, facts, progress):
-        records = parse_delimited(block.data, block.file.layout, COLUMNS, block.first_line)
-        if not len(records) and not rows[number] and records.problems:
-            raise not_this_archive(files[number], source, records.problems)
-        rows[number] += len(records) + len(records.problems)
-        problems += [(number, problem) for problem in records.problems]
-        parts.append(records)
-    check_malformed(files, rows, problems, source)
-    filled = [replace(fact, rows=count) for fact, count in zip(facts, rows, strict=True)]
-    rejected = {Reason.malformed_record.name: len(problems)} if problems else {}
-    return _from_records(parts, tuple(filled), rejected)
+    every = [FileBlocks(file, source, read.teller(n)) for n, file in enumerate(files)]
+    for blocks in every:
+        for block in blocks:
+            records = parse_delimited(block.data, block.file.layout, COLUMNS, block.first_line)
+            blocks.add(len(records) + len(records.problems), records.problems)
+            parts.append(records)
+    facts = tuple(blocks.facts for blocks in every)
+    check_contents(files, facts, source)
+    malformed = sum(blocks.malformed for blocks in every)
+    rejected = {Reason.malformed_record.name: malformed} if malformed else {}
+    return _from_records(parts, facts, rejected)
 
 
 def _from_records(

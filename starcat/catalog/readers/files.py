@@ -209,16 +209,30 @@ def source_of_file(path: Path) -> str | None:
     str or None
         A name of ``data_sources``; None where no archive has a file of that name.
     """
-    named = (name for name in source_names() if _named_layout(data_source(name), path))
+    named = (name for name in source_names() if named_layout(data_source(name), path))
     return next(named, None)
 
 
 def _layout_of(source: DataSource, path: Path) -> RecordFile:
     """Return the layout whose archive name the file has; the first where none fits."""
-    return _named_layout(source, path) or source.files[0]
+    return named_layout(source, path) or source.files[0]
 
 
-def _named_layout(source: DataSource, path: Path) -> RecordFile | None:
+def named_layout(source: DataSource, path: Path) -> RecordFile | None:
+    """Return the layout of a source whose archive name a file has.
+
+    Parameters
+    ----------
+    source : DataSource
+        The source.
+    path : Path
+        The file, with or without ``.gz``.
+
+    Returns
+    -------
+    RecordFile or None
+        None where the archive has no file of that name.
+    """
     name = path.name.removesuffix(".gz")
     for layout in source.files:
         for pattern in layout.file_names:
@@ -426,13 +440,16 @@ def map_in_order(
     items : iterator
         Read by the calling thread, a few items ahead of the results.
     workers : int, default 2
-        Number of threads.
+        Number of threads; with none, the calling thread does the work.
 
     Yields
     ------
     object
         Results in the order of the items.
     """
+    if not workers:
+        yield from map(function, items)
+        return
     pending: deque[Future[_Result]] = deque()
     with ThreadPoolExecutor(workers) as pool:
         for item in items:

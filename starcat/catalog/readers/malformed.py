@@ -83,45 +83,40 @@ def not_this_archive(
 
 
 def check_malformed(
-    files: Sequence[InputFile],
-    rows: Sequence[int],
-    problems: Sequence[tuple[int, Problem]],
-    source: DataSource,
+    file: InputFile, rows: int, malformed: int, problems: Sequence[Problem], source: DataSource
 ) -> None:
     """Refuse a file without records or with too many malformed ones.
 
     Parameters
     ----------
-    files : sequence of InputFile
+    file : InputFile
         What was read.
-    rows : sequence of int
-        Records in each.
-    problems : sequence of (int, Problem)
-        File number and problem of every malformed record.
+    rows, malformed : int
+        Records in it, and how many of them are malformed.
+    problems : sequence of Problem
+        The first of the malformed ones.
     source : DataSource
-        What they belong to.
+        What it belongs to.
 
     Raises
     ------
     ParseError
-        If a file has no record, or more than 10 of them and 1 % are malformed.
+        If the file has no record, or more than 10 of them and 1 % are malformed.
     """
-    for number, file in enumerate(files):
-        if not rows[number]:
-            raise ParseError(
-                f"{file.path}: no record in the file; expected records of {source.name} "
-                f"({file.layout.name}). Is this the right archive?",
-                source=source.name,
-                path=file.path,
-            )
-        bad = [problem for n, problem in problems if n == number]
-        if len(bad) > 10 and len(bad) > MAX_MALFORMED_FRACTION * rows[number]:
-            raise ParseError(
-                f"{file.path}: {len(bad)} of {rows[number]} records are malformed; at most "
-                f"{MAX_MALFORMED_FRACTION:.0%} may be. The first: {bad[0]}",
-                source=source.name,
-                path=file.path,
-                line=bad[0].line,
-                byte_range=bad[0].byte_range,
-                field=bad[0].field,
-            )
+    if not rows:
+        raise ParseError(
+            f"{file.path}: no record in the file; expected records of {source.name} "
+            f"({file.layout.name}). Is this the right archive?",
+            source=source.name,
+            path=file.path,
+        )
+    if malformed > 10 and malformed > MAX_MALFORMED_FRACTION * rows:
+        raise ParseError(
+            f"{file.path}: {malformed} of {rows} records are malformed; at most "
+            f"{MAX_MALFORMED_FRACTION:.0%} may be. The first: {problems[0]}",
+            source=source.name,
+            path=file.path,
+            line=problems[0].line,
+            byte_range=problems[0].byte_range,
+            field=problems[0].field,
+        )

@@ -1,0 +1,376 @@
+"""Stores as the input of a build: only the partitions, row groups and columns that it can use.
+
+A store that starcat made gives what reading its archive files gives, to the last bit: it keeps
+rejected records, and records whose star was read before, beside the stars, and says what it was
+made from. HATS catalogs of others need the columns `NEEDED`; what else of the stars schema they
+have is used, and their own files are the inputs that the artifact names.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from starcat.catalog.blocks import Reading, join_parts
+from starcat.catalog.file_parts import NAMED_PROBLEMS, FileFacts
+from starcat.catalog.ingest import (
+    Ingested,
+    check_band,
+    ingest,
+    star_catalog,
+    unmoved_stars,
+)
+from starcat.catalog.nearest import add_nearest_neighbours
+from starcat.catalog.readers.files import map_in_order
+from starcat.catalog.stars import floats_of, move_to_epoch, with_columns
+from starcat.catalog.verdict import Reason
+from starcat.errors import ConfigError, ProductError, SchemaError, SchemaVersionError
+from starcat.progress import Progress, no_progress
+from starcat.storage.digests import file_sha256
+from starcat.store.account import MANIFEST_VERSION
+from starcat.store.layout import MANIFEST_NAME, REJECTED, REPEATED, Store, is_store, open_store
+from starcat.tables.schema import product_schema
+
+NEEDED = ("star_id", "ra_deg", "dec_deg", "epoch_jyear", "mag")
+"""Columns that a catalog of others must have; ``band`` is taken for the one asked for."""
+
+
+def read_catalog(
+    source_name: str,
+    paths: Sequence[Path],
+    *,
+    band: str | None = None,
+    epoch_jyear: float | None = None,
+    read_limit_mag: float | None = None,
+    neighbours: bool = True,
+    workers: int = 2,
+    progress: Progress = no_progress,
+) -> Ingested:
+    """Read a star catalog from a store or from archive files.
+
+    Parameters
+    ----------
+    source_name : str
+        A star catalog of ``data_sources``.
+    paths : sequence of Path
+        A store, or the archive's files and the folders that hold them.
+    band, epoch_jyear, read_limit_mag, neighbours, workers, progress
+        As `starcat.catalog.ingest.ingest` has them.
+
+    Returns
+    -------
+    Ingested
+        The same from either.
+
+    Raises
+    ------
+    ConfigError
+        If a store was made of another catalog or otherwise, or is one of several inputs.
+    SourceError, ProductError, SchemaError
+        If a file is missing, damaged, or not of this catalog.
+    """
+    if not any(path.is_dir() and is_store(path) for path in paths):
+        return ingest(
+            source_name,
+            paths,
+            band=band,
+            epoch_jyear=epoch_jyear,
+            read_limit_mag=read_limit_mag,
+            neighbours=neighbours,
+            workers=workers,
+            progress=progress,
+        )
+    if len(paths) > 1:
+        raise ConfigError(
+            f"{source_name}: {len(paths)} inputs are given, and one of them is a store; a store is "
+            "a whole catalog, give it alone",
+            key="input",
+            value=[str(path) for path in paths],
+        )
+    wanted = check_band(star_catalog(source_name), band)
+    how = Reading(source_name, wanted, epoch_jyear, read_limit_mag)
+    read = _read_store(open_store(paths[0]), how, workers, progress)
+    return _with_neighbours(read, workers) if neighbours else read
+
+
+def _with_neighbours(read: Ingested, workers: int) -> Ingested:
+    stars = add_nearest_neighbours(read.stars, workers)
+    facts = {name: getattr(read, name) for name in read.__dataclass_fields__}
+    return Ingested(**{**facts, "stars": stars})
+
+
+@dataclass
+class _Found:
+    """What has been read of a store so far."""
+
+    stars: list[pa.Table] = field(default_factory=list)
+    rejected: list[pa.Table] = field(default_factory=list)
+    beyond: int = 0
+
+
+def _read_store(store: Store, how: Reading, workers: int, progress: Progress) -> Ingested:
+    manifest = read_manifest(store)
+    if manifest is not None:
+        _check_made_for(store, manifest, how)
+    stage = f"rows {how.source_name}"
+    partitions = [(number, path) for number, path in enumerate(_paths(store))]
+    found = _Found()
+
+    def read(numbered: tuple[int, Path]) -> tuple[pa.Table, int]:
+        return _bright_rows(*numbered, how, is_ours=manifest is not None)
+
+    done = 0
+    rows = [0] * len(partitions)
+    for (number, _), (stars, beyond) in zip(
+        partitions, map_in_order(read, iter(partitions), workers), strict=True
+    ):
+        found.stars.append(stars)
+        found.beyond += beyond
+        rows[number] = len(stars) + beyond
+        done += rows[number]
+        progress(stage, done, None if manifest is None else manifest["kept"])
+    if manifest is not None:
+        _read_beside(store, how, found)
+        files = tuple(FileFacts(**file) for file in manifest["files"])
+    else:
+        files = _own_files(store, [path for _, path in partitions], rows)
+    return _joined(found, how, files, manifest)
+
+
+def _joined(
+    found: _Found,
+    how: Reading,
+    files: tuple[FileFacts, ...],
+    manifest: dict[str, Any] | None,
+) -> Ingested:
+    """Return what was read as reading the archive's files returns it."""
+    rejected = product_schema("rejected").arrow_schema.empty_table()
+    stars, left_out = join_parts(found.stars, [rejected, *found.rejected])
+    if manifest is None or manifest["epoch_jyear"] is None:
+        stars = _moved(stars, how.epoch_jyear)
+    product_schema("stars").check(stars)
+    malformed = left_out.filter(pc.equal(left_out["reason"], Reason.malformed_record.name))
+    malformed = malformed.sort_by([("source_file", "ascending"), ("source_line", "ascending")])
+    problems = tuple(
+        f"{files[row['source_file']].name} {row['detail']}"
+        for row in malformed.slice(0, NAMED_PROBLEMS).to_pylist()
+    )
+    notes = (
+        *(manifest or {}).get("notes", ()),
+        *unmoved_stars(how.source_name, stars, how.epoch_jyear),
+    )
+    return Ingested(
+        how.source_name, how.band, stars, left_out, files, problems, notes, found.beyond
+    )
+
+
+def read_manifest(store: Store) -> dict[str, Any] | None:
+    """Return what a store says of itself.
+
+    Parameters
+    ----------
+    store : Store
+        A store, or a catalog of others.
+
+    Returns
+    -------
+    dict or None
+        None for a catalog of others.
+
+    Raises
+    ------
+    ProductError
+        If it cannot be read.
+    SchemaVersionError
+        If another version of starcat wrote it in another way.
+    """
+    if not store.is_ours:
+        return None
+    path = store.folder / MANIFEST_NAME
+    try:
+        manifest: dict[str, Any] = json.loads(path.read_bytes())
+        found = (str(manifest["store_version"]), str(manifest["schema"]))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ProductError(
+            f"{path}: cannot be read ({error!r}); expected the account of a store. Make it again "
+            "with 'starcat ingest SOURCE --to hats'",
+            path=path,
+        ) from error
+    schema = product_schema("stars")
+    expected = (MANIFEST_VERSION, f"stars-{schema.version}")
+    if found[0].split(".")[0] != MANIFEST_VERSION.split(".")[0] or found[1] != expected[1]:
+        raise SchemaVersionError(
+            f"{store.folder}: a store of version {found[0]} with {found[1]}; this starcat reads "
+            f"version {expected[0]} with {expected[1]}. Make it again with 'starcat ingest SOURCE "
+            "--to hats', or read it with the starcat that made it",
+            product="stars",
+            found=found,
+            expected=expected,
+        )
+    return manifest
+
+
+def _check_made_for(store: Store, manifest: dict[str, Any], how: Reading) -> None:
+    """Check that a store was made of what a build asks for."""
+    limit = manifest["read_limit_mag"]
+    kept = [
+        ("source", manifest["source"], how.source_name, manifest["source"] == how.source_name),
+        ("band", manifest["band"], how.band, manifest["band"] == how.band),
+        (
+            "epoch_jyear",
+            manifest["epoch_jyear"],
+            how.epoch_jyear,
+            manifest["epoch_jyear"] in (None, how.epoch_jyear),
+        ),
+        (
+            "read_limit_mag",
+            limit,
+            how.read_limit_mag,
+            limit is None or (how.read_limit_mag is not None and how.read_limit_mag <= limit),
+        ),
+    ]
+    for key, has, asked, fits in kept:
+        if not fits:
+            option = f" --band '{how.band}'" if key == "band" else ""
+            raise ConfigError(
+                f"{store.folder}: the store has {key} {has}, {asked} is asked for; make one that "
+                f"fits with 'starcat ingest {how.source_name} --to hats{option} -o DIR'",
+                key=key,
+                value=has,
+            )
+
+
+def _paths(store: Store) -> list[Path]:
+    return [path for partition in store.catalog.partitions for path in partition.paths]
+
+
+def _bright_rows(number: int, path: Path, how: Reading, *, is_ours: bool) -> tuple[pa.Table, int]:
+    """Return a file's stars within the limit, and how many are beyond it."""
+    names = product_schema("stars").arrow_schema.names
+    try:
+        with pq.ParquetFile(path) as file:
+            has = file.schema_arrow.names
+            _check_columns(path, has)
+            columns = [name for name in names if name in has and not name.startswith("nearest_")]
+            groups = _groups_within(file, how.read_limit_mag)
+            table = file.read_row_groups(groups, columns, use_threads=False)
+            table = table.replace_schema_metadata(None)
+            total = file.metadata.num_rows
+    except (OSError, pa.ArrowException) as error:
+        raise ProductError(
+            f"{path}: cannot be read as Parquet ({error}); get the catalog again", path=path
+        ) from error
+    if how.read_limit_mag is not None:
+        table = table.filter(pc.less_equal(table["mag"], how.read_limit_mag))
+    return _as_stars(table, number, how, is_ours=is_ours), total - len(table)
+
+
+def _groups_within(file: pq.ParquetFile, limit: float | None) -> list[int]:
+    """Return the row groups that may have stars within a limit."""
+    place = file.schema_arrow.names.index("mag")
+    groups = []
+    for k in range(file.metadata.num_row_groups):
+        group = file.metadata.row_group(k)
+        known = group.column(place).statistics
+        is_known = limit is not None and known is not None
+        is_blank = is_known and known.has_null_count and known.null_count == group.num_rows
+        is_faint = is_known and known.has_min_max and known.min > limit
+        if not (is_blank or is_faint):
+            groups.append(k)
+    return groups
+
+
+def _check_columns(path: Path, has: Sequence[str]) -> None:
+    lacking = [name for name in NEEDED if name not in has]
+    if lacking:
+        raise SchemaError(
+            f"{path}: no column {', '.join(lacking)}; a build reads {', '.join(NEEDED)} of a HATS "
+            "catalog, and what else the stars schema names",
+            product="stars",
+            field=lacking[0],
+            found=list(has),
+            expected=NEEDED,
+        )
+
+
+def _as_stars(table: pa.Table, number: int, how: Reading, *, is_ours: bool) -> pa.Table:
+    """Return rows as a table of the stars schema, with what a catalog of others lacks."""
+    schema = product_schema("stars").arrow_schema
+    count = len(table)
+    given: dict[str, Any] = {
+        "catalog": pa.repeat(how.source_name, count),
+        "band": pa.repeat(how.band, count),
+        "source_file": pa.repeat(pa.scalar(number, pa.int32()), count),
+        "source_line": pa.array(np.arange(1, count + 1)),
+        "quality_flags": pa.repeat(pa.scalar(0, pa.int32()), count),
+        "is_flagged_double": pa.repeat(False, count),
+        "is_flagged_variable": pa.repeat(False, count),
+    }
+    if not is_ours:
+        table = table.drop_columns(
+            [
+                n
+                for n in ("catalog", "band", "source_file", "source_line")
+                if n in table.column_names
+            ]
+        )
+    columns = []
+    for wanted in schema:
+        if wanted.name in table.column_names:
+            columns.append(table[wanted.name].cast(wanted.type))
+        elif wanted.name == "designation":
+            words = table["star_id"].cast(pa.string())
+            columns.append(pc.binary_join_element_wise(how.source_name, words, " "))
+        elif wanted.name in ("x", "y", "z"):
+            columns.append(pa.array(np.zeros(count)))  # move_to_epoch fills them in
+        else:
+            columns.append(given.get(wanted.name, pa.nulls(count, wanted.type)))
+    return pa.Table.from_arrays(columns, schema=schema)
+
+
+def _moved(stars: pa.Table, epoch_jyear: float | None) -> pa.Table:
+    """Return stars at an epoch, as reading archive files moves them."""
+    names = ("ra_deg", "dec_deg", "epoch_jyear", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")
+    columns: dict[str, Any] = {name: floats_of(stars, name) for name in names}
+    columns["quality_flags"] = stars["quality_flags"].to_numpy()
+    return with_columns(stars, move_to_epoch(columns, epoch_jyear))
+
+
+def _read_beside(store: Store, how: Reading, found: _Found) -> None:
+    """Read rejected records, and those whose star was read before."""
+    limit = how.read_limit_mag
+    for path in sorted((store.folder / REPEATED).glob("*.parquet")):
+        again = pq.read_table(path)
+        if limit is not None:
+            within = again.filter(pc.less_equal(again["mag"], limit))
+            found.beyond += len(again) - len(within)
+            again = within
+        found.stars.append(_as_stars(again, 0, how, is_ours=True))
+    for path in sorted((store.folder / REJECTED).glob("*.parquet")):
+        rejected = pq.read_table(path, schema=product_schema("rejected").arrow_schema)
+        if limit is not None:
+            listed = pc.or_(
+                pc.fill_null(pc.less_equal(rejected["mag"], limit), False),
+                pc.equal(rejected["reason"], Reason.malformed_record.name),
+            )
+            found.beyond += len(rejected)
+            rejected = rejected.filter(listed)
+            found.beyond -= len(rejected)
+        found.rejected.append(rejected)
+
+
+def _own_files(store: Store, paths: Sequence[Path], rows: Sequence[int]) -> tuple[FileFacts, ...]:
+    """Return the files of a catalog of others as the inputs that they are."""
+    folder = store.catalog.folder
+    return tuple(
+        FileFacts(path.relative_to(folder).as_posix(), file_sha256(path), path.stat().st_size, n)
+        for path, n in zip(paths, rows, strict=True)
+    )

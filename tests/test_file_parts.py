@@ -1,0 +1,165 @@
+"""Files read one by one: the same parts whoever reads them, and what is said of bad files."""
+
+from __future__ import annotations
+
+import gzip
+import sys
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
+
+from twomass_parts import PARTS, part_bytes
+
+from starcat.catalog import ingest as ingest_module
+from starcat.catalog.blocks import Reading, TablePile
+from starcat.catalog.file_parts import FileReading
+from starcat.catalog.ingest import Ingested, ingest
+from starcat.catalog.readers import files as files_module
+from starcat.catalog.readers.files import InputFile
+from starcat.catalog.source import data_source
+from starcat.errors import ParseError, SourceError
+from starcat.tables.schema import product_schema
+
+SOURCE = data_source("2mass")
+PSC = SOURCE.files[0]
+ROWS = 400
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Six parts of 2MASS with 400 records each, among them malformed ones."""
+    folder = tmp_path_factory.mktemp("psc")
+    paths = []
+    for number, name in enumerate(PARTS[:6]):
+        lines = part_bytes(number, ROWS, 1 + number * ROWS).splitlines(keepends=True)
+        lines[100] = b"no record\n"
+        lines[200] = lines[200].replace(b"|", b"|x", 1)
+        path = folder / f"psc_{name}.gz"
+        path.write_bytes(gzip.compress(b"".join(lines), mtime=0))
+        paths.append(path)
+    return paths
+
+
+@pytest.fixture
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blocks of some 30 records."""
+    monkeypatch.setattr(files_module, "BLOCK_BYTES", 10_000)
+
+
+def same(one: Ingested, other: Ingested) -> None:
+    assert one.stars.equals(other.stars)
+    assert one.rejected.equals(other.rejected)
+    assert one.files == other.files
+    assert one.problems == other.problems
+    assert one.rejected_by_reason == other.rejected_by_reason
+
+
+@pytest.mark.usefixtures("small_blocks")
+@pytest.mark.parametrize("limit_mag", [None, 13.0])
+@pytest.mark.parametrize("count", [1, 6])
+def test_the_number_of_workers_does_not_matter(
+    parts: list[Path], limit_mag: float | None, count: int
+) -> None:
+    read = [
+        ingest("2mass", parts[:count], read_limit_mag=limit_mag, neighbours=False, workers=workers)
+        for workers in (1, 2, 5)
+    ]
+    assert read[0].rows_read == count * ROWS
+    assert read[0].rejected_by_reason["malformed_record"] == 2 * count
+    assert (read[0].beyond_read_limit > 0) == (limit_mag is not None)
+    same(read[0], read[1])
+    same(read[0], read[2])
+
+
+@pytest.mark.usefixtures("small_blocks")
+def test_a_file_read_by_itself_has_the_parts_that_ingest_joins(parts: list[Path]) -> None:
+    whole = ingest("2mass", parts[:3], read_limit_mag=14.0, neighbours=False)
+    stars, rejected, counted, facts = [], [], 0, []
+    for number, path in enumerate(parts[:3]):
+        how = Reading("2mass", "Ks", read_limit_mag=14.0)
+        reading = FileReading(InputFile(path, PSC), number, SOURCE, how)
+        blocks = list(reading)
+        assert len(blocks) > 5
+        stars += [part.stars for part in blocks]
+        rejected += [part.rejected for part in blocks]
+        counted += sum(part.counted for part in blocks)
+        facts.append(reading.facts)
+        assert [problem.split(",")[0] for problem in reading.problems] == [
+            f"{path.name} line 101", f"{path.name} line 201"
+        ]  # fmt: skip
+    assert tuple(facts) == whole.files
+    assert counted == whole.beyond_read_limit
+    assert pa.concat_tables(stars).sort_by("star_id").equals(whole.stars)
+    assert sum(len(table) for table in rejected) == len(whole.rejected)
+
+
+def test_facts_of_a_file_that_was_not_read_to_its_end(parts: list[Path]) -> None:
+    reading = FileReading(InputFile(parts[0], PSC), 0, SOURCE, Reading("2mass", "Ks"))
+    with pytest.raises(SourceError, match="not read to its end"):
+        _ = reading.blocks.facts
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_progress_of_files_side_by_side_ends_with_all_bytes(
+    parts: list[Path], workers: int
+) -> None:
+    events: list[tuple[str, int, int | None]] = []
+    ingest("2mass", parts, neighbours=False, workers=workers, progress=lambda *e: events.append(e))
+    size = sum(path.stat().st_size for path in parts)
+    assert events[-1] == ("read 2mass", size, size)
+    done = [event[1] for event in events]
+    assert done == sorted(done)
+
+
+def copy_of(parts: list[Path], folder: Path) -> list[Path]:
+    folder.mkdir(exist_ok=True)
+    copies = [folder / path.name for path in parts]
+    for path, copy in zip(parts, copies, strict=True):
+        copy.write_bytes(path.read_bytes())
+    return copies
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_the_error_of_the_first_bad_file_is_told(
+    parts: list[Path], tmp_path: Path, workers: int
+) -> None:
+    copies = copy_of(parts, tmp_path)
+    for bad in (2, 4):
+        copies[bad].write_bytes(gzip.compress(b"1|2|3\n" * 50, mtime=0))
+    with pytest.raises(ParseError, match=r"psc_aac\.gz: none of the first 50 records") as caught:
+        ingest("2mass", copies, workers=workers)
+    assert caught.value.path == copies[2]
+
+
+def test_an_interrupted_reading_of_files_side_by_side_stops(
+    parts: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ingest_module, "_TELL_EVERY_S", 0.0)
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        ingest("2mass", parts, progress=interrupt)
+
+
+def test_a_pile_of_small_tables_is_joined_in_order() -> None:
+    schema = product_schema("rejected").arrow_schema
+    pile = TablePile("rejected")
+    assert [len(table) for table in pile.tables] == [0]
+    tables = []
+    for number in range(2000):
+        columns = [
+            pa.array([number] * 7, field.type) if field.name == "source_line" else
+            pa.array(["x"] * 7) if field.name in ("catalog", "band", "reason") else
+            pa.array([0] * 7, field.type) if field.name == "source_file" else
+            pa.nulls(7, field.type)
+            for field in schema
+        ]  # fmt: skip
+        tables.append(pa.Table.from_arrays(columns, schema=schema))
+        pile.add(tables[-1])
+    assert pa.concat_tables(pile.tables).equals(pa.concat_tables(tables))
+    assert len(pile.tables) < 10

@@ -1,0 +1,212 @@
+"""Runs that end early: what is done is kept, checked and gone on from, to the same bytes."""
+
+from __future__ import annotations
+
+import gzip
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
+
+from folder_bytes import bytes_of
+from twomass_parts import write_part
+
+from starcat.errors import BuildError, ConfigError, OutputError, ParseError, SourceError
+from starcat.store import split as splitting
+from starcat.store.ingest import ingest_to_store
+from starcat.store.ledger import Work
+from starcat.store.options import StoreOptions
+
+ROWS = 4_000
+SMALL = {"max_partition_rows": 3_000}
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("parts")
+    return [write_part(folder, part, ROWS, 1 + part * ROWS) for part in (0, 40, 91)]
+
+
+@pytest.fixture(scope="module")
+def whole(parts, tmp_path_factory):
+    """A store that was made without disturbance."""
+    folder = tmp_path_factory.mktemp("whole") / "store"
+    ingest_to_store("2mass", parts, folder, options=StoreOptions(**SMALL))
+    return bytes_of(folder)
+
+
+def make(parts, folder: Path, **options):
+    return ingest_to_store("2mass", parts, folder, options=StoreOptions(**{**SMALL, **options}))
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_any_number_of_workers_writes_the_same_bytes(workers, parts, whole, tmp_path):
+    made = make(parts, tmp_path / "store", workers=workers)
+    assert bytes_of(tmp_path / "store") == whole
+    assert made.outcome == "written"
+    assert [path.name for path in tmp_path.iterdir()] == ["store"]
+
+
+def test_memory_is_no_part_of_the_bytes(parts, whole, tmp_path):
+    make(parts, tmp_path / "store", memory_bytes=1 << 30)
+    assert bytes_of(tmp_path / "store") == whole
+
+
+@pytest.fixture
+def damaged(parts, tmp_path):
+    """The parts, the second of them cut off in its middle, and the whole of it."""
+    copies = [Path(shutil.copy(part, tmp_path)) for part in parts]
+    whole = copies[1].read_bytes()
+    copies[1].write_bytes(whole[: len(whole) // 2])
+    return copies, whole
+
+
+def test_a_damaged_part_is_named_and_what_is_done_is_kept(damaged, whole, tmp_path):
+    copies, content = damaged
+    store = tmp_path / "store"
+    with pytest.raises(ParseError, match=rf"{copies[1].name}: .*cut off"):
+        make(copies, store, workers=1)
+    assert not store.exists()
+    work = Work.of(store)
+    assert work.done("file-00000") is not None
+    assert work.done("file-00001") is None
+    copies[1].write_bytes(content)
+    make(copies, store, resume=True)
+    assert bytes_of(store) == whole
+
+
+def test_a_file_that_was_mended_is_read_again(parts, whole, tmp_path):
+    copies = [Path(shutil.copy(part, tmp_path)) for part in parts]
+    content = bytearray(copies[1].read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    copies[1].write_bytes(content)
+    store = tmp_path / "store"
+    with pytest.raises(SourceError, match=copies[1].name):
+        make(copies, store, workers=1)
+    shutil.copy(parts[1], copies[1])
+    make(copies, store, resume=True)
+    assert bytes_of(store) == whole
+
+
+def test_what_is_done_is_not_done_again_and_what_was_changed_is(
+    damaged, whole, tmp_path, monkeypatch
+):
+    copies, content = damaged
+    copies[1].write_bytes(bytes(len(content)))
+    store = tmp_path / "store"
+    with pytest.raises(SourceError):
+        make(copies, store, workers=1)
+    copies[1].write_bytes(content)
+    opened = []
+    reading = splitting.FileReading
+
+    def spy(file, *rest):
+        opened.append(file.path.name)
+        return reading(file, *rest)
+
+    monkeypatch.setattr(splitting, "FileReading", spy)
+    assert Work.of(store).done("file-00000") is not None
+    next((Work.of(store) / "runs").glob("file-00000*.arrow")).write_bytes(b"no longer")
+    make(copies, store, resume=True)
+    assert set(opened) >= {path.name for path in copies[:2]}
+    assert bytes_of(store) == whole
+    opened.clear()
+    work = Work.of(tmp_path / "again")
+    with monkeypatch.context() as patch:
+        patch.setattr("starcat.store.ingest.make_manifest", _fail)
+        with pytest.raises(BuildError):
+            make(copies, tmp_path / "again")
+    assert work.folder.exists()
+    assert len(opened) == 3
+    make(copies, tmp_path / "again", resume=True)
+    assert len(opened) == 3
+    assert bytes_of(tmp_path / "again").keys() == {
+        name.replace("store", "again") for name in whole if name != "store.json"
+    } | {"store.json"}
+
+
+def _fail(*_):
+    raise BuildError("stopped by the test")
+
+
+def test_an_input_that_has_changed_since_is_read_again(parts, whole, tmp_path, monkeypatch):
+    copies = [Path(shutil.copy(part, tmp_path)) for part in parts]
+    lines = gzip.decompress(copies[0].read_bytes()).splitlines(keepends=True)
+    copies[0].write_bytes(gzip.compress(b"".join(lines[: ROWS // 2]), 1, mtime=0))
+    store = tmp_path / "store"
+    with monkeypatch.context() as patch:
+        patch.setattr("starcat.store.ingest.make_manifest", _fail)
+        with pytest.raises(BuildError):
+            make(copies, store)
+    shutil.copy(parts[0], copies[0])
+    make(copies, store, resume=True)
+    assert bytes_of(store) == whole
+
+
+def test_an_unfinished_run_is_not_overwritten(damaged, tmp_path):
+    copies, content = damaged
+    copies[1].write_bytes(bytes(len(content)))
+    store = tmp_path / "store"
+    with pytest.raises(SourceError):
+        make(copies, store)
+    with pytest.raises(OutputError, match=r"unfinished run.*--resume"):
+        make(copies, store)
+    with pytest.raises(ConfigError, match="max_partition_rows 3000, this one 2000"):
+        make(copies, store, resume=True, max_partition_rows=2_000)
+
+
+def test_a_store_is_replaced_only_when_asked(parts, whole, tmp_path):
+    store = tmp_path / "store"
+    make(parts, store)
+    with pytest.raises(OutputError, match="--replace"):
+        make(parts, store)
+    assert make(parts, store, replace=True).outcome == "unchanged"
+    assert make(parts, store, replace=True, max_partition_rows=2_000).outcome == "replaced"
+    assert bytes_of(store) != whole
+
+
+def test_too_little_memory_says_what_it_takes(parts, tmp_path):
+    with pytest.raises(ConfigError, match=r"--memory 512 MiB is too little for 2 workers"):
+        make(parts, tmp_path / "store", memory_bytes=512 << 20, max_partition_rows=500_000)
+
+
+def test_a_cluster_that_is_not_there_is_told(parts, tmp_path, monkeypatch):
+    monkeypatch.setattr("starcat.store.cluster._CONNECT_S", 0.5)
+    with pytest.raises(ConfigError, match=r"--scheduler tcp://127.0.0.1:9: nobody answers"):
+        make(parts, tmp_path / "store", scheduler="tcp://127.0.0.1:9")
+
+
+def test_a_part_that_is_there_twice_is_told(parts, tmp_path):
+    again = Path(shutil.copy(parts[0], tmp_path / "psc_zzz.gz"))
+    with pytest.raises(SourceError, match="same content"):
+        make([*parts, again], tmp_path / "store")
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 2 MB, and a function that makes it larger."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+
+    def mount(*options: str) -> bool:
+        arguments = ["mount", "-t", "tmpfs", "-o", ",".join(options), "tmpfs", str(folder)]
+        return subprocess.run(arguments, capture_output=True, check=False).returncode == 0
+
+    if not mount("size=2m"):
+        pytest.skip("a small file system is wanted, and this user may not mount one")
+    yield folder, lambda: mount("remount", "size=200m")
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_a_full_disk_is_told_and_the_run_goes_on_when_there_is_room(parts, whole, small_disk):
+    folder, make_room = small_disk
+    with pytest.raises(OutputError, match=r"No space left on device.*make room.*--resume"):
+        make(parts, folder / "store")
+    assert not (folder / "store").exists()
+    assert make_room()
+    make(parts, folder / "store", resume=True)
+    assert bytes_of(folder / "store") == whole
