@@ -1,0 +1,126 @@
+"""Stores as LSDB sees them: opened, valid in the strict sense, and matched with the same pairs."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from starcat.pipeline.match_stores import match_stores
+from starcat.specs.product_sections import Crossmatch
+from starcat.store.ingest import ingest_to_store
+from starcat.store.layout import open_store
+from starcat.store.options import StoreOptions
+from starcat.tables.parquet import read_parquet
+
+lsdb = pytest.importorskip("lsdb", reason="LSDB comes with the extra dev")
+
+# LSDB, Dask and pandas warn of what is theirs.
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300), pytest.mark.filterwarnings("ignore")]
+
+RADIUS_ARCSEC = 9.5
+"""Within the margins of the stores, which LSDB cannot look beyond."""
+
+TOLERANCE_ARCSEC = 1e-5
+"""LSDB takes an arc sine of half the chord of directions, which have 15 digits."""
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two catalogs of the same stars in Gaia's layout, many of them on a border of base pixels."""
+    folder = tmp_path_factory.mktemp("lsdb")
+    generator = np.random.default_rng(29)
+    count = 1500
+    ra_deg = np.append(generator.uniform(0.0, 360.0, 900), np.full(600, 90.0))
+    dec_deg = np.append(generator.uniform(-88.0, 88.0, 900), generator.uniform(45.0, 85.0, 600))
+    made = []
+    for number, name in enumerate(("first", "second")):
+        east, north = generator.normal(scale=4.0 / 3600.0, size=(2, count))
+        ra = (ra_deg + east / np.cos(np.radians(dec_deg))) % 360.0
+        mag = generator.uniform(3.0, 9.0, count)
+        values = (ra, dec_deg + north, mag, mag + 0.1, mag - 0.5)
+        ids = 1 + 10_000 * number + generator.permutation(count)
+        records = [struct.pack("<qddfff", *row) for row in zip(ids, *values, strict=True)]
+        path = folder / name / "gaia_merged.bin"
+        path.parent.mkdir()
+        path.write_bytes(b"GDR3" + struct.pack("<IQ", 1, count) + b"".join(records))
+        options = StoreOptions(max_partition_rows=250)
+        ingest_to_store("gaia", [path], folder / f"{name}.hats", options=options)
+        made.append(folder / f"{name}.hats")
+    return made[0], made[1]
+
+
+def pairs_of(frame: Any) -> dict[tuple[int, int], float]:
+    """Return the separations of LSDB's pairs, arcseconds."""
+    ids = zip(frame["star_id_a"], frame["star_id_b"], strict=True)
+    return {
+        (int(a), int(b)): float(angle)
+        for (a, b), angle in zip(ids, frame["_dist_arcsec"], strict=True)
+    }
+
+
+def test_lsdb_opens_a_store(stores: tuple[Path, Path]):
+    for store in stores:
+        catalog = lsdb.open_catalog(store)
+        opened = open_store(store)
+        rows = int(opened.catalog.properties["hats_nrows"])
+        assert len(catalog) == rows > 1000
+        assert len(catalog.get_healpix_pixels()) == len(opened.catalog.partitions) > 12
+        assert catalog.margin is not None
+        assert catalog.margin.hc_structure.catalog_info.margin_threshold == opened.margin_arcsec
+
+
+def test_hats_finds_a_store_valid(stores: tuple[Path, Path]):
+    from hats.io.validation import is_valid_collection
+
+    for store in stores:
+        assert is_valid_collection(store, strict=True, verbose=False)
+
+
+def test_lsdb_finds_the_same_pairs(stores: tuple[Path, Path], tmp_path: Path):
+    wanted = Crossmatch(radius_arcsec=RADIUS_ARCSEC)
+    match_stores(*stores, tmp_path / "ours.parquet", wanted)
+    ours = read_parquet(tmp_path / "ours.parquet")
+    names = zip(ours["star_id"].to_pylist(), ours["counterpart_id"].to_pylist(), strict=True)
+    angles = dict(zip(names, ours["separation_arcsec"].to_pylist(), strict=True))
+    a, b = (lsdb.open_catalog(store) for store in stores)
+    found = a.crossmatch(
+        b,
+        n_neighbors=int(ours["n_candidates"].to_numpy().max()) + 1,
+        radius_arcsec=RADIUS_ARCSEC,
+        suffixes=("_a", "_b"),
+        suffix_method="all_columns",
+        require_right_margin=True,
+    ).compute()
+    theirs = pairs_of(found)
+    assert theirs.keys() == angles.keys()
+    assert len(theirs) == len(found) > 800
+    off = [abs(theirs[pair] - angles[pair]) for pair in theirs]
+    assert max(off) < TOLERANCE_ARCSEC
+    # Pairs across the borders of partitions are among them.
+    edges = _across_borders(stores, ours["star_id"].to_numpy(), ours["counterpart_id"].to_numpy())
+    assert edges > 50
+
+
+def _across_borders(stores: tuple[Path, Path], star: Any, counterpart: Any) -> int:
+    """Return how many pairs have their counterpart in a partition that the star is not in."""
+    of_star, of_other = (_places(store) for store in stores)
+    bounds = [part.pixel.first for part in open_store(stores[1]).catalog.partitions]
+    places = [
+        np.searchsorted(bounds, [known[each] for each in ids.tolist()], side="right")
+        for known, ids in ((of_star, star), (of_other, counterpart))
+    ]
+    return int((places[0] != places[1]).sum())
+
+
+def _places(store: Path) -> dict[int, int]:
+    found: dict[int, int] = {}
+    for partition in open_store(store).catalog.partitions:
+        for path in partition.paths:
+            table = read_parquet(path)
+            ids, places = table["star_id"].to_pylist(), table["_healpix_29"].to_pylist()
+            found.update(zip(ids, places, strict=True))
+    return found
