@@ -26,6 +26,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from hats_stores import write_catalog, write_facts
 
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import check_artifact
@@ -35,6 +36,7 @@ from starcat.errors import StarcatError
 from starcat.exchange.formats import format_of
 from starcat.images.image_file import write_image
 from starcat.releases.publishing import publish_artifact
+from starcat.store.pixels import Pixel
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "errors.md"
 
@@ -470,6 +472,86 @@ def _(place: Place) -> Call:
     text = table["ra_deg"].cast("string")
     pq.write_table(table.set_column(where, "ra_deg", text), place.folder / "stars.parquet")
     return matched_with(place, place.folder / "stars.parquet")
+
+
+def matched_store(place: Place, change: Callable[[Path, pa.Table], None]) -> Call:
+    """Find the stars of a good artifact in a store, one of whose partitions is changed."""
+    store = place.folder / "store"
+    write_catalog(pq.read_table(place.artifact / "stars.parquet"), store, 100)
+    part = min(store.rglob("Npix=*.parquet"))
+    change(part, pq.ParquetFile(part).read())
+    return matched_with(place, store)
+
+
+@case("store to match, without a column", 4)
+def _(place: Place) -> Call:
+    def change(part: Path, _: pa.Table) -> None:
+        for path in part.parents[3].rglob("Npix=*.parquet"):
+            pq.write_table(pq.ParquetFile(path).read().drop_columns("mag"), path)
+
+    return matched_store(place, change)
+
+
+@case("store to match, with a column of another type", 4)
+def _(place: Place) -> Call:
+    def change(part: Path, table: pa.Table) -> None:
+        where = table.column_names.index("mag")
+        pq.write_table(table.set_column(where, "mag", table["mag"].cast("float")), part)
+
+    return matched_store(place, change)
+
+
+@case("store to match, with a star in another pixel", 5)
+def _(place: Place) -> Call:
+    def change(part: Path, table: pa.Table) -> None:
+        where = table.column_names.index("_healpix_29")
+        elsewhere = pa.array([12 * 4**29 - 1] * len(table))
+        pq.write_table(table.set_column(where, "_healpix_29", elsewhere), part)
+
+    return matched_store(place, change)
+
+
+@case("store to match, with two partitions of one place", 5)
+def _(place: Place) -> Call:
+    def change(part: Path, table: pa.Table) -> None:
+        del table
+        pixels = (Pixel(0, 3), Pixel(1, 12))
+        for pixel in pixels:
+            path = part.parents[2] / pixel.path
+            path.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(part, path)
+        write_facts(part.parents[3], pixels, 2)
+
+    return matched_store(place, change)
+
+
+@case("store to match, with pixels of another order", 5)
+def _(place: Place) -> Call:
+    def change(part: Path, _: pa.Table) -> None:
+        facts = part.parents[3] / "hats.properties"
+        facts.write_text("hats_col_healpix_order=19\n")
+
+    return matched_store(place, change)
+
+
+@case("store to match, with a damaged partition", 3)
+def _(place: Place) -> Call:
+    def change(part: Path, _: pa.Table) -> None:
+        part.write_bytes(part.read_bytes()[:-100])
+
+    return matched_store(place, change)
+
+
+@case("star table to match with a store, off the sky", 4)
+def _(place: Place) -> Call:
+    table = pq.read_table(place.artifact / "stars.parquet")
+    where = table.column_names.index("dec_deg")
+    dec_deg = pa.array([91.0, *table["dec_deg"].to_pylist()[1:]])
+    changed = table.set_column(where, table.schema.field("dec_deg"), dec_deg)
+    pq.write_table(changed, place.folder / "stars.parquet")
+    write_catalog(table, place.folder / "store", 100)
+    output = place.out / "x.parquet"
+    return ["crossmatch", place.folder / "stars.parquet", place.folder / "store", "-o", output]
 
 
 @case("cross-identification in place of a folder", 1)
