@@ -35,14 +35,10 @@ class StarBlock:
         that the archive does not have is left out.
     verdicts : Verdicts
         Records that are not stars to keep, with the reason.
-    brightest_mag : ndarray of float64, shape (N,), optional
-        The brightest that a star without a magnitude can be, in the band of ``mag``, where the
-        archive has an upper limit of its brightness; NaN where it has none.
     """
 
     columns: dict[str, Values]
     verdicts: Verdicts
-    brightest_mag: NDArray[np.float64] | None = None
 
     def where(self, chosen: NDArray[np.bool_]) -> StarBlock:
         """Return some of the records.
@@ -59,24 +55,6 @@ class StarBlock:
         """
         columns = {name: _values_where(values, chosen) for name, values in self.columns.items()}
         return StarBlock(columns, self.verdicts.where(chosen))
-
-    def is_fainter_than(self, limit_mag: float) -> NDArray[np.bool_]:
-        """Return which stars are fainter than a magnitude, whatever they are otherwise.
-
-        Parameters
-        ----------
-        limit_mag : float
-            The limit itself is not fainter.
-
-        Returns
-        -------
-        ndarray of bool, shape (N,)
-            False where neither a magnitude nor an upper limit of the brightness says so.
-        """
-        mag = np.asarray(self.columns["mag"], dtype=np.float64)
-        if self.brightest_mag is not None:
-            mag = np.where(np.isnan(mag), self.brightest_mag, mag)
-        return np.asarray(mag > limit_mag)
 
 
 def _values_where(values: Values, chosen: NDArray[np.bool_]) -> Values:

@@ -98,17 +98,32 @@ def stars(records: Records, band: str) -> StarBlock:
             ),
         },
         verdicts,
-        np.sum([weight * _brightest(records, mags[n], n) for n, weight in weights.items()], axis=0),
     )
 
 
-def _brightest(records: Records, measured: NDArray[np.float64], band: str) -> NDArray[np.float64]:
-    """Return the brightest that a star can be in a band: NaN where the archive sets no limit.
+def brightest_mag(records: Records, band: str) -> NDArray[np.float64]:
+    """Return the brightest that each star can be.
 
-    Quality U says that the magnitude is a limit: the star is fainter at a confidence of 95 %.
+    Parameters
+    ----------
+    records : Records
+        Columns as `COLUMNS` lists them.
+    band : str
+        As for `stars`.
+
+    Returns
+    -------
+    ndarray of float64, shape (N,)
+        The magnitude, or where there is none the limit that quality U gives it (the star is
+        fainter at a confidence of 95 %); NaN where the archive says neither.
     """
+    weights = blend_weights(band)
+    return np.asarray(np.sum([weight * _brightest(records, n) for n, weight in weights.items()], 0))
+
+
+def _brightest(records: Records, band: str) -> NDArray[np.float64]:
     is_limit = _any_flag(records, "ph_qual", b"U", {band: 1.0})
-    return np.where(is_limit, records[_BANDS[band][1]], measured)
+    return np.where(is_limit, records[_BANDS[band][1]], _measured(records, band))
 
 
 def _measured(records: Records, band: str) -> NDArray[np.float64]:
