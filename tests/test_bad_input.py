@@ -26,6 +26,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from genuine_records import PSC
 from hats_stores import write_catalog, write_facts
 
 from starcat.artifact.reader import open_artifact
@@ -216,6 +217,45 @@ def _(place: Place) -> Call:
 def _(place: Place) -> Call:
     wrong = with_text(place.lines[4], 115, b"\xff\xfe")
     return place.ingest([*place.lines[:4], wrong, *place.lines[5:]])
+
+
+def parts(place: Place, **contents: bytes) -> Call:
+    """Ingest parts of 2MASS, each in a folder of its own and named by the archive or not."""
+    paths = [
+        place.write(f"{number}/{name.replace('_gz', '.gz')}", content)
+        for number, (name, content) in enumerate(contents.items())
+    ]
+    inputs = [word for path in paths for word in ("--input", path)]
+    return ["ingest", "2mass", *inputs, "-o", place.out / "stars.parquet"]
+
+
+@case("part of 2MASS given twice", 3)
+def _(place: Place) -> Call:
+    return parts(place, psc_aaa=PSC, psc_aab=PSC + b"\n", psc_aaa_gz=gzip.compress(PSC))
+
+
+@case("part of 2MASS under two names", 3)
+def _(place: Place) -> Call:
+    return parts(place, psc_aaa=PSC, psc_aab=PSC)
+
+
+@case("part of another release of 2MASS", 3)
+def _(place: Place) -> Call:
+    other = PSC.rpartition(b"|")[0] + b"\n"
+    return parts(place, psc_aaa=PSC, psc_aab=other * 3)
+
+
+@case("part of 2MASS with lines of another release", 3)
+def _(place: Place) -> Call:
+    other = PSC.rpartition(b"|")[0] + b"\n"
+    return parts(place, psc_aaa=PSC, psc_aab=(PSC + b"\n") * 30_000 + other * 3_000)
+
+
+@case("part of 2MASS damaged in the middle", 3)
+def _(place: Place) -> Call:
+    data = bytearray(gzip.compress((PSC + b"\n") * 30_000))
+    data[len(data) // 2] ^= 0x20
+    return parts(place, psc_aaa=PSC, psc_aab_gz=bytes(data))
 
 
 @case("the same star twice", 0)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from starcat.catalog.archives import gaia, hipparcos, sao, twomass, tycho1, tycho2
 from starcat.catalog.plausible import without_impossible
@@ -29,10 +30,15 @@ _PARSERS = {
 
 @dataclass(frozen=True)
 class CatalogModule:
-    """What ingest needs of a catalog: the columns to parse and what they mean."""
+    """What ingest needs of a catalog: the columns to parse and what they mean.
+
+    A large catalog also gives the magnitudes by themselves: with a read limit nothing else is
+    made of the records beyond it.
+    """
 
     columns: Mapping[str, Sequence[str]]
     stars: Callable[[Records, str], StarBlock]
+    magnitudes: Callable[[Records, str], NDArray[np.float64]] | None = None
 
 
 CATALOGS = {
@@ -40,7 +46,7 @@ CATALOGS = {
     "hipparcos": CatalogModule(hipparcos.COLUMNS, hipparcos.stars),
     "tycho1": CatalogModule(tycho1.COLUMNS, tycho1.stars),
     "tycho2": CatalogModule(tycho2.COLUMNS, tycho2.stars),
-    "2mass": CatalogModule(twomass.COLUMNS, twomass.stars),
+    "2mass": CatalogModule(twomass.COLUMNS, twomass.stars, twomass.magnitudes),
     "gaia": CatalogModule(gaia.COLUMNS, gaia.stars),
 }
 """The star catalogs, by the name of their data source."""
@@ -115,12 +121,13 @@ def parse_block(file_number: int, block: Block, how: Reading) -> Part:
     module = CATALOGS[how.source_name]
     names = list(module.columns[layout.name])
     records = _PARSERS[layout.layout](block.data, layout, names, block.first_line)
-    made, line, counted = module.stars(records, how.band), records.line, 0
-    if how.read_limit_mag is not None:
-        # Nearly all records of a large catalog leave here, before anything is made of them.
-        is_held = made.is_within(how.read_limit_mag)
+    count, limit_mag = len(records), how.read_limit_mag
+    if limit_mag is not None and module.magnitudes is not None:
+        records = records.where(module.magnitudes(records, how.band) <= limit_mag)
+    made, line = module.stars(records, how.band), records.line
+    if limit_mag is not None:
+        is_held = np.asarray(made.columns["mag"], dtype=np.float64) <= limit_mag
         made, line = made.where(is_held), line[is_held]
-        counted = len(records) - len(line)
     made = without_impossible(made)
     columns = move_to_epoch(made.columns, how.epoch_jyear)
     columns |= {"catalog": how.source_name, "source_file": file_number}
@@ -137,7 +144,8 @@ def parse_block(file_number: int, block: Block, how: Reading) -> Part:
         rejected.append(malformed_rows(problems, file_number, how.source_name, how.band))
     empty = product_schema("rejected").arrow_schema.empty_table()
     left_out = pa.concat_tables(rejected) if rejected else empty
-    return Part(file_number, len(records) + len(problems), stars, left_out, problems, counted)
+    counted = count - len(line)
+    return Part(file_number, count + len(problems), stars, left_out, problems, counted)
 
 
 def reject_rows(stars: pa.Table, reasons: pa.Array) -> pa.Table:

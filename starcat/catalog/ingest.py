@@ -157,8 +157,10 @@ def ingest(
     source = star_catalog(source_name)
     how = Reading(source_name, check_band(source, band), epoch_jyear, read_limit_mag)
     files = given_files(source, paths)
-    gathered = list(_read_files(files, source, how, workers, progress))
-    check_contents(files, [each.facts for each in gathered], source)
+    gathered: list[_Gathered] = []
+    for each in _read_files(files, source, how, workers, progress):
+        gathered.append(each)
+        check_contents(files[: len(gathered)], [one.facts for one in gathered], source)
     stars, rejected = join_parts(
         [table for each in gathered for table in each.stars],
         [table for each in gathered for table in each.rejected],

@@ -56,21 +56,6 @@ class StarBlock:
         columns = {name: _values_where(values, chosen) for name, values in self.columns.items()}
         return StarBlock(columns, self.verdicts.where(chosen))
 
-    def is_within(self, limit_mag: float) -> NDArray[np.bool_]:
-        """Return which stars are no fainter than a magnitude, whatever they are otherwise.
-
-        Parameters
-        ----------
-        limit_mag : float
-            The limit itself is within.
-
-        Returns
-        -------
-        ndarray of bool, shape (N,)
-            False where there is no magnitude.
-        """
-        return np.asarray(np.asarray(self.columns["mag"], dtype=np.float64) <= limit_mag)
-
 
 def _values_where(values: Values, chosen: NDArray[np.bool_]) -> Values:
     if isinstance(values, pa.Array | pa.ChunkedArray):

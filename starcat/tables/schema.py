@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -105,7 +105,7 @@ class ProductSchema:
         """``<product>-<version>``."""
         return f"{self.product}-{self.version}"
 
-    @property
+    @cached_property
     def arrow_schema(self) -> pa.Schema:
         """The columns as a pyarrow schema with units and meanings as field metadata."""
         import pyarrow as pa

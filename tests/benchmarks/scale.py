@@ -145,6 +145,7 @@ def build_case(given: Given) -> list[str]:
     faint_limit_mag = 4.4 + 2.5 * math.log10(ARCHIVE_ROWS / given.rows)
     return [
         *(sys.executable, "-m", "starcat", "build", "--preset", "2mass-8x6"),
+        *("--set", "self_test.min_identified=0"),
         *("--set", f"selection.faint_limit_mag={faint_limit_mag:.2f}"),
         *("--set", f"catalog.read_limit_mag={max(8.0, faint_limit_mag + 1.0):.2f}"),
         *("--input", f"2mass={given.parts}", "-o", str(given.scratch / "built"), "--replace"),

@@ -101,6 +101,25 @@ def stars(records: Records, band: str) -> StarBlock:
     )
 
 
+def magnitudes(records: Records, band: str) -> NDArray[np.float64]:
+    """Return the magnitudes of 2MASS records.
+
+    Parameters
+    ----------
+    records : Records
+        Columns as `COLUMNS` lists them.
+    band : str
+        As for `stars`.
+
+    Returns
+    -------
+    ndarray of float64, shape (N,)
+        NaN where a band was not measured, or has an upper limit of the brightness only.
+    """
+    weights = blend_weights(band)
+    return np.asarray(np.sum([weight * _measured(records, n) for n, weight in weights.items()], 0))
+
+
 def _measured(records: Records, band: str) -> NDArray[np.float64]:
     """Return the magnitudes that were measured: NaN for upper limits and bands without a source."""
     _, column = _BANDS[band]

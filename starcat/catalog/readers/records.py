@@ -125,6 +125,22 @@ class Records:
         chars = text.view(np.uint8).reshape(len(text), text.dtype.itemsize)
         return np.asarray((chars <= 32).all(axis=1))
 
+    def where(self, chosen: NDArray[np.bool_]) -> Records:
+        """Return some of the records, with all problems.
+
+        Parameters
+        ----------
+        chosen : ndarray of bool, shape (N,)
+            Rows to keep.
+
+        Returns
+        -------
+        Records
+            In the same order.
+        """
+        columns = {name: values[chosen] for name, values in self.columns.items()}
+        return replace(self, line=self.line[chosen], columns=columns)
+
     def without(self, bad: NDArray[np.bool_], problems: Sequence[Problem]) -> Records:
         """Return the records that are not bad, with more problems listed.
 
@@ -143,9 +159,7 @@ class Records:
         merged = sorted([*self.problems, *problems], key=lambda problem: problem.line)
         if not bad.any():
             return replace(self, problems=merged)
-        keep = ~bad
-        columns = {name: values[keep] for name, values in self.columns.items()}
-        return Records(self.layout, self.line[keep], columns, merged)
+        return replace(self.where(~bad), problems=merged)
 
 
 def reject_impossible_numbers(records: Records, layout: RecordFile) -> Records:
