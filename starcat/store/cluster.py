@@ -68,7 +68,9 @@ def cluster(
             threads_per_worker=1,
             processes=not is_small,
             memory_limit=0,  # what a task may hold is decided by what it is asked to do
-            dashboard_address=None,
+            # Without an address it would take port 8787 of all interfaces, and warn if it is taken.
+            dashboard_address="127.0.0.1:0",
+            scheduler_kwargs={"dashboard": False},
             silence_logs=logging.CRITICAL,
         ) as local,
         distributed.Client(local) as client,
