@@ -128,6 +128,7 @@ class Given:
     parts: Path
     rows: int
     scratch: Path
+    store: Path
     workers: int
 
 
@@ -138,6 +139,22 @@ def bare_case(given: Given) -> list[str]:
     """The fastest bare parse."""
     parts, workers = str(given.parts), str(given.workers)
     return [sys.executable, __file__, "--bare", "--parts", parts, "--workers", workers]
+
+
+def store_case(given: Given) -> list[str]:
+    """A store of the preset's band."""
+    return [
+        *(sys.executable, "-m", "starcat", "ingest", "2mass", "--to", "hats", "--band", "(J+H)/2"),
+        *("--input", str(given.parts), "-o", str(given.store), "--replace"),
+        *("--workers", str(given.workers)),
+    ]
+
+
+def from_store_case(given: Given) -> list[str]:
+    """The build from the store."""
+    asked = build_case(given)
+    asked[asked.index(f"2mass={given.parts}")] = f"2mass={given.store}"
+    return asked
 
 
 def build_case(given: Given) -> list[str]:
@@ -153,7 +170,12 @@ def build_case(given: Given) -> list[str]:
     ]
 
 
-CASES: dict[str, Case] = {"bare": bare_case, "build": build_case}
+CASES: dict[str, Case] = {
+    "bare": bare_case,
+    "store": store_case,
+    "build": build_case,
+    "from-store": from_store_case,
+}
 """The commands, by name; each is compared with the first that is run."""
 
 
@@ -162,6 +184,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rows", type=int, default=5_000_000)
     parser.add_argument("--parts", type=Path, help="a folder of parts that are there already")
+    parser.add_argument("--store", type=Path, help="where the store is, or is made and left")
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--runs", type=int, default=1)
@@ -172,16 +195,17 @@ def main() -> None:
         return
     with tempfile.TemporaryDirectory() as folder:
         scratch, parts = Path(folder), given.parts
+        store = given.store or scratch / "store"
         if parts is None:
             from twomass_parts import write_parts
 
             parts = scratch / "parts"
             write_parts(parts, given.rows, given.workers)
-        rows = bare(parts, given.workers)
+        rows = given.rows if given.parts is None else bare(parts, given.workers)
         print(f"{rows:,} rows in {len(list(parts.glob('psc_*.gz')))} parts")
         first: Measured | None = None
         for name in given.cases * given.runs:
-            took = measure(CASES[name](Given(parts, rows, scratch, given.workers)))
+            took = measure(CASES[name](Given(parts, rows, scratch, store, given.workers)))
             first = first or took
             times = took.seconds / first.seconds, took.cpu_s / first.cpu_s
             print(
