@@ -20,6 +20,21 @@ CREATE MACRO _files_between(places, ra_min, ra_max, dec_min, dec_max) AS list_tr
         lambda p: p.file
     )
 )[1];
+-- How far in right ascension a circle reaches; everywhere where a pole may be in it.
+CREATE MACRO _half_width(dec, radius) AS CASE
+    WHEN abs(dec) + radius >= 89.999 THEN 360
+    ELSE 1e-5 + degrees(asin(greatest(0, least(1, sind(radius) / cosd(dec)))))
+END;
+CREATE MACRO _is_beside(found, ra, width) AS (
+    found BETWEEN ra - width AND ra + width
+    OR found >= ra + 360 - width OR found <= ra - 360 + width
+);
+-- Whether a right ascension may be that of a place within a radius of another. The least and the
+-- largest of a part of a file are enough to tell that none is. Right ascensions may be from 0 or
+-- from -180 on.
+CREATE MACRO _may_be_near(found, ra, dec, radius) AS _is_beside(
+    found, ra - 360 * floor(ra / 360), _half_width(dec, radius)
+);
 -- Half of the diagonal of a camera's field.
 CREATE MACRO _half_diagonal(fov_x, fov_y) AS degrees(atan(sqrt(
     power(tan(radians(fov_x / 2)), 2) + power(tan(radians(fov_y / 2)), 2)
