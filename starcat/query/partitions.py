@@ -31,23 +31,22 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Extents:
-    """Circles and boxes that hold pixels, degrees; arrays of shape (N,).
+    """Circles and boxes that hold pixels; arrays of float64, of shape (N,) where no other is said.
 
     Attributes
     ----------
-    ra_deg, dec_deg : ndarray of float64
-        Centre of the circle.
+    centre : ndarray of float64, shape (N, 3)
+        Directions of the centres of the circles.
     reach_deg : ndarray of float64
-        Radius of the circle.
+        Radius of the circle, degrees.
     ra_from_deg, ra_to_deg : ndarray of float64
-        Sides of the box; the first is from 0 to 360, the second is larger, also than 360 where
-        the box goes through 0.
+        Sides of the box, degrees; the first is from 0 to 360, the second is larger, also than 360
+        where the box goes through 0.
     dec_from_deg, dec_to_deg : ndarray of float64
-        Lower and upper side of the box.
+        Lower and upper side of the box, degrees.
     """
 
-    ra_deg: Floats
-    dec_deg: Floats
+    centre: Floats
     reach_deg: Floats
     ra_from_deg: Floats
     ra_to_deg: Floats
@@ -79,8 +78,7 @@ def extents(pixels: Sequence[Pixel]) -> Extents:
     first = middle + east.min(axis=0) - MARGIN_DEG
     width = np.ptp(east, axis=0) + 2 * MARGIN_DEG
     return Extents(
-        middle,
-        np.degrees(np.arcsin(centre[:, 2])),
+        centre,
         np.degrees(reach) + MARGIN_DEG,
         np.mod(first, 360.0),
         np.mod(first, 360.0) + width,

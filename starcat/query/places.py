@@ -17,10 +17,18 @@ from starcat.query.targets import POSITION, Target, View
 
 _MACROS = Path(__file__).parent / "sql" / "places.sql"
 
-_NO_FILE = (
-    "[]::STRUCT(file VARCHAR, ra DOUBLE, dec DOUBLE, reach DOUBLE, "
-    "ra_from DOUBLE, ra_to DOUBLE, dec_from DOUBLE, dec_to DOUBLE)[]"
-)
+_NUMBERS = ["x", "y", "z", "cosine", "sine", "reach", "ra_from", "ra_to", "dec_from", "dec_to"]
+"""What is known of each file beside its name. Angles are in degrees."""
+
+_NEAR = "_may_be_near(found, file, known, ra, dec, radius)"
+_BETWEEN = "_may_be_between(file, known, ra_min, ra_max, dec_min, dec_max)"
+
+_IN_FILES = {
+    _NEAR: "_is_beside(found, ra - 360 * floor(ra / 360), _half_width(dec, radius)) "
+    "AND _is_wanted(file, _files_near(known, ra, dec, radius))",
+    _BETWEEN: "_is_wanted(file, _files_between(known, ra_min, ra_max, dec_min, dec_max))",
+}
+"""What a row of a store is asked first; of other targets nothing, which takes less time."""
 
 
 def place_macros() -> str:
@@ -65,6 +73,9 @@ def place_statements(target: Target) -> Iterator[str]:
     """
     schema = places_schema(target)
     yield f"CREATE SCHEMA IF NOT EXISTS {schema};"
+    is_store = any(view.pixels for view in target.views)
+    for macro, asked in _IN_FILES.items():
+        yield f"CREATE MACRO {schema}.{macro} AS ({asked if is_store else 'true'});"
     for view in target.views:
         place = ", ".join(
             f"{value} AS _place_{name}"
@@ -75,7 +86,9 @@ def place_statements(target: Target) -> Iterator[str]:
         else:
             rows = f"SELECT *, {place}, '' AS _place_file {reading(view)}"
         yield f"CREATE VIEW {schema}.{view.name} AS {rows};"
-        yield f"SET VARIABLE {quoted_name(f'{schema}.{view.name}')} = {_known_of_files(view)};"
+        if is_store:
+            variable = quoted_name(f"{schema}.{view.name}")
+            yield f"SET VARIABLE {variable} = {_known_of_files(view)};"
 
 
 def reading(view: View, more: str = "") -> str:
@@ -118,18 +131,24 @@ def _position(view: View) -> tuple[str, str]:
 def _known_of_files(view: View) -> str:
     """Return a list, as SQL writes it, of circles and boxes on the sky that hold the files."""
     if not view.pixels:
-        return _NO_FILE
+        kinds = ", ".join(f"{name} DOUBLE" for name in _NUMBERS)
+        return f"[]::STRUCT(file VARCHAR, {kinds}, files BIGINT)[]"
+    import numpy as np
+
     from starcat.query.partitions import extents
 
     found = extents(view.pixels)
-    columns = (
-        found.ra_deg, found.dec_deg, found.reach_deg,
+    reach = np.radians(found.reach_deg)
+    table = np.column_stack([
+        found.centre, np.cos(reach), np.sin(reach), found.reach_deg,
         found.ra_from_deg, found.ra_to_deg, found.dec_from_deg, found.dec_to_deg,
-    )  # fmt: skip
+    ])  # fmt: skip
     rows = ", ".join(
         f"({quoted(file)}, {', '.join(map(repr, numbers))})"
-        for file, *numbers in zip(view.files, *(column.tolist() for column in columns), strict=True)
+        for file, numbers in zip(view.files, table.tolist(), strict=True)
     )
-    names = "file, ra, dec, reach, ra_from, ra_to, dec_from, dec_to"
-    row = ", ".join(f"{name!r}: {name}" for name in names.split(", "))
-    return f"(SELECT list({{{row}}}) FROM (VALUES {rows}) AS t({names}))"
+    row = ", ".join(f"'{name}': {name}" for name in ("file", *_NUMBERS))
+    names = ", ".join(("file", *_NUMBERS))
+    return (
+        f"(SELECT list({{{row}, 'files': {len(view.files)}}}) FROM (VALUES {rows}) AS t({names}))"
+    )

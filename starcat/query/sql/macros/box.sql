@@ -10,7 +10,6 @@ WHERE _place_dec_deg BETWEEN dec_min AND dec_max
         WHEN ra_min <= ra_max THEN _place_ra_deg BETWEEN ra_min AND ra_max
         ELSE _place_ra_deg >= ra_min OR _place_ra_deg <= ra_max
     END
-    AND (_place_file = '' OR list_contains(
-        _files_between(getvariable('{places}.' || lower(of)), ra_min, ra_max, dec_min, dec_max),
-        _place_file
-    ))
+    AND {places}._may_be_between(
+        _place_file, getvariable('{places}.' || lower(of)), ra_min, ra_max, dec_min, dec_max
+    )

@@ -10,9 +10,8 @@ FROM (
     FROM query_table('{places}.' || of)
     -- What prunes even where the numbers come from another table stands first.
     WHERE _place_dec_deg BETWEEN dec - radius - 1e-9 AND dec + radius + 1e-9
-        AND _may_be_near(_place_ra_deg, ra, dec, radius)
-        AND (_place_file = '' OR list_contains(
-            _files_near(getvariable('{places}.' || lower(of)), ra, dec, radius), _place_file
-        ))
 )
 WHERE _apart <= radius
+    AND {places}._may_be_near(
+        _place_ra_deg, _place_file, getvariable('{places}.' || lower(of)), ra, dec, radius
+    )

@@ -16,13 +16,10 @@ FROM (
             + cosd(dec) * cosd(_place_dec_deg) * cosd(_place_ra_deg - ra) AS _ahead
     FROM query_table('{places}.' || of)
     WHERE abs(_place_dec_deg - dec) <= 1e-9 + _half_diagonal(fov_x, fov_y)
-        AND _may_be_near(_place_ra_deg, ra, dec, _half_diagonal(fov_x, fov_y))
-        AND (_place_file = '' OR list_contains(
-            _files_near(
-                getvariable('{places}.' || lower(of)), ra, dec, _half_diagonal(fov_x, fov_y)
-            ),
-            _place_file
-        ))
+        AND {places}._may_be_near(
+            _place_ra_deg, _place_file, getvariable('{places}.' || lower(of)),
+            ra, dec, _half_diagonal(fov_x, fov_y)
+        )
 )
 WHERE _ahead > 0
     AND abs(field_x_deg) <= fov_x / 2
