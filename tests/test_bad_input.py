@@ -976,6 +976,40 @@ def _(place: Place) -> Call:
     return ["sql", path, "FROM odd"]
 
 
+@case("place in a table that has none", 2)
+def _(place: Place) -> Call:
+    return ["sql", place.artifact, "FROM cone(1, 2, 3, of := 'pairs')"]
+
+
+def sky_store(place: Place, *numbers: int) -> Path:
+    """A HATS catalog with partitions of order 0."""
+    store = place.write("sky/hats.properties", "obs_collection=sky\n").parent
+    for number in numbers:
+        path = place.write(f"sky/dataset/Norder=0/Dir=0/Npix={number}.parquet", "")
+        pq.write_table(pa.table({"ra_deg": [45.0], "dec_deg": [0.0]}), path)
+    return store
+
+
+@case("store without a partition under a query", 5)
+def _(place: Place) -> Call:
+    return ["sql", sky_store(place), "FROM stars"]
+
+
+@case("store whose partition is cut off, under a query", 5)
+def _(place: Place) -> Call:
+    path = sky_store(place, 4, 5) / "dataset/Norder=0/Dir=0/Npix=4.parquet"
+    path.write_bytes(path.read_bytes()[:-1])
+    return ["sql", place.folder / "sky", "FROM stars"]
+
+
+@case("store with a link to somewhere else, under a query", 5)
+def _(place: Place) -> Call:
+    path = sky_store(place, 4, 5) / "dataset/Norder=0/Dir=0/Npix=4.parquet"
+    shutil.move(path, place.folder / "secret.parquet")
+    path.symlink_to(place.folder / "secret.parquet")
+    return ["sql", place.folder / "sky", "FROM stars"]
+
+
 # Registries --------------------------------------------------------------------------------
 
 

@@ -23,8 +23,8 @@ def sql(
         list[str] | None,
         typer.Argument(
             metavar="TARGET... [QUERY]",
-            help="Artifacts, Parquet files, archive files (or SOURCE=PATH), sources; then SQL, "
-            "or - to read it from stdin. Without a query: a prompt.",
+            help="Artifacts, catalog stores, Parquet files, archive files (or SOURCE=PATH), "
+            "sources; then SQL, or - to read it from stdin. Without a query: a prompt.",
         ),
     ] = None,
     named: Annotated[str | None, typer.Option(help="A query of the gallery; see --list.")] = None,
@@ -52,7 +52,8 @@ def sql(
     """Ask questions about artifacts and catalogs in SQL; nothing is written but -o FILE.
 
     Every product is a view: stars, rejected, pairs, triangles ... With several targets each has
-    a schema of its name, and they are a, b, c ... too.
+    a schema of its name, and they are a, b, c ... too. The folder of a store may be any HATS
+    collection or catalog; cone, box and field read only the files that they may reach.
 
     Example: starcat sql dist/gaia-12deg-1.0.0 "SELECT designation, mag FROM cone(37.95, 89.26, 5)"
     """

@@ -1,8 +1,8 @@
 """The macros that every session has: one SQL file each, with its help in the comments above.
 
 A file holds ``CREATE MACRO`` of the name of the file, after those of helpers whose names begin
-with ``_``. A table macro is made once for every schema, whose name stands in its text as
-``{schema}``.
+with ``_``. A table macro is made once for every schema; ``{places}`` in its text is the schema of
+its target's views with places (`starcat.query.places`).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Macro:
     help, example : str
         What it gives, and a query that shows it and runs on any artifact.
     text : str
-        The SQL that makes it, with ``{schema}`` where its own schema has to be named.
+        The SQL that makes it, with ``{places}`` where that schema has to be named.
     """
 
     name: str
@@ -43,21 +43,23 @@ class Macro:
         """Whether it stands after FROM."""
         return "AS TABLE" in self.text
 
-    def statement(self, schema: str) -> str:
-        """Return the SQL that makes the macro.
+    def statement(self, schema: str, places: str) -> str:
+        """Return the SQL that makes a table macro.
 
         Parameters
         ----------
         schema : str
             Schema to make it in.
+        places : str
+            Schema of the views with places that it is about.
 
         Returns
         -------
         str
             One or more statements.
         """
-        made = self.text.replace("{schema}", schema)
-        return made.replace("CREATE MACRO ", f"CREATE MACRO {schema}.") if self.is_table else made
+        made = self.text.replace("{places}", places)
+        return made.replace("CREATE MACRO ", f"CREATE MACRO {schema}.")
 
 
 @cache

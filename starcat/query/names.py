@@ -1,4 +1,4 @@
-"""Names of schemas and views that SQL needs no quotes for.
+"""Names of schemas and views that SQL needs no quotes for, and quotes for the rest.
 
 A name that is a word of SQL ends with an underscore: ``group.parquet`` is ``group_``.
 """
@@ -114,3 +114,40 @@ def _variants(name: str, is_taken: bool) -> Iterator[str]:
     yield name
     for number in count(2):
         yield f"{name}_{number}"
+
+
+def quoted(text: str) -> str:
+    """Return a text as SQL writes it.
+
+    Parameters
+    ----------
+    text : str
+        Any.
+
+    Returns
+    -------
+    str
+        The text in single quotes, with single quotes inside it doubled.
+
+    Examples
+    --------
+    >>> print(quoted("Barnard's star"))
+    'Barnard''s star'
+    """
+    return "'" + text.replace("'", "''") + "'"
+
+
+def quoted_name(text: str) -> str:
+    """Return any name of a column or variable as SQL writes it.
+
+    Parameters
+    ----------
+    text : str
+        Any.
+
+    Returns
+    -------
+    str
+        The name in double quotes, with double quotes inside it doubled.
+    """
+    return '"' + text.replace('"', '""') + '"'

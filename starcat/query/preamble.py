@@ -10,7 +10,8 @@ from starcat.errors import QueryError
 from starcat.query.columns import Facts
 from starcat.query.engine import Engine
 from starcat.query.macros import macros
-from starcat.query.names import short_names
+from starcat.query.names import quoted, short_names
+from starcat.query.places import place_macros, place_statements, places_schema, reading
 from starcat.query.targets import Target, View, open_targets
 
 PREAMBLE_GB = 1.0
@@ -49,12 +50,16 @@ def preamble(targets: Sequence[Target]) -> str:
     str
         Statements, each on one line or more.
     """
+    tables = [macro for macro in macros() if macro.is_table]
     lines = [macro.text + ";" for macro in macros() if not macro.is_table]
+    lines.append(place_macros())
+    for target in targets:
+        lines += place_statements(target)
     for schema, target in schemas_of(targets).items():
         lines.append(f"CREATE SCHEMA IF NOT EXISTS {schema};")
         for view in target.views:
             lines += _view_statements(f"{schema}.{view.name}", view)
-        lines += [macro.statement(schema) + ";" for macro in macros() if macro.is_table]
+        lines += [macro.statement(schema, places_schema(target)) + ";" for macro in tables]
     return "\n".join(lines)
 
 
@@ -91,27 +96,14 @@ def preamble_of(given: Sequence[str]) -> str:
         return preamble(targets)
 
 
-def quoted(text: str) -> str:
-    """Return a text as SQL writes it.
-
-    Parameters
-    ----------
-    text : str
-        Any.
-
-    Returns
-    -------
-    str
-        The text in single quotes, with single quotes inside it doubled.
-    """
-    return "'" + text.replace("'", "''") + "'"
-
-
 def _view_statements(name: str, view: View) -> list[str]:
-    files = ", ".join(quoted(str(path.resolve())) for path in view.paths)
-    made = [f"CREATE VIEW {name} AS FROM read_parquet([{files}], hive_partitioning = false);"]
+    made = [f"CREATE VIEW {name} AS {reading(view)};"]
     if view.schema is None:
         return made
     facts = {c.name: str(Facts(c.unit, c.description)) for c in view.schema.columns}
     made.append(f"COMMENT ON VIEW {name} IS {quoted(view.schema.description)};")
-    return made + [f"COMMENT ON COLUMN {name}.{c} IS {quoted(told)};" for c, told in facts.items()]
+    return made + [
+        f"COMMENT ON COLUMN {name}.{c} IS {quoted(told)};"
+        for c, told in facts.items()
+        if c in view.columns
+    ]

@@ -21,7 +21,8 @@ from starcat.query.columns import column_facts, facts_by_name
 from starcat.query.engine import Allowance, Engine, WorkerEnded
 from starcat.query.macros import macros
 from starcat.query.messages import Statement, Views
-from starcat.query.preamble import preamble, quoted, schemas_of
+from starcat.query.names import quoted
+from starcat.query.preamble import preamble, schemas_of
 from starcat.query.running_query import RunningQuery
 from starcat.query.targets import Target, View, open_targets
 
@@ -221,7 +222,7 @@ def open_session(
 
 def _make_views(engine: Engine, targets: Sequence[Target]) -> None:
     views = [view for target in targets for view in target.views]
-    files = tuple(str(path.resolve()) for view in views for path in view.paths)
+    files = tuple(file for view in views for file in view.files)
     names = frozenset(macro.name for macro in macros() if macro.is_table)
     try:
         engine.open(Views(preamble(targets), files, names))
@@ -239,7 +240,7 @@ def _which_fails(engine: Engine, views: Sequence[View]) -> View | None:
     """Return the first view whose files end a process that only looks at their columns."""
     for view in views:
         try:
-            engine.ask("look_at", [str(path.resolve()) for path in view.paths])
+            engine.ask("look_at", list(view.files))
         except QueryError:
             return view
     return None

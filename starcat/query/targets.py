@@ -1,10 +1,12 @@
-"""What a query is about: artifacts, star tables, archive files, and the views on them."""
+"""What a query is about: artifacts, star tables, stores, archive files, and the views on them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
 from starcat.catalog.star_files import rejected_path
@@ -14,7 +16,11 @@ from starcat.query.engine import Engine
 from starcat.query.names import distinct, identifier, short_names
 from starcat.tables.schema import ProductSchema, product_schema
 
-HATS_NAMES = ("hats.properties", "properties")
+if TYPE_CHECKING:
+    from starcat.store.layout import Store
+    from starcat.store.pixels import Pixel
+
+POSITION = ("ra_deg", "dec_deg")
 
 
 @dataclass(frozen=True)
@@ -26,14 +32,28 @@ class View:
     name : str
         The name of the product, or of the file where starcat did not write it.
     paths : tuple of Path
-        Its Parquet files: one, or the partitions of a HATS catalog.
+        Its Parquet files: one, or many of a store.
+    columns : tuple of str
+        Names of its columns.
     schema : ProductSchema, optional
         The schema of the product, with units and meanings of its columns.
+    position : tuple of str, optional
+        Columns with right ascension and declination, where they have other names than in starcat.
+    pixels : tuple of Pixel
+        For each file the part of the sky that its rows are in; empty where that is not known.
     """
 
     name: str
     paths: tuple[Path, ...]
+    columns: tuple[str, ...]
     schema: ProductSchema | None = None
+    position: tuple[str, str] | None = None
+    pixels: tuple[Pixel, ...] = ()
+
+    @cached_property
+    def files(self) -> tuple[str, ...]:
+        """Full paths of its files, links resolved."""
+        return tuple(str(path.resolve()) for path in self.paths)
 
 
 @dataclass(frozen=True)
@@ -63,9 +83,9 @@ def open_targets(
     Parameters
     ----------
     given : sequence of str
-        For each target the folder of an artifact or of a HATS catalog, a Parquet file, an
-        archive's file under its own name, ``SOURCE=PATH``, or the name of a source that `locate`
-        finds.
+        For each target the folder of an artifact or of a store (a HATS collection or catalog), a
+        Parquet file, an archive's file under its own name, ``SOURCE=PATH``, or the name of a source
+        that `locate` finds.
     scratch : Path
         Folder for the star tables of archive files.
     engine : Engine
@@ -103,8 +123,8 @@ def _open_target(text: str, scratch: Path, engine: Engine, progress: Progress) -
     path = Path(text)
     if path.is_dir() and (path / MANIFEST_NAME).exists():
         return _artifact(path)
-    if path.is_dir() and any((path / name).exists() for name in HATS_NAMES):
-        return _hats(path, engine)
+    if path.is_dir() and (store := _store_in(path)):
+        return _store(store, engine)
     if path.is_file() and path.suffix == ".parquet":
         return _tables(path, engine)
     source, inputs = _source_of(text, path)
@@ -134,7 +154,7 @@ def _artifact(folder: Path) -> Target:
                 path=folder,
             )
         _check_file(path)
-        views.append(View(product, (path,), product_schema(name, version)))
+        views.append(_product_view(product, path, product_schema(name, version)))
     return Target(identifier(manifest["name"]), manifest["version"], tuple(views))
 
 
@@ -165,24 +185,59 @@ def _tables(path: Path, engine: Engine) -> Target:
     return Target(identifier(path.stem), "", tuple(views))
 
 
-def _hats(folder: Path, engine: Engine) -> Target:
-    """Return a HATS catalog: one table in many files, each a part of the sky."""
-    parts = tuple(sorted(folder.glob("dataset/Norder=*/Dir=*/Npix=*.parquet")))
+def _store_in(folder: Path) -> Store | None:
+    """Return the store of a folder, if it is one."""
+    from starcat.store.layout import is_store, open_store
+
+    return open_store(folder) if is_store(folder) else None
+
+
+def _store(store: Store, engine: Engine) -> Target:
+    """Return a store: the stars in many files, each a part of the sky, and what was left out."""
+    from starcat.store.layout import REJECTED, REPEATED
+
+    parts = [(path, part.pixel) for part in store.catalog.partitions for path in part.paths]
     if not parts:
         raise ProductError(
-            f"{folder}: a HATS catalog without a partition "
-            "(dataset/Norder=*/Dir=*/Npix=*.parquet); get it again",
-            path=folder,
+            f"{store.catalog.folder}: a HATS catalog without a partition; get it again",
+            path=store.catalog.folder,
         )
-    name = identifier(folder.resolve().name)
-    view = _table(parts[0], engine)
-    return Target(name, "", (replace(view, name=view.name if view.schema else name, paths=parts),))
+    stars = _many_files("stars", store.folder, [path for path, _ in parts], engine)
+    told = store.catalog.properties
+    named = (told.get("hats_col_ra", POSITION[0]), told.get("hats_col_dec", POSITION[1]))
+    stars = replace(
+        stars,
+        name=stars.schema.product if stars.schema else "stars",
+        position=None if named == POSITION else named,
+        pixels=tuple(pixel for _, pixel in parts),
+    )
+    beside = {
+        name: sorted((store.folder / name).rglob("*.parquet")) for name in (REJECTED, REPEATED)
+    }
+    views = [
+        _many_files(name, store.folder, paths, engine) for name, paths in beside.items() if paths
+    ]
+    return Target(identifier(store.folder.resolve().name), "", (stars, *views))
+
+
+def _many_files(name: str, folder: Path, paths: Sequence[Path], engine: Engine) -> View:
+    """Return the view of a table in many files of a folder, which all look like Parquet."""
+    inside = folder.resolve()
+    for path in paths:
+        if not path.resolve().is_relative_to(inside):
+            raise ProductError(
+                f"{path}: a link to {path.resolve()}, which is not in the store; a query reads "
+                "what is in the folder only. Put the file there",
+                path=path,
+            )
+        _check_file(path)
+    return replace(_table(paths[0], engine), name=name, paths=tuple(paths))
 
 
 def _table(path: Path, engine: Engine) -> View:
     _check_file(path)
     try:
-        [found] = engine.ask("schema_name", str(path.resolve()))
+        [(found, columns)] = engine.ask("footer", str(path.resolve()))
     except QueryError as error:
         told = str(error).splitlines()[0]
         raise ProductError(
@@ -190,7 +245,11 @@ def _table(path: Path, engine: Engine) -> View:
         ) from error
     name, _, version = found.rpartition("-")
     schema = product_schema(name, version) if found else None
-    return View(schema.product if schema else identifier(path.stem), (path,), schema)
+    return View(schema.product if schema else identifier(path.stem), (path,), columns, schema)
+
+
+def _product_view(name: str, path: Path, schema: ProductSchema) -> View:
+    return View(name, (path,), tuple(column.name for column in schema.columns), schema)
 
 
 def _source_of(text: str, path: Path) -> tuple[str | None, list[Path]]:
@@ -218,5 +277,5 @@ def _archive(source: str, inputs: list[Path], scratch: Path, progress: Progress)
     for name, table in (("stars", read.stars), ("rejected", read.rejected)):
         path = scratch / f"{name}.parquet"
         write_parquet(table, path)
-        views.append(View(name, (path,), product_schema(name)))
+        views.append(_product_view(name, path, product_schema(name)))
     return Target(identifier(source), "", tuple(views))

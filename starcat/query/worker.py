@@ -123,21 +123,27 @@ class Worker:
             self._is_running = False
             self._send(kind, found)
 
-    def schema_name(self, path: str) -> str:
-        """Return the name of the schema in the footer of a Parquet file, or nothing."""
+    def footer(self, path: str) -> tuple[str, tuple[str, ...]]:
+        """Return the schema's name, or nothing, and the columns that a Parquet file tells."""
         # DuckDB fails in the middle of an answer where the name of a column is not UTF-8.
         self._connection.execute("SELECT max(name) FROM parquet_schema($path)", {"path": path})
         asked = "SELECT decode(value) FROM parquet_kv_metadata($path) WHERE key = encode($key)"
         values = {"path": path, "key": SCHEMA_KEY}
         found = self._connection.execute(asked, values).fetchall()
-        return str(found[0][0]) if found else ""
+        self.look_at([path])
+        columns = tuple(str(column[0]) for column in self._connection.description or ())
+        return (str(found[0][0]) if found else ""), columns
 
     def look_at(self, files: list[str]) -> None:
         """Read the columns of the Parquet files of a table, as a view would."""
-        self._connection.execute("FROM read_parquet($files) LIMIT 0", {"files": files})
+        self._connection.execute(
+            "FROM read_parquet($files, hive_partitioning = false) LIMIT 0", {"files": files}
+        )
 
     def open(self, views: Views) -> None:
         """Make the views, and allow no other file and no other setting from here on."""
+        # A footer is read once, when a query first reaches its file.
+        self._connection.execute("SET parquet_metadata_cache = true")
         self._connection.execute(views.sql)
         self._macros = views.macros
         # Progress is kept, and printed by who asks for it. Times have the zone UTC everywhere.

@@ -1,0 +1,124 @@
+"""Where on the sky the partitions of a store are, as the macros of SQL compare it with places.
+
+From pixels to circles and boxes around them. No package for HEALPix is loaded: four corners and a
+centre are what is wanted, and loading one takes longer than a query.
+
+References
+----------
+Gorski et al. 2005, ApJ 622, 759, section 4 (HEALPix).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.geometry.sphere import separation
+from starcat.store.pixels import Pixel
+
+MARGIN_DEG = 1e-6
+"""By how much circles and boxes are wider than the corners need, for what rounding takes."""
+
+_RING_OF_FACE = np.array([2, 2, 2, 2, 3, 3, 3, 3, 4, 4, 4, 4])
+_EIGHTH_OF_FACE = np.array([1, 3, 5, 7, 0, 2, 4, 6, 1, 3, 5, 7])
+_CORNERS = ((0.0, 0.0), (0.0, 1.0), (1.0, 0.0), (1.0, 1.0))
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Extents:
+    """Circles and boxes that hold pixels; arrays of float64, of shape (N,) where no other is said.
+
+    Attributes
+    ----------
+    centre : ndarray of float64, shape (N, 3)
+        Directions of the centres of the circles.
+    reach_deg : ndarray of float64
+        Radius of the circle, degrees.
+    ra_from_deg, ra_to_deg : ndarray of float64
+        Sides of the box, degrees; the first is from 0 to 360, the second is larger, also than 360
+        where the box goes through 0.
+    dec_from_deg, dec_to_deg : ndarray of float64
+        Lower and upper side of the box, degrees.
+    """
+
+    centre: Floats
+    reach_deg: Floats
+    ra_from_deg: Floats
+    ra_to_deg: Floats
+    dec_from_deg: Floats
+    dec_to_deg: Floats
+
+
+def extents(pixels: Sequence[Pixel]) -> Extents:
+    """Return circles and boxes that hold pixels.
+
+    Parameters
+    ----------
+    pixels : sequence of Pixel
+        N pixels.
+
+    Returns
+    -------
+    Extents
+        No point of a pixel is outside of its circle or its box.
+    """
+    order = np.array([pixel.order for pixel in pixels], dtype=np.int64)
+    number = np.array([pixel.number for pixel in pixels], dtype=np.int64)
+    centre, middle, _ = _place(order, number, 0.5, 0.5)
+    corners = [_place(order, number, *corner) for corner in _CORNERS]
+    reach = np.max([separation(centre, corner) for corner, _, _ in corners], axis=0)
+    # The pole has no right ascension; the corners beside it have those of the sides.
+    east = np.array([np.where(is_pole, 0.0, _turned(ra - middle)) for _, ra, is_pole in corners])
+    dec = np.degrees([np.arcsin(corner[:, 2]) for corner, _, _ in corners])
+    first = middle + east.min(axis=0) - MARGIN_DEG
+    width = np.ptp(east, axis=0) + 2 * MARGIN_DEG
+    return Extents(
+        centre,
+        np.degrees(reach) + MARGIN_DEG,
+        np.mod(first, 360.0),
+        np.mod(first, 360.0) + width,
+        dec.min(axis=0) - MARGIN_DEG,
+        dec.max(axis=0) + MARGIN_DEG,
+    )
+
+
+def _place(
+    order: NDArray[np.int64], number: NDArray[np.int64], x: float, y: float
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Return directions and right ascensions of a point of each pixel, and which are a pole.
+
+    The point is given by its parts of the way along the two sides that meet in the south.
+    """
+    face = number >> 2 * order
+    side = np.left_shift(1, order).astype(np.float64)
+    east = (_every_second_bit(number, order) + x) / side
+    west = (_every_second_bit(number >> 1, order) + y) / side
+    # From the north pole down: 0 at the pole, 1 at the edge of its cap, 2 at the equator.
+    ring = _RING_OF_FACE[face] - east - west
+    cap = np.minimum(1.0, np.minimum(ring, 4.0 - ring))
+    z = np.where(ring < 1.0, 1.0 - cap**2 / 3.0, np.where(ring > 3.0, cap**2 / 3.0 - 1.0, 0.0))
+    z = np.where(cap < 1.0, z, (2.0 - ring) * 2.0 / 3.0)
+    is_pole = cap <= 0.0
+    along = _EIGHTH_OF_FACE[face] * cap + east - west
+    ra_deg = 45.0 * along / np.where(is_pole, 1.0, cap)
+    radius = np.where(cap < 1.0, cap * np.sqrt((1.0 + np.abs(z)) / 3.0), np.sqrt(1.0 - z**2))
+    angle = np.radians(ra_deg)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1), ra_deg, is_pole
+
+
+def _every_second_bit(number: NDArray[np.int64], order: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the number that the bits 0, 2, 4 … below an order are."""
+    found = np.zeros_like(number)
+    for bit in range(int(order.max(initial=0))):
+        found |= np.where(bit < order, (number >> bit) & (1 << bit), 0)
+    return found
+
+
+def _turned(angle_deg: Floats) -> Floats:
+    """Return angles between -180 and 180 degrees."""
+    return np.mod(angle_deg + 180.0, 360.0) - 180.0
