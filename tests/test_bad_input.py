@@ -1010,6 +1010,143 @@ def _(place: Place) -> Call:
     return ["sql", place.folder / "sky", "FROM stars"]
 
 
+# Catalog stores ----------------------------------------------------------------------------
+
+
+def to_store(place: Place, *more: object, lines: list[bytes] | None = None) -> list[Any]:
+    """Read the stars into a store."""
+    path = place.write("sao.dat", place.lines if lines is None else lines)
+    return ["ingest", "sao", "--input", path, "--to", "hats", "-o", place.out, *more]
+
+
+def build_from(place: Place, change: Callable[[Path], object], *more: object, **options: Any) -> Call:
+    """Build from a store of good stars that something was done to."""
+    from starcat.store.ingest import ingest_to_store
+
+    store = place.folder / "store"
+    ingest_to_store("sao", [place.write("sao.dat", place.lines)], store, **options)
+    for path in store.rglob("*"):
+        path.chmod(0o755 if path.is_dir() else 0o644)
+    change(store)
+    spec = place.write("spec.toml", place.spec)
+    return ["build", spec, "--input", f"sao={store}", "-o", place.out, *more]
+
+
+def nothing(_: Path) -> None:
+    """Leave a store as it is."""
+
+
+def account(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
+    """Change what a store says of itself."""
+
+    def edit(store: Path) -> None:
+        content = json.loads((store / "store.json").read_text())
+        change(content)
+        (store / "store.json").write_text(json.dumps(content))
+
+    return edit
+
+
+def part_of(store: Path) -> Path:
+    return store / "store" / "dataset" / "Norder=0" / "Dir=0" / "Npix=4.parquet"
+
+
+@case("ingest to a format unknown", 2)
+def _(place: Place) -> Call:
+    return [*place.ingest(place.lines), "--to", "hat"]  # type: ignore[misc]
+
+
+@case("store where something is already", 1)
+def _(place: Place) -> Call:
+    place.out.mkdir()
+    return to_store(place)
+
+
+@case("store beside an unfinished run", 1)
+def _(place: Place) -> Call:
+    place.write(".out.work/options.json", "{}")
+    return to_store(place)
+
+
+@case("unfinished run with other options", 2)
+def _(place: Place) -> Call:
+    place.write(".out.work/options.json", '{"source": "sao", "band": "P"}')
+    return to_store(place, "--resume")
+
+
+@case("too little memory for a store", 2)
+def _(place: Place) -> Call:
+    return to_store(place, "--memory", "0.5")
+
+
+@case("build from a store of another catalog", 2)
+def _(place: Place) -> Call:
+    call = build_from(place, nothing)
+    assert isinstance(call, list)
+    spec = place.spec.replace('source = "sao"', 'source = "hipparcos"')
+    place.write("spec.toml", spec)
+    return [f"hipparcos={place.folder / 'store'}" if str(a).startswith("sao=") else a for a in call]
+
+
+@case("build from a store of another band", 2)
+def _(place: Place) -> Call:
+    return build_from(place, nothing, "--set", "catalog.band=P")
+
+
+@case("build from a store at another epoch", 2)
+def _(place: Place) -> Call:
+    return build_from(place, nothing, epoch_jyear=1991.25)
+
+
+@case("build from a store with a brighter limit", 2)
+def _(place: Place) -> Call:
+    return build_from(place, nothing, read_limit_mag=5.0)
+
+
+@case("build from a store and files", 2)
+def _(place: Place) -> Call:
+    return build_from(place, nothing, "--input", f"sao={place.folder / 'sao.dat'}")
+
+
+@case("build from a store of a later starcat", 4)
+def _(place: Place) -> Call:
+    return build_from(place, account(lambda known: known.update(store_version="2.0.0")))
+
+
+@case("build from a store whose account is damaged", 5)
+def _(place: Place) -> Call:
+    return build_from(place, lambda store: (store / "store.json").write_text("{"))
+
+
+@case("build from a store without a partition", 5)
+def _(place: Place) -> Call:
+    return build_from(place, lambda store: part_of(store).unlink())
+
+
+@case("build from a store with a damaged partition", 5)
+def _(place: Place) -> Call:
+    return build_from(place, lambda store: part_of(store).write_bytes(b"PAR1 and no more"))
+
+
+@case("build from a HATS catalog without magnitudes", 4)
+def _(place: Place) -> Call:
+    def change(store: Path) -> None:
+        (store / "store.json").unlink()
+        table = pq.ParquetFile(part_of(store)).read()
+        pq.write_table(table.drop_columns("mag"), part_of(store))
+
+    return build_from(place, change)
+
+
+@case("build from a collection that leads elsewhere", 5)
+def _(place: Place) -> Call:
+    def change(store: Path) -> None:
+        text = "obs_collection=store\nhats_primary_table_url=../other\n"
+        (store / "collection.properties").write_text(text)
+
+    return build_from(place, change)
+
+
 # Registries --------------------------------------------------------------------------------
 
 

@@ -129,16 +129,19 @@ def parse_block(file_number: int, block: Block, how: Reading) -> Part:
         is_held = np.asarray(made.columns["mag"], dtype=np.float64) <= limit_mag
         made, line = made.where(is_held), line[is_held]
     made = without_impossible(made)
-    columns = move_to_epoch(made.columns, how.epoch_jyear)
-    columns |= {"catalog": how.source_name, "source_file": file_number}
-    columns |= {"source_line": line}
-    table = table_from_columns("stars", columns, len(line))
+
+    def table_of(some: StarBlock, lines: NDArray[np.int64]) -> pa.Table:
+        columns = move_to_epoch(some.columns, how.epoch_jyear)
+        columns |= {"catalog": how.source_name, "source_file": file_number, "source_line": lines}
+        return table_from_columns("stars", columns, len(lines))
+
     kept = made.verdicts.is_kept
     if kept.all():
-        stars, rejected = table, []
+        stars, rejected = table_of(made, line), []
     else:
-        out = table.filter(pa.array(~kept))
-        stars, rejected = table.filter(pa.array(kept)), [reject_rows(out, made.verdicts.reasons)]
+        stars = table_of(made.where(kept), line[kept])
+        out = table_of(made.where(~kept), line[~kept])
+        rejected = [reject_rows(out, made.verdicts.reasons)]
     problems = records.problems
     if problems:
         rejected.append(malformed_rows(problems, file_number, how.source_name, how.band))

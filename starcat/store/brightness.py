@@ -33,7 +33,7 @@ def bright_first(stars: pa.Table) -> tuple[pa.Table, tuple[int, ...]]:
     Parameters
     ----------
     stars : pyarrow.Table
-        ``_healpix_29`` and the stars schema.
+        Ordered by pixel and star_id.
 
     Returns
     -------
@@ -42,19 +42,18 @@ def bright_first(stars: pa.Table) -> tuple[pa.Table, tuple[int, ...]]:
     rows : tuple of int
         How many each group has.
     """
-    mag = floats_of(stars, "mag")
-    group = _groups(mag)
-    keys = (stars["star_id"].to_numpy(), stars[HEALPIX_COLUMN].to_numpy(), group)
-    order = np.lexsort(keys)
+    group = _groups(floats_of(stars, "mag"))
+    order = np.argsort(group, kind="stable")
     counts = np.bincount(group)
     return stars.take(pa.array(order)), tuple(counts[counts > 0].tolist())
 
 
 def _groups(mag: NDArray[np.float64]) -> NDArray[np.int8]:
-    known = np.sort(mag[~np.isnan(mag)])
-    cuts = [known[len(known) // share] for share in _SHARES if len(known) // share >= _LEAST_ROWS]
+    known = mag[~np.isnan(mag)]
+    ranks = [len(known) // share for share in _SHARES if len(known) // share >= _LEAST_ROWS]
+    cuts = np.partition(known, ranks)[ranks] if ranks else known[:0]
     # A magnitude that is a limit belongs to the fainter group, however many stars have it.
-    group = np.searchsorted(np.array(cuts), mag, side="right").astype(np.int8)
+    group = np.searchsorted(cuts, mag, side="right").astype(np.int8)
     group[np.isnan(mag)] = len(cuts) + 1
     return group
 

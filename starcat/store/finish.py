@@ -20,7 +20,7 @@ from starcat.store.index import RunIndex, read_index
 from starcat.store.layout import DATASET, REPEATED
 from starcat.store.neighbours import COLUMNS, add_neighbours
 from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, Pixel, Pixels, border_of, pixel_field
-from starcat.store.runs import places_of, read_shares
+from starcat.store.runs import places_of, read_shares, with_constants
 from starcat.tables.schema import product_schema
 
 SKYMAP_ORDER = 6
@@ -87,7 +87,8 @@ def finish(asked: Finish) -> tuple[dict[str, Any], list[Path]]:
         path = asked.collection / REPEATED / f"{pixel.order}-{pixel.number}.parquet"
         path.parent.mkdir(exist_ok=True)
         with placed(path) as partial:
-            pq.write_table(again.drop_columns(HEALPIX_COLUMN), partial, compression="zstd")
+            schema = product_schema("stars").arrow_schema
+            pq.write_table(with_constants(again, schema), partial, compression="zstd")
         files.append(path)
     result: dict[str, Any] = {"rows": len(stars), "repeated": len(again)}
     if not len(stars):
@@ -101,25 +102,9 @@ def finish(asked: Finish) -> tuple[dict[str, Any], list[Path]]:
     path = asked.catalog / DATASET / pixel.path
     result["map"] = _map(stars[HEALPIX_COLUMN].to_numpy())
     ordered, rows = bright_first(stars)
-    write_partition(with_schema(ordered), rows, path)
+    write_partition(with_constants(ordered, store_schema()), rows, path)
     result |= {"sha256": file_sha256(path), "bytes": path.stat().st_size}
     return result, [*files, path]
-
-
-def with_schema(stars: pa.Table) -> pa.Table:
-    """Return stars with the meanings and units of their columns.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        ``_healpix_29`` and the stars schema.
-
-    Returns
-    -------
-    pyarrow.Table
-        The same.
-    """
-    return stars.cast(store_schema())
 
 
 @lru_cache(maxsize=1)
@@ -137,8 +122,11 @@ def store_schema() -> pa.Schema:
 
 def _in_order(stars: pa.Table) -> pa.Table:
     """Return stars by pixel and number; records of the same star in reading order."""
-    keys = (places_of(stars), stars["star_id"].to_numpy(), stars[HEALPIX_COLUMN].to_numpy())
-    return stars.take(pa.array(np.lexsort(keys)))
+    pixels = stars[HEALPIX_COLUMN].to_numpy()
+    order = np.argsort(pixels, kind="stable")
+    if (np.diff(pixels[order]) == 0).any():
+        order = np.lexsort((places_of(stars), stars["star_id"].to_numpy(), pixels))
+    return stars.take(pa.array(order))
 
 
 @lru_cache(maxsize=2)
@@ -178,16 +166,18 @@ def _write_borders(stars: pa.Table, asked: Finish) -> list[Path]:
         return []
     path = border_path(asked.borders, asked.pixel)
     pixels = stars[HEALPIX_COLUMN].to_numpy()
+    schema = store_schema()
     with (
         placed(path) as partial,
         pa.OSFile(str(partial), "wb") as sink,
-        pa.ipc.new_file(sink, stars.schema) as writer,
+        pa.ipc.new_file(sink, schema) as writer,
     ):
         for other in asked.beside:
             order, border = border_of(other, asked.margin_rad)
             rows = rows_within(pixels, order, border, other)
-            batches = stars.take(pa.array(rows)).combine_chunks().to_batches()
-            writer.write_batch(batches[0] if batches else _empty(stars.schema))
+            some = with_constants(stars.take(pa.array(rows)), schema)
+            batches = some.combine_chunks().to_batches()
+            writer.write_batch(batches[0] if batches else _empty(schema))
     return [path]
 
 
@@ -278,7 +268,7 @@ def write_margin(asked: Margin) -> tuple[dict[str, Any], list[Path]]:
     path = asked.catalog / DATASET / asked.pixel.path
     keys = (stars["star_id"].to_numpy(), stars[HEALPIX_COLUMN].to_numpy())
     ordered = stars.take(pa.array(np.lexsort(keys)))
-    write_partition(with_schema(ordered), (len(stars),), path)
+    write_partition(ordered, (len(stars),), path)
     facts = {"rows": len(stars), "sha256": file_sha256(path), "bytes": path.stat().st_size}
     return facts, [path]
 

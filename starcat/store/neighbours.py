@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from starcat.catalog.stars import directions_of, floats_of, with_columns
+from starcat.catalog.stars import directions_of, floats_of
 from starcat.geometry.proximity import nearest_chords, separation_from_chord
 from starcat.geometry.sphere import chord_from_separation
 from starcat.store.pixels import Pixel
@@ -60,7 +60,7 @@ def add_neighbours(stars: pa.Table, pixel: Pixel, around: Around, is_alone: bool
     Parameters
     ----------
     stars : pyarrow.Table
-        Table of the stars schema: all stars in the pixel, each once.
+        All stars in the pixel, each once, with the columns `COLUMNS`.
     pixel : Pixel
         The partition.
     around : callable
@@ -71,7 +71,8 @@ def add_neighbours(stars: pa.Table, pixel: Pixel, around: Around, is_alone: bool
     Returns
     -------
     pyarrow.Table
-        The same rows, with the values that `add_nearest_neighbours` gives the whole catalog.
+        The same rows, with two more columns, which have the values that `add_nearest_neighbours`
+        gives the whole catalog.
     """
     if is_alone or not len(stars):
         return stars
@@ -85,11 +86,10 @@ def add_neighbours(stars: pa.Table, pixel: Pixel, around: Around, is_alone: bool
         for piece in around(reach):
             _look(found, rows, directions, piece)
     mag = floats_of(stars, "mag")
-    columns = {
-        "nearest_separation_arcsec": np.degrees(separation_from_chord(found.chord)) * 3600.0,
-        "nearest_delta_mag": found.mag - mag,
-    }
-    return with_columns(stars, columns)
+    apart = np.degrees(separation_from_chord(found.chord)) * 3600.0
+    stars = stars.append_column("nearest_separation_arcsec", pa.array(apart))
+    delta = found.mag - mag
+    return stars.append_column("nearest_delta_mag", pa.array(delta, mask=np.isnan(delta)))
 
 
 def _first_reach(pixel: Pixel, count: int) -> float:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from starcat.catalog.stars import floats_of
 from starcat.storage.atomic import placed
-from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, Pixels, healpix_29
+from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, Pixels, healpix_29, pixel_field
 from starcat.tables.schema import product_schema
 
 BUCKETS = 64
@@ -31,6 +31,10 @@ HISTOGRAM_ORDER = 9
 """Order at which stars are counted (7 arcmin): no partition is smaller than such a pixel."""
 
 _CONSTANTS = b"starcat.constants"
+_VARIES = object()
+_NEEDED = ("mag", "source_file")
+"""Columns that a partition computes with, even where they have one value."""
+
 _SPREAD = np.uint64(0x9E3779B97F4A7C15)
 _PLACE_BITS = np.int64(40)
 
@@ -213,7 +217,8 @@ def read_shares(
     Returns
     -------
     pyarrow.Table
-        ``_healpix_29`` and the columns, in the order of the shares.
+        ``_healpix_29`` and the columns, in the order of the shares. Columns of one value are in
+        the metadata: `with_constants` puts them back.
     """
     schema = product_schema("stars").arrow_schema
     wanted = list(schema.names if names is None else names)
@@ -241,33 +246,51 @@ def _batches(share: Share, names: Sequence[str]) -> Iterator[tuple[pa.Table, dic
 def _joined(
     parts: Sequence[pa.Table], told: Sequence[Mapping[str, Any]], fields: Sequence[pa.Field]
 ) -> pa.Table:
-    """Join batches of which each may have other columns as constants."""
-    pixel = pa.field(HEALPIX_COLUMN, pa.int64(), nullable=False)
+    """Join batches; a column that has one value in all of them is left a constant."""
+    common: dict[str, Any] = {}
     columns = [pa.chunked_array([part[HEALPIX_COLUMN].chunk(0) for part in parts], pa.int64())]
+    kept = [pixel_field()]
     for field in fields:
+        values = {constants.get(field.name, _VARIES) for constants in told}
+        if len(values) == 1 and _VARIES not in values and field.name not in _NEEDED:
+            common[field.name] = values.pop()
+            continue
         chunks = []
         for part, constants in zip(parts, told, strict=True):
             if field.name in part.column_names:
                 chunks += part[field.name].chunks
             else:
-                chunks.append(constant(constants[field.name], len(part), field.type))
+                chunks.append(_constant(constants[field.name], len(part), field.type))
         columns.append(pa.chunked_array(chunks, field.type))
-    return pa.Table.from_arrays(columns, schema=pa.schema([pixel, *fields])).combine_chunks()
+        kept.append(field)
+    table = pa.Table.from_arrays(columns, schema=pa.schema(kept)).combine_chunks()
+    return table.replace_schema_metadata({_CONSTANTS: json.dumps(common).encode()})
 
 
-def constant(value: Any, count: int, kind: pa.DataType) -> pa.Array:
-    """Return a column of one value.
+def with_constants(stars: pa.Table, schema: pa.Schema) -> pa.Table:
+    """Return stars with the columns of one value put back.
 
     Parameters
     ----------
-    value : object
-        None for a column without values.
-    count, kind : int, pyarrow.DataType
-        Length and type.
+    stars : pyarrow.Table
+        As `read_shares` returns them: any rows, and values of other columns too.
+    schema : pyarrow.Schema
+        All columns.
 
     Returns
     -------
-    pyarrow.Array
-        The value in every row.
+    pyarrow.Table
+        Of that schema.
     """
+    constants = json.loads((stars.schema.metadata or {}).get(_CONSTANTS, b"{}"))
+    columns = [
+        stars[field.name]
+        if field.name in stars.column_names
+        else _constant(constants[field.name], len(stars), field.type)
+        for field in schema
+    ]
+    return pa.Table.from_arrays(columns, schema=schema)
+
+
+def _constant(value: Any, count: int, kind: pa.DataType) -> pa.Array:
     return pa.nulls(count, kind) if value is None else pa.repeat(pa.scalar(value, kind), count)
