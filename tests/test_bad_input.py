@@ -1019,7 +1019,9 @@ def to_store(place: Place, *more: object, lines: list[bytes] | None = None) -> l
     return ["ingest", "sao", "--input", path, "--to", "hats", "-o", place.out, *more]
 
 
-def build_from(place: Place, change: Callable[[Path], object], *more: object, **options: Any) -> Call:
+def build_from(
+    place: Place, change: Callable[[Path], object], *more: object, **options: Any
+) -> Call:
     """Build from a store of good stars that something was done to."""
     from starcat.store.ingest import ingest_to_store
 

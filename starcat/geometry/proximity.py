@@ -64,8 +64,12 @@ def nearest_chords(
     """
     # A plain split by midpoints builds far faster and searches no slower on a sky of stars.
     tree = cKDTree(stars, leafsize=16, balanced_tree=False)
-    best, index = np.full(len(points), np.inf), np.full(len(points), len(stars))
-    rows, count = np.arange(len(points)), 3
+    near = tree.query(points, k=3, workers=workers)
+    chord, found = np.asarray(near[0]), np.asarray(near[1], dtype=np.int64)
+    # Nearly always a point finds itself, one star and, farther away, another.
+    best, index = chord[:, 1].copy(), found[:, 1].copy()
+    rows = np.flatnonzero((found[:, 0] != itself) | ~(chord[:, 2] > chord[:, 1]))
+    count = 3
     while len(rows):
         near = tree.query(points[rows], k=count, workers=workers)
         chord, found = np.asarray(near[0]), np.asarray(near[1], dtype=np.int64)

@@ -19,7 +19,15 @@ from starcat.store.brightness import bright_first, write_partition
 from starcat.store.index import RunIndex, read_index
 from starcat.store.layout import DATASET, REPEATED
 from starcat.store.neighbours import COLUMNS, add_neighbours
-from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, Pixel, Pixels, border_of, pixel_field
+from starcat.store.pixels import (
+    HEALPIX_COLUMN,
+    MAX_ORDER,
+    Pixel,
+    Pixels,
+    border_of,
+    pixel_field,
+    runs_of,
+)
 from starcat.store.runs import places_of, read_shares, with_constants
 from starcat.tables.schema import product_schema
 
@@ -156,7 +164,7 @@ def _around(
 
 def _map(pixels: Pixels) -> list[list[int]]:
     """Return the pixels of the map of counts that have stars, and how many; pixels ascend."""
-    number, count = np.unique(pixels >> 2 * (MAX_ORDER - SKYMAP_ORDER), return_counts=True)
+    number, _, count = runs_of(pixels, SKYMAP_ORDER)
     return [number.tolist(), count.tolist()]
 
 

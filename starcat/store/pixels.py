@@ -88,6 +88,26 @@ class Pixel:
         return np.arange(self.number << shift, (self.number + 1) << shift, dtype=np.int64)
 
 
+def runs_of(pixels: Pixels, order: int) -> tuple[Pixels, Pixels, Pixels]:
+    """Return which pixels of an order stars are in, where each begins, and how many it has.
+
+    Parameters
+    ----------
+    pixels : ndarray of int64, shape (N,)
+        Pixels of order 29, ascending.
+    order : int
+        A lower order.
+
+    Returns
+    -------
+    numbers, begins, counts : ndarray of int64, shape (M,)
+        Pixels, ascending; row of the first star; number of stars.
+    """
+    lower = pixels >> 2 * (MAX_ORDER - order)
+    begins = np.flatnonzero(np.diff(lower, prepend=-1))
+    return lower[begins], begins, np.diff(begins, append=len(pixels))
+
+
 def pixel_field() -> pa.Field:
     """Return the column of the stars' pixels.
 

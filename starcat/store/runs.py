@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from starcat.catalog.stars import floats_of
 from starcat.storage.atomic import placed
-from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, Pixels, healpix_29, pixel_field
+from starcat.store.pixels import HEALPIX_COLUMN, Pixels, healpix_29, pixel_field, runs_of
 from starcat.tables.schema import product_schema
 
 BUCKETS = 64
@@ -123,8 +123,7 @@ def write_run(stars: pa.Table, order: int, folder: Path, name: str) -> tuple[Run
     table = varying.take(pa.array(ascending))
     table = table.add_column(0, HEALPIX_COLUMN, pa.array(pixels))
     table = table.replace_schema_metadata({_CONSTANTS: json.dumps(constants).encode()})
-    coarse, begins = np.unique(pixels >> 2 * (MAX_ORDER - order), return_index=True)
-    rows = np.diff([*begins, len(pixels)]).astype(np.int64)
+    coarse, begins, rows = runs_of(pixels, order)
     path = folder / f"{name}.arrow"
     with (
         placed(path) as partial,
@@ -138,7 +137,7 @@ def write_run(stars: pa.Table, order: int, folder: Path, name: str) -> tuple[Run
     beside = folder / f"{name}.places"
     with placed(beside) as partial:
         partial.write_bytes(places.tobytes())
-    return Run(path, beside, coarse.astype(np.int64), rows, buckets), pixels
+    return Run(path, beside, coarse, rows, buckets), pixels
 
 
 def _without_constants(stars: pa.Table) -> tuple[pa.Table, dict[str, Any]]:

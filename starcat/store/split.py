@@ -20,7 +20,7 @@ from starcat.catalog.source import data_source
 from starcat.catalog.verdict import Reason
 from starcat.storage.atomic import placed
 from starcat.storage.digests import file_sha256
-from starcat.store.pixels import MAX_ORDER
+from starcat.store.pixels import runs_of
 from starcat.store.runs import HISTOGRAM_ORDER, Run, write_run
 from starcat.tables.schema import product_schema
 
@@ -75,8 +75,8 @@ class _Written:
         name = f"{self.asked.name}-{len(self.runs):04}"
         run, pixels = write_run(stars, self.asked.order, self.asked.runs, name)
         self.runs.append(run)
-        fine = pixels >> 2 * (MAX_ORDER - HISTOGRAM_ORDER)
-        self.pixels.append(np.unique(fine, return_counts=True))
+        fine, _, counts = runs_of(pixels, HISTOGRAM_ORDER)
+        self.pixels.append((fine, counts))
         self.files += [run.stars, run.places]
 
     def rejected(self, rejected: pa.Table) -> None:

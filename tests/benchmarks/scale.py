@@ -182,7 +182,7 @@ CASES: dict[str, Case] = {
 def main() -> None:
     """Make the parts, run the cases in turn and print what they took."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rows", type=int, default=5_000_000)
+    parser.add_argument("--rows", type=int, default=5_000_000, help="of the parts, given or made")
     parser.add_argument("--parts", type=Path, help="a folder of parts that are there already")
     parser.add_argument("--store", type=Path, help="where the store is, or is made and left")
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
@@ -201,7 +201,7 @@ def main() -> None:
 
             parts = scratch / "parts"
             write_parts(parts, given.rows, given.workers)
-        rows = given.rows if given.parts is None else bare(parts, given.workers)
+        rows = given.rows
         print(f"{rows:,} rows in {len(list(parts.glob('psc_*.gz')))} parts")
         first: Measured | None = None
         for name in given.cases * given.runs:
@@ -211,7 +211,8 @@ def main() -> None:
             print(
                 f"  {name:<10}{took.seconds:>8.1f} s {took.cpu_s:>8.1f} s CPU"
                 f"{1e6 * took.cpu_s / rows:>7.2f} us CPU a row {took.peak_mib:>7.0f} MiB"
-                f"{times[0]:>7.2f} x time {times[1]:>6.2f} x CPU of {given.cases[0]}"
+                f"{times[0]:>7.2f} x time {times[1]:>6.2f} x CPU of {given.cases[0]}",
+                flush=True,
             )
 
 
