@@ -22,12 +22,14 @@ _CONNECT_S = 20
 _WORKER_ENVIRONMENT = {
     "MALLOC_TRIM_THRESHOLD_": str(256 << 20),
     "MALLOC_MMAP_THRESHOLD_": str(32 << 20),
+    "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
     "OMP_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
 }
 """Blocks of an archive come and go by the megabyte: where their memory is given back each time, as
-Dask has its workers do, a quarter of the time goes into getting it again."""
+Dask has its workers do, a quarter of the time goes into getting it again. Dask's profiler looks at
+each worker a hundred times a second."""
 
 
 @contextmanager

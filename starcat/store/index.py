@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.store.pixels import Pixel, Pixels
-from starcat.store.runs import Run, Share
+from starcat.store.runs import BUCKETS, Run, Share, repeated_places
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,8 @@ class RunIndex:
         Coarse pixel of each batch, ascending.
     runs, batches : ndarray of int64, shape (B,)
         Number of its run, and its number in the run.
+    buckets : ndarray of int64, shape (R, BUCKETS + 1)
+        Where each bucket of numbers begins in the places of each run.
     """
 
     order: int
@@ -35,6 +37,7 @@ class RunIndex:
     pixels: Pixels
     runs: NDArray[np.int64]
     batches: NDArray[np.int64]
+    buckets: NDArray[np.int64]
 
     def shares(self, pixel: Pixel) -> list[Share]:
         """Return the batches that hold the stars of a pixel.
@@ -138,6 +141,7 @@ def write_index(path: Path, order: int, runs: Sequence[Run]) -> None:
         pixels=pixels[ascending],
         runs=number[ascending],
         batches=batch[ascending],
+        buckets=np.array([run.buckets for run in runs]).reshape(len(runs), BUCKETS + 1),
     )
 
 
@@ -157,4 +161,24 @@ def read_index(path: Path) -> RunIndex:
     """
     with np.load(path) as held:
         paths = tuple(Path(text) for text in held["paths"].tolist())
-        return RunIndex(int(held["order"]), paths, held["pixels"], held["runs"], held["batches"])
+        names = ("pixels", "runs", "batches", "buckets")
+        return RunIndex(int(held["order"]), paths, *(held[name] for name in names))
+
+
+def find_repeated(asked: tuple[Path, int]) -> NDArray[np.int64]:
+    """Return the records of a bucket of numbers whose star was read before.
+
+    Parameters
+    ----------
+    asked : (Path, int)
+        File of the index, and number of the bucket.
+
+    Returns
+    -------
+    ndarray of int64, shape (N,)
+        Places, ascending: of each star all records but the first in reading order.
+    """
+    index = read_index(asked[0])
+    ranges = index.buckets[:, asked[1] : asked[1] + 2].tolist()
+    files = [path.with_suffix(".places") for path in index.paths]
+    return repeated_places(list(zip(files, ranges, strict=True)))

@@ -34,17 +34,20 @@ from starcat.store.account import Written, describe_store, make_manifest
 from starcat.store.cluster import cluster, run_tasks, versions
 from starcat.store.finish import Finish, Margin, border_path, finish
 from starcat.store.finish import write_margin as make_margin
-from starcat.store.index import read_runs, write_index
+from starcat.store.index import find_repeated, read_runs, write_index
 from starcat.store.layout import REJECTED, REPEATED
 from starcat.store.ledger import RESUME_ADVICE, Job, Work
 from starcat.store.options import StoreOptions, rows_of_a_run
 from starcat.store.pixels import MAX_ORDER, Pixel, border_of
 from starcat.store.plan import partition_pixels, spill_order
-from starcat.store.runs import BUCKETS, HISTOGRAM_ORDER, Run, repeated_places
+from starcat.store.runs import BUCKETS, HISTOGRAM_ORDER
 from starcat.store.split import Split, is_unchanged, split
 
 if TYPE_CHECKING:
     from distributed import Client
+
+Bordering = dict[Pixel, tuple[Pixel, ...]]
+"""For each partition those whose margins reach into it."""
 
 _SMALL_BYTES = 50 << 20
 """Inputs below this are read before worker processes would have started."""
@@ -228,12 +231,13 @@ def _make(run: _Ingest) -> tuple[dict[str, Any], tuple[str, ...]]:
         for one in read_runs(path, part["runs"])
     ]
     index = _kept(run.work / "index.npz", partial(write_index, order=order, runs=runs))
-    places = _repeated(run, runs)
+    places = _repeated(run, index)
     repeated = _kept(run.work / "repeated.npy", lambda path: np.save(path, places))
     pixels = _plan(run, indexes)
     left = int(sum(run.rows.sum() for run in runs)) - len(places)
-    finished = _finish_all(run, pixels, index, repeated, left, content)
-    margins = _margins_all(run, pixels, finished, content)
+    beside = bordering(pixels, run.margin_rad)
+    finished = _finish_all(run, beside, index, repeated, left, content)
+    margins = _margins_all(run, beside, finished, content)
     partitions = list(zip(pixels, finished, strict=True))
     written = Written(parts, len(places), partitions, margins)
     manifest = make_manifest(run.name, run.how, written, missing_files(source, run.files))
@@ -279,9 +283,9 @@ def _begin_partitions(run: _Ingest, facts: Sequence[FileFacts]) -> str:
     return content
 
 
-def _repeated(run: _Ingest, runs: Sequence[Run]) -> NDArray[np.int64]:
+def _repeated(run: _Ingest, index: Path) -> NDArray[np.int64]:
     """Return the records of stars that were read before."""
-    found = run_tasks(run.client, partial(repeated_places, runs), range(BUCKETS))
+    found = run_tasks(run.client, find_repeated, [(index, bucket) for bucket in range(BUCKETS)])
     return np.sort(np.concatenate(found))
 
 
@@ -296,14 +300,13 @@ def _plan(run: _Ingest, indexes: Sequence[Path]) -> tuple[Pixel, ...]:
 
 
 def _finish_all(
-    run: _Ingest, pixels: Sequence[Pixel], index: Path, repeated: Path, rows: int, content: str
+    run: _Ingest, beside: Bordering, index: Path, repeated: Path, rows: int, content: str
 ) -> list[dict[str, Any]]:
-    beside = bordering(pixels, run.margin_rad)
     jobs = []
-    for pixel in pixels:
+    for pixel, others in beside.items():
         asked = Finish(
             pixel,
-            beside[pixel],
+            others,
             run.margin_rad,
             index,
             repeated,
@@ -317,7 +320,7 @@ def _finish_all(
     return run.run(jobs, "rows by partition", [1] * len(jobs), rows)
 
 
-def bordering(pixels: Sequence[Pixel], margin_rad: float) -> dict[Pixel, tuple[Pixel, ...]]:
+def bordering(pixels: Sequence[Pixel], margin_rad: float) -> Bordering:
     """Return for each partition those whose margins reach into it.
 
     Parameters
@@ -350,16 +353,16 @@ def bordering(pixels: Sequence[Pixel], margin_rad: float) -> dict[Pixel, tuple[P
 
 
 def _margins_all(
-    run: _Ingest, pixels: Sequence[Pixel], finished: Sequence[dict[str, Any]], content: str
+    run: _Ingest, beside: Bordering, finished: Sequence[dict[str, Any]], content: str
 ) -> list[tuple[Pixel, dict[str, Any]]]:
     """Write the margins, and return those that have stars."""
-    has_stars = {pixel for pixel, facts in zip(pixels, finished, strict=True) if facts["rows"]}
-    batches: dict[Pixel, list[tuple[Path, int]]] = {pixel: [] for pixel in pixels}
-    for pixel, others in bordering(pixels, run.margin_rad).items():
+    has_stars = {pixel for pixel, facts in zip(beside, finished, strict=True) if facts["rows"]}
+    batches: dict[Pixel, list[tuple[Path, int]]] = {pixel: [] for pixel in beside}
+    for pixel, others in beside.items():
         for number, other in enumerate(others if pixel in has_stars else ()):
             batches[other].append((border_path(run.work / "borders", pixel), number))
     jobs = []
-    asked_of = [pixel for pixel in pixels if batches[pixel] and pixel in has_stars]
+    asked_of = [pixel for pixel in beside if batches[pixel] and pixel in has_stars]
     for pixel in asked_of:
         asked = Margin(pixel, tuple(batches[pixel]), run.margin)
         name = f"margin-{content}-{pixel.order}-{pixel.number}"

@@ -168,15 +168,13 @@ def _by_bucket(stars: pa.Table) -> tuple[NDArray[Any], NDArray[np.int64]]:
     return places, np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 
 
-def repeated_places(runs: Sequence[Run], bucket: int) -> NDArray[np.int64]:
-    """Return the records of a bucket whose star was read before.
+def repeated_places(ranges: Sequence[tuple[Path, Sequence[int]]]) -> NDArray[np.int64]:
+    """Return the records whose star was read before.
 
     Parameters
     ----------
-    runs : sequence of Run
-        All runs of the catalog.
-    bucket : int
-        Number of the bucket.
+    ranges : sequence of (Path, (int, int))
+        Files of `PLACES`, and which records of each: first, and the one behind the last.
 
     Returns
     -------
@@ -184,10 +182,9 @@ def repeated_places(runs: Sequence[Run], bucket: int) -> NDArray[np.int64]:
         Places, ascending: of each star all records but the first in reading order.
     """
     parts = []
-    for run in runs:
-        begin, end = run.buckets[bucket : bucket + 2].tolist()
+    for path, (begin, end) in ranges:
         offset = begin * PLACES.itemsize
-        parts.append(np.fromfile(run.places, PLACES, end - begin, offset=offset))
+        parts.append(np.fromfile(path, PLACES, end - begin, offset=offset))
     all_places = np.concatenate(parts) if parts else np.empty(0, PLACES)
     numbers = np.sort(all_places["star_id"])
     twice = np.unique(numbers[1:][numbers[1:] == numbers[:-1]])
