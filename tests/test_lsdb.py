@@ -19,7 +19,7 @@ from starcat.tables.parquet import read_parquet
 lsdb = pytest.importorskip("lsdb", reason="LSDB comes with the extra dev")
 
 # LSDB, Dask and pandas warn of what is theirs.
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300), pytest.mark.filterwarnings("ignore")]
+pytestmark = [pytest.mark.timeout(300), pytest.mark.filterwarnings("ignore")]
 
 RADIUS_ARCSEC = 9.5
 """Within the margins of the stores, which LSDB cannot look beyond."""

@@ -7,8 +7,11 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from genuine_records import SAO
 
 from starcat.catalog.ingest import ingest
+from starcat.exchange.hats import write_hats
+from starcat.storage.digests import file_sha256
 from starcat.store.ingest import ingest_to_store
 from starcat.store.layout import open_store
 from starcat.store.options import StoreOptions
@@ -61,3 +64,43 @@ def test_a_build_reads_from_a_store_what_it_reads_from_files(
     assert store.rejected_by_reason == files.rejected_by_reason
     assert (store.files, store.problems) == (files.files, files.problems)
     assert store.notes == files.notes
+
+
+def test_a_hats_catalog_of_others_is_read_with_what_it_has(catalogs, tmp_path):
+    read = ingest("hipparcos", [catalogs / "hip_main.dat.gz"])
+    some = ["star_id", "ra_deg", "dec_deg", "epoch_jyear", "mag", "pm_ra_cosdec_mas_yr"]
+    write_hats(read.stars.select([*some, "pm_dec_mas_yr"]), tmp_path / "theirs", "theirs", 500)
+    how = {"epoch_jyear": 2026.0, "read_limit_mag": 8.0}
+    found = read_catalog("hipparcos", [tmp_path / "theirs"], **how)
+    wanted = ingest("hipparcos", [catalogs / "hip_main.dat.gz"], **how)
+    kept = [*some, "pm_dec_mas_yr", "x", "y", "z", "nearest_separation_arcsec"]
+    assert found.stars.select(kept).equals(wanted.stars.select(kept))
+    assert found.rows_read == len(read.stars)
+    assert found.beyond_read_limit == len(read.stars) - len(found.stars)
+    first = found.files[0]
+    assert first.sha256 == file_sha256(tmp_path / "theirs" / first.name)
+
+
+def sao_record(number: int, mag: float) -> bytes:
+    """The record of SAO 106 with another number and magnitude."""
+    return f"{number:6}".encode() + SAO[6:80] + f"{mag:4.1f}".encode() + SAO[84:]
+
+
+def test_repeated_records_are_judged_within_the_limit_of_the_build(tmp_path):
+    """A record is repeated, or not, by what a build reads: as if it read the archive's file."""
+    lines = [
+        sao_record(1, 9.0),
+        sao_record(1, 5.0),
+        sao_record(2, 5.0),
+        sao_record(2, 6.0),
+    ]
+    archive = tmp_path / "sao.dat"
+    archive.write_bytes(b"\n".join(lines) + b"\n")
+    made = ingest_to_store("sao", [archive], tmp_path / "store")
+    assert made.manifest["rejected"] == {"duplicate_record": 2}
+    for limit in (None, 8.0, 5.5, 4.0):
+        files = ingest("sao", [archive], read_limit_mag=limit)
+        store = read_catalog("sao", [tmp_path / "store"], read_limit_mag=limit)
+        assert store.stars.equals(files.stars)
+        assert store.rejected.equals(files.rejected)
+        assert store.rejected_by_reason == files.rejected_by_reason

@@ -105,9 +105,9 @@ def ingest(
     Example: starcat ingest sao --input sao.dat.gz -o sao.parquet --epoch-jyear 2026.0
     """
     from starcat.catalog.fetching.locate import locate
-    from starcat.catalog.ingest import ingest as read_catalog
     from starcat.catalog.star_files import write_star_tables
     from starcat.errors import ConfigError
+    from starcat.store.reading import read_catalog
     from starcat.terminal.builds import print_ingested, print_stored
     from starcat.terminal.console import progress_bars
 

@@ -111,8 +111,8 @@ def ingest(
         If the source is unknown, or its files are missing or damaged.
     """
     from starcat.catalog.fetching.locate import locate
-    from starcat.catalog.ingest import ingest as read
     from starcat.progress import no_progress
+    from starcat.store.reading import read_catalog as read
 
     return read(
         source,

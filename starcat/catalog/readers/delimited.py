@@ -20,6 +20,7 @@ from starcat.catalog.readers.records import (
     Problem,
     Records,
     apply_nulls,
+    line_ends,
     number_from_text,
     reject_impossible_numbers,
     reject_required_blanks,
@@ -66,6 +67,8 @@ def _parse_regular(
         return None
     try:
         table = _read_csv(data, layout, chosen, as_text=False)
+        if len(table) != line_ends(data) + (not data.endswith(b"\n")):
+            return None  # pyarrow passes over empty lines
         columns = {column.name: _array(table[column.name], column) for column in chosen}
     except (pa.ArrowInvalid, pa.ArrowKeyError):
         return None
@@ -120,9 +123,7 @@ def _read_csv(
             use_threads=False,
             block_size=max(len(data) + 1, 1 << 16),
         ),
-        parse_options=csv.ParseOptions(
-            delimiter=layout.delimiter, quote_char=False, ignore_empty_lines=False
-        ),
+        parse_options=csv.ParseOptions(delimiter=layout.delimiter, quote_char=False),
         convert_options=csv.ConvertOptions(
             include_columns=[column.name for column in chosen],
             column_types=kinds,
