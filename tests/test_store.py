@@ -66,6 +66,16 @@ def test_a_build_reads_from_a_store_what_it_reads_from_files(
     assert store.notes == files.notes
 
 
+def test_a_store_with_a_limit_counts_what_it_left_out(catalogs, tmp_path):
+    paths = [catalogs / "sao.dat.gz"]
+    ingest_to_store("sao", paths, tmp_path / "store", read_limit_mag=6.5)
+    files = ingest("sao", paths, read_limit_mag=6.0)
+    store = read_catalog("sao", [tmp_path / "store"], read_limit_mag=6.0)
+    assert store.rejected_by_reason == files.rejected_by_reason
+    assert store.rows_read == files.rows_read > len(store.stars) > 0
+    assert store.stars.equals(files.stars)
+
+
 def test_a_hats_catalog_of_others_is_read_with_what_it_has(catalogs, tmp_path):
     read = ingest("hipparcos", [catalogs / "hip_main.dat.gz"])
     some = ["star_id", "ra_deg", "dec_deg", "epoch_jyear", "mag", "pm_ra_cosdec_mas_yr"]

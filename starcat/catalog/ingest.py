@@ -179,12 +179,23 @@ def ingest(
         notes,
         sum(each.counted for each in gathered),
     )
-    _check_balance(read)
+    check_balance(read)
     return read
 
 
-def _check_balance(read: Ingested) -> None:
-    """Check that every record read is kept or rejected."""
+def check_balance(read: Ingested) -> None:
+    """Check that every record read is kept or rejected.
+
+    Parameters
+    ----------
+    read : Ingested
+        A whole catalog.
+
+    Raises
+    ------
+    BuildError
+        If some are neither.
+    """
     rejected = sum(read.rejected_by_reason.values())
     if read.rows_read != len(read.stars) + rejected:
         raise BuildError(

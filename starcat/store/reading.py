@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from starcat.catalog.blocks import Reading, join_parts
 from starcat.catalog.file_parts import NAMED_PROBLEMS, FileFacts
 from starcat.catalog.ingest import (
     Ingested,
+    check_balance,
     check_band,
     ingest,
     star_catalog,
@@ -76,6 +77,8 @@ def read_catalog(
         If a store was made of another catalog or otherwise, or is one of several inputs.
     SourceError, ProductError, SchemaError
         If a file is missing, damaged, or not of this catalog.
+    BuildError
+        If the records read are not all kept or rejected.
     """
     if not any(path.is_dir() and is_store(path) for path in paths):
         return ingest(
@@ -98,13 +101,8 @@ def read_catalog(
     wanted = check_band(star_catalog(source_name), band)
     how = Reading(source_name, wanted, epoch_jyear, read_limit_mag)
     read = _read_store(open_store(paths[0]), how, workers, progress)
-    return _with_neighbours(read, workers) if neighbours else read
-
-
-def _with_neighbours(read: Ingested, workers: int) -> Ingested:
-    stars = add_nearest_neighbours(read.stars, workers)
-    facts = {name: getattr(read, name) for name in read.__dataclass_fields__}
-    return Ingested(**{**facts, "stars": stars})
+    check_balance(read)
+    return replace(read, stars=add_nearest_neighbours(read.stars, workers)) if neighbours else read
 
 
 @dataclass
@@ -138,6 +136,8 @@ def _read_store(store: Store, how: Reading, workers: int, progress: Progress) ->
         done += rows[number]
         progress(stage, done, None if manifest is None else manifest["kept"])
     if manifest is not None:
+        # What is beyond the limit of the store itself was only counted when it was made.
+        found.beyond += manifest["rejected"].get(Reason.beyond_read_limit.name, 0)
         _read_beside(store, how, found)
         files = tuple(FileFacts(**file) for file in manifest["files"])
     else:
