@@ -29,10 +29,10 @@ def commands(page):
 
 WALKED = [
     "README.md",
-    "docs/tutorial.md",
-    "docs/howto-prove.md",
-    "docs/howto-query.md",
-    "docs/howto-release.md",
+    pytest.param("docs/tutorial.md", marks=pytest.mark.slow),
+    pytest.param("docs/howto-prove.md", marks=pytest.mark.slow),
+    pytest.param("docs/howto-query.md", marks=pytest.mark.slow),
+    pytest.param("docs/howto-release.md", marks=pytest.mark.slow),
 ]
 
 

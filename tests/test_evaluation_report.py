@@ -749,6 +749,7 @@ def test_papers_are_evaluated_end_to_end(
     assert "## S0: a made-up paper" in page.read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_artifacts_are_built_from_presets(
     monkeypatch: pytest.MonkeyPatch, small_spec: str, sao_lines: list[bytes], tmp_path: Path
 ) -> None:

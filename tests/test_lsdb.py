@@ -80,6 +80,7 @@ def test_hats_finds_a_store_valid(stores: tuple[Path, Path]):
         assert is_valid_collection(store, strict=True, verbose=False)
 
 
+@pytest.mark.slow
 def test_lsdb_finds_the_same_pairs(stores: tuple[Path, Path], tmp_path: Path):
     wanted = Crossmatch(radius_arcsec=RADIUS_ARCSEC)
     match_stores(*stores, tmp_path / "ours.parquet", wanted)

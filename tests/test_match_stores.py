@@ -164,6 +164,7 @@ def test_any_stores_are_matched_as_whole_tables_are(
         check_same(a, b, radius_arcsec, Path(folder), max_rows=max_rows, piece_load=piece_load)
 
 
+@pytest.mark.slow
 def test_a_cluster_longer_than_messages_go(tmp_path: Path):
     """Each star of a row of them is a candidate of the next: all hang together."""
     generator = np.random.default_rng(4)

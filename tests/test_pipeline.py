@@ -332,6 +332,7 @@ def test_leftovers_of_a_killed_build_do_not_disturb(
     assert visible(tmp_path / "dist") == ["small-1.0.0", LOG]
 
 
+@pytest.mark.slow
 def test_two_builds_at_once(
     slower: tuple[Path, Path, dict[str, bytes], float], tmp_path: Path
 ) -> None:

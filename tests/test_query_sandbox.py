@@ -180,6 +180,7 @@ def test_what_needs_too_much_memory_is_stopped(folder):
         answer.rows(1)
 
 
+@pytest.mark.slow
 def test_what_is_larger_than_the_memory_is_sorted_on_disk(folder):
     limits = Limits(time_s=50.0, memory_gb=0.05)
     text = "SELECT range AS n FROM range(8000000) ORDER BY range % 7919, range"

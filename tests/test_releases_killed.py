@@ -311,6 +311,7 @@ def _rounds(
     return kills
 
 
+@pytest.mark.slow
 def test_8_rounds_with_random_kills(
     workers: Workers, artifact_version: Version, tmp_path: Path
 ) -> None:

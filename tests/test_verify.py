@@ -133,6 +133,7 @@ def test_every_file_is_of_a_known_kind(files: Sequence[str]) -> None:
     assert {MANIFEST_NAME, DATABASE_NAME, "stars.parquet", "pairs.parquet"} <= set(files)
 
 
+@pytest.mark.slow
 def test_200_flipped_bytes_are_all_found(copy: Path, files: Sequence[str]) -> None:
     """Some in every file, the places drawn at random; each is put back before the next."""
     generator = random.Random(200)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from starcat.commands.shared import Json, Scheduler, Workers, inputs_by_source
+
+if TYPE_CHECKING:
+    from starcat.store.options import StoreOptions
 
 app = typer.Typer()
 
@@ -55,6 +59,24 @@ def fetch(
     print_fetched(report, as_json=json)
 
 
+ToFormat = Annotated[
+    str, typer.Option(help="parquet: one file; hats: a store of any size, by Dask.")
+]
+EpochJyear = Annotated[
+    float | None,
+    typer.Option(min=1800, max=2200, help="Julian year to move positions to; default: its own."),
+]
+ReadLimitMag = Annotated[
+    float | None, typer.Option(min=-30, max=40, help="Count fainter records, without listing them.")
+]
+MemoryGib = Annotated[
+    float, typer.Option("--memory", min=0.1, help="GiB of all processes together (hats).")
+]
+PartitionRows = Annotated[int, typer.Option(min=1, help="Stars of a partition at most (hats).")]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on with a run that was ended (hats).")]
+Replace = Annotated[bool, typer.Option("--replace", help="Replace a store that differs (hats).")]
+
+
 @app.command()
 def ingest(
     source: Annotated[str, typer.Argument(help="A star catalog, such as sao.")],
@@ -69,35 +91,16 @@ def ingest(
             help="File or folder of the catalog. Repeatable.",
         ),
     ] = None,
-    to: Annotated[
-        str, typer.Option(help="parquet: one file; hats: a store of any size, by Dask.")
-    ] = "parquet",
-    epoch_jyear: Annotated[
-        float | None,
-        typer.Option(
-            min=1800, max=2200, help="Julian year to move positions to; default: its own."
-        ),
-    ] = None,
+    to: ToFormat = "parquet",
+    epoch_jyear: EpochJyear = None,
     band: Annotated[str | None, typer.Option(help="Band of the magnitudes.")] = None,
-    read_limit_mag: Annotated[
-        float | None,
-        typer.Option(min=-30, max=40, help="Count fainter records, without listing them."),
-    ] = None,
+    read_limit_mag: ReadLimitMag = None,
     workers: Workers = 2,
     scheduler: Scheduler = None,
-    memory_gib: Annotated[
-        float,
-        typer.Option("--memory", min=0.1, help="GiB of all processes together (hats)."),
-    ] = 2.0,
-    max_partition_rows: Annotated[
-        int, typer.Option(min=1, help="Stars of a partition at most (hats).")
-    ] = 500_000,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with a run that was ended (hats).")
-    ] = False,
-    replace: Annotated[
-        bool, typer.Option("--replace", help="Replace a store that differs (hats).")
-    ] = False,
+    memory_gib: MemoryGib = 2.0,
+    max_partition_rows: PartitionRows = 500_000,
+    resume: Resume = False,
+    replace: Replace = False,
     json: Json = False,
 ) -> None:
     """Read an archive into a star table (Parquet) or a store (HATS), with a reason for every row.
@@ -105,52 +108,63 @@ def ingest(
     Example: starcat ingest sao --input sao.dat.gz -o sao.parquet --epoch-jyear 2026.0
     """
     from starcat.catalog.fetching.locate import locate
-    from starcat.catalog.star_files import write_star_tables
     from starcat.errors import ConfigError
-    from starcat.store.reading import read_catalog
-    from starcat.terminal.builds import print_ingested, print_stored
-    from starcat.terminal.console import progress_bars
+    from starcat.store.options import StoreOptions
 
     if to not in ("parquet", "hats"):
         raise ConfigError(f"--to {to}: choose parquet or hats", key="to", value=to)
     paths = locate(source, inputs_by_source(inputs, source))
-    with progress_bars() as progress:
-        if to == "hats":
-            from starcat.store.ingest import ingest_to_store
-            from starcat.store.options import StoreOptions
-
-            stored = ingest_to_store(
-                source,
-                paths,
-                output,
-                band=band,
-                epoch_jyear=epoch_jyear,
-                read_limit_mag=read_limit_mag,
-                options=StoreOptions(
-                    max_partition_rows=max_partition_rows,
-                    memory_bytes=int(memory_gib * 2**30),
-                    workers=workers,
-                    scheduler=scheduler,
-                    resume=resume,
-                    replace=replace,
-                ),
-                progress=progress,
-            )
-        else:
-            read = read_catalog(
-                source,
-                paths,
-                band=band,
-                epoch_jyear=epoch_jyear,
-                read_limit_mag=read_limit_mag,
-                workers=workers,
-                progress=progress,
-            )
-            write_star_tables(read, output)
+    how = {"band": band, "epoch_jyear": epoch_jyear, "read_limit_mag": read_limit_mag}
     if to == "hats":
-        print_stored(stored, as_json=json)
+        options = StoreOptions(
+            max_partition_rows=max_partition_rows,
+            memory_bytes=int(memory_gib * 2**30),
+            workers=workers,
+            scheduler=scheduler,
+            resume=resume,
+            replace=replace,
+        )
+        _ingest_to_store(source, paths, output, how, options, as_json=json)
     else:
-        print_ingested(read, output, as_json=json)
+        _ingest_to_file(source, paths, output, how, workers, as_json=json)
+
+
+def _ingest_to_store(
+    source: str,
+    paths: Sequence[Path],
+    output: Path,
+    how: dict[str, Any],
+    options: StoreOptions,
+    *,
+    as_json: bool,
+) -> None:
+    from starcat.store.ingest import ingest_to_store
+    from starcat.terminal.builds import print_stored
+    from starcat.terminal.console import progress_bars
+
+    with progress_bars() as progress:
+        stored = ingest_to_store(source, paths, output, **how, options=options, progress=progress)
+    print_stored(stored, as_json=as_json)
+
+
+def _ingest_to_file(
+    source: str,
+    paths: Sequence[Path],
+    output: Path,
+    how: dict[str, Any],
+    workers: int,
+    *,
+    as_json: bool,
+) -> None:
+    from starcat.catalog.star_files import write_star_tables
+    from starcat.store.reading import read_catalog
+    from starcat.terminal.builds import print_ingested
+    from starcat.terminal.console import progress_bars
+
+    with progress_bars() as progress:
+        read = read_catalog(source, paths, **how, workers=workers, progress=progress)
+        write_star_tables(read, output)
+    print_ingested(read, output, as_json=as_json)
 
 
 @app.command()

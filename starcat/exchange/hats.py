@@ -11,11 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from starcat.catalog.stars import floats_of
 from starcat.errors import ConfigError
-from starcat.store.metadata import Described, describe_catalog
+from starcat.store.metadata import Described, describe_catalog, write_slices
 from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, healpix_29, pixel_field
 from starcat.store.plan import partition_pixels
 
@@ -72,17 +71,9 @@ def write_hats(stars: pa.Table, folder: Path, name: str, max_rows: int = MAX_ROW
         one place, or cdshealpix is not installed.
     """
     table, left_out = _with_pixels(stars, name)
-    pixels = table[HEALPIX_COLUMN].to_numpy()
-    found, counts = np.unique(pixels, return_counts=True)
+    found, counts = np.unique(table[HEALPIX_COLUMN].to_numpy(), return_counts=True)
     partitions = partition_pixels(found, counts, MAX_ORDER, max_rows, name)
-    size = 0
-    for pixel in partitions:
-        begin, end = np.searchsorted(pixels, [pixel.first, pixel.end])
-        path = folder / "dataset" / pixel.path
-        path.parent.mkdir(parents=True, exist_ok=True)
-        rows = table.slice(begin, end - begin)
-        pq.write_table(rows, path, compression="zstd", row_group_size=max_rows)
-        size += path.stat().st_size
+    size = write_slices(table, partitions, folder, max_rows)
     described = Described(name, "object", len(table), size, max_rows, partitions, {})
     describe_catalog(folder, described, table.schema)
     order = max(pixel.order for pixel in partitions)

@@ -21,9 +21,16 @@ import pyarrow.parquet as pq
 from starcat.artifact.crossmatch_table import NEEDED
 from starcat.errors import ParseError, ProductError, SchemaError, reason
 from starcat.pipeline.counterparts import check_star_columns
-from starcat.store.layout import Partition, Store, open_store
-from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, Pixels, healpix_29
-from starcat.store.region import WHOLE_SKY, Region
+from starcat.store.layout import (
+    PROPERTIES_NAMES,
+    Partition,
+    Store,
+    open_store,
+    write_properties,
+)
+from starcat.store.metadata import write_pixel_list, write_slices
+from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, Pixel, Pixels, healpix_29, runs_of
+from starcat.store.region import Region
 from starcat.tables.schema import product_schema
 
 _ALIKE = {
@@ -288,19 +295,11 @@ def store_of_file(stars: pa.Table, path: Path, folder: Path) -> None:
     pixels = healpix_29(stars["ra_deg"].to_numpy(), dec_deg)
     order = np.argsort(pixels, kind="stable")
     table = stars.append_column(HEALPIX_COLUMN, pa.array(pixels)).take(pa.array(order))
-    widths = WHOLE_SKY[0][1] // 12
-    bounds = np.searchsorted(pixels[order], [number * widths for number in range(13)])
-    lines = ["Norder,Npix"]
-    for number in range(12):
-        rows = table.slice(bounds[number], bounds[number + 1] - bounds[number])
-        if len(rows):
-            lines.append(f"0,{number}")
-            place = folder / "dataset" / "Norder=0" / "Dir=0" / f"Npix={number}.parquet"
-            place.parent.mkdir(parents=True, exist_ok=True)
-            pq.write_table(rows, place, row_group_size=_SMALL_GROUP)
+    partitions = [Pixel(0, number) for number in runs_of(pixels[order], 0)[0].tolist()]
     folder.mkdir(exist_ok=True)
-    (folder / "partition_info.csv").write_text("\n".join(lines) + "\n")
-    (folder / "hats.properties").write_text(f"hats_col_healpix={HEALPIX_COLUMN}\n")
+    write_slices(table, partitions, folder, _SMALL_GROUP)
+    write_pixel_list(folder, partitions)
+    write_properties(folder / PROPERTIES_NAMES[0], {"hats_col_healpix": HEALPIX_COLUMN})
 
 
 _SMALL_GROUP = 1 << 15

@@ -14,10 +14,10 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from starcat.storage.atomic import placed
-from starcat.storage.digests import file_sha256
 from starcat.store.brightness import bright_first, write_partition
 from starcat.store.index import RunIndex, read_index
 from starcat.store.layout import DATASET, REPEATED
+from starcat.store.ledger import Digests, digests_of
 from starcat.store.neighbours import COLUMNS, add_neighbours
 from starcat.store.pixels import (
     HEALPIX_COLUMN,
@@ -70,7 +70,7 @@ class Finish:
     is_alone: bool
 
 
-def finish(asked: Finish) -> tuple[dict[str, Any], list[Path]]:
+def finish(asked: Finish) -> tuple[dict[str, Any], Digests]:
     """Write a partition.
 
     Parameters
@@ -82,8 +82,8 @@ def finish(asked: Finish) -> tuple[dict[str, Any], list[Path]]:
     -------
     result : dict
         Stars and repeated records in it, its digest and size, and its share of the map of counts.
-    files : list of Path
-        All that was written.
+    written : dict of Path to str
+        All files that were written, with digests.
     """
     index = read_index(asked.index)
     repeated = _read_places(asked.repeated)
@@ -100,7 +100,7 @@ def finish(asked: Finish) -> tuple[dict[str, Any], list[Path]]:
         files.append(path)
     result: dict[str, Any] = {"rows": len(stars), "repeated": len(again)}
     if not len(stars):
-        return result, files
+        return result, digests_of(files)
 
     def around(reach_rad: float) -> Iterator[pa.Table]:
         return _around(index, pixel, reach_rad, repeated)
@@ -111,8 +111,8 @@ def finish(asked: Finish) -> tuple[dict[str, Any], list[Path]]:
     result["map"] = _map(stars[HEALPIX_COLUMN].to_numpy())
     ordered, rows = bright_first(stars)
     write_partition(with_constants(ordered, store_schema()), rows, path)
-    result |= {"sha256": file_sha256(path), "bytes": path.stat().st_size}
-    return result, [*files, path]
+    written = digests_of([*files, path])
+    return result | {"sha256": written[path], "bytes": path.stat().st_size}, written
 
 
 @lru_cache(maxsize=1)
@@ -255,7 +255,7 @@ class Margin:
     catalog: Path
 
 
-def write_margin(asked: Margin) -> tuple[dict[str, Any], list[Path]]:
+def write_margin(asked: Margin) -> tuple[dict[str, Any], Digests]:
     """Write the margin of a partition.
 
     Parameters
@@ -266,19 +266,18 @@ def write_margin(asked: Margin) -> tuple[dict[str, Any], list[Path]]:
     Returns
     -------
     result : dict
-        Stars in it, and its digest and size where there are any.
-    files : list of Path
-        What was written: nothing for no star.
+        Stars in it, and its size where there are any.
+    written : dict of Path to str
+        What was written, with its digest: nothing for no star.
     """
     stars = _read_borders(asked.batches)
     if not len(stars):
-        return {"rows": 0}, []
+        return {"rows": 0}, {}
     path = asked.catalog / DATASET / asked.pixel.path
     keys = (stars["star_id"].to_numpy(), stars[HEALPIX_COLUMN].to_numpy())
     ordered = stars.take(pa.array(np.lexsort(keys)))
     write_partition(ordered, (len(stars),), path)
-    facts = {"rows": len(stars), "sha256": file_sha256(path), "bytes": path.stat().st_size}
-    return facts, [path]
+    return {"rows": len(stars), "bytes": path.stat().st_size}, digests_of([path])
 
 
 def _read_borders(batches: Sequence[tuple[Path, int]]) -> pa.Table:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.store.pixels import Pixel, Pixels
+from starcat.store.pixels import Pixel, Pixels, at_order
 from starcat.store.runs import BUCKETS, Run, Share, repeated_places
 
 
@@ -52,7 +52,7 @@ class RunIndex:
         list of Share
             One for each run that has any.
         """
-        return self._of(pixel.at(self.order))
+        return self.shares_of(pixel.order, np.array([pixel.number]))
 
     def shares_of(self, order: int, pixels: Pixels) -> list[Share]:
         """Return the batches that hold the stars of several pixels.
@@ -69,13 +69,7 @@ class RunIndex:
         list of Share
             One for each run that has any.
         """
-        if order >= self.order:
-            return self._of(np.unique(pixels >> 2 * (order - self.order)))
-        shift = 2 * (self.order - order)
-        within = (pixels[:, None] << shift) + np.arange(1 << shift)
-        return self._of(np.unique(within))
-
-    def _of(self, coarse: Pixels) -> list[Share]:
+        coarse = at_order(order, pixels, self.order)
         begins = np.searchsorted(self.pixels, coarse)
         ends = np.searchsorted(self.pixels, coarse, side="right")
         ranges = [np.arange(b, e) for b, e in zip(begins, ends, strict=True) if e > b]

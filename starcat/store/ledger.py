@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,27 @@ OPTIONS_NAME = "options.json"
 RESUME_ADVICE = "what is done is kept: make room, then go on with --resume"
 _DONE = "done"
 
-Task = Callable[[Any], tuple[dict[str, Any], list[Path]]]
+Digests = dict[Path, str]
+"""Files and their SHA-256."""
+
+Task = Callable[[Any], tuple[dict[str, Any], Digests]]
 """Does something and returns its result as plain values, and the files that it wrote."""
+
+
+def digests_of(files: Iterable[Path]) -> Digests:
+    """Return the digests of files.
+
+    Parameters
+    ----------
+    files : iterable of Path
+        What a task has written.
+
+    Returns
+    -------
+    dict of Path to str
+        SHA-256, hexadecimal.
+    """
+    return {file: file_sha256(file) for file in files}
 
 
 @dataclass(frozen=True)
@@ -127,7 +146,7 @@ class Work:
             pass
         return None
 
-    def record(self, name: str, result: Mapping[str, Any], files: Sequence[Path]) -> None:
+    def record(self, name: str, result: Mapping[str, Any], written: Digests) -> None:
         """Record that a task is done.
 
         Parameters
@@ -136,10 +155,12 @@ class Work:
             Name of the task.
         result : mapping of str to object
             Plain values.
-        files : sequence of Path
-            All that it wrote.
+        written : dict of Path to str
+            All that it wrote, with digests.
         """
-        digests = {file.relative_to(self.folder).as_posix(): file_sha256(file) for file in files}
+        digests = {
+            file.relative_to(self.folder).as_posix(): digest for file, digest in written.items()
+        }
         path = self._record(name)
         # Two workers may do the same task when one of them was thought dead: both write the same.
         partial = path.with_name(f".{path.name}.{os.getpid()}")
@@ -195,8 +216,8 @@ class Job:
         if before is not None and self.is_valid(self.asked, before):
             return before
         with writing(self.work.folder.parent, RESUME_ADVICE):
-            result, files = self.task(self.asked)
-            self.work.record(self.name, result, files)
+            result, written = self.task(self.asked)
+            self.work.record(self.name, result, written)
         return result
 
 

@@ -51,6 +51,53 @@ class Described:
     more: Mapping[str, Any]
 
 
+def write_slices(
+    stars: pa.Table, partitions: Sequence[Pixel], folder: Path, row_group_rows: int
+) -> int:
+    """Write the partitions of a table that is held in memory.
+
+    Parameters
+    ----------
+    stars : pyarrow.Table
+        With ``_healpix_29``, ascending.
+    partitions : sequence of Pixel
+        Each becomes a file, with or without stars.
+    folder : Path
+        Of the HATS catalog; made.
+    row_group_rows : int
+        Stars of a row group at most.
+
+    Returns
+    -------
+    int
+        Size of the files.
+    """
+    pixels = stars[HEALPIX_COLUMN].to_numpy()
+    size = 0
+    for pixel in partitions:
+        begin, end = np.searchsorted(pixels, [pixel.first, pixel.end])
+        path = folder / DATASET / pixel.path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        rows = stars.slice(begin, end - begin)
+        pq.write_table(rows, path, compression="zstd", row_group_size=row_group_rows)
+        size += path.stat().st_size
+    return size
+
+
+def write_pixel_list(folder: Path, partitions: Sequence[Pixel]) -> None:
+    """Write which partitions a HATS catalog has.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the catalog.
+    partitions : sequence of Pixel
+        By their place on the sky.
+    """
+    lines = "".join(f"{pixel.order},{pixel.number}\n" for pixel in partitions)
+    (folder / PARTITIONS_NAME).write_text(f"Norder,Npix\n{lines}", encoding="utf-8", newline="\n")
+
+
 def describe_catalog(folder: Path, catalog: Described, schema: pa.Schema) -> None:
     """Write what a HATS catalog has beside its partitions.
 
@@ -72,8 +119,7 @@ def describe_catalog(folder: Path, catalog: Described, schema: pa.Schema) -> Non
     known = {**(schema.metadata or {}), **votable_metadata(schema.empty_table())}
     pq.write_metadata(schema.with_metadata(known), dataset / "_common_metadata")
     pq.write_metadata(schema, dataset / "_metadata", footers)
-    lines = "".join(f"{pixel.order},{pixel.number}\n" for pixel in catalog.pixels)
-    (folder / PARTITIONS_NAME).write_text(f"Norder,Npix\n{lines}", encoding="utf-8", newline="\n")
+    write_pixel_list(folder, catalog.pixels)
     write_properties(folder / "hats.properties", _properties(catalog))
 
 

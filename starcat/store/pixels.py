@@ -82,10 +82,28 @@ class Pixel:
         ndarray of int64, shape (N,)
             Ascending: those within it, or the one that it lies in.
         """
-        if order <= self.order:
-            return np.array([self.number >> 2 * (self.order - order)], dtype=np.int64)
-        shift = 2 * (order - self.order)
-        return np.arange(self.number << shift, (self.number + 1) << shift, dtype=np.int64)
+        return at_order(self.order, np.array([self.number], dtype=np.int64), order)
+
+
+def at_order(order: int, pixels: Pixels, other: int) -> Pixels:
+    """Return the pixels of another order that some pixels have a part in.
+
+    Parameters
+    ----------
+    order, pixels : int, ndarray of int64, shape (N,)
+        The pixels.
+    other : int
+        The other order.
+
+    Returns
+    -------
+    ndarray of int64, shape (M,)
+        Ascending, each once: those within them, or the ones that they lie in.
+    """
+    if other <= order:
+        return np.unique(pixels >> 2 * (order - other))
+    shift = 2 * (other - order)
+    return np.unique((pixels[:, None] << shift) + np.arange(1 << shift))
 
 
 def runs_of(pixels: Pixels, order: int) -> tuple[Pixels, Pixels, Pixels]:
@@ -175,8 +193,8 @@ def border_of(pixel: Pixel, width_rad: float) -> tuple[int, Pixels]:
         return order, _valid(
             *_nested().external_neighbours(np.array([pixel.number]), pixel.order, depth)
         )
-    around = _nested().neighbours(pixel.at(order), order)
-    return order, _valid(pixel.at(order), around)
+    own = pixel.at(order)
+    return order, np.union1d(own, neighbours_of(own, order))
 
 
 def neighbours_of(pixels: Pixels, order: int) -> Pixels:

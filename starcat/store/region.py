@@ -110,7 +110,7 @@ def region_around(pixel: Pixel, hop_rad: float, rings: int) -> Region:
     order = border_order(width_rad)
     core = pixel
     if order < pixel.order:
-        core = Pixel(order, pixel.number >> 2 * (pixel.order - order))
+        core = Pixel(order, int(pixel.at(order)[0]))
     found = [border_of(core, width_rad)[1]]
     inner = np.array([core.number], dtype=np.int64) if core.order == order else nothing
     for _ in range(rings - 1):

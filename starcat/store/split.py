@@ -20,6 +20,7 @@ from starcat.catalog.source import data_source
 from starcat.catalog.verdict import Reason
 from starcat.storage.atomic import placed
 from starcat.storage.digests import file_sha256
+from starcat.store.ledger import Digests, digests_of
 from starcat.store.pixels import runs_of
 from starcat.store.runs import HISTOGRAM_ORDER, Run, write_run
 from starcat.tables.schema import product_schema
@@ -108,7 +109,7 @@ class _Written:
         return path
 
 
-def split(asked: Split) -> tuple[dict[str, Any], list[Path]]:
+def split(asked: Split) -> tuple[dict[str, Any], Digests]:
     """Split a file.
 
     Parameters
@@ -121,8 +122,8 @@ def split(asked: Split) -> tuple[dict[str, Any], list[Path]]:
     result : dict
         What was read, as plain values: the file's facts, counts by reason, the first malformed
         records, and how many runs there are.
-    files : list of Path
-        All that was written.
+    written : dict of Path to str
+        All files that were written, with digests.
 
     Raises
     ------
@@ -154,7 +155,7 @@ def split(asked: Split) -> tuple[dict[str, Any], list[Path]]:
         "runs": len(written.runs),
     }
     written.index()
-    return result, written.files
+    return result, digests_of(written.files)
 
 
 def is_unchanged(asked: Split, result: dict[str, Any]) -> bool:

@@ -124,14 +124,8 @@ def print_ingested(read: Ingested, output: Path, *, as_json: bool) -> None:
         "problems": list(read.problems),
         "notes": list(read.notes),
     }
-    for note in read.notes:
-        say(f"note: {note}")
-    if as_json:
-        print_json(facts)
-        return
-    print_table("", ("records", "rows"), _balance(facts), numbers=(1,))
-    print_problems(read.problems)
-    say(f"wrote {output}" + (f" and {rejected_path(output).name}" if len(read.rejected) else ""))
+    beside = f" and {rejected_path(output).name}" if len(read.rejected) else ""
+    _print_records(facts, f"wrote {output}{beside}", as_json=as_json)
 
 
 def print_stored(made: Stored, *, as_json: bool) -> None:
@@ -158,14 +152,20 @@ def print_stored(made: Stored, *, as_json: bool) -> None:
         "problems": list(made.problems),
         "notes": list(made.notes),
     }
-    for note in made.notes:
+    told = f"{made.outcome} {made.folder}: {len(manifest['partitions'])} partitions"
+    _print_records(facts, told, as_json=as_json)
+
+
+def _print_records(facts: dict[str, Any], told: str, *, as_json: bool) -> None:
+    """Print what was read, kept and rejected, and where it is."""
+    for note in facts["notes"]:
         say(f"note: {note}")
     if as_json:
         print_json(facts)
         return
     print_table("", ("records", "rows"), _balance(facts), numbers=(1,))
-    print_problems(made.problems)
-    say(f"{made.outcome} {made.folder}: {len(manifest['partitions'])} partitions")
+    print_problems(facts["problems"])
+    say(told)
 
 
 def print_problems(problems: Sequence[str]) -> None:

@@ -1,0 +1,159 @@
+/* starcat onboard: identifies the stars of a frame with an image of a guide-star database.
+ *
+ * C99, freestanding: no heap, no files, no global state, no recursion. All memory is the caller's.
+ * Directions are ICRS or camera unit vectors (camera frame: x right, y down, z along the
+ * boresight). Pixels start at the outer corner of the top-left pixel. Quaternions are scalar-last,
+ * turn ICRS into camera components, and have w >= 0.
+ *
+ * SPDX-License-Identifier: MIT
+ */
+#ifndef STARCAT_H
+#define STARCAT_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define STARCAT_VERSION "0.2.0"
+
+/* Largest number of centroids that a frame may have. */
+#ifndef STARCAT_MAX_CENTROIDS
+#define STARCAT_MAX_CENTROIDS 64
+#endif
+
+/* Largest number of stars in or next to a frame; an image that may exceed it is not opened. */
+#ifndef STARCAT_MAX_STARS
+#define STARCAT_MAX_STARS 192
+#endif
+
+/* Single precision by -DSTARCAT_SINGLE, double by default. */
+#ifdef STARCAT_SINGLE
+typedef float starcat_real;
+#else
+typedef double starcat_real;
+#endif
+
+/* What a call came to. Values below 0 are errors of the caller or of the image. */
+typedef enum {
+  STARCAT_IDENTIFIED = 0,
+  STARCAT_NO_MATCH = 1,             /* no attitude explains the frame beyond chance */
+  STARCAT_TOO_FEW_STARS = 2,        /* fewer than four usable centroids, or two directions */
+  STARCAT_E_NULL = -1,              /* a pointer is null */
+  STARCAT_E_SHORT = -2,             /* fewer bytes than the image says it has */
+  STARCAT_E_MAGIC = -3,             /* not an image of starcat */
+  STARCAT_E_VERSION = -4,           /* a format that this library does not read */
+  STARCAT_E_BYTE_ORDER = -5,        /* written for the other byte order */
+  STARCAT_E_ALIGNMENT = -6,         /* the image does not begin at a multiple of 8 */
+  STARCAT_E_LAYOUT = -7,            /* sizes or sections that contradict each other */
+  STARCAT_E_CRC = -8,               /* a damaged block; starcat_scrub names it */
+  STARCAT_E_CAPACITY = -9,          /* more stars in a field than STARCAT_MAX_STARS */
+  STARCAT_E_TOO_MANY_CENTROIDS = -10,
+  STARCAT_E_NOT_FINITE = -11,       /* a number of the options or of the prior is not finite */
+  STARCAT_E_CAMERA = -12,           /* a camera that cannot be */
+  STARCAT_E_OPTIONS = -13,          /* an option out of range */
+  STARCAT_E_BUDGET = -14            /* the steps are used up before an answer was found */
+} starcat_status;
+
+/* Results of a centroid beside the row of its star, which is 0 or more. */
+#define STARCAT_NO_STAR (-1)
+#define STARCAT_DROPPED_NOT_FINITE (-2)
+#define STARCAT_DROPPED_OUT_OF_FRAME (-3)
+#define STARCAT_DROPPED_DUPLICATE (-4)
+
+/* Flags of starcat_open. */
+#define STARCAT_SKIP_CRC 1u
+
+/* An image in place. Filled by starcat_open; its pointers point into the image. */
+typedef struct {
+  const uint8_t *bytes;
+  uint32_t total_bytes, data_bytes, method, n_stars, n_features, n_kvector, index_bytes;
+  uint32_t grid_bands, grid_sectors;
+  starcat_real kvector_intercept, kvector_slope, radius_quantum_rad, longest_rad;
+  starcat_real width_px, height_px, focal_length_px, epoch_jyear;
+  const int32_t *directions;
+  const int16_t *magnitudes;
+  const int64_t *star_ids;
+  const uint32_t *grid;
+  const uint32_t *kvector;
+  const void *features;    /* triangles or pairs: rows of uint16_t or uint32_t */
+  const uint16_t *radii;   /* null for the method pyramid */
+  const char *name;        /* up to 96 bytes, filled with zeros */
+  const uint8_t *manifest_sha256; /* 32 bytes */
+} starcat_image;
+
+/* A camera with square pixels; Brown's distortion as in OpenCV. */
+typedef struct {
+  starcat_real width_px, height_px, focal_length_px;
+  starcat_real x0_px, y0_px;             /* principal point */
+  starcat_real k1, k2, k3, p1, p2;       /* 0: none */
+  starcat_real fold_radius;              /* largest x/z that the distortion holds for; 0: no limit */
+} starcat_camera;
+
+typedef struct {
+  starcat_real tolerance_px;             /* largest error of a centroid, as a radius */
+  starcat_real noise_px;                 /* standard deviation on each axis; 0: not stated.
+                                            If stated, tolerance_px is 3 times this */
+  starcat_real noise_mag;                /* standard deviation of magnitudes; 0: not stated */
+  starcat_real log_chance;               /* natural logarithm of the largest accepted probability
+                                            that chance agrees as well */
+  uint32_t max_steps;                    /* bound on the work; see starcat_result.steps */
+} starcat_options;
+
+/* The centroids of a frame. Arrays of `count`; magnitudes may be null, and NaN where unknown. */
+typedef struct {
+  uint32_t count;
+  const starcat_real *x_px;
+  const starcat_real *y_px;
+  const starcat_real *magnitudes;
+} starcat_frame;
+
+typedef struct {
+  starcat_real q_body_from_icrs[4];
+  starcat_real matrix[9];                /* the same attitude by rows, body = matrix * icrs */
+  starcat_real residual_rad;             /* root mean square of the matched centroids */
+  starcat_real log_chance;               /* natural logarithm of the bound; 0 if not identified */
+  uint32_t n_matched;
+  uint32_t steps;                        /* steps that were taken */
+  uint32_t n_tried;                      /* attitudes that were verified */
+  int32_t star[STARCAT_MAX_CENTROIDS];   /* row in the image, or one of the negative numbers */
+} starcat_result;
+
+/* Memory that a call works in; its contents are nobody's business and need not be set. */
+typedef struct starcat_workspace starcat_workspace;
+
+/* Fill in the camera that the image was built for, and the options that the ground uses. */
+void starcat_camera_of(const starcat_image *image, starcat_camera *camera);
+void starcat_default_options(starcat_options *options);
+
+/* Open an image of `size` bytes at `bytes`, which stays where it is. */
+starcat_status starcat_open(starcat_image *image, const void *bytes, size_t size, uint32_t flags);
+
+/* Check blocks `first` to `first + count` of an image; every block if count is 0. On
+ * STARCAT_E_CRC `bad_block` is the first one that is damaged. */
+starcat_status starcat_scrub(const void *bytes, size_t size, uint32_t first, uint32_t count,
+                             uint32_t *bad_block);
+
+/* Identify the stars of a frame without any prior knowledge. */
+starcat_status starcat_identify(const starcat_image *image, const starcat_camera *camera,
+                                const starcat_options *options, const starcat_frame *frame,
+                                starcat_workspace *work, starcat_result *result);
+
+/* Identify the stars of a frame near a prior attitude, wrong by at most `uncertainty_rad`. */
+starcat_status starcat_track(const starcat_image *image, const starcat_camera *camera,
+                             const starcat_options *options, const starcat_frame *frame,
+                             const starcat_real q_prior[4], starcat_real uncertainty_rad,
+                             starcat_workspace *work, starcat_result *result);
+
+/* Find the rotation that best turns `icrs` into `body`, pairs of unit vectors by rows. */
+starcat_status starcat_attitude(const starcat_real (*body)[3], const starcat_real (*icrs)[3],
+                                uint32_t count, starcat_real q_body_from_icrs[4]);
+
+#include "starcat_workspace.h"
+
+#ifdef __cplusplus
+}
+#endif
+#endif
