@@ -20,20 +20,18 @@ MAX_CELLS = 2**20
 BANDS_OF_A_FIELD = 8
 """So many bands the circle of a camera should cross: fewer hold stars that are not near it."""
 
-FACE_CELLS = 8
+FACE_CELLS = 2
 """Cells along a side of a cube's face when the search for the fullest circle begins."""
 
-LEVELS = 6
-"""So often a cell is halved at the most."""
-
-MAX_PRODUCTS = 50_000_000
-"""Work of the search that is not exceeded by halving cells: cells times stars."""
-
-CHUNK = 1_000_000
-"""Products that are held at a time."""
+FINENESS = 12
+"""Cells are halved until they reach from their centre by one in so many of the radius."""
 
 SLACK_RAD = 1e-5
 """The radius is so much larger, for who compares in single precision."""
+
+_CORNERS = np.array(list(product((-1.0, 1.0), repeat=2)))
+_FACES = [sign * np.roll(np.eye(3), axis, axis=0) for axis, sign in product(range(3), (1.0, -1.0))]
+"""Of each face of the cube the normal and the two axes in it, by rows."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,8 @@ class Grid:
         ndarray of int64, shape (n_cells + 1,)
             The last entry is the number of stars.
         """
-        return np.searchsorted(cells, np.arange(self.n_cells + 1), side="left").astype(np.int64)
+        first = np.searchsorted(cells, np.arange(self.n_cells + 1), side="left")
+        return np.asarray(first, dtype=np.int64)
 
 
 def quarter_turns(u: Array) -> Array:
@@ -112,7 +111,8 @@ def quarter_turns(u: Array) -> Array:
     t = np.divide(y, length, out=np.zeros(len(u)), where=length > 0.0)
     second_or_third = ((x <= 0.0) & (y > 0.0)) | (x < 0.0)
     fourth = (x >= 0.0) & (y < 0.0)
-    return np.where(second_or_third, 2.0 - t, np.where(fourth, 4.0 + t, t))
+    turns: Array = np.where(second_or_third, 2.0 - t, np.where(fourth, 4.0 + t, t))
+    return turns
 
 
 def grid_for(n_stars: int, radius_rad: float) -> Grid:
@@ -149,70 +149,86 @@ def most_near(u: Array, radius_rad: float) -> int:
     Returns
     -------
     int
-        Never too small; too large by the stars of a ring of a fortieth of the radius or less,
-        unless the stars are so many that the search is ended before.
+        Never too small; too large by what a ring of a twelfth of the radius adds.
 
     Notes
     -----
-    The sphere is divided into cells of the faces of a cube. No circle about a direction of a cell
-    holds more stars than the circle about its centre that is wider by the cell's half diagonal.
-    Only cells that may hold more than what a circle was found to hold are halved.
+    The sphere is divided into cells, squares on the faces of a cube. No circle about a direction
+    of a cell holds more stars than the circle about its centre that is wider by what the cell
+    reaches from there. Cells that may hold more than is known of others are divided further.
     """
-    if not len(u):
-        return 0
     unit = u / np.sqrt(np.einsum("ij,ij->i", u, u))[:, None]
-    cells, half = _first_cells()
-    found = 0
-    for level in range(LEVELS + 1):
-        centres, reach_rad = _centres(cells, half)
-        inner, outer = _counts(unit, centres, radius_rad + SLACK_RAD, reach_rad)
-        found = max(found, inner)
-        fuller = cells[outer > found]
-        if level == LEVELS or 4 * len(fuller) * len(u) > MAX_PRODUCTS:
-            break
-        half *= 0.5
-        steps = np.array([(0.0, a * half, b * half) for a, b in product((-1.0, 1.0), repeat=2)])
-        cells = (fuller[:, None] + steps).reshape(-1, 3)
-    return max(found, int(outer.max(initial=0)))
-
-
-def _first_cells() -> tuple[Array, float]:
-    """Return face, u and v of the first cells' centres, and half of their side."""
     half = 1.0 / FACE_CELLS
     places = np.arange(-1.0 + half, 1.0, 2.0 * half)
-    return np.array(list(product(range(6), places, places))), half
+    squares = np.array(list(product(places, repeat=2)))
+    roots = []
+    for face in _FACES:
+        centres, reach_rad = _centres(face, squares, half)
+        wide = _cosines(radius_rad + reach_rad)
+        for n, (centre, least) in enumerate(zip(centres, wide, strict=True)):
+            roots.append((face, squares[n : n + 1], np.flatnonzero(unit @ centre >= least)))
+    most = 0
+    # The fullest first, as what is known of them settles the others.
+    for face, square, near in sorted(roots, key=lambda root: -len(root[2])):
+        if len(near) > most:
+            most = _most_in(face, square, half, unit[near], radius_rad, most)
+    return most
 
 
-def _centres(cells: Array, half: float) -> tuple[Array, Array]:
+def _most_in(
+    face: Array,
+    squares: Array,
+    half: float,
+    near: Array,
+    radius_rad: float,
+    most: int,
+) -> int:
+    """Return an upper bound for the directions of one cell, or that of the others if larger.
+
+    Parameters
+    ----------
+    face : ndarray of float64, shape (3, 3)
+        The face of the cube.
+    squares : ndarray of float64, shape (1, 2)
+        Middle of the cell on the face.
+    half : float
+        Half of its side.
+    near : ndarray of float64, shape (P, 3)
+        Directions of the stars that are near.
+    radius_rad : float
+        Radians.
+    most : int
+        The bound of the others.
+
+    Returns
+    -------
+    int
+        The larger of both bounds.
+    """
+    inner = _cosines(np.array(radius_rad))
+    while True:
+        half *= 0.5
+        squares = (squares[:, None] + half * _CORNERS).reshape(-1, 2)
+        centres, reach_rad = _centres(face, squares, half)
+        cosine = centres @ near.T
+        count = np.count_nonzero(cosine >= _cosines(radius_rad + reach_rad)[:, None], axis=1)
+        if reach_rad.max() * FINENESS <= radius_rad:
+            return max(most, int(count.max()))
+        most = max(most, int(np.count_nonzero(cosine >= inner, axis=1).max()))
+        squares = squares[count > most]
+        if not len(squares):
+            return most
+
+
+def _cosines(radius_rad: Array) -> Array:
+    return np.asarray(np.cos(np.minimum(radius_rad + SLACK_RAD, np.pi)))
+
+
+def _centres(face: Array, squares: Array, half: float) -> tuple[Array, Array]:
     """Return the directions of the cells' centres, and the angles to their farthest corners."""
-    centres = _directions(cells)
-    reach = np.zeros(len(cells))
-    for a, b in product((-half, half), repeat=2):
-        chord = np.linalg.norm(_directions(cells + (0.0, a, b)) - centres, axis=1)
-        reach = np.maximum(reach, 2.0 * np.arcsin(0.5 * chord))
-    return centres, reach
-
-
-def _directions(cells: Array) -> Array:
-    face = cells[:, 0].astype(np.int64)
-    axis, rows = face // 2, np.arange(len(cells))
-    v = np.empty((len(cells), 3))
-    v[rows, axis] = np.where(face % 2, -1.0, 1.0)
-    v[rows, (axis + 1) % 3], v[rows, (axis + 2) % 3] = cells[:, 1], cells[:, 2]
-    return np.asarray(v / np.linalg.norm(v, axis=1)[:, None])
-
-
-def _counts(
-    u: Array, centres: Array, radius_rad: float, reach_rad: Array
-) -> tuple[int, NDArray[np.int64]]:
-    """Return the fullest circle about a centre, and the stars of each circle with its reach."""
-    fullest, outer = 0, np.zeros(len(centres), dtype=np.int64)
-    wide = np.cos(np.minimum(radius_rad + reach_rad, np.pi))
-    step = max(1, CHUNK // len(u))
-    for start in range(0, len(centres), step):
-        part = slice(start, start + step)
-        cosine = centres[part] @ u.T
-        outer[part] = np.count_nonzero(cosine >= wide[part, None], axis=1)
-        within = np.count_nonzero(cosine >= np.cos(min(radius_rad, np.pi)), axis=1)
-        fullest = max(fullest, int(within.max(initial=0)))
-    return fullest, outer
+    places = np.concatenate([squares[:, None], squares[:, None] + half * _CORNERS], axis=1)
+    v = face[0] + places @ face[1:]
+    v /= np.sqrt(np.einsum("ijk,ijk->ij", v, v))[..., None]
+    chord = v[:, 1:] - v[:, :1]
+    farthest = np.sqrt(np.einsum("ijk,ijk->ij", chord, chord).max(axis=1))
+    return np.ascontiguousarray(v[:, 0]), np.asarray(2.0 * np.arcsin(0.5 * farthest))

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 ByteOrder = Literal["little", "big"]
 BYTE_ORDERS: tuple[ByteOrder, ...] = ("little", "big")
-MARKS: dict[ByteOrder, str] = {"little": "<", "big": ">"}
-"""How numpy calls the byte orders."""
 
 MAGIC = b"STARCAT\0"
 ORDER_WORD = 0x01020304
@@ -227,4 +225,4 @@ def in_order(dtype: np.dtype[Any] | str, byte_order: ByteOrder) -> np.dtype[Any]
     dtype
         With the fields at the same places.
     """
-    return np.dtype(dtype).newbyteorder(MARKS[byte_order])
+    return np.dtype(dtype).newbyteorder(byte_order)
