@@ -271,8 +271,9 @@ def _sorted_features(rows: Rows, u: Array, contents: Contents) -> _Features:
 
 def _ascending(rows: Rows) -> Rows:
     """Return two or three numbers a row in order: sorting so few takes longer."""
-    low, high = rows.min(axis=1), rows.max(axis=1)
-    middle = [rows.sum(axis=1) - low - high] if rows.shape[1] == 3 else []
+    columns = np.ascontiguousarray(rows.T)
+    low, high = columns.min(axis=0), columns.max(axis=0)
+    middle = [columns.sum(axis=0) - low - high] if len(columns) == 3 else []
     return np.stack([low, *middle, high], axis=1)
 
 
