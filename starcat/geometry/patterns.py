@@ -1,4 +1,4 @@
-"""The bins of star patterns: how neighbours about a star are numbered for a look-up.
+"""Star patterns: the area of a triangle, and how neighbours about a star are numbered.
 
 Products number what the catalog has around every star; the matcher numbers what a frame has
 around a centroid, and the two meet only where both count alike. So each rule stands here once.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+Array = NDArray[np.float64]
 Whole = NDArray[np.int64]
 
 
@@ -158,3 +159,36 @@ def cyclic_shifts(pattern: Whole | int, sectors: int) -> Whole:
     shift = np.arange(sectors).reshape(-1, *[1] * np.ndim(pattern))
     every = (1 << sectors) - 1
     return np.asarray((pattern >> shift) | ((pattern << (sectors - shift)) & every))
+
+
+def triangle_area(a: Array, b: Array, c: Array) -> Array:
+    """Return the area of plane triangles from their sides.
+
+    Parameters
+    ----------
+    a, b, c : ndarray of float64, shape (M,)
+        Sides, any unit, in any order.
+
+    Returns
+    -------
+    ndarray of float64, shape (M,)
+        The unit squared; 0 where the sides do not close.
+
+    References
+    ----------
+    Heron's formula in the order of operations of Kahan 2014, which keeps its digits for
+    needle-like triangles.
+
+    Examples
+    --------
+    >>> triangle_area(np.array([3.0]), np.array([5.0]), np.array([4.0]))
+    array([6.])
+    """
+    short, middle, long = np.sort(np.stack([a, b, c]), axis=0)
+    product = (
+        (long + (middle + short))
+        * (short - (long - middle))
+        * (short + (long - middle))
+        * (long + (middle - short))
+    )
+    return np.asarray(0.25 * np.sqrt(np.maximum(product, 0.0)))

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.geometry.kvector import build_kvector
+from starcat.geometry.patterns import triangle_area
 from starcat.geometry.sphere import separation
 from starcat.products.boresights import FieldStars
 from starcat.products.index import Index, kvector_index
@@ -161,36 +162,3 @@ def _distinct_rows(
     is_first[1:] = (rows[1:] != rows[:-1]).any(axis=1)
     first = np.flatnonzero(is_first)
     return rows[first], np.diff(first, append=len(rows))
-
-
-def triangle_area(a: Array, b: Array, c: Array) -> Array:
-    """Return the area of plane triangles from their sides.
-
-    Parameters
-    ----------
-    a, b, c : ndarray of float64, shape (M,)
-        Sides, any unit, in any order.
-
-    Returns
-    -------
-    ndarray of float64, shape (M,)
-        The unit squared; 0 where the sides do not close.
-
-    References
-    ----------
-    Heron's formula in the order of operations of Kahan 2014, which keeps its digits for
-    needle-like triangles.
-
-    Examples
-    --------
-    >>> triangle_area(np.array([3.0]), np.array([5.0]), np.array([4.0]))
-    array([6.])
-    """
-    short, middle, long = np.sort(np.stack([a, b, c]), axis=0)
-    product = (
-        (long + (middle + short))
-        * (short - (long - middle))
-        * (short + (long - middle))
-        * (long + (middle - short))
-    )
-    return np.asarray(0.25 * np.sqrt(np.maximum(product, 0.0)))

@@ -1,0 +1,234 @@
+"""The grid of an onboard image: stars by bands of declination and cells of right ascension.
+
+Bands are of equal height in z, so they hold equal parts of the sky. Nothing here needs an angle
+but the upper bound of the stars that a camera can have in its circle.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+MAX_CELLS = 2**20
+
+BANDS_OF_A_FIELD = 8
+"""So many bands the circle of a camera should cross: fewer hold stars that are not near it."""
+
+FACE_CELLS = 2
+"""Cells along a side of a cube's face when the search for the fullest circle begins."""
+
+FINENESS = 12
+"""Cells are halved until they reach from their centre by one in so many of the radius."""
+
+SLACK_RAD = 1e-5
+"""The radius is so much larger, for who compares in single precision."""
+
+_CORNERS = np.array(list(product((-1.0, 1.0), repeat=2)))
+_FACES = [sign * np.roll(np.eye(3), axis, axis=0) for axis, sign in product(range(3), (1.0, -1.0))]
+"""Of each face of the cube the normal and the two axes in it, by rows."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Numbers of bands and of the sectors of each.
+
+    Attributes
+    ----------
+    bands, sectors : int
+        1 or more.
+    """
+
+    bands: int
+    sectors: int
+
+    @property
+    def n_cells(self) -> int:
+        """Number of cells."""
+        return self.bands * self.sectors
+
+    def cells(self, u: Array) -> NDArray[np.int64]:
+        """Return the cells of directions.
+
+        Parameters
+        ----------
+        u : ndarray of float64, shape (N, 3)
+            ICRS directions.
+
+        Returns
+        -------
+        ndarray of int64, shape (N,)
+            Band times sectors plus sector.
+        """
+        band = np.floor((u[:, 2] + 1.0) / 2.0 * self.bands)
+        sector = np.floor(quarter_turns(u) / 4.0 * self.sectors)
+        band = np.minimum(np.maximum(band, 0.0), self.bands - 1)
+        sector = np.minimum(sector, self.sectors - 1)
+        return np.asarray(band * self.sectors + sector).astype(np.int64)
+
+    def offsets(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the row of the first star of each cell.
+
+        Parameters
+        ----------
+        cells : ndarray of int64, shape (N,)
+            Ascending.
+
+        Returns
+        -------
+        ndarray of int64, shape (n_cells + 1,)
+            The last entry is the number of stars.
+        """
+        first = np.searchsorted(cells, np.arange(self.n_cells + 1), side="left")
+        return np.asarray(first, dtype=np.int64)
+
+
+def quarter_turns(u: Array) -> Array:
+    """Return a number that grows with right ascension, from 0 to 4, without an angle.
+
+    Parameters
+    ----------
+    u : ndarray of float64, shape (N, 3)
+        ICRS directions.
+
+    Returns
+    -------
+    ndarray of float64, shape (N,)
+        0, 1, 2, 3 at right ascension 0, 90, 180, 270 deg; 0 at a pole.
+
+    Examples
+    --------
+    >>> quarter_turns(np.array([[1.0, 0, 0], [0, 1, 0], [-1, -1, 0], [0, 0, 1]]))
+    array([0. , 1. , 2.5, 0. ])
+    """
+    x, y = u[:, 0], u[:, 1]
+    length = np.abs(x) + np.abs(y)
+    t = np.divide(y, length, out=np.zeros(len(u)), where=length > 0.0)
+    second_or_third = ((x <= 0.0) & (y > 0.0)) | (x < 0.0)
+    fourth = (x >= 0.0) & (y < 0.0)
+    turns: Array = np.where(second_or_third, 2.0 - t, np.where(fourth, 4.0 + t, t))
+    return turns
+
+
+def grid_for(n_stars: int, radius_rad: float) -> Grid:
+    """Return a grid of about as many cells as stars, but no finer than a camera has use for.
+
+    Parameters
+    ----------
+    n_stars : int
+        Stars.
+    radius_rad : float
+        Angle from the camera's axis to a corner, radians.
+
+    Returns
+    -------
+    Grid
+        Twice as many sectors as bands, so that cells at the equator are about square.
+    """
+    useful = math.ceil(BANDS_OF_A_FIELD / math.sin(min(radius_rad, 0.5 * math.pi)))
+    largest = math.isqrt(MAX_CELLS // 2)
+    bands = max(1, min(round(math.sqrt(n_stars / 2.0)), useful, largest))
+    return Grid(bands, 2 * bands)
+
+
+def most_near(u: Array, radius_rad: float) -> int:
+    """Return an upper bound of the stars within a radius of any direction.
+
+    Parameters
+    ----------
+    u : ndarray of float64, shape (N, 3)
+        ICRS directions of the stars.
+    radius_rad : float
+        Radians.
+
+    Returns
+    -------
+    int
+        Never too small; too large by what a ring of a twelfth of the radius adds.
+
+    Notes
+    -----
+    The sphere is divided into cells, squares on the faces of a cube. No circle about a direction
+    of a cell holds more stars than the circle about its centre that is wider by what the cell
+    reaches from there. Cells that may hold more than is known of others are divided further.
+    """
+    unit = u / np.sqrt(np.einsum("ij,ij->i", u, u))[:, None]
+    half = 1.0 / FACE_CELLS
+    places = np.arange(-1.0 + half, 1.0, 2.0 * half)
+    squares = np.array(list(product(places, repeat=2)))
+    roots = []
+    for face in _FACES:
+        centres, reach_rad = _centres(face, squares, half)
+        wide = _cosines(radius_rad + reach_rad)
+        for n, (centre, least) in enumerate(zip(centres, wide, strict=True)):
+            roots.append((face, squares[n : n + 1], np.flatnonzero(unit @ centre >= least)))
+    most = 0
+    # The fullest first, as what is known of them settles the others.
+    for face, square, near in sorted(roots, key=lambda root: -len(root[2])):
+        if len(near) > most:
+            most = _most_in(face, square, half, unit[near], radius_rad, most)
+    return most
+
+
+def _most_in(
+    face: Array,
+    squares: Array,
+    half: float,
+    near: Array,
+    radius_rad: float,
+    most: int,
+) -> int:
+    """Return an upper bound for the directions of one cell, or that of the others if larger.
+
+    Parameters
+    ----------
+    face : ndarray of float64, shape (3, 3)
+        The face of the cube.
+    squares : ndarray of float64, shape (1, 2)
+        Middle of the cell on the face.
+    half : float
+        Half of its side.
+    near : ndarray of float64, shape (P, 3)
+        Directions of the stars that are near.
+    radius_rad : float
+        Radians.
+    most : int
+        The bound of the others.
+
+    Returns
+    -------
+    int
+        The larger of both bounds.
+    """
+    inner = _cosines(np.array(radius_rad))
+    while True:
+        half *= 0.5
+        squares = (squares[:, None] + half * _CORNERS).reshape(-1, 2)
+        centres, reach_rad = _centres(face, squares, half)
+        cosine = centres @ near.T
+        count = np.count_nonzero(cosine >= _cosines(radius_rad + reach_rad)[:, None], axis=1)
+        if reach_rad.max() * FINENESS <= radius_rad:
+            return max(most, int(count.max()))
+        most = max(most, int(np.count_nonzero(cosine >= inner, axis=1).max()))
+        squares = squares[count > most]
+        if not len(squares):
+            return most
+
+
+def _cosines(radius_rad: Array) -> Array:
+    return np.asarray(np.cos(np.minimum(radius_rad + SLACK_RAD, np.pi)))
+
+
+def _centres(face: Array, squares: Array, half: float) -> tuple[Array, Array]:
+    """Return the directions of the cells' centres, and the angles to their farthest corners."""
+    places = np.concatenate([squares[:, None], squares[:, None] + half * _CORNERS], axis=1)
+    v = face[0] + places @ face[1:]
+    v /= np.sqrt(np.einsum("ijk,ijk->ij", v, v))[..., None]
+    chord = v[:, 1:] - v[:, :1]
+    farthest = np.sqrt(np.einsum("ijk,ijk->ij", chord, chord).max(axis=1))
+    return np.ascontiguousarray(v[:, 0]), np.asarray(2.0 * np.arcsin(0.5 * farthest))

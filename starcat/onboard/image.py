@@ -1,0 +1,370 @@
+"""Guide stars and their features to the bytes of an onboard image.
+
+Everything that is computed is computed from the directions as the image holds them, so that a
+reader that computes the same finds the same. The same contents give the same bytes.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.errors import ConfigError
+from starcat.geometry.camera import Camera
+from starcat.geometry.patterns import triangle_area
+from starcat.geometry.sphere import separation
+from starcat.onboard.grid import grid_for, most_near
+from starcat.onboard.layout import (
+    BLOCK_BYTES,
+    CRCS_PER_BLOCK,
+    DIRECTION_SCALE,
+    HEADER,
+    HEADER_BYTES,
+    MAG_SCALE,
+    MAG_UNKNOWN,
+    MAGIC,
+    MAX_BYTES,
+    METHOD_NUMBERS,
+    METHODS,
+    NAME_BYTES,
+    ORDER_WORD,
+    RADIUS_RANGE,
+    RADIUS_STEPS,
+    RADIUS_UNKNOWN,
+    SECTION,
+    STARS_OF_FEATURE,
+    VERSION,
+    ByteOrder,
+    Sizes,
+    check_bytes,
+    in_order,
+)
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.integer[Any]]
+
+LINE_MARGIN = 1e-6
+"""The K-vector's line begins and ends this far outside, in units of the largest value: more than
+single precision rounds."""
+
+SMALLEST_MARGIN = 1e-12
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What an image is made of.
+
+    Attributes
+    ----------
+    name : str
+        ``<name>-<version>`` of the artifact.
+    epoch_jyear : float
+        Epoch of the directions, Julian year.
+    camera : Camera
+        Size of the detector and focal length are used.
+    star_id : ndarray of int64, shape (N,)
+        Permanent star numbers.
+    directions : ndarray of float64, shape (N, 3)
+        ICRS unit vectors.
+    mag : ndarray of float64, shape (N,)
+        Magnitudes; NaN where unknown.
+    method : {"triangle", "pyramid"}
+        What the features are.
+    features : ndarray of int, shape (M, 3) or (M, 2)
+        Rows of the stars of each triangle or pair, in any order.
+    manifest_sha256 : bytes
+        32 bytes; zeros where there is no manifest.
+    """
+
+    name: str
+    epoch_jyear: float
+    camera: Camera
+    star_id: NDArray[np.int64]
+    directions: Array
+    mag: Array
+    method: str
+    features: Rows
+    manifest_sha256: bytes = bytes(32)
+
+
+@dataclass(frozen=True)
+class MadeImage:
+    """An image and where its stars are from.
+
+    Attributes
+    ----------
+    data : bytes
+        The image.
+    star_rows : ndarray of int64, shape (N,)
+        The row in the contents of each star of the image.
+    n_features : int
+        Triangles or pairs of the image.
+    most_near : int
+        Upper bound of the stars in the camera's circle.
+    """
+
+    data: bytes
+    star_rows: NDArray[np.int64]
+    n_features: int
+    most_near: int
+
+
+def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImage:
+    """Make the image of guide stars and their triangles or pairs.
+
+    Parameters
+    ----------
+    contents : Contents
+        Stars and features.
+    byte_order : {"little", "big"}
+        That of the target.
+
+    Returns
+    -------
+    MadeImage
+        Pairs longer than the longer side of the detector are not in it.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such method, the name is too long, or the image would be 4 GiB or more.
+    """
+    check_contents(contents)
+    directions = quantised(contents.directions)
+    u = directions / DIRECTION_SCALE
+    grid = grid_for(len(u), contents.camera.radius_rad)
+    cells = grid.cells(u)
+    star_rows = np.lexsort((contents.star_id, cells))
+    place = np.empty(len(u), dtype=np.int64)
+    place[star_rows] = np.arange(len(u))
+    u = u[star_rows]
+    found = _sorted_features(place[contents.features], u, contents)
+    sizes = Sizes(contents.method, len(u), len(found.rows), grid.n_cells)
+    if sizes.total_bytes > MAX_BYTES:
+        raise ConfigError(
+            f"{contents.name}: the image would have {sizes.total_bytes:,} bytes; at most "
+            f"{MAX_BYTES:,} can be said in it. Build a smaller artifact, or pass --max-bytes",
+            key="max_bytes",
+        )
+    kvector, intercept, slope = _kvector(found.values, sizes.n_kvector)
+    quantum_rad = RADIUS_RANGE * contents.camera.diagonal_rad / RADIUS_STEPS
+    near = most_near(u, contents.camera.radius_rad)
+    facts = {
+        "grid_bands": grid.bands,
+        "grid_sectors": grid.sectors,
+        "most_near": near,
+        "kvector_intercept": intercept,
+        "kvector_slope": slope,
+        "radius_quantum_rad": quantum_rad if contents.method == "triangle" else 0.0,
+        "longest_rad": found.longest_rad,
+    }
+    sections = {
+        "directions": directions[star_rows],
+        "magnitudes": _stored_mag(contents.mag[star_rows]),
+        "star_ids": contents.star_id[star_rows],
+        "grid": grid.offsets(cells[star_rows]),
+        "kvector": kvector,
+        "triangles": found.rows,
+        "radii": _stored_radii(found.radii, quantum_rad),
+        "pairs": found.rows,
+    }
+    data = _data(contents, sizes, facts, sections, byte_order)
+    return MadeImage(data + check_blocks(data, byte_order), star_rows, len(found.rows), near)
+
+
+def check_contents(contents: Contents) -> None:
+    """Check what can be wrong with contents that come from a user.
+
+    Parameters
+    ----------
+    contents : Contents
+        Stars and features.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such method, or the name is too long.
+    """
+    if contents.method not in METHODS:
+        raise ConfigError(
+            f"method {contents.method!r} has no onboard image; choose one of {', '.join(METHODS)}",
+            key="method",
+            value=contents.method,
+        )
+    if len(contents.name.encode()) > NAME_BYTES:
+        raise ConfigError(
+            f"{contents.name}: an onboard image has room for names of {NAME_BYTES} bytes; this one "
+            f"has {len(contents.name.encode())}. Build the artifact under a shorter name",
+            key="name",
+            value=contents.name,
+        )
+
+
+def quantised(directions: Array) -> NDArray[np.int64]:
+    """Return directions as the image holds them.
+
+    Parameters
+    ----------
+    directions : ndarray of float64, shape (N, 3)
+        Unit vectors.
+
+    Returns
+    -------
+    ndarray of int64, shape (N, 3)
+        Components times 2147483647, rounded.
+    """
+    return np.rint(np.clip(directions, -1.0, 1.0) * DIRECTION_SCALE).astype(np.int64)
+
+
+def longest_pair_rad(camera: Camera) -> float:
+    """Return the longest pair that an image holds: the angle across the detector's longer side.
+
+    Parameters
+    ----------
+    camera : Camera
+        With its axis in the middle.
+
+    Returns
+    -------
+    float
+        Radians.
+    """
+    half_px = 0.5 * max(camera.width_px, camera.height_px)
+    return float(2.0 * np.arctan(half_px / camera.focal_length_px))
+
+
+@dataclass(frozen=True)
+class _Features:
+    """Features in the order of the image: rows, values, circumradii and the longest side."""
+
+    rows: Rows
+    values: Array
+    radii: Array
+    longest_rad: float
+
+
+def _sorted_features(rows: Rows, u: Array, contents: Contents) -> _Features:
+    """Return the features by their values, and by rows where these are equal."""
+    rows = _ascending(rows.reshape(-1, STARS_OF_FEATURE[contents.method]))
+    if contents.method == "pyramid":
+        values = longest = separation(u[rows[:, 0]], u[rows[:, 1]])
+        radii = np.empty(0)
+        kept = values <= longest_pair_rad(contents.camera)
+        rows, values, longest = rows[kept], values[kept], longest[kept]
+    else:
+        v = [u[rows[:, n]] for n in range(3)]
+        a, b, c = separation(v[1], v[2]), separation(v[0], v[2]), separation(v[0], v[1])
+        values, longest = triangle_area(a, b, c), np.maximum(np.maximum(a, b), c)
+        radii = np.full(len(values), np.inf)
+        np.divide(a * b * c, 4.0 * values, out=radii, where=values > 0.0)
+    order = np.argsort(values)
+    if bool(np.any(np.diff(values[order]) == 0.0)):
+        order = np.lexsort((*rows.T[::-1], values))
+    radii = radii[order] if len(radii) else radii
+    return _Features(rows[order], values[order], radii, float(longest.max(initial=0.0)))
+
+
+def _ascending(rows: Rows) -> Rows:
+    """Return two or three numbers a row in order: sorting so few takes longer."""
+    columns = np.ascontiguousarray(rows.T)
+    low, high = columns.min(axis=0), columns.max(axis=0)
+    middle = [columns.sum(axis=0) - low - high] if len(columns) == 3 else []
+    return np.stack([low, *middle, high], axis=1)
+
+
+def _kvector(values: Array, n_kvector: int) -> tuple[NDArray[np.int64], float, float]:
+    """Return the entries of the K-vector, and intercept and slope of its line."""
+    first, last = (float(values[0]), float(values[-1])) if len(values) else (0.0, 0.0)
+    margin = max(LINE_MARGIN * last, SMALLEST_MARGIN)
+    intercept = first - margin
+    slope = (last + margin - intercept) / (n_kvector - 1)
+    line = intercept + slope * np.arange(n_kvector)
+    return np.searchsorted(values, line, side="right"), intercept, slope
+
+
+def _stored_mag(mag: Array) -> NDArray[np.int64]:
+    known = np.isfinite(mag)
+    steps = np.rint(np.where(known, mag, 0.0) * MAG_SCALE)
+    largest = -MAG_UNKNOWN - 1
+    return np.where(known, np.clip(steps, -largest, largest), MAG_UNKNOWN).astype(np.int64)
+
+
+def _stored_radii(radii: Array, quantum_rad: float) -> NDArray[np.int64]:
+    steps = np.rint(radii / quantum_rad)
+    return np.where(steps <= RADIUS_STEPS, steps, RADIUS_UNKNOWN).astype(np.int64)
+
+
+def _data(
+    contents: Contents,
+    sizes: Sizes,
+    facts: Mapping[str, float],
+    sections: Mapping[str, NDArray[Any]],
+    byte_order: ByteOrder,
+) -> bytes:
+    """Return header, section table and sections, filled to whole blocks."""
+    data, table = bytearray(sizes.data_bytes), sizes.table()
+    header = np.zeros(1, dtype=in_order(HEADER, byte_order))
+    known = {
+        "magic": MAGIC,
+        "byte_order": ORDER_WORD,
+        "version_major": VERSION[0],
+        "version_minor": VERSION[1],
+        "header_bytes": HEADER_BYTES,
+        "total_bytes": sizes.total_bytes,
+        "data_bytes": sizes.data_bytes,
+        "method": METHOD_NUMBERS[sizes.method],
+        "n_stars": sizes.n_stars,
+        "n_features": sizes.n_features,
+        "n_kvector": sizes.n_kvector,
+        "index_bytes": sizes.index_bytes,
+        "n_sections": len(sizes.sections()),
+        "width_px": contents.camera.width_px,
+        "height_px": contents.camera.height_px,
+        "focal_length_px": contents.camera.focal_length_px,
+        "epoch_jyear": contents.epoch_jyear,
+        "block_bytes": BLOCK_BYTES,
+        "manifest_sha256": np.void(contents.manifest_sha256),
+        "name": contents.name.encode(),
+        **facts,
+    }
+    for name, value in known.items():
+        header[name] = value
+    head = header.tobytes() + table.astype(in_order(SECTION, byte_order)).tobytes()
+    data[: len(head)] = head
+    for (name, dtype, shape), entry in zip(sizes.sections(), table, strict=False):
+        stored = sections[name].reshape(shape).astype(in_order(dtype, byte_order))
+        data[int(entry["offset"]) : int(entry["offset"] + entry["bytes"])] = stored.tobytes()
+    return bytes(data)
+
+
+def check_blocks(data: bytes, byte_order: ByteOrder) -> bytes:
+    """Return the check blocks of data.
+
+    Parameters
+    ----------
+    data : bytes
+        Header and sections, in whole blocks.
+    byte_order : {"little", "big"}
+        That of the target.
+
+    Returns
+    -------
+    bytes
+        CRC-32 of each block, of the whole, and of each check block itself.
+    """
+    word = in_order("u4", byte_order)
+    whole = zlib.crc32(data)
+    crcs = np.zeros(check_bytes(len(data)) // BLOCK_BYTES * CRCS_PER_BLOCK, dtype=word)
+    view = memoryview(data)
+    for n, start in enumerate(range(0, len(data), BLOCK_BYTES)):
+        crcs[n] = zlib.crc32(view[start : start + BLOCK_BYTES])
+    blocks = []
+    for of_block in crcs.reshape(-1, CRCS_PER_BLOCK):
+        block = of_block.tobytes() + np.array(whole, dtype=word).tobytes()
+        blocks.append(block + np.array(zlib.crc32(block), dtype=word).tobytes())
+    return b"".join(blocks)

@@ -1,0 +1,228 @@
+"""The layout of an onboard image: header, section table, kinds of sections, sizes.
+
+``docs/onboard-format.md`` says the same in words. All types are here for one byte order, and
+`in_order` gives them for another.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+ByteOrder = Literal["little", "big"]
+BYTE_ORDERS: tuple[ByteOrder, ...] = ("little", "big")
+
+MAGIC = b"STARCAT\0"
+ORDER_WORD = 0x01020304
+VERSION = (1, 0)
+
+HEADER_BYTES = 512
+"""Header and section table."""
+SECTION_ALIGNMENT = 64
+MAX_SECTIONS = 16
+BLOCK_BYTES = 4096
+CRCS_PER_BLOCK = 1022
+NAME_BYTES = 96
+MAX_BYTES = 2**32 - 1
+
+DIRECTION_SCALE = 2147483647
+"""What a component of 1 is stored as."""
+MAG_SCALE = 1000
+MAG_UNKNOWN = -32768
+RADIUS_UNKNOWN = 65535
+"""Circumradii that are larger than any of use."""
+RADIUS_STEPS = 65534
+RADIUS_RANGE = 2.5
+"""The largest circumradius that is told apart, in units of the camera's diagonal."""
+
+METHODS = ("triangle", "pyramid")
+METHOD_NUMBERS = {"triangle": 1, "pyramid": 2}
+STARS_OF_FEATURE = {"triangle": 3, "pyramid": 2}
+
+KINDS = {
+    "directions": 1,
+    "magnitudes": 2,
+    "star_ids": 3,
+    "grid": 4,
+    "kvector": 5,
+    "triangles": 6,
+    "radii": 7,
+    "pairs": 8,
+}
+
+_COMMON = ("directions", "magnitudes", "star_ids", "grid", "kvector")
+SECTIONS = {"triangle": (*_COMMON, "triangles", "radii"), "pyramid": (*_COMMON, "pairs")}
+"""The sections of an image by method, in order."""
+
+HEADER = np.dtype(
+    [
+        ("magic", "S8"),
+        ("byte_order", "u4"),
+        ("version_major", "u2"),
+        ("version_minor", "u2"),
+        ("header_bytes", "u4"),
+        ("total_bytes", "u4"),
+        ("data_bytes", "u4"),
+        ("method", "u4"),
+        ("n_stars", "u4"),
+        ("n_features", "u4"),
+        ("n_kvector", "u4"),
+        ("index_bytes", "u4"),
+        ("grid_bands", "u4"),
+        ("grid_sectors", "u4"),
+        ("most_near", "u4"),
+        ("n_sections", "u4"),
+        ("width_px", "u4"),
+        ("height_px", "u4"),
+        ("focal_length_px", "f8"),
+        ("epoch_jyear", "f8"),
+        ("kvector_intercept", "f8"),
+        ("kvector_slope", "f8"),
+        ("radius_quantum_rad", "f8"),
+        ("longest_rad", "f8"),
+        ("block_bytes", "u4"),
+        ("reserved", "u4"),
+        ("manifest_sha256", "V32"),
+        ("name", f"S{NAME_BYTES}"),
+    ]
+)
+SECTION = np.dtype([("kind", "u4"), ("offset", "u4"), ("bytes", "u4"), ("element_bytes", "u4")])
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """What the size of an image depends on.
+
+    Attributes
+    ----------
+    method : {"triangle", "pyramid"}
+        What the features are.
+    n_stars, n_features, n_cells : int
+        Stars, triangles or pairs, and cells of the grid.
+    """
+
+    method: str
+    n_stars: int
+    n_features: int
+    n_cells: int
+
+    @property
+    def index_bytes(self) -> int:
+        """Size of a star's row number."""
+        return 2 if self.n_stars <= 1 << 16 else 4
+
+    @property
+    def n_kvector(self) -> int:
+        """Entries of the K-vector."""
+        return self.n_features // 4 + 2
+
+    def sections(self) -> list[tuple[str, str, tuple[int, ...]]]:
+        """Return name, dtype and shape of each section, in order.
+
+        Returns
+        -------
+        list of tuple
+            Types of this machine's byte order.
+        """
+        n, m, index = self.n_stars, self.n_features, f"u{self.index_bytes}"
+        every = {
+            "directions": ("i4", (n, 3)),
+            "magnitudes": ("i2", (n,)),
+            "star_ids": ("i8", (n,)),
+            "grid": ("u4", (self.n_cells + 1,)),
+            "kvector": ("u4", (self.n_kvector,)),
+            "triangles": (index, (m, 3)),
+            "radii": ("u2", (m,)),
+            "pairs": (index, (m, 2)),
+        }
+        return [(name, *every[name]) for name in SECTIONS[self.method]]
+
+    def table(self) -> NDArray[Any]:
+        """Return the section table.
+
+        Returns
+        -------
+        ndarray of SECTION, shape (MAX_SECTIONS,)
+            In this machine's byte order; offsets are those of an image of this size.
+        """
+        table = np.zeros(MAX_SECTIONS, dtype=[(name, "u8") for name in SECTION.names or ()])
+        offset = HEADER_BYTES
+        for row, (name, dtype, shape) in enumerate(self.sections()):
+            element = np.dtype(dtype).itemsize * int(np.prod(shape[1:], dtype=np.int64))
+            table[row] = (KINDS[name], offset, element * shape[0], element)
+            offset = rounded_up(offset + element * shape[0], SECTION_ALIGNMENT)
+        return table
+
+    @property
+    def data_bytes(self) -> int:
+        """Size of header and sections, in whole blocks."""
+        table = self.table()
+        return rounded_up(int((table["offset"] + table["bytes"]).max()), BLOCK_BYTES)
+
+    @property
+    def total_bytes(self) -> int:
+        """Size of the image."""
+        return self.data_bytes + check_bytes(self.data_bytes)
+
+
+def check_bytes(data_bytes: int) -> int:
+    """Return the size of the check blocks.
+
+    Parameters
+    ----------
+    data_bytes : int
+        Size of what they check, in whole blocks.
+
+    Returns
+    -------
+    int
+        Bytes.
+
+    Examples
+    --------
+    >>> check_bytes(1023 * 4096)
+    8192
+    """
+    return rounded_up(data_bytes // BLOCK_BYTES, CRCS_PER_BLOCK) // CRCS_PER_BLOCK * BLOCK_BYTES
+
+
+def rounded_up(value: int, step: int) -> int:
+    """Return the next multiple.
+
+    Parameters
+    ----------
+    value, step : int
+        0 or more, and 1 or more.
+
+    Returns
+    -------
+    int
+        ``value`` itself if it is one.
+
+    Examples
+    --------
+    >>> rounded_up(65, 64)
+    128
+    """
+    return -(-value // step) * step
+
+
+def in_order(dtype: np.dtype[Any] | str, byte_order: ByteOrder) -> np.dtype[Any]:
+    """Return a type in a byte order.
+
+    Parameters
+    ----------
+    dtype : dtype or str
+        In any order.
+    byte_order : {"little", "big"}
+        The order.
+
+    Returns
+    -------
+    dtype
+        With the fields at the same places.
+    """
+    return np.dtype(dtype).newbyteorder(byte_order)
