@@ -16,6 +16,8 @@
 
 enum { DIRECTIONS = 1, MAGNITUDES, STAR_IDS, GRID, KVECTOR, TRIANGLES, RADII, PAIRS };
 
+const char *starcat_version(void) { return STARCAT_VERSION; }
+
 static uint16_t u16_at(const uint8_t *bytes, size_t offset) {
   return *(const uint16_t *)(const void *)(bytes + offset);
 }
