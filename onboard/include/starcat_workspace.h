@@ -51,6 +51,11 @@ struct starcat_workspace {
   int16_t before[STARCAT_MAX_CENTROIDS];
   starcat_real match_square[STARCAT_MAX_CENTROIDS];
 
+  /* Stars that each centroid may be by its magnitude; bounds of the ways to assign n of them. */
+  uint16_t compatible[STARCAT_MAX_CENTROIDS];
+  starcat_real log_ways[STARCAT_MAX_CENTROIDS + 1];
+  starcat_real sums[STARCAT_MAX_CENTROIDS + 1];
+
   starcat_agreement found;
   starcat_agreement wider;
   starcat_agreement best;

@@ -7,76 +7,17 @@
 #include "internal.h"
 
 #ifdef STARCAT_SINGLE
-#define LARGE R(1e24)
 #define LEAST_SQUARE R(1e-12)
 #else
-#define LARGE R(1e200)
 #define LEAST_SQUARE R(1e-30)
 #endif
+#define LOG_NEARLY_CERTAIN R(-18.420680743952367) /* of 1e-8 */
+#define LOG_PI R(1.1447298858494001741)
+#define LOG_ALL_ATTITUDES R(4.3689013133786361) /* of 8 pi^2, the volume of the rotations */
+#define NEXT_SHARE R(0.1)
+#define LOG_NEXT_SHARE R(-2.3025850929940456840)
 
 static real larger(real a, real b) { return a > b ? a : b; }
-
-/* A product whose logarithm is taken when it gets too large or too small for a number. */
-typedef struct {
-  real product, logarithm;
-} long_product;
-
-static void times(long_product *p, real factor) {
-  p->product *= factor;
-  if ((p->product > LARGE) || (p->product < R(1.0) / LARGE)) {
-    p->logarithm += STARCAT_LOG(p->product);
-    p->product = R(1.0);
-  }
-}
-
-static real logarithm_of(const long_product *p) { return p->logarithm + STARCAT_LOG(p->product); }
-
-/* Logarithm of the elementary symmetric polynomial of degree n of `count` numbers, the largest of
- * which is `most`: a bound of the ways to choose n of them and a partner for each. */
-static real log_symmetric(const uint16_t *numbers, uint32_t count, uint32_t n, uint16_t most) {
-  real sums[STARCAT_MAX_CENTROIDS + 1];
-  long_product p = {R(1.0), R(0.0)};
-  sums[0] = R(1.0);
-  for (uint32_t k = 1; k <= n; k++) {
-    sums[k] = R(0.0);
-  }
-  for (uint32_t i = 0; i < count; i++) {
-    const real share = (real)numbers[i] / (real)most;
-    for (uint32_t k = n; k > 0u; k--) {
-      sums[k] += share * sums[k - 1u];
-    }
-  }
-  for (uint32_t k = 0; k < n; k++) {
-    times(&p, (real)most);
-  }
-  times(&p, sums[n]);
-  return logarithm_of(&p);
-}
-
-/* Logarithm of a bound of the ways to assign n of the centroids to n stars of like magnitude. */
-static real log_compatible_ways(const sc_call *call, uint32_t n) {
-  starcat_workspace *w = call->work;
-  uint16_t of_centroid[STARCAT_MAX_CENTROIDS];
-  uint16_t *of_star = w->nearest; /* free here */
-  uint16_t most_stars = 1, most_centroids = 1;
-  for (uint32_t j = 0; j < w->n_within; j++) {
-    of_star[j] = 0;
-  }
-  for (uint32_t i = 0; i < w->count; i++) {
-    of_centroid[i] = 0;
-    for (uint32_t j = 0; j < w->n_within; j++) {
-      if (sc_compatible(call, i, w->near_row[w->within[j]])) {
-        of_centroid[i]++;
-        of_star[j]++;
-        most_centroids = of_star[j] > most_centroids ? of_star[j] : most_centroids;
-      }
-    }
-    most_stars = of_centroid[i] > most_stars ? of_centroid[i] : most_stars;
-  }
-  const real a = log_symmetric(of_centroid, w->count, n, most_stars);
-  const real b = log_symmetric(of_star, w->n_within, n, most_centroids);
-  return a < b ? a : b;
-}
 
 /* How places move as the camera turns, summed over the matched centroids: the determinant. */
 static real information_of_places(const sc_call *call) {
@@ -98,33 +39,58 @@ static real information_of_places(const sc_call *call) {
          h[2] * (h[1] * h[4] - h[2] * h[3]);
 }
 
+/* Logarithm of the volume of the unit ball in 2 n - 3 dimensions, where n is at least 2: by
+ * Gamma(k + 1/2) = (2 k)! sqrt(pi) / (4^k k!) with k = n - 1. */
+static real log_unit_ball(uint32_t n) {
+  const uint32_t k = n - 1u;
+  return (real)(k - 1u) * LOG_PI - sc_log_factorial(2u * k) + sc_log_factorial(k) +
+         (real)(2u * k) * R(0.69314718055994530942);
+}
+
+/* Logarithm of the expected number of agreements of n centroids. */
+static real log_expected(const sc_call *call, uint32_t n, real square_px, real log_information) {
+  return call->work->log_ways[n] + LOG_ALL_ATTITUDES + R(3.0) * call->camera.log_focal +
+         R(0.5) * log_information + log_unit_ball(n) +
+         R(0.5) * (real)(2u * n - 3u) * STARCAT_LOG(larger(square_px, LEAST_SQUARE)) -
+         (real)n * call->camera.log_area;
+}
+
+/* Logarithm of the share of the probability that n of `most` stars are allotted where the noise
+ * is stated: most to the number whose agreements are typically just certain, a tenth of it to the
+ * next one, and so on. */
+static real log_share(const sc_call *call, uint32_t n, uint32_t most) {
+  const starcat_camera *c = &call->camera.given;
+  const real log_spread = STARCAT_LOG((c->width_px * c->width_px + c->height_px * c->height_px) /
+                                      (R(12.0) * c->focal_length_px * c->focal_length_px));
+  const real square_px = call->noise_px * call->noise_px;
+  uint32_t typical = SC_MIN_STARS;
+  real total = R(0.0), share = R(1.0);
+  while ((typical < most) &&
+         (log_expected(call, typical, (real)(2u * typical - 3u) * square_px,
+                       R(3.0) * STARCAT_LOG((real)typical) + log_spread) > LOG_NEARLY_CERTAIN)) {
+    typical++;
+  }
+  for (uint32_t distance = 0; distance <= most - SC_MIN_STARS; distance++) {
+    total += share * (real)((uint32_t)(typical >= SC_MIN_STARS + distance) +
+                            (uint32_t)((distance > 0u) && (typical + distance <= most)));
+    share *= NEXT_SHARE;
+  }
+  return (real)(n > typical ? n - typical : typical - n) * LOG_NEXT_SHARE - STARCAT_LOG(total);
+}
+
 /* Logarithm of the bound; 0 if it says nothing. */
-real sc_log_chance(const sc_call *call, real square_px, uint32_t n_matched, uint32_t n_within) {
-  const uint32_t n = n_matched, count = call->work->count;
-  const uint32_t stars = n_within > n ? n_within : n;
+real sc_log_chance(const sc_call *call, real square_px, uint32_t n_matched) {
+  const starcat_workspace *w = call->work;
+  const uint32_t fewer = w->count < w->n_within ? w->count : w->n_within;
+  const int is_stated = call->noise_px > R(0.0);
   const real information = information_of_places(call);
-  long_product ways = {R(1.0), R(0.0)}, rest = {R(1.0), R(0.0)};
   if (!(information > R(0.0))) {
     return R(0.0);
   }
-  times(&rest, R(8.0) * SC_PI * SC_PI * STARCAT_SQRT(information));
-  times(&rest, count > 4u ? (real)(count - 3u) : R(1.0));
-  /* The volume of the unit ball in 2 n - 3 dimensions: of 1 it is 2, of k 2 pi / k that of k - 2. */
-  times(&rest, R(2.0));
-  for (uint32_t k = 0; k < n; k++) {
-    times(&ways, (real)(count - k) * (real)(stars - k) / (real)(k + 1u));
-    if (k >= 2u) {
-      times(&rest, R(2.0) * SC_PI / (real)(2u * k - 1u));
-    }
-  }
-  real log_ways = logarithm_of(&ways);
-  if (call->mag_reach > R(0.0)) {
-    const real compatible = log_compatible_ways(call, n);
-    log_ways = compatible < log_ways ? compatible : log_ways;
-  }
-  const real log_ball = R(0.5) * (real)(2u * n - 3u) * STARCAT_LOG(larger(square_px, LEAST_SQUARE));
-  const real expected = log_ways + logarithm_of(&rest) + R(3.0) * call->camera.log_focal +
-                        log_ball - (real)n * call->camera.log_area;
+  sc_count_ways(call, is_stated ? fewer : n_matched);
+  const real expected = log_expected(call, n_matched, square_px, STARCAT_LOG(information)) -
+                        (is_stated ? log_share(call, n_matched, fewer)
+                                   : -STARCAT_LOG((real)(w->count - 3u)));
   return expected < R(0.0) ? expected : R(0.0);
 }
 

@@ -119,6 +119,7 @@ static void set_limits(sc_call *call, const starcat_options *options) {
   const starcat_workspace *w = call->work;
   call->tolerance_px = options->noise_px > R(0.0) ? SC_SIGMAS_OF_TOLERANCE * options->noise_px
                                                   : options->tolerance_px;
+  call->noise_px = options->noise_px;
   call->tolerance_rad = call->tolerance_px / call->camera.given.focal_length_px;
   call->reach_px = SC_REACH * call->tolerance_px;
   call->mag_reach = w->has_magnitudes != 0u ? SC_MAG_DEVIATIONS * options->noise_mag : R(0.0);

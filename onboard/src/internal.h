@@ -7,8 +7,6 @@
 
 #include "vectors.h"
 
-#define SC_PI R(3.14159265358979323846)
-
 /* Image format, docs/onboard-format.md. */
 #define SC_MAGIC "STARCAT"
 #define SC_VERSION_MAJOR 1u
@@ -52,6 +50,7 @@ typedef struct {
   const starcat_image *image;
   sc_camera camera;
   real tolerance_px, tolerance_rad, reach_px;
+  real noise_px;  /* standard deviation of a centroid on each axis; 0: not stated */
   real mag_reach; /* largest difference of magnitudes of a match; 0: any */
   real log_limit; /* largest accepted chance */
   real log_certain;
@@ -83,8 +82,12 @@ int sc_pixel(const sc_camera *camera, const real body[3], real *x_px, real *y_px
 uint32_t sc_gather(const sc_call *call, const real centre[3], real cos_r, real sin_r,
                    uint32_t most, uint32_t *rows, real (*icrs)[3]);
 
+/* ways.c */
+real sc_log_factorial(uint32_t n);
+void sc_count_ways(const sc_call *call, uint32_t most);
+
 /* chance.c */
-real sc_log_chance(const sc_call *call, real square_px, uint32_t n_matched, uint32_t n_within);
+real sc_log_chance(const sc_call *call, real square_px, uint32_t n_matched);
 real sc_share(const sc_call *call, const real m[9], real residual_rad, uint32_t n_matched);
 int sc_is_scaled(const sc_call *call, uint32_t n_matched);
 

@@ -175,7 +175,7 @@ static real judge(const sc_call *call, const real m[9], uint32_t matched, starca
     }
   }
   found->residual_rad = STARCAT_SQRT(square_rad / (real)matched);
-  found->log_chance = sc_log_chance(call, square_px, matched, w->n_within);
+  found->log_chance = sc_log_chance(call, square_px, matched);
   if (found->log_chance < R(0.0)) {
     if (matched < w->n_within) {
       share = sc_share(call, m, found->residual_rad, matched);
