@@ -35,6 +35,10 @@ class Observation:
     dropped : tuple of (int, str)
         Row and reason of every centroid that is not used: ``not_finite``, ``out_of_frame`` or
         ``duplicate``.
+    noise_px : float or None
+        Standard deviation of a centroid on each axis, where it was stated.
+    noise_mag : float or None
+        Standard deviation of a magnitude in the band of the database, where it was stated.
     """
 
     rows: NDArray[np.int64]
@@ -44,6 +48,8 @@ class Observation:
     camera: Camera
     tolerance_px: float
     dropped: tuple[tuple[int, str], ...] = ()
+    noise_px: float | None = None
+    noise_mag: float | None = None
 
     def __len__(self) -> int:
         """Return the number of usable centroids."""
@@ -68,6 +74,9 @@ def observe(
     camera: Camera,
     tolerance_px: float,
     magnitudes: ArrayLike | None = None,
+    *,
+    noise_px: float | None = None,
+    noise_mag: float | None = None,
 ) -> Observation:
     """Prepare a frame for identification.
 
@@ -80,7 +89,10 @@ def observe(
     tolerance_px : float
         Largest error of a centroid, as a radius.
     magnitudes : array_like of float64, shape (N,), optional
-        Magnitudes with any zero point, larger is fainter; NaN where unknown.
+        Magnitudes, larger is fainter; NaN where unknown. The zero point may be any one, unless
+        ``noise_mag`` is stated.
+    noise_px, noise_mag : float, optional
+        As the attributes of `Observation`.
 
     Returns
     -------
@@ -107,7 +119,9 @@ def observe(
     kept = given[rows]
     known = None if mag is None or not np.isfinite(mag[rows]).any() else mag[rows]
     body = camera.directions_from_pixels(kept)
-    return Observation(rows, kept, body, known, camera, tolerance_px, (*dropped, *repeats))
+    return Observation(
+        rows, kept, body, known, camera, tolerance_px, (*dropped, *repeats), noise_px, noise_mag
+    )
 
 
 def _unusable(given: Array, usable: NDArray[np.bool_]) -> list[tuple[int, str]]:
