@@ -6,7 +6,6 @@ reader that computes the same finds the same. The same contents give the same by
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -18,10 +17,10 @@ from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.geometry.patterns import triangle_area
 from starcat.geometry.sphere import separation
+from starcat.onboard.blocks import check_blocks
 from starcat.onboard.grid import grid_for, most_near
 from starcat.onboard.layout import (
     BLOCK_BYTES,
-    CRCS_PER_BLOCK,
     DIRECTION_SCALE,
     HEADER,
     HEADER_BYTES,
@@ -41,7 +40,6 @@ from starcat.onboard.layout import (
     VERSION,
     ByteOrder,
     Sizes,
-    check_bytes,
     in_order,
 )
 
@@ -340,31 +338,3 @@ def _data(
         stored = sections[name].reshape(shape).astype(in_order(dtype, byte_order))
         data[int(entry["offset"]) : int(entry["offset"] + entry["bytes"])] = stored.tobytes()
     return bytes(data)
-
-
-def check_blocks(data: bytes, byte_order: ByteOrder) -> bytes:
-    """Return the check blocks of data.
-
-    Parameters
-    ----------
-    data : bytes
-        Header and sections, in whole blocks.
-    byte_order : {"little", "big"}
-        That of the target.
-
-    Returns
-    -------
-    bytes
-        CRC-32 of each block, of the whole, and of each check block itself.
-    """
-    word = in_order("u4", byte_order)
-    whole = zlib.crc32(data)
-    crcs = np.zeros(check_bytes(len(data)) // BLOCK_BYTES * CRCS_PER_BLOCK, dtype=word)
-    view = memoryview(data)
-    for n, start in enumerate(range(0, len(data), BLOCK_BYTES)):
-        crcs[n] = zlib.crc32(view[start : start + BLOCK_BYTES])
-    blocks = []
-    for of_block in crcs.reshape(-1, CRCS_PER_BLOCK):
-        block = of_block.tobytes() + np.array(whole, dtype=word).tobytes()
-        blocks.append(block + np.array(zlib.crc32(block), dtype=word).tobytes())
-    return b"".join(blocks)
