@@ -132,7 +132,8 @@ def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImag
     ConfigError
         If there is no such method, the name is too long, or the image would be 4 GiB or more.
     """
-    check_contents(contents)
+    check_method(contents.method)
+    _check_name(contents.name)
     directions = quantised(contents.directions)
     u = directions / DIRECTION_SCALE
     grid = grid_for(len(u), contents.camera.radius_rad)
@@ -175,31 +176,35 @@ def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImag
     return MadeImage(data + check_blocks(data, byte_order), star_rows, len(found.rows), near)
 
 
-def check_contents(contents: Contents) -> None:
-    """Check what can be wrong with contents that come from a user.
+def check_method(method: str) -> None:
+    """Check that there are onboard images for a method.
 
     Parameters
     ----------
-    contents : Contents
-        Stars and features.
+    method : str
+        Its name.
 
     Raises
     ------
     ConfigError
-        If there is no such method, or the name is too long.
+        If there are none.
     """
-    if contents.method not in METHODS:
+    if method not in METHODS:
         raise ConfigError(
-            f"method {contents.method!r} has no onboard image; choose one of {', '.join(METHODS)}",
+            f"method {method!r} has no onboard image; choose one of {', '.join(METHODS)}",
             key="method",
-            value=contents.method,
+            value=method,
         )
-    if len(contents.name.encode()) > NAME_BYTES:
+
+
+def _check_name(name: str) -> None:
+    size = len(name.encode())
+    if size > NAME_BYTES:
         raise ConfigError(
-            f"{contents.name}: an onboard image has room for names of {NAME_BYTES} bytes; this one "
-            f"has {len(contents.name.encode())}. Build the artifact under a shorter name",
+            f"{name}: has {size} bytes; an onboard image has room for names of {NAME_BYTES}. Build "
+            "the artifact under a shorter name",
             key="name",
-            value=contents.name,
+            value=name,
         )
 
 

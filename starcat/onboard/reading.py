@@ -119,6 +119,21 @@ class OnboardImage:
         name = "triangles" if self.method == "triangle" else "pairs"
         return self.sections[name].astype(np.int64)
 
+    def as_dict(self) -> dict[str, Any]:
+        """Return name, numbers and sizes as plain values, for JSON."""
+        return {
+            "name": self.name,
+            "format": self.version,
+            "byte_order": self.byte_order,
+            "method": self.method,
+            "manifest_sha256": self.manifest_sha256,
+            "header": {name: self.header[name] for name in self.header if name != "byte_order"},
+            "sections": {
+                name: {"rows": len(part), "bytes": part.nbytes}
+                for name, part in self.sections.items()
+            },
+        }
+
 
 def read_image(source: bytes | Path) -> OnboardImage:
     """Read an onboard image.
