@@ -7,7 +7,7 @@ expected and what to do next. ``exit_code`` is what the command line returns for
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -249,6 +249,43 @@ class ArtifactMissing(ProductError):  # noqa: N818 - the name reads as the fact
     """No artifact, or no database, at the place that was named."""
 
     exit_code = 3
+
+
+class OnboardImageError(ProductError):
+    """An onboard image that is damaged, cut short, or another file.
+
+    Parameters
+    ----------
+    message : str
+        What was found, what was expected, what to do.
+    path : Path, optional
+        The file.
+    bad_blocks : sequence of int
+        Numbers of the damaged blocks of 4096 bytes, where they are known.
+    """
+
+    def __init__(
+        self, message: str, *, path: Path | None = None, bad_blocks: Sequence[int] = ()
+    ) -> None:
+        super().__init__(message, path=path)
+        self.bad_blocks = tuple(bad_blocks)
+
+
+class OnboardSizeError(StarcatError):
+    """An onboard image that cannot be made as small as was asked for.
+
+    Parameters
+    ----------
+    message : str
+        What was asked for, what it would take.
+    max_bytes, smallest_bytes : int
+        The size that was asked for, and the smallest one that is possible.
+    """
+
+    def __init__(self, message: str, *, max_bytes: int, smallest_bytes: int) -> None:
+        super().__init__(message)
+        self.max_bytes = max_bytes
+        self.smallest_bytes = smallest_bytes
 
 
 class QueryError(StarcatError):

@@ -35,6 +35,7 @@ LIGHT = {
     "starcat.errors",
     "starcat.storage.hdf5",
     *(f"starcat.geometry.{name}" for name in GEOMETRY),
+    *(f"starcat.onboard.{name}" for name in ("blocks", "grid", "image", "layout")),
 }
 """What a small machine carries along with the matcher."""
 

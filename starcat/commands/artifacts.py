@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from starcat.commands.shared import Input, Json, chosen_spec, inputs_by_source
-from starcat.errors import ProductError
+from starcat.errors import ConfigError, ProductError
 
 app = typer.Typer()
 
@@ -55,13 +55,21 @@ def build(
 
 @app.command()
 def inspect(
-    artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
+    artifact: Annotated[
+        Path, typer.Argument(help="The folder <name>-<version>, or an onboard image.")
+    ],
     json: Json = False,
 ) -> None:
-    """Say what an artifact holds and what it was made from.
+    """Say what an artifact or an onboard image holds and what it was made from.
 
     Example: starcat inspect dist/gaia-12deg-1.0.0
     """
+    if artifact.is_file():
+        from starcat.onboard.reading import read_image
+        from starcat.terminal.onboard import print_image
+
+        print_image(read_image(artifact), as_json=json)
+        return
     from starcat.artifact.reader import open_artifact
     from starcat.terminal.builds import print_artifact
 
@@ -88,19 +96,32 @@ def coverage(
 
 @app.command()
 def verify(
-    artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
+    artifact: Annotated[
+        Path, typer.Argument(help="The folder <name>-<version>, or an onboard image.")
+    ],
+    against: Annotated[
+        Path | None, typer.Option(help="The artifact that an onboard image should be of.")
+    ] = None,
     json: Json = False,
 ) -> None:
-    """Check an artifact: digests, schemas, rows, orders, indices, references, counts.
+    """Check an artifact or an onboard image: digests, contents, orders, indices, references.
 
     Exits with 5 if anything is wrong.
 
     Example: starcat verify dist/gaia-12deg-1.0.0
     """
-    from starcat.artifact.verify import verify_artifact
     from starcat.terminal.artifacts import print_verification
 
-    found = verify_artifact(artifact)
+    if artifact.is_file():
+        from starcat.exchange.onboard import verify_image
+
+        found = verify_image(artifact, against)
+    elif against is not None:
+        raise ConfigError(f"--against is for an onboard image; {artifact} is none", key="against")
+    else:
+        from starcat.artifact.verify import verify_artifact
+
+        found = verify_artifact(artifact)
     print_verification(found, as_json=json)
     if found.findings:
         raise typer.Exit(ProductError.exit_code)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,6 +15,9 @@ if TYPE_CHECKING:
     from starcat.exchange.tables import NamedTables
 
 app = typer.Typer()
+
+ONBOARD_FORMATS = ("onboard", "c")
+"""The formats of `export` that are no tables."""
 
 
 @app.command()
@@ -27,14 +31,22 @@ def export(
     form: Annotated[
         str,
         typer.Option(
+            "--to",
             "--format",
             metavar="FORMAT",
-            help="csv, json, parquet, votable, fits, ecsv, npz or hats.",
+            help="csv, json, parquet, votable, fits, ecsv, npz or hats; onboard or c for flight "
+            "software.",
         ),
     ] = "csv",
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="Folder to put one file a product into.")
-    ] = Path("export"),
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            help="Folder to put one file a product into, default: export; for onboard and c the "
+            "file, default: <name>-<version>.img or .c.",
+        ),
+    ] = None,
     product: Annotated[
         list[str] | None, typer.Option(help="Product of an artifact; default: all. Repeatable.")
     ] = None,
@@ -43,26 +55,77 @@ def export(
     ] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace files that differ.")] = False,
     max_partition_rows: Annotated[
-        int, typer.Option(min=1, help="Stars in a file of HATS, at most.")
-    ] = 1_000_000,
+        int | None, typer.Option(min=1, help="Stars in a file of HATS; default: 1,000,000.")
+    ] = None,
+    method: Annotated[
+        str | None, typer.Option(help="onboard, c: triangle or pyramid; default: triangle.")
+    ] = None,
+    endian: Annotated[
+        str | None, typer.Option(help="onboard, c: of the target, little or big; default: little.")
+    ] = None,
+    max_bytes: Annotated[
+        int | None, typer.Option(min=1, help="onboard, c: size of the image; default: no limit.")
+    ] = None,
     json: Json = False,
 ) -> None:
-    """Write tables in a format of other tools: one file a product, units where it has them.
+    """Write tables for other tools, one file a product, or an image for flight software.
 
-    Example: starcat export dist/gaia-12deg-1.0.0 --format fits -o fits
+    Examples: starcat export dist/gaia-12deg-1.0.0 --to fits -o fits
+
+    starcat export dist/gaia-12deg-1.0.0 --to onboard -o db.img
     """
+    of_images: dict[str, object] = {"method": method, "endian": endian, "max_bytes": max_bytes}
+    of_tables: dict[str, object] = {"product": product, "from_peer": from_peer}
+    of_hats: dict[str, object] = {"max_partition_rows": max_partition_rows}
+    if form in ONBOARD_FORMATS:
+        _refuse(form, of_tables | of_hats)
+        _export_image(source, form, output, of_images, replace=replace, as_json=json)
+        return
+    _refuse(form, of_images if form == "hats" else of_images | of_hats)
     from starcat.exchange.export import export_tables
+    from starcat.exchange.hats import MAX_ROWS
     from starcat.terminal.exports import print_exported
 
     exported = export_tables(
         _tables(source, from_peer),
         form,
-        output,
+        output or Path("export"),
         products=product,
         replace=replace,
-        max_partition_rows=max_partition_rows,
+        max_partition_rows=max_partition_rows or MAX_ROWS,
     )
     print_exported(exported, as_json=json)
+
+
+def _export_image(
+    source: Path | None,
+    form: str,
+    output: Path | None,
+    options: dict[str, Any],
+    *,
+    replace: bool,
+    as_json: bool,
+) -> None:
+    from starcat.exchange.onboard import export_image
+    from starcat.terminal.onboard import print_exported_image
+
+    given = {name: value for name, value in options.items() if value is not None}
+    exported = export_image(_named(source), form, output, replace=replace, **given)
+    print_exported_image(exported, as_json=as_json)
+
+
+def _refuse(form: str, options: Mapping[str, object]) -> None:
+    """Refuse options that a format has no use for."""
+    for name, value in options.items():
+        if value is not None:
+            option = f"--{name.replace('_', '-')}"
+            raise ConfigError(f"{option} means nothing with --to {form}; leave it out", key=name)
+
+
+def _named(source: Path | None) -> Path:
+    if source is None:
+        raise ConfigError("say what to export: an artifact's folder or a Parquet file")
+    return source
 
 
 def _tables(source: Path | None, peer: str | None) -> NamedTables:
@@ -71,6 +134,4 @@ def _tables(source: Path | None, peer: str | None) -> NamedTables:
 
     if peer is not None:
         return peer_tables(peer, source)
-    if source is None:
-        raise ConfigError("say what to export: an artifact's folder or a Parquet file")
-    return tables_of(source)
+    return tables_of(_named(source))

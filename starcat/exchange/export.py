@@ -153,7 +153,8 @@ def _check_asked(file_format: str, folder: Path) -> None:
     """Refuse what cannot be done before anything is read."""
     if file_format not in EXPORT_FORMATS:
         raise ConfigError(
-            f"format {file_format!r} is unknown; choose one of {', '.join(EXPORT_FORMATS)}",
+            f"format {file_format!r} is unknown; choose one of {', '.join(EXPORT_FORMATS)}, or "
+            "onboard or c",
             key="to",
             value=file_format,
         )

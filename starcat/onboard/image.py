@@ -6,7 +6,6 @@ reader that computes the same finds the same. The same contents give the same by
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -18,10 +17,10 @@ from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.geometry.patterns import triangle_area
 from starcat.geometry.sphere import separation
+from starcat.onboard.blocks import check_blocks
 from starcat.onboard.grid import grid_for, most_near
 from starcat.onboard.layout import (
     BLOCK_BYTES,
-    CRCS_PER_BLOCK,
     DIRECTION_SCALE,
     HEADER,
     HEADER_BYTES,
@@ -41,7 +40,6 @@ from starcat.onboard.layout import (
     VERSION,
     ByteOrder,
     Sizes,
-    check_bytes,
     in_order,
 )
 
@@ -134,7 +132,8 @@ def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImag
     ConfigError
         If there is no such method, the name is too long, or the image would be 4 GiB or more.
     """
-    check_contents(contents)
+    check_method(contents.method)
+    _check_name(contents.name)
     directions = quantised(contents.directions)
     u = directions / DIRECTION_SCALE
     grid = grid_for(len(u), contents.camera.radius_rad)
@@ -177,31 +176,35 @@ def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImag
     return MadeImage(data + check_blocks(data, byte_order), star_rows, len(found.rows), near)
 
 
-def check_contents(contents: Contents) -> None:
-    """Check what can be wrong with contents that come from a user.
+def check_method(method: str) -> None:
+    """Check that there are onboard images for a method.
 
     Parameters
     ----------
-    contents : Contents
-        Stars and features.
+    method : str
+        Its name.
 
     Raises
     ------
     ConfigError
-        If there is no such method, or the name is too long.
+        If there are none.
     """
-    if contents.method not in METHODS:
+    if method not in METHODS:
         raise ConfigError(
-            f"method {contents.method!r} has no onboard image; choose one of {', '.join(METHODS)}",
+            f"method {method!r} has no onboard image; choose one of {', '.join(METHODS)}",
             key="method",
-            value=contents.method,
+            value=method,
         )
-    if len(contents.name.encode()) > NAME_BYTES:
+
+
+def _check_name(name: str) -> None:
+    size = len(name.encode())
+    if size > NAME_BYTES:
         raise ConfigError(
-            f"{contents.name}: an onboard image has room for names of {NAME_BYTES} bytes; this one "
-            f"has {len(contents.name.encode())}. Build the artifact under a shorter name",
+            f"{name}: has {size} bytes; an onboard image has room for names of {NAME_BYTES}. Build "
+            "the artifact under a shorter name",
             key="name",
-            value=contents.name,
+            value=name,
         )
 
 
@@ -340,31 +343,3 @@ def _data(
         stored = sections[name].reshape(shape).astype(in_order(dtype, byte_order))
         data[int(entry["offset"]) : int(entry["offset"] + entry["bytes"])] = stored.tobytes()
     return bytes(data)
-
-
-def check_blocks(data: bytes, byte_order: ByteOrder) -> bytes:
-    """Return the check blocks of data.
-
-    Parameters
-    ----------
-    data : bytes
-        Header and sections, in whole blocks.
-    byte_order : {"little", "big"}
-        That of the target.
-
-    Returns
-    -------
-    bytes
-        CRC-32 of each block, of the whole, and of each check block itself.
-    """
-    word = in_order("u4", byte_order)
-    whole = zlib.crc32(data)
-    crcs = np.zeros(check_bytes(len(data)) // BLOCK_BYTES * CRCS_PER_BLOCK, dtype=word)
-    view = memoryview(data)
-    for n, start in enumerate(range(0, len(data), BLOCK_BYTES)):
-        crcs[n] = zlib.crc32(view[start : start + BLOCK_BYTES])
-    blocks = []
-    for of_block in crcs.reshape(-1, CRCS_PER_BLOCK):
-        block = of_block.tobytes() + np.array(whole, dtype=word).tobytes()
-        blocks.append(block + np.array(zlib.crc32(block), dtype=word).tobytes())
-    return b"".join(blocks)

@@ -1,0 +1,281 @@
+"""An artifact as an onboard image or as C source, and images held against their artifacts."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.artifact.manifest import MANIFEST_NAME
+from starcat.artifact.reader import Artifact, open_artifact
+from starcat.artifact.verify import Finding, Verification, check_artifact
+from starcat.catalog.stars import directions_of, floats_of
+from starcat.errors import ConfigError, OnboardImageError, OutputError
+from starcat.onboard.c_source import c_header, c_source
+from starcat.onboard.checking import artifact_problems, capacity_problems, value_problems
+from starcat.onboard.fit import Fitted, fit
+from starcat.onboard.image import Contents, MadeImage, check_method, make_image
+from starcat.onboard.layout import BLOCK_BYTES, BYTE_ORDERS, ByteOrder
+from starcat.onboard.reading import bytes_of_file, read_image
+from starcat.pipeline.recipes import tile_guide_stars
+from starcat.products.boresights import FieldStars
+from starcat.specs.reading import spec_from_dict
+from starcat.storage.atomic import whole_file
+
+PRODUCTS = {"triangle": ("triangles", "ijk"), "pyramid": ("pairs", "ij")}
+"""The product that each method's features are from, and its columns of rows."""
+
+
+@dataclass(frozen=True)
+class ExportedImage:
+    """An onboard image as it was written.
+
+    Attributes
+    ----------
+    made : MadeImage
+        The image.
+    fitted : Fitted
+        What is in it, and what was left out.
+    file_format : {"onboard", "c"}
+        What was written.
+    byte_order : {"little", "big"}
+        That of the target.
+    files : tuple of Path
+        The image, or source and header.
+    """
+
+    made: MadeImage
+    fitted: Fitted
+    file_format: str
+    byte_order: str
+    files: tuple[Path, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        fitted = self.fitted
+        return {
+            "source": fitted.contents.name,
+            "format": self.file_format,
+            "method": fitted.contents.method,
+            "endian": self.byte_order,
+            "files": [str(path) for path in self.files],
+            "image_bytes": len(self.made.data),
+            "stars": fitted.stars,
+            "stars_in_artifact": fitted.stars_before,
+            "stars_per_field": fitted.stars_per_field,
+            "features": fitted.features,
+            "features_without_limit": fitted.features_before,
+            "most_near": self.made.most_near,
+        }
+
+
+def export_image(
+    artifact: Path,
+    file_format: str,
+    output: Path | None = None,
+    *,
+    method: str = "triangle",
+    endian: str = "little",
+    max_bytes: int | None = None,
+    replace: bool = False,
+) -> ExportedImage:
+    """Write the onboard image of an artifact.
+
+    Parameters
+    ----------
+    artifact : Path
+        The folder ``<name>-<version>``; it is verified first.
+    file_format : {"onboard", "c"}
+        The image, or C source with a header beside it.
+    output : Path, optional
+        The file; by default ``<name>-<version>.img`` or ``.c``.
+    method : {"triangle", "pyramid"}
+        What the image is for.
+    endian : {"little", "big"}
+        Byte order of the target.
+    max_bytes : int, optional
+        Size of the image at most.
+    replace : bool, default False
+        Whether files that differ may be replaced.
+
+    Returns
+    -------
+    ExportedImage
+        The files and what is in them.
+
+    Raises
+    ------
+    ConfigError
+        If an option is wrong, or the artifact lacks the product of the method.
+    ProductError
+        If the artifact is damaged.
+    OnboardSizeError
+        If the image cannot be made so small.
+    OutputError
+        If a file cannot be written, or is there and differs.
+    """
+    check_method(method)
+    order = next((known for known in BYTE_ORDERS if known == endian), None)
+    if order is None:
+        raise ConfigError(
+            f"--endian {endian!r}: choose {' or '.join(BYTE_ORDERS)}",
+            key="endian",
+            value=endian,
+        )
+    opened = open_artifact(artifact)
+    suffix = ".c" if file_format == "c" else ".img"
+    target = output or Path(f"{_name(opened)}{suffix}")
+    if file_format == "c" and target.suffix != ".c":
+        raise ConfigError(f"--output {target}: C source has a name that ends with .c", key="output")
+    if target.is_dir():
+        raise OutputError(f"{target}: is a folder; choose a file with --output", path=target)
+    contents = contents_of(opened, method)
+    check_artifact(artifact)
+    fitted = fit(contents, _times_seen(opened, method), partial(_fields, opened), max_bytes)
+    made = make_image(fitted.contents, order)
+    files = {target: made.data}
+    if file_format == "c":
+        files = _c_files(made, fitted.contents.name, target, order)
+    _write(files, replace=replace)
+    return ExportedImage(made, fitted, file_format, order, tuple(files))
+
+
+def contents_of(artifact: Artifact, method: str) -> Contents:
+    """Return what the image of an artifact is made of.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        Open.
+    method : {"triangle", "pyramid"}
+        What the features are.
+
+    Returns
+    -------
+    Contents
+        All stars, and all triangles or pairs.
+
+    Raises
+    ------
+    ConfigError
+        If the artifact lacks the product of the method.
+    """
+    product, columns = PRODUCTS[method]
+    if product not in artifact.products:
+        raise ConfigError(
+            f"{_name(artifact)} has no product {product!r}, which an image for the method {method} "
+            f"is made of; set products.{product}.enabled = true in its spec and build it again, or "
+            "choose another --method",
+            key="method",
+            value=method,
+        )
+    stars, features = artifact.table("stars"), artifact.table(product)
+    manifest = artifact.manifest
+    spec = spec_from_dict(manifest["spec"], MANIFEST_NAME)
+    return Contents(
+        name=_name(artifact),
+        epoch_jyear=float(manifest["epoch_jyear"]),
+        camera=spec.camera.camera(),
+        star_id=stars["star_id"].to_numpy(),
+        directions=directions_of(stars),
+        mag=floats_of(stars, "mag"),
+        method=method,
+        features=np.stack([features[name].to_numpy() for name in columns], axis=-1),
+        manifest_sha256=hashlib.sha256((artifact.folder / MANIFEST_NAME).read_bytes()).digest(),
+    )
+
+
+def verify_image(path: Path, against: Path | None = None) -> Verification:
+    """Check an onboard image: its blocks, its parts, and what its artifact says.
+
+    Parameters
+    ----------
+    path : Path
+        The image.
+    against : Path, optional
+        The folder of the artifact that it should be of.
+
+    Returns
+    -------
+    Verification
+        With every problem; of a damaged image the blocks, as nothing in them is to be trusted.
+
+    Raises
+    ------
+    ArtifactMissing
+        If there is no such file, or no such artifact.
+    OnboardImageError
+        If the file cannot be read.
+    SchemaVersionError
+        If it is of a version of the format that this starcat does not read.
+    ProductError
+        If the artifact is damaged.
+    """
+    artifact = None if against is None else check_artifact(against)
+    data = bytes_of_file(path)
+    checks, findings = 1, list(_damage(data, path.name))
+    if not findings:
+        image = read_image(data)
+        problems = [*value_problems(image), *capacity_problems(image)]
+        checks += 5
+        if artifact is not None:
+            problems += artifact_problems(image, contents_of(artifact, image.method))
+            checks += 7
+        findings = [Finding(path.name, "", problem) for problem in problems]
+    return Verification(path, checks, tuple(findings))
+
+
+def _damage(data: bytes, file: str) -> Iterator[Finding]:
+    """Yield what keeps an image from being read."""
+    try:
+        read_image(data)
+    except OnboardImageError as error:
+        for block in error.bad_blocks:
+            where = f"bytes {block * BLOCK_BYTES} to {(block + 1) * BLOCK_BYTES - 1}"
+            yield Finding(file, "", f"block {block}: damaged ({where})")
+        if not error.bad_blocks:
+            yield Finding(file, "", str(error))
+
+
+def _name(artifact: Artifact) -> str:
+    return f"{artifact.manifest['name']}-{artifact.manifest['version']}"
+
+
+def _times_seen(artifact: Artifact, method: str) -> NDArray[np.int32] | None:
+    """Return the boresights that see each triangle; None for pairs, which no one counts."""
+    if method != "triangle":
+        return None
+    seen: NDArray[np.int32] = artifact.table("triangles")["times_seen"].to_numpy()
+    return seen
+
+
+def _fields(artifact: Artifact) -> FieldStars:
+    """Return the tiling of an artifact's stars, all stars of each field."""
+    spec = spec_from_dict(artifact.manifest["spec"], MANIFEST_NAME)
+    return tile_guide_stars(artifact.table("stars"), spec)
+
+
+def _c_files(made: MadeImage, name: str, target: Path, byte_order: ByteOrder) -> dict[Path, bytes]:
+    """Return source and header by their paths."""
+    header = target.with_suffix(".h")
+    source = c_source(name, made.data, byte_order, header.name)
+    return {target: source.encode(), header: c_header(name, len(made.data)).encode()}
+
+
+def _write(files: Mapping[Path, bytes], *, replace: bool) -> None:
+    """Write files that are not there yet, all or none."""
+    for path, data in files.items():
+        if path.exists() and not replace and not (path.is_file() and path.read_bytes() == data):
+            raise OutputError(
+                f"{path} already exists and differs; choose another --output, or pass --replace",
+                path=path,
+            )
+    for path, data in files.items():
+        with whole_file(path) as unfinished:
+            unfinished.write_bytes(data)

@@ -1,0 +1,180 @@
+"""Checks of an onboard image: what its numbers say of each other, and what its artifact says.
+
+Everything is computed again from directions and rows. Functions yield what is wrong, in words.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.geometry.patterns import triangle_area
+from starcat.geometry.sphere import separation
+from starcat.onboard.image import Contents, quantised
+from starcat.onboard.layout import MAG_SCALE, RADIUS_STEPS, RADIUS_UNKNOWN
+from starcat.onboard.reading import OnboardImage
+
+Array = NDArray[np.float64]
+
+VALUE_TOLERANCE = 1e-12
+"""What a machine may round otherwise than another one, square radians and radians."""
+
+RADIUS_TOLERANCE = 1e-3
+"""What a circumradius may lie beside half a quantum: that of a flat triangle has few digits."""
+
+MAX_PRODUCTS = 20_000_000
+
+
+def value_problems(image: OnboardImage) -> Iterator[str]:
+    """Yield where values, K-vector, circumradii and longest side are not those of the stars.
+
+    Parameters
+    ----------
+    image : OnboardImage
+        As `read_image` returns it.
+
+    Yields
+    ------
+    str
+        What is wrong; nothing for a sound image.
+    """
+    values, radii, longest = _values(image)
+    if (np.diff(values) < -VALUE_TOLERANCE).any():
+        yield f"section {_features(image)}: not by ascending value"
+        return
+    counts = image.sections["kvector"].astype(np.int64)
+    line = image.header["kvector_intercept"] + image.header["kvector_slope"] * np.arange(
+        len(counts), dtype=np.float64
+    )
+    fenced = np.concatenate([[-np.inf], values, [np.inf]])
+    below, above = fenced[counts] - line, fenced[counts + 1] - line
+    if (below > VALUE_TOLERANCE).any() or (above < -VALUE_TOLERANCE).any():
+        yield "section kvector: not the numbers of values below its line"
+    if "radii" in image.sections:
+        steps = radii / image.header["radius_quantum_rad"]
+        stored = image.sections["radii"].astype(np.float64)
+        near = np.abs(stored - steps) <= 0.5 + RADIUS_TOLERANCE * np.maximum(1.0, steps)
+        large = (stored == RADIUS_UNKNOWN) & (steps > RADIUS_STEPS)
+        if not (near | large).all():
+            row = int(np.flatnonzero(~(near | large))[0])
+            yield f"section radii: row {row} is {stored[row]:.0f}; expected {steps[row]:.1f}"
+    if longest > image.header["longest_rad"] + VALUE_TOLERANCE:
+        yield f"longest_rad is {image.header['longest_rad']:.9g}; a side has {longest:.9g} rad"
+
+
+def capacity_problems(image: OnboardImage) -> Iterator[str]:
+    """Yield where a circle about a star holds more stars than the header says one can.
+
+    Parameters
+    ----------
+    image : OnboardImage
+        As `read_image` returns it.
+
+    Yields
+    ------
+    str
+        What is wrong.
+    """
+    u = image.directions
+    if not len(u):
+        return
+    least = np.cos(image.camera.radius_rad)
+    tried = u[:: max(1, len(u) ** 2 // MAX_PRODUCTS)]
+    step = max(1, 1_000_000 // len(u))
+    most = max(
+        int(np.count_nonzero(tried[n : n + step] @ u.T >= least, axis=1).max())
+        for n in range(0, len(tried), step)
+    )
+    if most > image.header["most_near"]:
+        yield f"most_near is {image.header['most_near']}; {most} stars are near one of them"
+
+
+def artifact_problems(image: OnboardImage, contents: Contents) -> Iterator[str]:
+    """Yield where an image is not of an artifact.
+
+    Parameters
+    ----------
+    image : OnboardImage
+        As `read_image` returns it.
+    contents : Contents
+        Of the artifact, for the method of the image.
+
+    Yields
+    ------
+    str
+        What is wrong. An image may have fewer stars and features than its artifact.
+    """
+    digest = contents.manifest_sha256.hex()
+    if image.manifest_sha256 != digest:
+        yield (
+            f"the sha256 of its manifest begins with {image.manifest_sha256[:12]}; that of "
+            f"{contents.name} with {digest[:12]}"
+        )
+    camera = (image.camera.width_px, image.camera.height_px, image.camera.focal_length_px)
+    theirs = contents.camera
+    for name, ours, other in (
+        ("name", image.name, contents.name),
+        ("epoch", image.header["epoch_jyear"], contents.epoch_jyear),
+        ("camera", camera, (theirs.width_px, theirs.height_px, theirs.focal_length_px)),
+    ):
+        if ours != other:
+            yield f"{name} is {ours}; the artifact says {other}"
+    order = np.argsort(contents.star_id)
+    numbers = image.star_id
+    place = np.searchsorted(contents.star_id[order], numbers)
+    row = order[np.minimum(place, len(order) - 1)] if len(order) else place
+    missing = contents.star_id[row] != numbers if len(order) else np.ones(len(row), dtype=bool)
+    if missing.any():
+        named = ", ".join(map(str, numbers[missing][:5].tolist()))
+        yield f"{int(missing.sum())} stars are not in the artifact: {named}"
+        return
+    yield from _star_problems(image, contents, row)
+    features = np.sort(row[image.features], axis=1)
+    if not _in_rows(features, np.sort(contents.features, axis=1), len(order)).all():
+        yield f"section {_features(image)}: not all of them are in the artifact"
+
+
+def _star_problems(
+    image: OnboardImage, contents: Contents, row: NDArray[np.int64]
+) -> Iterator[str]:
+    """Yield where directions or magnitudes of stars differ by more than their quantum."""
+    moved = (image.sections["directions"] != quantised(contents.directions[row])).any(axis=1)
+    if moved.any():
+        worst = separation(image.directions[moved], contents.directions[row][moved]).max()
+        yield (
+            f"section directions: {int(moved.sum())} stars lie elsewhere than in the artifact, by "
+            f"up to {np.degrees(worst) * 3600.0:.4g} arcsec"
+        )
+    ours, theirs = image.mag, contents.mag[row]
+    far = ~(np.abs(ours - theirs) <= 0.5 / MAG_SCALE + 1e-9)
+    far &= ~(np.isnan(ours) & ~np.isfinite(theirs)) & ~(np.abs(theirs) > 32.7)
+    if far.any():
+        yield f"section magnitudes: {int(far.sum())} stars have another one in the artifact"
+
+
+def _in_rows(found: NDArray[np.int64], known: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
+    """Return which rows are among others; rows are numbers below a count."""
+    if count**3 < 2**62:
+        scale = count ** np.arange(found.shape[1])
+        return np.isin(found @ scale, known @ scale)
+    _, group = np.unique(np.concatenate([known, found]), axis=0, return_inverse=True)
+    return np.isin(group.ravel()[len(known) :], group.ravel()[: len(known)])
+
+
+def _features(image: OnboardImage) -> str:
+    return "triangles" if image.method == "triangle" else "pairs"
+
+
+def _values(image: OnboardImage) -> tuple[Array, Array, float]:
+    """Return values and circumradii of the features, and the longest side."""
+    u = image.directions[image.features]
+    if image.method == "pyramid":
+        apart = separation(u[:, 0], u[:, 1])
+        return apart, np.empty(0), float(apart.max(initial=0.0))
+    sides = np.stack([separation(u[:, a], u[:, b]) for a, b in ((1, 2), (0, 2), (0, 1))])
+    area = triangle_area(*sides)
+    radii = np.full(len(area), np.inf)
+    np.divide(sides.prod(axis=0), 4.0 * area, out=radii, where=area > 0.0)
+    return area, radii, float(sides.max(initial=0.0))
