@@ -25,6 +25,7 @@ typedef struct {
   const double *magnitudes;
   const double *q_prior;
   double uncertainty_rad;
+  const double *directions;
 } starcat_frames;
 typedef struct {
   int32_t status;

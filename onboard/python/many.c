@@ -5,6 +5,7 @@
  */
 #include <time.h>
 
+#include "internal.h"
 #include "many.h"
 
 static double now_s(void) {
@@ -15,6 +16,32 @@ static double now_s(void) {
   (void)timespec_get(&now, TIME_UTC);
 #endif
   return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
+}
+
+/* Fit the attitude once more, with directions that were not rounded. */
+static void fit_again(const double *directions, const starcat_workspace *work,
+                      starcat_result *result) {
+  double body[STARCAT_MAX_CENTROIDS][3] = {{0}}, icrs[STARCAT_MAX_CENTROIDS][3] = {{0}};
+  double square = 0.0;
+  uint32_t n = 0;
+  for (uint32_t i = 0; i < work->count; i++) {
+    if (work->best.star[i] >= 0) {
+      for (size_t k = 0; k < 3u; k++) {
+        body[n][k] = work->body[i][k];
+        icrs[n][k] = directions[3u * (size_t)work->best.star[i] + k];
+      }
+      n++;
+    }
+  }
+  sc_refine(result->matrix, &body[0][0], &icrs[0][0], NULL, n, 4);
+  sc_quaternion(result->matrix, result->q_body_from_icrs);
+  sc_matrix(result->q_body_from_icrs, result->matrix);
+  for (uint32_t i = 0; i < n; i++) {
+    double turned[3];
+    sc_turn(result->matrix, icrs[i], turned);
+    square += sc_chord_square(body[i], turned);
+  }
+  result->residual_rad = sqrt(square / (double)n);
 }
 
 void starcat_many(const starcat_image *image, const starcat_camera *camera,
@@ -41,6 +68,9 @@ void starcat_many(const starcat_image *image, const starcat_camera *camera,
       stars[start + i] = result->star[i];
     }
     if (status == STARCAT_IDENTIFIED) {
+      if (frames->directions != NULL) {
+        fit_again(frames->directions, work, result);
+      }
       answer->n_matched = (int32_t)result->n_matched;
       answer->residual_rad = result->residual_rad;
       answer->log_chance = result->log_chance;

@@ -16,6 +16,7 @@ typedef struct {
   const double *magnitudes; /* null: none known */
   const double *q_prior;    /* four a frame; null: lost in space */
   double uncertainty_rad;
+  const double *directions; /* of the image's stars before they were rounded; null: the image's */
 } starcat_frames;
 
 /* The answer to one frame. */

@@ -86,7 +86,8 @@ static void take_usable(const sc_call *call, const starcat_frame *frame, starcat
     result->star[i] = STARCAT_NO_STAR;
     if (!is_finite(x) || !is_finite(y)) {
       result->star[i] = STARCAT_DROPPED_NOT_FINITE;
-    } else if ((x < R(0.0)) || (x > camera->width_px) || (y < R(0.0)) || (y > camera->height_px)) {
+    } else if ((x < R(0.0)) || (x >= camera->width_px) || (y < R(0.0)) ||
+               (y >= camera->height_px)) {
       result->star[i] = STARCAT_DROPPED_OUT_OF_FRAME;
     } else if ((frame->magnitudes != NULL) && is_finite(frame->magnitudes[i])) {
       w->has_magnitudes = 1;
@@ -189,10 +190,8 @@ starcat_status sc_end(const sc_call *call, const starcat_options *options, starc
   if ((w->best.n_matched < SC_MIN_STARS) || !(w->best.log_chance <= call->log_limit)) {
     return w->steps_left == 0u ? STARCAT_E_BUDGET : STARCAT_NO_MATCH;
   }
-  for (uint32_t k = 0; k < 9u; k++) {
-    result->matrix[k] = w->best.matrix[k];
-  }
   sc_quaternion(w->best.matrix, result->q_body_from_icrs);
+  sc_matrix(result->q_body_from_icrs, result->matrix);
   result->residual_rad = w->best.residual_rad;
   result->log_chance = w->best.log_chance;
   result->n_matched = w->best.n_matched;

@@ -18,9 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.errors import ProductError
+from starcat.errors import ConfigError, ProductError
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
+from starcat.matcher.result import Status
 from starcat.onboard.image import Contents, make_image
 
 try:
@@ -39,7 +40,7 @@ MAX_STEPS = 2_000_000_000
 CHUNK = 256
 """Frames that one thread takes at a time."""
 
-WORDS = {0: "identified", 1: "no_match", 2: "too_few_stars", -14: "no_match"}
+WORDS: dict[int, Status] = {0: "identified", 1: "no_match", 2: "too_few_stars", -14: "no_match"}
 """What a frame came to, by the number that the library returns. The last one is a budget that
 was used up."""
 
@@ -71,13 +72,14 @@ class Limits:
     ----------
     tolerance_px : float
         Largest error of a centroid, as a radius.
-    noise_mag : float
-        Standard deviation of the magnitudes; 0 where it is not stated.
+    noise_px, noise_mag : float
+        Standard deviations of a centroid on each axis and of a magnitude; 0 where not stated.
     max_false_match_probability : float
         Answers that chance would give more often than this are withheld.
     """
 
     tolerance_px: float
+    noise_px: float
     noise_mag: float
     max_false_match_probability: float
 
@@ -134,6 +136,9 @@ class FastMatcher:
         The image.
     rows : ndarray of int64, shape (N,), optional
         Row of the database for each star of the image; the image's own rows by default.
+    directions : ndarray of float64, shape (N, 3), optional
+        Directions of the image's stars before they were rounded, for attitudes without that
+        error; the image's own by default, as in flight.
 
     Raises
     ------
@@ -141,7 +146,12 @@ class FastMatcher:
         If the library does not open the image.
     """
 
-    def __init__(self, data: bytes, rows: NDArray[np.int64] | None = None) -> None:
+    def __init__(
+        self,
+        data: bytes,
+        rows: NDArray[np.int64] | None = None,
+        directions: Array | None = None,
+    ) -> None:
         ffi, lib = _onboard.ffi, _onboard.lib
         # Memory of numpy begins at a multiple of 16, as the library wants it; bytes need not.
         words = np.zeros(-(-len(data) // 8), dtype=np.uint64)
@@ -154,6 +164,7 @@ class FastMatcher:
             )
         count = int(self._image.n_stars)
         own = np.arange(count) if rows is None else rows
+        self._directions = directions
         # Numbers below 0 say why a centroid has no star; they index this table from its end.
         self._rows = np.concatenate([own, [-4, -3, -2, -1]]).astype(np.int32)
 
@@ -208,7 +219,7 @@ class FastMatcher:
         px = np.concatenate(frames) if frames else np.empty((0, 2))
         x, y = (np.ascontiguousarray(px[:, axis]) for axis in (0, 1))
         mag = None if magnitudes is None else np.concatenate([*magnitudes, np.empty(0)])
-        work = _Work(self._image, camera, limits, x, y, mag, priors)
+        work = _Work(self._image, self._directions, camera, limits, x, y, mag, priors)
         found = np.zeros(len(frames), dtype=ANSWER), np.full(len(px), -1, dtype=np.int32)
         answers = Answers(starts, *found)
         slices = [range(n, min(n + CHUNK, len(frames))) for n in range(0, len(frames), CHUNK)]
@@ -226,6 +237,7 @@ class _Work:
     """What the calls for the parts of many frames share."""
 
     image: Any
+    directions: Array | None
     camera: Camera
     limits: Limits
     x: Array
@@ -243,15 +255,16 @@ class _Work:
             ("double[]", self.y),
             ("double[]", self.mag),
             ("double[]", None if prior is None else prior[part.start :]),
+            ("double[]", self.directions),
         )
-        pointers = [
+        *pointers, directions = (
             ffi.NULL if array is None else ffi.from_buffer(kind, array) for kind, array in arrays
-        ]
+        )
         lib.starcat_many(
             self.image,
             _camera(self.camera),
             _options(self.limits),
-            ffi.new("starcat_frames *", [len(part), *pointers, uncertainty_rad]),
+            ffi.new("starcat_frames *", [len(part), *pointers, uncertainty_rad, directions]),
             ffi.from_buffer("starcat_answer[]", answers.frames[part.start :]),
             ffi.from_buffer("int32_t[]", answers.star_index),
             *_memory(),
@@ -288,15 +301,16 @@ def _camera(camera: Camera) -> Any:
 
 def _options(limits: Limits) -> Any:
     chance = math.log(max(limits.max_false_match_probability, 1e-300))
-    options = [limits.tolerance_px, 0.0, limits.noise_mag, chance, MAX_STEPS]
+    stated = limits.noise_px, limits.noise_mag
+    options = [limits.tolerance_px, *stated, chance, MAX_STEPS]
     return _onboard.ffi.new("starcat_options *", options)
 
 
-MOST_FEATURES = 100_000_000
-"""An image of more triangles or pairs would hardly fit into 4 GiB."""
+MOST_FEATURES = 4_000_000
+"""Triangles or pairs of a database that are made an image unasked: that takes a second."""
 
 
-def fast_matcher(database: Database, method: str) -> FastMatcher | None:
+def fast_matcher(database: Database, method: str, always: bool = True) -> FastMatcher | None:
     """Return the fast path of a database, made once.
 
     Parameters
@@ -305,6 +319,8 @@ def fast_matcher(database: Database, method: str) -> FastMatcher | None:
         With the product that the method needs.
     method : str
         A key of `METHODS`.
+    always : bool, default True
+        Whether an image is made however long that takes.
 
     Returns
     -------
@@ -314,15 +330,17 @@ def fast_matcher(database: Database, method: str) -> FastMatcher | None:
     """
     if _onboard is None or method not in FEATURES:
         return None
-    made = _made_triangle if method == "triangle" else _made_pyramid
-    return database.derived(made)
+    product, columns = FEATURES[method]
+    if not always and len(database.products[product][columns[0]]) > MOST_FEATURES:
+        return None
+    return database.derived(_of_triangles if method == "triangle" else _of_pairs)
 
 
-def _made_triangle(database: Database) -> FastMatcher | None:
+def _of_triangles(database: Database) -> FastMatcher | None:
     return _made(database, "triangle")
 
 
-def _made_pyramid(database: Database) -> FastMatcher | None:
+def _of_pairs(database: Database) -> FastMatcher | None:
     return _made(database, "pyramid")
 
 
@@ -330,20 +348,21 @@ def _made(database: Database, method: str) -> FastMatcher | None:
     product, columns = FEATURES[method]
     arrays = database.products[product]
     features = np.stack([arrays[column] for column in columns], axis=-1)
-    if len(features) > MOST_FEATURES:
-        return None
-    made = make_image(
-        Contents(
-            database.name,
-            database.epoch_jyear,
-            database.camera,
-            database.star_id,
-            database.directions,
-            database.mag,
-            method,
-            features,
-        )
+    contents = Contents(
+        database.name,
+        database.epoch_jyear,
+        database.camera,
+        database.star_id,
+        database.directions,
+        database.mag,
+        method,
+        features,
     )
+    try:
+        made = make_image(contents)
+    except ConfigError:  # larger than an image can say
+        return None
     if made.most_near > int(_onboard.lib.STARCAT_MAX_STARS):
         return None
-    return FastMatcher(made.data, made.star_rows)
+    exact = np.ascontiguousarray(database.directions[made.star_rows])
+    return FastMatcher(made.data, made.star_rows, exact)

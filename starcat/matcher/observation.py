@@ -105,13 +105,7 @@ def observe(
     ValueError
         If the centroids are not pairs of numbers, or the magnitudes are not one a centroid.
     """
-    given = np.asarray(centroids_px, dtype=np.float64)
-    given = given.reshape(0, 2) if given.size == 0 else given
-    if given.ndim != 2 or given.shape[1] != 2:
-        raise ValueError(f"centroids_px has shape {given.shape}; expected (N, 2)")
-    mag = None if magnitudes is None else np.asarray(magnitudes, dtype=np.float64)
-    if mag is not None and mag.shape != (len(given),):
-        raise ValueError(f"magnitudes have shape {mag.shape}; expected ({len(given)},)")
+    given, mag = as_frame(centroids_px, magnitudes)
     usable = camera.contains(given)
     rows, dropped = np.flatnonzero(usable), _unusable(given, usable)
     rows = rows[_own_order(given[rows], None if mag is None else mag[rows], camera)]
@@ -122,6 +116,40 @@ def observe(
     return Observation(
         rows, kept, body, known, camera, tolerance_px, (*dropped, *repeats), noise_px, noise_mag
     )
+
+
+def as_frame(
+    centroids_px: ArrayLike, magnitudes: ArrayLike | None = None
+) -> tuple[Array, Array | None]:
+    """Return what a caller gives as arrays.
+
+    Parameters
+    ----------
+    centroids_px : array_like of float64, shape (N, 2)
+        Pixels.
+    magnitudes : array_like of float64, shape (N,), optional
+        One a centroid.
+
+    Returns
+    -------
+    centroids_px : ndarray of float64, shape (N, 2)
+        The same.
+    magnitudes : ndarray of float64, shape (N,), or None
+        The same.
+
+    Raises
+    ------
+    ValueError
+        If the centroids are not pairs of numbers, or the magnitudes are not one a centroid.
+    """
+    given = np.asarray(centroids_px, dtype=np.float64)
+    given = given.reshape(0, 2) if given.size == 0 else given
+    if given.ndim != 2 or given.shape[1] != 2:
+        raise ValueError(f"centroids_px has shape {given.shape}; expected (N, 2)")
+    mag = None if magnitudes is None else np.asarray(magnitudes, dtype=np.float64)
+    if mag is not None and mag.shape != (len(given),):
+        raise ValueError(f"magnitudes have shape {mag.shape}; expected ({len(given)},)")
+    return given, mag
 
 
 def _unusable(given: Array, usable: NDArray[np.bool_]) -> list[tuple[int, str]]:
