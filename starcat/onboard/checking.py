@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 VALUE_TOLERANCE = 1e-12
 """What a machine may round otherwise than another one, square radians and radians."""
 
-RADIUS_TOLERANCE = 1e-3
-"""What a circumradius may lie beside half a quantum: that of a flat triangle has few digits."""
+RADIUS_TOLERANCE = 1e-6
+"""The same of circumradii, as a part of them."""
 
 MAX_PRODUCTS = 20_000_000
 
@@ -54,12 +54,12 @@ def value_problems(image: OnboardImage) -> Iterator[str]:
         yield "section kvector: not the numbers of values below its line"
     if "radii" in image.sections:
         steps = radii / image.header["radius_quantum_rad"]
+        expected = np.where(steps < RADIUS_STEPS + 0.5, steps, RADIUS_UNKNOWN)
         stored = image.sections["radii"].astype(np.float64)
-        near = np.abs(stored - steps) <= 0.5 + RADIUS_TOLERANCE * np.maximum(1.0, steps)
-        large = (stored == RADIUS_UNKNOWN) & (steps > RADIUS_STEPS)
-        if not (near | large).all():
-            row = int(np.flatnonzero(~(near | large))[0])
-            yield f"section radii: row {row} is {stored[row]:.0f}; expected {steps[row]:.1f}"
+        far = np.flatnonzero(np.abs(stored - expected) > 0.5 + RADIUS_TOLERANCE * expected)
+        if len(far):
+            found, wanted = stored[far[0]], expected[far[0]]
+            yield f"section radii: row {far[0]} is {found:.0f}; expected {wanted:.1f}"
     if longest > image.header["longest_rad"] + VALUE_TOLERANCE:
         yield f"longest_rad is {image.header['longest_rad']:.9g}; a side has {longest:.9g} rad"
 

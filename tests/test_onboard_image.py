@@ -1,0 +1,449 @@
+"""Onboard images: made from any sky they read back as they were, and no damage goes unseen."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from starcat.errors import ConfigError, OnboardImageError, OnboardSizeError, SchemaVersionError
+from starcat.geometry.camera import Camera
+from starcat.geometry.sphere import separation
+from starcat.onboard.blocks import check_blocks, data_blocks, scrub
+from starcat.onboard.c_source import c_header, c_source, c_symbol
+from starcat.onboard.checking import artifact_problems, capacity_problems, value_problems
+from starcat.onboard.fit import LEAST_SHARE, fit
+from starcat.onboard.grid import Grid, grid_for, most_near
+from starcat.onboard.image import Contents, longest_pair_rad, make_image
+from starcat.onboard.layout import BYTE_ORDERS, HEADER, Sizes, check_bytes, in_order
+from starcat.onboard.reading import read_image
+from starcat.products.boresights import tile_sphere
+from starcat.products.pairs import find_pairs
+from starcat.products.triangles import find_triangles
+
+CAMERA = Camera(1024, 768, fov_x_deg=20.0)
+
+
+def sky(count: int, seed: int, method: str = "triangle", n_features: int = 50) -> Contents:
+    """Return stars anywhere, poles and equal directions included, and features of any of them."""
+    generator = np.random.default_rng(seed)
+    u = generator.normal(size=(count, 3))
+    special = np.array([[0, 0, 1], [0, 0, -1], [-1, 0, 0], [1, -1e-11, 0], [0, 1, 0], [0, 1, 0]])
+    u[: len(special)] = special[:count]
+    mag = generator.uniform(-1.5, 9.0, count)
+    mag[::7] = np.nan
+    width = 3 if method == "triangle" else 2
+    n_features = n_features if count >= width else 0
+    rows = [generator.choice(count, width, replace=False) for _ in range(n_features)]
+    return Contents(
+        name="sky-1.0.0",
+        epoch_jyear=2026.5,
+        camera=CAMERA,
+        star_id=generator.permutation(10**12 + np.arange(count)),
+        directions=u / np.linalg.norm(u, axis=1)[:, None],
+        mag=mag,
+        method=method,
+        features=np.array(rows, dtype=np.int32).reshape(-1, width),
+        manifest_sha256=bytes(range(32)),
+    )
+
+
+@pytest.fixture(scope="module")
+def real() -> tuple[Contents, np.ndarray]:
+    """A sky of 1,500 stars with the triangles that a build makes of it, and how often each is seen.
+
+    Nothing is left of a frame's stars that a build would not put in.
+    """
+    stars = sky(1500, 5, n_features=0)
+    fields = tile_sphere(500, stars.directions, np.nan_to_num(stars.mag, nan=9.0), CAMERA)
+    made = find_triangles(fields, stars.directions, 8)
+    features = np.stack([made.i, made.j, made.k], axis=-1)
+    return replace(stars, features=features), made.times_seen
+
+
+@given(
+    st.integers(0, 40),
+    st.integers(0, 99),
+    st.sampled_from(["triangle", "pyramid"]),
+    st.sampled_from(BYTE_ORDERS),
+    st.integers(0, 12),
+)
+def test_any_sky_reads_back(count, seed, method, byte_order, n_features):
+    contents = sky(count, seed, method, n_features)
+    made = make_image(contents, byte_order)
+    image = read_image(made.data)
+    assert (image.byte_order, image.method, image.name) == (byte_order, method, "sky-1.0.0")
+    assert image.header["epoch_jyear"] == 2026.5
+    assert image.camera == CAMERA
+    assert image.manifest_sha256 == bytes(range(32)).hex()
+    assert sorted(made.star_rows.tolist()) == list(range(count))
+    np.testing.assert_array_equal(image.star_id, contents.star_id[made.star_rows])
+    theirs = contents.directions[made.star_rows]
+    np.testing.assert_allclose(image.directions, theirs, rtol=0, atol=0.51 / 2147483647)
+    np.testing.assert_allclose(image.mag, contents.mag[made.star_rows], rtol=0, atol=0.000501)
+    features = made.star_rows[image.features]
+    u = contents.directions[contents.features]
+    is_near = np.ones(len(u), dtype=bool)
+    if method == "pyramid":
+        is_near = separation(u[:, 0], u[:, 1]) <= longest_pair_rad(CAMERA)
+    expected = np.sort(contents.features[is_near], axis=1)
+    assert sorted(np.sort(features, axis=1).tolist()) == sorted(expected.tolist())
+    assert not [*value_problems(image), *capacity_problems(image)]
+    assert not list(artifact_problems(image, contents))
+    assert not scrub(made.data)
+
+
+def test_the_same_contents_give_the_same_bytes_in_any_order_of_features():
+    contents = sky(100, 3)
+    made = make_image(contents).data
+    turned = replace(contents, features=contents.features[::-1, ::-1])
+    assert make_image(turned).data == made
+    assert make_image(contents, "big").data != made
+
+
+def test_equal_values_go_by_rows():
+    contents = sky(12, 1, n_features=0)
+    pair = np.array([[4, 6], [5, 6], [4, 7], [5, 7]])  # 4 and 5 are at the same place
+    image = read_image(make_image(replace(contents, method="pyramid", features=pair)).data)
+    u = image.directions[image.features]
+    apart = separation(u[:, 0], u[:, 1])
+    for a, b in zip(range(len(apart)), range(1, len(apart)), strict=False):
+        assert (apart[a], *image.features[a]) < (apart[b], *image.features[b])
+
+
+def test_more_stars_than_two_bytes_can_count():
+    count = 65_538
+    contents = replace(sky(count, 8, n_features=0), features=np.arange(count).reshape(-1, 3))
+    image = read_image(make_image(contents, "big").data)
+    assert image.header["index_bytes"] == 4
+    assert image.sections["triangles"].dtype == np.dtype(">u4")
+    assert image.features.max() == 65_537
+    assert not list(artifact_problems(image, contents))
+
+
+def test_a_name_that_is_too_long_is_refused():
+    contents = replace(sky(5, 1), name="a" * 91 + "-1.0.0")
+    with pytest.raises(
+        ConfigError, match="has 97 bytes; an onboard image has room for names of 96"
+    ):
+        make_image(contents)
+    assert read_image(make_image(replace(contents, name="a" * 90 + "-1.0.0")).data).name
+
+
+def test_any_flipped_bit_is_found_and_its_block_named(real):
+    sound = make_image(real[0], "big").data
+    n_blocks = len(sound) // 4096
+    assert n_blocks > 30
+    generator = np.random.default_rng(2000)
+    ends = [0, 8, 20, 24, len(sound) - 1, len(sound) - 4, data_blocks(len(sound)) * 4096]
+    for at in [*ends, *generator.integers(0, len(sound), 2000).tolist()]:
+        damaged = bytearray(sound)
+        damaged[at] ^= 1 << int(generator.integers(8))
+        assert scrub(bytes(damaged)) == [at // 4096], at
+    with pytest.raises(OnboardImageError, match=r"damaged in 1 of \d+ blocks of 4096 bytes: \d+;"):
+        read_image(bytes(damaged))
+
+
+@pytest.mark.parametrize("blocks", [1, 1022, 1023, 2045])
+def test_check_blocks_are_told_from_data_by_the_size(blocks):
+    data = bytes(blocks * 4096)
+    whole = data + check_blocks(data, "little")
+    assert len(whole) == len(data) + check_bytes(len(data))
+    assert data_blocks(len(whole)) == blocks
+    assert scrub(whole) == []
+    assert scrub(whole[:-4096] + b"\1" + whole[-4095:]) == [len(whole) // 4096 - 1]
+    assert scrub(whole + b"\0") == [len(whole) // 4096]
+
+
+def sealed(image: bytes, name: str, value: int | float) -> bytes:
+    """Return an image with another number in its header, and CRCs that fit."""
+    head = np.frombuffer(image, in_order(HEADER, "little"), 1).copy()
+    head[name] = value
+    data = head.tobytes() + image[HEADER.itemsize : data_blocks(len(image)) * 4096]
+    return data + check_blocks(data, "little")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("n_stars", 70_000, "index_bytes is 2; expected 4"),
+        ("n_stars", 29, "most_near|grid|section"),
+        ("n_stars", 31, "section directions: 360 bytes"),
+        ("n_features", 49, "section|n_kvector"),
+        ("n_kvector", 3, "n_kvector is 3; expected 14"),
+        ("total_bytes", 4096, "total_bytes is 4096; expected 8192"),
+        ("data_bytes", 8192, "data_bytes is 8192; it does not fit"),
+        ("data_bytes", 0, "data_bytes is 0"),
+        ("header_bytes", 256, "header_bytes is 256; expected 512"),
+        ("method", 3, "method is 3; expected 1 or 2"),
+        ("method", 2, "section pairs: there 0 times"),
+        ("grid_bands", 0, "grid_bands is 0; expected 1 to"),
+        ("grid_bands", 2**31, "grid_bands is 2147483648"),
+        ("grid_sectors", 9, "section grid"),
+        ("most_near", 31, "most_near is 31; expected 0 to 30"),
+        ("n_sections", 17, "n_sections is 17"),
+        ("width_px", 0, "width_px is 0"),
+        ("focal_length_px", 0.0, "focal_length_px is 0.0; expected more than 0"),
+        ("focal_length_px", float("nan"), "focal_length_px is nan; expected a finite number"),
+        ("kvector_slope", -1.0, "kvector_slope is -1.0"),
+        ("longest_rad", float("inf"), "longest_rad is inf"),
+    ],
+)
+def test_numbers_that_contradict_each_other_are_refused(name, value, words):
+    image = make_image(sky(30, 1)).data
+    with pytest.raises(OnboardImageError, match=words) as refused:
+        read_image(sealed(image, name, value))
+    assert "export it again" in str(refused.value)
+
+
+def test_another_major_version_is_refused_and_a_later_minor_one_is_read():
+    image = make_image(sky(30, 1)).data
+    with pytest.raises(SchemaVersionError, match=r"format 2\.0; this starcat reads 1\.x"):
+        read_image(sealed(image, "version_major", 2))
+    assert read_image(sealed(image, "version_minor", 7)).version == "1.7"
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"", "not an onboard image: begins with ''"),
+        (b"SIMPLE  =                    T", "begins with 'SIMPLE  '"),
+        (b"STARCAT\0" + bytes(100), "cut short: 108 bytes"),
+        (b"STARCAT\0" + bytes(4096 * 3 - 8), "its header says 0"),
+        (make_image(sky(30, 1)).data[:-1], r"8,191 bytes; its header says 8,192"),
+        (make_image(sky(300, 1, n_features=5000)).data[:-8192], "its header says"),
+    ],
+)
+def test_what_is_no_image_or_not_all_of_one_is_refused(data, words):
+    with pytest.raises(OnboardImageError, match=words):
+        read_image(data)
+
+
+def place_of(image: bytes, section: str) -> int:
+    """Return where a section begins."""
+    read = read_image(image)
+    contents = Sizes(
+        read.method,
+        int(read.header["n_stars"]),
+        int(read.header["n_features"]),
+        len(read.sections["grid"]) - 1,
+    )
+    names = [name for name, _, _ in contents.sections()]
+    return int(contents.table()["offset"][names.index(section)])
+
+
+@pytest.mark.parametrize(
+    ("section", "at", "words"),
+    [
+        ("triangles", 0, "section triangles: row"),
+        ("grid", 0, "section grid: does not ascend from 0 to 30"),
+        ("kvector", 0, "section kvector: does not ascend from 0 to 50"),
+        ("directions", 2, "section directions: not all of length 1"),
+    ],
+)
+def test_rows_and_orders_that_cannot_be_are_refused(section, at, words):
+    image = bytearray(make_image(sky(30, 1)).data)
+    image[place_of(bytes(image), section) + at] ^= 0x7F
+    data = bytes(image[: data_blocks(len(image)) * 4096])
+    with pytest.raises(OnboardImageError, match=words):
+        read_image(data + check_blocks(data, "little"))
+
+
+@pytest.mark.parametrize(
+    ("section", "mask", "words"),
+    [
+        ("radii", 0x40, "section radii: row "),
+        ("kvector", None, "section kvector: not the numbers of values below its line"),
+    ],
+)
+def test_values_that_are_not_those_of_the_stars_are_found(real, section, mask, words):
+    image = make_image(real[0]).data
+    read, place = read_image(image), place_of(image, section)
+    array = read.sections[section].copy()
+    if mask is None:
+        array[1:-1] = array[2:]  # still ascends, and says too much of every step
+    else:
+        array[len(array) // 2] ^= mask
+    data = image[:place] + array.tobytes() + image[place + array.nbytes :]
+    data = data[: data_blocks(len(data)) * 4096]
+    changed = read_image(data + check_blocks(data, "little"))
+    assert [problem for problem in value_problems(changed) if words in problem]
+
+
+def test_a_header_that_says_too_little_is_found(real):
+    image = make_image(real[0]).data
+    near = read_image(sealed(image, "most_near", 3))
+    assert next(capacity_problems(near)).startswith("most_near is 3; ")
+    short = read_image(sealed(image, "longest_rad", 0.01))
+    assert next(value_problems(short)).startswith("longest_rad is 0.01; a side has 0.")
+
+
+def test_an_image_of_another_artifact_is_found(real):
+    contents = real[0]
+    image = read_image(make_image(contents).data)
+    assert not [*artifact_problems(image, contents)]
+
+    def said(**changes: object) -> str:
+        return " ".join(artifact_problems(image, replace(contents, **changes)))  # type: ignore[arg-type]
+
+    assert "the sha256 of its manifest begins with 000102" in said(manifest_sha256=bytes(32))
+    assert "epoch is 2026.5; the artifact says 2000.0" in said(epoch_jyear=2000.0)
+    assert "name is sky-1.0.0" in said(name="sky-2.0.0")
+    assert "camera is (1024, 768," in said(camera=Camera(1024, 768, 4000.0))
+    assert "1500 stars are not in the artifact: " in said(star_id=contents.star_id + 10**9)
+    moved = contents.directions + 1e-8
+    moved /= np.linalg.norm(moved, axis=1)[:, None]
+    assert "stars lie elsewhere than in the artifact, by up to 0.00" in said(directions=moved)
+    assert "magnitudes: 1285 stars have another one" in said(mag=contents.mag + 0.002)
+    fewer = contents.features[1:]
+    assert "section triangles: not all of them are in the artifact" in said(features=fewer)
+
+
+def test_the_grid_covers_the_sky_and_knows_its_corners():
+    grid = Grid(4, 8)
+    u = np.array([[0, 0, -1.0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
+    assert grid.cells(u).tolist() == [0, 24, 16, 18, 20, 22]
+    almost = np.array([[1.0, -1e-12, 0.0], [1.0, -1e-300, 0.0]])
+    assert grid.cells(almost).tolist() == [23, 23]
+    assert grid_for(0, 0.1) == Grid(1, 2)
+    assert grid_for(10**9, 1e-6).n_cells <= 2**20
+
+
+@pytest.mark.parametrize(("count", "radius_deg"), [(1, 5.0), (300, 10.0), (2000, 3.0), (200, 70.0)])
+def test_no_circle_holds_more_stars_than_the_bound(count, radius_deg, random_directions):
+    u = random_directions(count, 11)
+    u[: count // 3] = u[0] + 0.05 * u[: count // 3]  # a cluster
+    u /= np.linalg.norm(u, axis=1)[:, None]
+    radius_rad = np.radians(radius_deg)
+    bound = most_near(u, radius_rad)
+    # The fullest circle has two stars on its edge: all such circles are tried, and more.
+    tried = np.concatenate([u, random_directions(5000, 12), _edge_centres(u[:150], radius_rad)])
+    most = max(
+        int(np.count_nonzero(part @ u.T >= np.cos(radius_rad) - 1e-12, axis=1).max())
+        for part in np.array_split(tried, 20)
+        if len(part)
+    )
+    assert most <= bound <= 1.35 * most + 2
+
+
+def _edge_centres(u: np.ndarray, radius_rad: float) -> np.ndarray:
+    """Return the centres of the circles that have two of the stars on their edge."""
+    i, j = np.triu_indices(len(u), 1)
+    total, normal = u[i] + u[j], np.cross(u[i], u[j])
+    squared = np.einsum("ij,ij->i", total, total)
+    along = 2.0 * np.cos(radius_rad) / squared
+    height = 1.0 - along**2 * squared
+    fits = (height > 0.0) & (np.linalg.norm(normal, axis=1) > 1e-9)
+    total, normal, along = total[fits], normal[fits], along[fits]
+    across = np.sqrt(height[fits]) / np.linalg.norm(normal, axis=1)
+    up, level = across[:, None] * normal, along[:, None] * total
+    return np.concatenate([level + up, level - up])
+
+
+def fields_of(contents: Contents):
+    mag = np.nan_to_num(contents.mag, nan=9.0)
+    return lambda: tile_sphere(500, contents.directions, mag, CAMERA)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.999, 0.8, 0.6, 0.5, 0.4, 0.3])
+@pytest.mark.parametrize("method", ["triangle", "pyramid"])
+def test_an_image_is_made_to_fit_by_as_little_as_it_takes(real, method, share):
+    contents, seen = real
+    if method == "pyramid":
+        found = find_pairs(contents.directions, 0.0, CAMERA.diagonal_rad)
+        pairs = np.stack([found.i, found.j], axis=-1)
+        contents, seen = replace(contents, method=method, features=pairs), None
+    whole = len(make_image(contents).data)
+    limit = int(share * whole)
+    fitted = fit(contents, seen, fields_of(contents), limit)
+    made = make_image(fitted.contents)
+    assert len(made.data) <= limit
+    assert len(made.data) > limit - 8192
+    image = read_image(made.data)
+    assert (image.header["n_stars"], image.header["n_features"]) == (fitted.stars, fitted.features)
+    assert not list(artifact_problems(image, contents))
+    assert fitted.stars_before == 1500
+    assert fitted.features <= fitted.features_before
+    if share == 1.0:
+        assert made.data == make_image(contents).data
+    if fitted.stars == 1500 and method == "triangle":
+        kept = {tuple(row) for row in fitted.contents.features.tolist()}
+        left = np.array([tuple(row) in kept for row in contents.features.tolist()])
+        assert seen[~left].max(initial=0) <= seen[left].min()
+        assert seen[left].sum() >= LEAST_SHARE * seen.sum()
+    if fitted.stars < 1500:
+        _, wanted = fields_of(contents)().brightest(fitted.stars_per_field)
+        assert set(contents.star_id[wanted]) == set(fitted.contents.star_id)
+
+
+def test_an_image_that_cannot_be_so_small_is_refused_with_what_it_takes(real):
+    contents, seen = real
+    with pytest.raises(OnboardSizeError, match="9,000 bytes are too few") as refused:
+        fit(contents, seen, fields_of(contents), 9_000)
+    smallest = refused.value.smallest_bytes
+    assert f"the smallest that is of use has {smallest:,} bytes" in str(refused.value)
+    fitted = fit(contents, seen, fields_of(contents), smallest)
+    assert len(make_image(fitted.contents).data) == smallest
+    with pytest.raises(OnboardSizeError):
+        fit(contents, seen, fields_of(contents), smallest - 1)
+
+
+def test_nothing_can_be_fitted_too():
+    contents = sky(0, 1)
+    fitted = fit(contents, np.empty(0, np.int32), fields_of(contents), 8192)
+    assert (fitted.stars, fitted.features) == (0, 0)
+    with pytest.raises(OnboardSizeError):
+        fit(contents, np.empty(0, np.int32), fields_of(contents), 8191)
+
+
+def test_an_image_knows_its_size_before_it_is_made(real):
+    contents = real[0]
+    n_cells = grid_for(1500, CAMERA.radius_rad).n_cells
+    sizes = Sizes("triangle", 1500, len(contents.features), n_cells)
+    assert sizes.total_bytes == len(make_image(contents).data)
+
+
+def compiler() -> str:
+    found = shutil.which("gcc") or shutil.which("cc")
+    if found is None:
+        pytest.skip("there is no C compiler")
+    return found
+
+
+def test_the_c_source_compiles_to_the_image(tmp_path: Path):
+    gcc, name = compiler(), "sky-1.0.0"
+    data = make_image(sky(30, 1)).data
+    (tmp_path / "db.h").write_text(c_header(name, len(data)))
+    (tmp_path / "db.c").write_text(c_source(name, data, "little", "db.h"))
+    symbol = c_symbol(name)
+    (tmp_path / "main.c").write_text(
+        '#include "db.h"\n#include <stdio.h>\nint main(void) {\n'
+        f"  return fwrite({symbol}, 1, sizeof {symbol}, stdout) != sizeof {symbol};\n}}\n"
+    )
+    flags = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]
+    built = [gcc, *flags, tmp_path / "main.c", tmp_path / "db.c", "-o", tmp_path / "main"]
+    subprocess.run(built, check=True)
+    assert subprocess.run([tmp_path / "main"], stdout=-1, check=True).stdout == data
+
+
+def test_the_c_source_is_refused_by_a_machine_of_the_other_byte_order(tmp_path: Path):
+    gcc, data = compiler(), make_image(sky(30, 1), "big").data
+    (tmp_path / "db.h").write_text(c_header("sky-1.0.0", len(data)))
+    (tmp_path / "db.c").write_text(c_source("sky-1.0.0", data, "big", "db.h"))
+    built = subprocess.run(
+        [gcc, "-c", tmp_path / "db.c", "-o", tmp_path / "db.o"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert built.returncode != 0
+    assert "big-endian: export it with the other --endian" in built.stderr
+    words = re.findall(r"0x([0-9A-F]{16})u", (tmp_path / "db.c").read_text())
+    assert bytes.fromhex("".join(words)) == data
