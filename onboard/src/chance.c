@@ -11,7 +11,7 @@
 #else
 #define LEAST_SQUARE R(1e-30)
 #endif
-#define LOG_NEARLY_CERTAIN R(-18.420680743952367) /* of 1e-8 */
+#define LOG_NEARLY_CERTAIN R(-16.118095650958319) /* of 1e-7 */
 #define LOG_PI R(1.1447298858494001741)
 #define LOG_ALL_ATTITUDES R(4.3689013133786361) /* of 8 pi^2, the volume of the rotations */
 #define NEXT_SHARE R(0.1)

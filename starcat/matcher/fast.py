@@ -12,6 +12,7 @@ import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib import import_module
 from typing import Any
 
@@ -215,18 +216,20 @@ class FastMatcher:
             In the order of the frames, whatever the number of threads.
         """
         starts = np.zeros(len(frames) + 1, dtype=np.int64)
-        np.cumsum([len(frame) for frame in frames], out=starts[1:])
-        px = np.concatenate(frames) if frames else np.empty((0, 2))
-        x, y = (np.ascontiguousarray(px[:, axis]) for axis in (0, 1))
-        mag = None if magnitudes is None else np.concatenate([*magnitudes, np.empty(0)])
-        work = _Work(self._image, self._directions, camera, limits, x, y, mag, priors)
-        found = np.zeros(len(frames), dtype=ANSWER), np.full(len(px), -1, dtype=np.int32)
-        answers = Answers(starts, *found)
-        slices = [range(n, min(n + CHUNK, len(frames))) for n in range(0, len(frames), CHUNK)]
-        if threads <= 1 or len(slices) <= 1:
-            for part in slices:
-                work.run(part, answers)
+        if len(frames) == 1:  # by far the most frequent call
+            starts[1], px = len(frames[0]), frames[0]
+            mag = None if magnitudes is None else np.ascontiguousarray(magnitudes[0])
         else:
+            np.cumsum([len(frame) for frame in frames], out=starts[1:])
+            px = np.concatenate([*frames, np.empty((0, 2))])
+            mag = None if magnitudes is None else np.concatenate([*magnitudes, np.empty(0)])
+        x, y = np.ascontiguousarray(px.T)
+        work = _Work(self._image, self._directions, camera, limits, x, y, mag, priors)
+        answers = Answers(starts, np.zeros(len(frames), ANSWER), np.full(len(px), -1, np.int32))
+        if threads <= 1 or len(frames) <= CHUNK:
+            work.run(range(len(frames)), answers)
+        else:
+            slices = [range(n, min(n + CHUNK, len(frames))) for n in range(0, len(frames), CHUNK)]
             with ThreadPoolExecutor(min(threads, os.cpu_count() or 1)) as pool:
                 list(pool.map(lambda part: work.run(part, answers), slices))
         return Answers(starts, answers.frames, self._rows[answers.star_index])
@@ -283,6 +286,7 @@ def _memory() -> tuple[Any, Any]:
     return found
 
 
+@lru_cache(maxsize=16)
 def _camera(camera: Camera) -> Any:
     """Return a camera as the library has it."""
     lens = camera.distortion
@@ -299,6 +303,7 @@ def _camera(camera: Camera) -> Any:
     )
 
 
+@lru_cache(maxsize=16)
 def _options(limits: Limits) -> Any:
     chance = math.log(max(limits.max_false_match_probability, 1e-300))
     stated = limits.noise_px, limits.noise_mag

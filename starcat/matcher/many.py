@@ -88,6 +88,8 @@ class MatchResults(Sequence[MatchResult]):
 
 def _dropped(star: NDArray[np.int32]) -> tuple[tuple[int, str], ...]:
     """Return row and reason of every centroid that was not used, repeats last."""
+    if not (star < -1).any():
+        return ()
     rows = np.flatnonzero(star < -1)
     reasons = [(int(row), DROPPED[int(star[row])]) for row in rows]
     return tuple(sorted(reasons, key=lambda item: item[1] == "duplicate"))
