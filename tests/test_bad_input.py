@@ -35,7 +35,11 @@ from starcat.catalog.readers.delimited import parse_delimited
 from starcat.catalog.source import data_source, read_source
 from starcat.errors import StarcatError
 from starcat.exchange.formats import format_of
+from starcat.geometry.camera import Camera
 from starcat.images.image_file import write_image
+from starcat.onboard.blocks import check_blocks
+from starcat.onboard.image import Contents, make_image
+from starcat.onboard.reading import read_image
 from starcat.releases.publishing import publish_artifact
 from starcat.store.pixels import Pixel
 
@@ -1449,6 +1453,164 @@ def _(place: Place) -> Call:
 def _(place: Place) -> Call:
     path = place.write("default_database.npz", "no archive")
     return ["export", path, "--from-peer", "cedar-solve", "-o", place.out]
+
+
+# Onboard images ----------------------------------------------------------------------------
+
+
+def image_of(place: Place, change: Callable[[bytes], bytes] = bytes) -> Path:
+    """A sound onboard image of three stars, or what became of it."""
+    return place.write("db.img", change(make_image(three_stars("three-1.0.0")).data))
+
+
+def three_stars(name: str) -> Contents:
+    return Contents(
+        name=name,
+        epoch_jyear=2026.0,
+        camera=Camera(512, 512, fov_x_deg=40.0),
+        star_id=np.arange(1, 4),
+        directions=np.eye(3),
+        mag=np.zeros(3),
+        method="triangle",
+        features=np.array([[0, 1, 2]]),
+    )
+
+
+def with_word(at: int, value: int) -> Callable[[bytes], bytes]:
+    """Return what puts a number into an image and gives it CRCs that fit."""
+
+    def change(image: bytes) -> bytes:
+        data = image[:at] + struct.pack("<I", value) + image[at + 4 : -4096]
+        return data + check_blocks(data, "little")
+
+    return change
+
+
+def onboard(place: Place, *more: object) -> Call:
+    return ["export", place.artifact, "--to", "onboard", "-o", place.out / "db.img", *more]
+
+
+@case("onboard image that cannot be so small", 1)
+def _(place: Place) -> Call:
+    return onboard(place, "--max-bytes", "9000")
+
+
+@case("onboard image for a method that has none", 2)
+def _(place: Place) -> Call:
+    return onboard(place, "--method", "grid")
+
+
+@case("byte order unknown", 2)
+def _(place: Place) -> Call:
+    return onboard(place, "--endian", "middle")
+
+
+@case("option of an onboard image for tables", 2)
+def _(place: Place) -> Call:
+    return ["export", place.artifact, "--to", "fits", "--max-bytes", "9000", "-o", place.out]
+
+
+@case("option of tables for an onboard image", 2)
+def _(place: Place) -> Call:
+    return onboard(place, "--product", "stars")
+
+
+@case("option of HATS for another format", 2)
+def _(place: Place) -> Call:
+    return ["export", place.artifact, "--to", "csv", "--max-partition-rows", "9", "-o", place.out]
+
+
+@case("onboard image of an artifact without triangles", 2)
+def _(place: Place) -> Call:
+    place.artifact = place.manifest(lambda manifest: manifest["products"].pop("triangles"))
+    return onboard(place)
+
+
+@case("onboard image of a damaged artifact", 5)
+def _(place: Place) -> Call:
+    place.artifact = place.copy()
+    flip(place.artifact / "triangles.parquet")
+    return onboard(place)
+
+
+@case("onboard image of a file", 3)
+def _(place: Place) -> Call:
+    place.artifact = place.write("stars.csv", "star_id\n1\n")
+    return onboard(place)
+
+
+@case("another file of the image's name", 1)
+def _(place: Place) -> Call:
+    place.write("out/db.img", "mine")
+    return onboard(place)
+
+
+@case("folder in place of the image", 1)
+def _(place: Place) -> Call:
+    (place.out / "db.img").mkdir(parents=True)
+    return onboard(place)
+
+
+@case("C source under another name", 2)
+def _(place: Place) -> Call:
+    return ["export", place.artifact, "--to", "c", "-o", place.out / "db"]
+
+
+@case("name too long for an onboard image", 2)
+def _(place: Place) -> Call:
+    return lambda: make_image(three_stars("x" * 97))
+
+
+@case("onboard image missing", 3)
+def _(place: Place) -> Call:
+    return lambda: read_image(place.folder / "db.img")
+
+
+@case("folder read as an onboard image", 5)
+def _(place: Place) -> Call:
+    return lambda: read_image(place.folder)
+
+
+@case("file that is no onboard image", 5)
+def _(place: Place) -> Call:
+    return ["inspect", place.write("db.img", "star_id\n1\n")]
+
+
+@case("onboard image cut off", 5)
+def _(place: Place) -> Call:
+    return ["inspect", image_of(place, lambda image: image[:5000])]
+
+
+@case("onboard image cut off in its header", 5)
+def _(place: Place) -> Call:
+    return ["inspect", image_of(place, lambda image: image[:100])]
+
+
+@case("onboard image with a damaged block", 5)
+def _(place: Place) -> Call:
+    path = image_of(place)
+    flip(path, 0.1)
+    return ["inspect", path]
+
+
+@case("onboard image of another version", 4)
+def _(place: Place) -> Call:
+    return ["inspect", image_of(place, with_word(12, 2))]
+
+
+@case("onboard image with a number that cannot be", 5)
+def _(place: Place) -> Call:
+    return ["inspect", image_of(place, with_word(28, 7))]
+
+
+@case("onboard image with a section that cannot be", 5)
+def _(place: Place) -> Call:
+    return ["inspect", image_of(place, with_word(256 + 8, 24))]
+
+
+@case("artifact held against an artifact", 2)
+def _(place: Place) -> Call:
+    return ["verify", place.artifact, "--against", place.artifact]
 
 
 # The tests ---------------------------------------------------------------------------------

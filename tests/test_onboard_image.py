@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from starcat.errors import ConfigError, OnboardImageError, OnboardSizeError, SchemaVersionError
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
+from starcat.onboard import image as image_module
 from starcat.onboard.blocks import check_blocks, data_blocks, scrub
 from starcat.onboard.c_source import c_header, c_source, c_symbol
 from starcat.onboard.checking import artifact_problems, capacity_problems, value_problems
@@ -135,6 +136,14 @@ def test_a_name_that_is_too_long_is_refused():
     ):
         make_image(contents)
     assert read_image(make_image(replace(contents, name="a" * 90 + "-1.0.0")).data).name
+
+
+def test_an_image_of_four_gigabytes_is_refused(monkeypatch):
+    monkeypatch.setattr(image_module, "MAX_BYTES", 8191)
+    with pytest.raises(
+        ConfigError, match="would have 8,192 bytes; at most 8,191 can be said in it"
+    ):
+        make_image(sky(5, 1))
 
 
 def test_any_flipped_bit_is_found_and_its_block_named(real):
@@ -352,7 +361,7 @@ def fields_of(contents: Contents):
     return lambda: tile_sphere(500, contents.directions, mag, CAMERA)
 
 
-@pytest.mark.parametrize("share", [1.0, 0.999, 0.8, 0.6, 0.5, 0.4, 0.3])
+@pytest.mark.parametrize("share", [1.0, 0.999, 0.8, 0.6, 0.5, 0.4, 0.3, 0.25])
 @pytest.mark.parametrize("method", ["triangle", "pyramid"])
 def test_an_image_is_made_to_fit_by_as_little_as_it_takes(real, method, share):
     contents, seen = real
@@ -377,8 +386,11 @@ def test_an_image_is_made_to_fit_by_as_little_as_it_takes(real, method, share):
         kept = {tuple(row) for row in fitted.contents.features.tolist()}
         left = np.array([tuple(row) in kept for row in contents.features.tolist()])
         assert seen[~left].max(initial=0) <= seen[left].min()
-        assert seen[left].sum() >= LEAST_SHARE * seen.sum()
+        assert seen[left].sum() >= LEAST_SHARE[method] * seen.sum()
+    if share <= 0.25:
+        assert fitted.stars < 1500
     if fitted.stars < 1500:
+        assert fitted.stars_per_field is not None
         _, wanted = fields_of(contents)().brightest(fitted.stars_per_field)
         assert set(contents.star_id[wanted]) == set(fitted.contents.star_id)
 

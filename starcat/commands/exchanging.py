@@ -70,9 +70,9 @@ def export(
 ) -> None:
     """Write tables for other tools, one file a product, or an image for flight software.
 
-    Examples: starcat export dist/gaia-12deg-1.0.0 --to fits -o fits
+    Example: starcat export dist/gaia-12deg-1.0.0 --to fits -o fits
 
-    starcat export dist/gaia-12deg-1.0.0 --to onboard -o db.img
+    Example: starcat export dist/gaia-12deg-1.0.0 --to onboard -o db.img
     """
     of_images: dict[str, object] = {"method": method, "endian": endian, "max_bytes": max_bytes}
     of_tables: dict[str, object] = {"product": product, "from_peer": from_peer}

@@ -135,8 +135,8 @@ def export_image(
         raise ConfigError(f"--output {target}: C source has a name that ends with .c", key="output")
     if target.is_dir():
         raise OutputError(f"{target}: is a folder; choose a file with --output", path=target)
-    contents = contents_of(opened, method)
-    check_artifact(artifact)
+    _check_product(opened, method)
+    contents = contents_of(check_artifact(artifact), method)
     fitted = fit(contents, _times_seen(opened, method), partial(_fields, opened), max_bytes)
     made = make_image(fitted.contents, order)
     files = {target: made.data}
@@ -166,15 +166,8 @@ def contents_of(artifact: Artifact, method: str) -> Contents:
     ConfigError
         If the artifact lacks the product of the method.
     """
+    _check_product(artifact, method)
     product, columns = PRODUCTS[method]
-    if product not in artifact.products:
-        raise ConfigError(
-            f"{_name(artifact)} has no product {product!r}, which an image for the method {method} "
-            f"is made of; set products.{product}.enabled = true in its spec and build it again, or "
-            "choose another --method",
-            key="method",
-            value=method,
-        )
     stars, features = artifact.table("stars"), artifact.table(product)
     manifest = artifact.manifest
     spec = spec_from_dict(manifest["spec"], MANIFEST_NAME)
@@ -245,6 +238,18 @@ def _damage(data: bytes, file: str) -> Iterator[Finding]:
 
 def _name(artifact: Artifact) -> str:
     return f"{artifact.manifest['name']}-{artifact.manifest['version']}"
+
+
+def _check_product(artifact: Artifact, method: str) -> None:
+    product, _ = PRODUCTS[method]
+    if product not in artifact.products:
+        raise ConfigError(
+            f"{_name(artifact)} has no product {product!r}, which an image for the method {method} "
+            f"is made of; set products.{product}.enabled = true in its spec and build it again, or "
+            "choose another --method",
+            key="method",
+            value=method,
+        )
 
 
 def _times_seen(artifact: Artifact, method: str) -> NDArray[np.int32] | None:

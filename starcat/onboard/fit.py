@@ -1,7 +1,7 @@
 """Making an image fit: fewer features first, then fewer stars a field, or a refusal.
 
 Triangles go that are seen from the fewest boresights, pairs that are the longest: they are those
-that a frame shows most rarely. When half of what frames show would be gone, stars go by the rule
+that a frame shows most rarely. When too few would be left, stars go by the rule
 that thins a build (`selection.max_stars_per_field`), and features with their stars.
 """
 
@@ -21,7 +21,7 @@ from starcat.onboard.image import Contents, longest_pair_rad
 from starcat.onboard.layout import Sizes
 from starcat.products.boresights import FieldStars
 
-LEAST_SHARE = 0.5
+LEAST_SHARE = {"triangle": 1.0 / 3.0, "pyramid": 0.5}
 """Of the sightings of all triangles, or of the longest pair's length, so much is left at least."""
 
 LEAST_STARS = 4
@@ -85,12 +85,12 @@ def fit(
     n_stars, n_features = len(contents.star_id), len(kept.features)
     if max_bytes is None:
         return Fitted(kept, n_stars, n_stars, n_features, n_features)
-    smallest = _sizes(kept, _least(weight)).total_bytes
+    smallest = _sizes(kept, _least(weight, kept.method)).total_bytes
     if smallest <= max_bytes:
         fewer = _fewer_features(kept, max_bytes)
         return Fitted(fewer, n_stars, n_stars, n_features, len(fewer.features))
     for most, thinner, left in _thinned(kept, weight, fields()):
-        size = _sizes(thinner, _least(left)).total_bytes
+        size = _sizes(thinner, _least(left, kept.method)).total_bytes
         smallest = min(smallest, size)
         if size <= max_bytes:
             fewer = _fewer_features(thinner, max_bytes)
@@ -121,10 +121,10 @@ def _by_use(
     return replace(contents, features=contents.features[order]), weight
 
 
-def _least(weight: NDArray[np.float64]) -> int:
+def _least(weight: NDArray[np.float64], method: str) -> int:
     """Return how many features have to be left."""
     use = np.cumsum(weight)
-    return int(np.searchsorted(use, LEAST_SHARE * use[-1])) + 1 if len(use) else 0
+    return int(np.searchsorted(use, LEAST_SHARE[method] * use[-1])) + 1 if len(use) else 0
 
 
 def _thinned(
