@@ -71,14 +71,19 @@ for part in PARTS:
 
 def _version(wanted: bool) -> None:
     if wanted:
+        from starcat.matcher.fast import library_version
+
+        library = library_version()
         typer.echo(f"starcat {__version__}")
+        typer.echo(f"matcher: {f'C library {library}' if library else 'numpy, no C library'}")
         raise typer.Exit
 
 
 @app.callback()
 def _options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+        bool,
+        typer.Option("--version", callback=_version, is_eager=True, help="Print the versions."),
     ] = False,
     debug: Annotated[
         bool, typer.Option("--debug", help="Show the traceback of errors; anywhere on the line.")

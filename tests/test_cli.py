@@ -20,6 +20,7 @@ import starcat as package
 from starcat.artifact.content import content_sha256
 from starcat.catalog.source import source_names
 from starcat.cli import app
+from starcat.matcher.fast import library_version
 from starcat.matcher.methods.table import METHODS
 from starcat.specs.reading import preset_names
 from starcat.tables.schema import product_schema
@@ -84,7 +85,10 @@ def test_no_command_shows_the_help(starcat: Run) -> None:
 
 
 def test_version(starcat: Run) -> None:
-    assert starcat(["--version"]).out == f"starcat {package.__version__}\n"
+    ours, matcher = starcat(["--version"]).out.splitlines()
+    assert ours == f"starcat {package.__version__}"
+    library = library_version()
+    assert matcher == f"matcher: {f'C library {library}' if library else 'numpy, no C library'}"
 
 
 @pytest.mark.parametrize(
@@ -100,7 +104,7 @@ def test_the_module_is_the_command() -> None:
     run = subprocess.run(
         [sys.executable, "-m", "starcat", "--version"], capture_output=True, text=True, check=True
     )
-    assert run.stdout == f"starcat {package.__version__}\n"
+    assert run.stdout.splitlines()[0] == f"starcat {package.__version__}"
 
 
 # Lists --------------------------------------------------------------------------------------

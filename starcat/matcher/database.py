@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from starcat.errors import ArtifactMissing, ProductError, SchemaVersionError, StarcatError
 from starcat.geometry.camera import Camera
 from starcat.matcher.layout import LAYOUT, check_product
+from starcat.onboard.reading import OnboardImage, read_image
 from starcat.storage.hdf5 import own_dataset, own_group
 
 Made = TypeVar("Made")
@@ -65,8 +66,8 @@ class Database:
     camera : Camera
         The camera that the database was built for.
     epoch_jyear : float
-            Epoch of the directions, Julian year.
-        star_id : ndarray of int64, shape (N,)
+        Epoch of the directions, Julian year.
+    star_id : ndarray of int64, shape (N,)
         Permanent star numbers.
     directions : ndarray of float64, shape (N, 3)
         ICRS unit vectors.
@@ -76,6 +77,8 @@ class Database:
         Names.
     products : mapping of str to ProductArrays
         The products that were opened.
+    image : OnboardImage or None
+        The onboard image that all this was read from, which has no products.
     """
 
     name: str
@@ -86,6 +89,7 @@ class Database:
     mag: NDArray[np.float64]
     designation: NDArray[np.bytes_]
     products: Mapping[str, ProductArrays] = field(default_factory=dict)
+    image: OnboardImage | None = None
     _derived: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __repr__(self) -> str:
@@ -141,6 +145,38 @@ def open_database(artifact: Path, products: Iterable[str] = ()) -> Database:
     with _readable(path) as file, path.open("rb") as raw:
         mapped = mmap.mmap(raw.fileno(), 0, access=mmap.ACCESS_READ)
         return _read(file, mapped, path, tuple(products))
+
+
+def open_image(path: Path) -> Database:
+    """Open an onboard image as a database, for the C library.
+
+    Parameters
+    ----------
+    path : Path
+        The image.
+
+    Returns
+    -------
+    Database
+        Stars in the order of the image, without names and products.
+
+    Raises
+    ------
+    OnboardImageError, SchemaVersionError
+        If the image cannot be read.
+    """
+    image = read_image(path)
+    header, stars = image.header, image.star_id
+    return Database(
+        name=image.name,
+        camera=image.camera,
+        epoch_jyear=float(header["epoch_jyear"]),
+        star_id=stars,
+        directions=image.directions,
+        mag=image.mag,
+        designation=np.full(len(stars), b""),
+        image=image,
+    )
 
 
 def products_in(artifact: Path) -> tuple[str, ...]:

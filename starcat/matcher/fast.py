@@ -45,6 +45,13 @@ WORDS: dict[int, Status] = {0: "identified", 1: "no_match", 2: "too_few_stars", 
 """What a frame came to, by the number that the library returns. The last one is a budget that
 was used up."""
 
+REFUSED = {
+    -4: "it is of a version of the format that the library does not read",
+    -5: "it was written for the other byte order",
+    -9: "a field of it has more stars than the library has room for",
+}
+"""Why an image that starcat can read is not opened, by the number that the library returns."""
+
 DROPPED = {-2: "not_finite", -3: "out_of_frame", -4: "duplicate"}
 """Why a centroid was not used, by the number that the library gives it."""
 
@@ -161,7 +168,8 @@ class FastMatcher:
         status = lib.starcat_open(self._image, ffi.from_buffer(words), len(data), 0)
         if status != 0:
             raise ProductError(
-                f"an onboard image of {len(data):,} bytes: the C library refuses it ({status})"
+                f"an onboard image of {len(data):,} bytes is not opened by the C library: "
+                f"{REFUSED.get(status, f'error {status}')}; export the artifact for this machine"
             )
         count = int(self._image.n_stars)
         own = np.arange(count) if rows is None else rows
@@ -335,10 +343,16 @@ def fast_matcher(database: Database, method: str, always: bool = True) -> FastMa
     """
     if _onboard is None or method not in FEATURES:
         return None
+    if database.image is not None:
+        return database.derived(_of_image) if database.image.method == method else None
     product, columns = FEATURES[method]
     if not always and len(database.products[product][columns[0]]) > MOST_FEATURES:
         return None
     return database.derived(_of_triangles if method == "triangle" else _of_pairs)
+
+
+def _of_image(database: Database) -> FastMatcher | None:
+    return None if database.image is None else FastMatcher(database.image.data)
 
 
 def _of_triangles(database: Database) -> FastMatcher | None:

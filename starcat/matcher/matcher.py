@@ -21,7 +21,7 @@ from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import checked_number
 from starcat.matcher.chance import MIN_STARS
-from starcat.matcher.database import Database, open_database, products_in
+from starcat.matcher.database import Database, open_database, open_image, products_in
 from starcat.matcher.fast import FEATURES, FastMatcher, Limits, fast_matcher, is_compiled
 from starcat.matcher.many import MatchResults
 from starcat.matcher.methods.table import METHODS, best_method, method_named
@@ -29,6 +29,7 @@ from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder
 from starcat.matcher.observation import Observation, as_frame, observe
 from starcat.matcher.result import MatchResult, identified, unidentified
 from starcat.matcher.verification import Agreement, verify
+from starcat.onboard.reading import is_image
 
 CERTAIN = 1e-9
 """Largest false-match probability of an answer, unless another one is asked for.
@@ -117,6 +118,9 @@ class Matcher:
             choices = ", ".join(get_args(Engine))
             text = f"engine is {self.engine!r}; choose one of {choices}"
             raise ConfigError(text, key="engine", value=self.engine)
+        if self.database.image is not None and self.engine == "numpy":
+            text = "engine 'numpy' needs an artifact; an onboard image has no products"
+            raise ConfigError(text, key="engine", value=self.engine)
         if self.engine == "c" and self._fast is None:
             raise ConfigError(f"engine 'c': {self._without_c()}", key="engine", value="c")
 
@@ -168,14 +172,16 @@ class Matcher:
         noise_mag: float | None = None,
         engine: Engine = "auto",
     ) -> Matcher:
-        """Open the database of an artifact.
+        """Open the database of an artifact, or an onboard image.
 
         Parameters
         ----------
         artifact : str or path-like
-            The artifact's folder.
+            The artifact's folder, or an image as `starcat export --to onboard` writes it. With an
+            image everything is as in flight: the C library, and directions as they are rounded.
         method : str, default "triangle"
-            A key of `METHODS`; None for the best one that the artifact's products allow.
+            A key of `METHODS`; None for the best one that the artifact's products allow. An
+            image has one method, which is used whatever is asked for.
         tolerance_px, max_false_match_probability, selection, noise_px, noise_mag, engine
             As the attributes.
 
@@ -193,11 +199,16 @@ class Matcher:
             If the artifact cannot be read, or lacks a product that the method needs.
         """
         path = Path(artifact)
-        method = best_method(products_in(path)) if method is None else method
-        database = open_database(path, method_named(method).products)
+        if is_image(path):
+            database = open_image(path)
+            chosen = database.image.method if database.image else ""
+            engine = "c" if engine == "auto" else engine
+        else:
+            chosen = best_method(products_in(path)) if method is None else method
+            database = open_database(path, method_named(chosen).products)
         return cls(
             database,
-            method,
+            chosen,
             tolerance_px,  # type: ignore[arg-type]
             max_false_match_probability,
             selection,

@@ -135,6 +135,26 @@ class OnboardImage:
         }
 
 
+def is_image(path: Path) -> bool:
+    """Return whether a file begins as an onboard image does.
+
+    Parameters
+    ----------
+    path : Path
+        Anything; a folder is none.
+
+    Returns
+    -------
+    bool
+        By its first eight bytes.
+    """
+    try:
+        with path.open("rb") as file:
+            return file.read(len(MAGIC)) == MAGIC
+    except OSError:  # a folder, or no such file: others say so
+        return False
+
+
 def read_image(source: bytes | Path) -> OnboardImage:
     """Read an onboard image.
 

@@ -73,7 +73,7 @@ def _stars(frame: MeasuredFrame, result: MatchResult, database: Database) -> lis
         star: dict[str, Any] = {"x_px": float(x), "y_px": float(y), "star": None, "mag": None}
         if row >= 0:
             star |= {
-                "star": database.designation[row].decode(),
+                "star": database.designation[row].decode() or str(database.star_id[row]),
                 "star_id": int(result.star_ids[number]),
                 "mag": float(database.mag[row]),
             }

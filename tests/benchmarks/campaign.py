@@ -1,0 +1,148 @@
+"""A million lost-in-space frames through the C library: how many answers are wrong.
+
+    python tests/benchmarks/campaign.py [--frames 1000000] [--workers 2] [PRESET ...]
+
+The frames are shared out among the presets, whose databases are built from the catalogs in
+$STARCAT_CATALOGS, and among four kinds: with noise of 0.5 px only (clean), or also with a tenth of
+the stars missing and three false spots (hard); without magnitudes, or with magnitudes of which the
+error, 0.3 mag, and that of the centroids are stated. An answer is wrong if its attitude puts a star
+of the frame farther from its true place than the tolerance. Frames with fewer than four stars have
+no right answer and may have none.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+import tempfile
+import time
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from synthetic import catalogs_folder
+
+from starcat.matcher.chance import MIN_STARS
+from starcat.matcher.matcher import Matcher
+from starcat.pipeline.build import build
+from starcat.simulation.simulate import Frame, Noise, simulate_frames
+from starcat.specs.reading import preset
+
+FILES: dict[str, dict[str, str]] = {
+    "sao-12deg": {"sao": "sao.dat.gz"},
+    "sao-12deg-512": {"sao": "sao.dat.gz"},
+    "sao-6deg": {"sao": "sao.dat.gz"},
+    "gaia-12deg": {},
+    "tycho2-12deg": {"tycho2": "tyc2.dat.gz"},
+    "2mass-8x6": {"2mass": "psc_estimated.gz"},
+}
+"""The presets, and the file of the catalogs that each is built from."""
+
+NOISE_PX, NOISE_MAG = 0.5, 0.3
+KINDS = {
+    "clean": (Noise(NOISE_PX, noise_mag=NOISE_MAG), False),
+    "clean, stated": (Noise(NOISE_PX, noise_mag=NOISE_MAG), True),
+    "hard": (Noise(NOISE_PX, 0.1, 3, noise_mag=NOISE_MAG), False),
+    "hard, stated": (Noise(NOISE_PX, 0.1, 3, noise_mag=NOISE_MAG), True),
+}
+BATCH = 1000
+
+
+@lru_cache(maxsize=2)
+def matcher_of(folder: Path, is_stated: bool) -> Matcher:
+    """Return the matcher of an artifact; each process opens its own."""
+    stated: dict[str, Any] = {"noise_px": NOISE_PX, "noise_mag": NOISE_MAG} if is_stated else {}
+    return Matcher.open(folder, engine="c", **stated)
+
+
+def batch(folder: Path, kind: str, seed: int) -> Counter[str]:
+    """Simulate and identify some frames; count what came out."""
+    noise, is_stated = KINDS[kind]
+    matcher = matcher_of(folder, is_stated)
+    database = matcher.database
+    given = (database.directions, database.camera, BATCH, noise, seed, database.mag)
+    frames = list(simulate_frames(*given))
+    mags = [frame.mag for frame in frames] if is_stated else None
+    px = [frame.centroids_px for frame in frames]
+    found = matcher.identify_many(px, magnitudes=mags, threads=1)
+    counted: Counter[str] = Counter()
+    for frame, answer in zip(frames, found, strict=True):
+        counted["too few"] += frame.n_stars < MIN_STARS
+        if answer.status == "identified":
+            is_right = error_px(answer.q_body_from_icrs, frame, matcher) <= 2.0
+            counted["right" if is_right else "wrong"] += 1
+        else:
+            counted["none"] += 1
+    counted["microseconds"] += round(1e6 * float(np.sum(found.seconds)))
+    return counted
+
+
+def error_px(quaternion: np.ndarray, frame: Frame, matcher: Matcher) -> float:
+    """Return how far an attitude puts the stars of a frame from their true places, at most."""
+    from starcat.geometry.attitude import matrix_from_quaternion
+
+    camera = matcher.database.camera
+    star = frame.star_index[frame.star_index >= 0]
+    u = matcher.database.directions[star]
+    truth = camera.pixels_from_directions(u @ frame.matrix.T)
+    there = camera.pixels_from_directions(u @ matrix_from_quaternion(quaternion).T)
+    apart = np.hypot(*(there - truth).T) if len(star) else np.full(1, np.inf)
+    return float(np.nan_to_num(apart, nan=np.inf).max())
+
+
+def main() -> None:
+    """Build the databases, let all processes work, print a line a preset and kind."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("presets", nargs="*", default=[])
+    parser.add_argument("--frames", type=int, default=1_000_000)
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    asked = parser.parse_args()
+    names = asked.presets or list(FILES)
+    batches = math.ceil(asked.frames / (BATCH * len(names) * len(KINDS)))
+    total: Counter[str] = Counter()
+    print(f"{'':<32}{'frames':>9}{'right':>9}{'wrong':>7}{'none':>7}{'<4 stars':>9}{'us each':>9}")
+    with tempfile.TemporaryDirectory() as scratch, ProcessPoolExecutor(asked.workers) as pool:
+        begun = time.perf_counter()
+        for place, name in enumerate(names):
+            files = {key: [catalogs_folder() / file] for key, file in FILES[name].items()}
+            folder = build(preset(name), files, Path(scratch)).folder
+            for number, kind in enumerate(KINDS):
+                first = 10_000 * (10 * place + number)
+                jobs = [pool.submit(batch, folder, kind, first + n) for n in range(batches)]
+                counted = sum((job.result() for job in jobs), Counter())
+                total += counted
+                print_line(f"{name}, {kind}", counted, batches * BATCH)
+        elapsed_s = time.perf_counter() - begun
+    frames = batches * BATCH * len(names) * len(KINDS)
+    print_line("all", total, frames)
+    answers = total["right"] + total["wrong"]
+    rate, alone = frames / elapsed_s, 1e6 * frames / max(1, total["microseconds"])
+    print(f"{rate:,.0f} frames/s by {asked.workers} processes, simulation and builds included")
+    print(f"{alone:,.0f} frames/s by the C library in one thread")
+    if not total["wrong"]:
+        bound = -math.log(0.05)
+        print(f"no wrong answer: at most {bound / answers:.1e} of the answers and")
+        print(f"{bound / frames:.1e} of the frames are wrong, with a confidence of 95 %")
+
+
+def print_line(what: str, counted: Counter[str], frames: int) -> None:
+    """Print one line of the table."""
+    counts = (counted[key] for key in ("right", "wrong", "none", "too few"))
+    right, wrong, none, few = counts
+    each_us = counted["microseconds"] / frames
+    print(
+        f"{what:<32}{frames:>9,}{right:>9,}{wrong:>7,}{none:>7,}{few:>9,}{each_us:>9.1f}",
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    main()
