@@ -12,11 +12,16 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from hypothesis import settings
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from starcat.geometry.camera import Camera
+    from starcat.matcher.database import Database
 
 # The same examples on every machine and in every run: a test fails for everybody or for nobody.
 settings.register_profile(
@@ -92,6 +97,47 @@ def random_directions() -> Callable[[int, int], NDArray[np.float64]]:
         return v / np.linalg.norm(v, axis=1)[:, None]
 
     return draw
+
+
+@pytest.fixture(scope="session")
+def sky_of() -> Callable[..., Database]:
+    """Databases in memory with pairs and triangles: of directions and a camera of 20 deg.
+
+    Star numbers are rows plus 1000, so that a mix-up of the two shows.
+    """
+    from starcat.geometry.camera import Camera
+    from starcat.matcher.database import Database, ProductArrays
+    from starcat.products.boresights import tile_sphere
+    from starcat.products.pairs import find_pairs
+    from starcat.products.triangles import find_triangles
+
+    def make(
+        u: NDArray[np.float64], camera: Camera | None = None, boresights: int = 1000
+    ) -> Database:
+        camera = camera or Camera(1024, 1024, fov_x_deg=20.0)
+        mag = np.random.default_rng(len(u)).uniform(1.0, 6.0, len(u))
+        found = find_pairs(u, 0.0, camera.diagonal_rad)
+        made = find_triangles(tile_sphere(boresights, u, mag, camera), u, 8)
+        columns = ("i", "j", "k", "area_rad2", "circumradius_rad")
+        triangles = {name: getattr(made, name) for name in columns}
+        pairs = {"i": found.i, "j": found.j, "separation_rad": found.separation_rad}
+        return Database(
+            name="sky-1.0.0",
+            camera=camera,
+            epoch_jyear=2026.0,
+            star_id=np.arange(len(u)) + 1000,
+            directions=u,
+            mag=mag,
+            designation=np.full(len(u), b"star"),
+            products={
+                "pairs": ProductArrays({**pairs, **found.index.datasets}, found.index.attributes),
+                "triangles": ProductArrays(
+                    {**triangles, **made.index.datasets}, made.index.attributes
+                ),
+            },
+        )
+
+    return make
 
 
 SMALL_SPEC = """\

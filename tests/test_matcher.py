@@ -23,7 +23,8 @@ from starcat.geometry.attitude import (
 )
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
-from starcat.matcher.database import Database, ProductArrays, open_database, products_in
+from starcat.matcher.database import Database, open_database, products_in
+from starcat.matcher.fast import FEATURES, is_compiled
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods import pairs, pyramid, triangle
 from starcat.matcher.methods.candidates import Candidates
@@ -31,61 +32,32 @@ from starcat.matcher.methods.table import METHODS, best_method
 from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder
 from starcat.matcher.observation import Observation, observe
 from starcat.matcher.verification import REACH, agree, agreeing_centroids, verify
-from starcat.products.boresights import tile_sphere
-from starcat.products.pairs import find_pairs
-from starcat.products.triangles import find_triangles
 from starcat.simulation.selftest import answers_rightly, self_test
 from starcat.simulation.simulate import Frame, Noise, simulate_frame, simulate_frames
 from starcat.simulation.sky import Sky
 
 CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
 
-FIRST_ID = 1000
-"""Star numbers are rows plus this, so that a mix-up of the two shows."""
-
 IN_MEMORY = ("triangle", "pairs", "pyramid")
-"""The methods whose products `sky_of` makes."""
-
-
-def sky_of(u: np.ndarray, camera: Camera = CAMERA, boresights: int = 1000) -> Database:
-    mag = np.random.default_rng(len(u)).uniform(1.0, 6.0, len(u))
-    found = find_pairs(u, 0.0, camera.diagonal_rad)
-    fields = tile_sphere(boresights, u, mag, camera)
-    made = find_triangles(fields, u, 8)
-    triangles = {
-        name: getattr(made, name) for name in ("i", "j", "k", "area_rad2", "circumradius_rad")
-    }
-    by_separation = {"i": found.i, "j": found.j, "separation_rad": found.separation_rad}
-    return Database(
-        name="sky-1.0.0",
-        camera=camera,
-        epoch_jyear=2026.0,
-        star_id=np.arange(len(u)) + FIRST_ID,
-        directions=u,
-        mag=mag,
-        designation=np.full(len(u), b"star"),
-        products={
-            "pairs": ProductArrays(
-                {**by_separation, **found.index.datasets}, found.index.attributes
-            ),
-            "triangles": ProductArrays({**triangles, **made.index.datasets}, made.index.attributes),
-        },
-    )
+"""The methods whose products the fixture `sky_of` makes."""
 
 
 @pytest.fixture(scope="module")
-def sky(random_directions) -> Database:
+def sky(sky_of, random_directions) -> Database:
     return sky_of(random_directions(1200, 1))
 
 
-@pytest.fixture(scope="module", params=IN_MEMORY)
+@pytest.fixture(scope="module", params=[*IN_MEMORY, *(f"{name} in C" for name in FEATURES)])
 def matcher(sky, request) -> Matcher:
-    return Matcher(sky, request.param)
+    method, _, in_c = request.param.partition(" ")
+    if in_c and not is_compiled():
+        pytest.skip("starcat was installed without a C compiler")
+    return Matcher(sky, method, engine="c" if in_c else "numpy")
 
 
 @pytest.fixture(scope="module")
 def triangles(sky) -> Matcher:
-    return Matcher(sky)
+    return Matcher(sky, engine="numpy")
 
 
 def frames(
@@ -227,7 +199,7 @@ def test_the_residual_is_that_of_the_attitude_that_is_returned(sky, solve_wahba_
         assert np.abs(matrix_from_quaternion(q) - found.matrix).max() < 1e-9
 
 
-def cluster_sky(random_directions) -> Database:
+def cluster_sky(sky_of, random_directions) -> Database:
     """Return a sky with ten stars within 100 px of its north pole."""
     offset = np.random.default_rng(5).normal(scale=25.0 / CAMERA.focal_length_px, size=(10, 2))
     cluster = np.column_stack([offset, np.ones(10)])
@@ -235,7 +207,7 @@ def cluster_sky(random_directions) -> Database:
     return sky_of(np.concatenate([random_directions(1200, 5), cluster]))
 
 
-def test_the_stars_outside_of_a_cluster_outweigh_a_wrong_one(random_directions):
+def test_the_stars_outside_of_a_cluster_outweigh_a_wrong_one(sky_of, random_directions):
     # Turned about the cluster by 8 px at 400 px another star takes the first centroid outside:
     # together with the cluster it holds the attitude there, for all that the others miss.
     cluster = cluster_sky(random_directions).directions[1200:]
@@ -383,7 +355,7 @@ def test_nothing_is_proposed_for_a_mirror_image_of_three_stars(sky):
         assert truth not in pairs.triangles_of_stars(np.arange(3), mirrored, sky).tolist()
 
 
-def test_star_pairs_make_all_triangles_that_fit(random_directions):
+def test_star_pairs_make_all_triangles_that_fit(sky_of, random_directions):
     u = random_directions(2000, 2)
     near = u[separation(u, [0.0, 0.0, 1.0]) < 0.4]
     seen = observe([[100.0, 80.0], [900.0, 300.0], [300.0, 700.0]], CAMERA, 40.0)
@@ -467,7 +439,7 @@ def test_every_clean_frame_is_identified_star_by_star(matcher):
         found = matcher.identify(frame.centroids_px)
         assert found.status == "identified"
         assert found.star_index.tolist() == frame.star_index.tolist()
-        assert found.star_ids.tolist() == (frame.star_index + FIRST_ID).tolist()
+        assert found.star_ids.tolist() == matcher.database.star_id[frame.star_index].tolist()
         assert (found.star_ids.dtype, found.star_index.dtype) == (np.int64, np.int32)
         assert found.n_matched == len(frame.star_index)
         assert found.false_match_probability <= matcher.max_false_match_probability

@@ -135,6 +135,17 @@ def library_version() -> str | None:
     return str(_onboard.ffi.string(_onboard.lib.starcat_version()).decode())
 
 
+def most_stars() -> int:
+    """Return the number of stars in or next to a frame that the C library has room for.
+
+    Returns
+    -------
+    int
+        As it was compiled for the ground; `docs/onboard-format.md` calls it ``most_near``.
+    """
+    return int(_onboard.lib.STARCAT_MAX_STARS)
+
+
 class FastMatcher:
     """An onboard image in memory, and the C library that reads it.
 
@@ -381,7 +392,7 @@ def _made(database: Database, method: str) -> FastMatcher | None:
         made = make_image(contents)
     except ConfigError:  # larger than an image can say
         return None
-    if made.most_near > int(_onboard.lib.STARCAT_MAX_STARS):
+    if made.most_near > most_stars():
         return None
     exact = np.ascontiguousarray(database.directions[made.star_rows])
     return FastMatcher(made.data, made.star_rows, exact)

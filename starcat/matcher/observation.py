@@ -179,4 +179,4 @@ def _without_repeats(
     if not same.any():
         return rows, []
     repeats = order[1:][same]
-    return np.delete(rows, repeats), [(int(row), "duplicate") for row in rows[np.sort(repeats)]]
+    return np.delete(rows, repeats), [(int(row), "duplicate") for row in np.sort(rows[repeats])]

@@ -1,0 +1,304 @@
+"""The matcher in C: the same stars as the one in numpy, whatever frame it gets."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from starcat.errors import ConfigError, ProductError
+from starcat.exchange.onboard import export_image
+from starcat.geometry.attitude import matrix_from_quaternion, quaternion_from_matrix
+from starcat.geometry.camera import Camera
+from starcat.geometry.distortion import Distortion
+from starcat.matcher import fast
+from starcat.matcher.database import Database
+from starcat.matcher.many import MatchResults
+from starcat.matcher.matcher import Matcher
+from starcat.matcher.methods.triangle_order import TriangleOrder
+from starcat.matcher.result import MatchResult
+from starcat.simulation.simulate import Frame, Noise, simulate_frame, simulate_frames
+from starcat.simulation.sky import Sky
+
+needs_c = pytest.mark.skipif(
+    not fast.is_compiled(), reason="starcat was installed without a C compiler"
+)
+
+CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
+HARD = Noise(0.7, 0.15, 4, noise_mag=0.3)
+
+
+@pytest.fixture(scope="module")
+def sky(sky_of, random_directions) -> Database:
+    return sky_of(random_directions(1200, 1))
+
+
+def frames(
+    database: Database, count: int, noise: Noise | None = None, seed: int = 3
+) -> list[Frame]:
+    given_sky = database.directions, database.camera
+    return list(simulate_frames(*given_sky, count, noise or Noise(), seed, database.mag))
+
+
+def both(sky: Database, method: str = "triangle", **stated: float) -> tuple[Matcher, Matcher]:
+    """Return the matcher in C and the one in numpy."""
+    return (
+        Matcher(sky, method, engine="c", **stated),
+        Matcher(sky, method, engine="numpy", **stated),
+    )
+
+
+def assert_same(found: MatchResult, expected: MatchResult) -> None:
+    """Check that two matchers say the same of a frame."""
+    assert found.status == expected.status
+    assert found.star_index.tolist() == expected.star_index.tolist()
+    assert found.star_ids.tolist() == expected.star_ids.tolist()
+    assert found.dropped == expected.dropped
+    assert found.n_matched == expected.n_matched
+    close = {"rtol": 1e-9, "atol": 1e-9, "equal_nan": True}
+    np.testing.assert_allclose(found.q_body_from_icrs, expected.q_body_from_icrs, **close)
+    np.testing.assert_allclose(found.residual_arcsec, expected.residual_arcsec, **close)
+    # The directions in an image are rounded; the bound is a power of residuals.
+    chance = np.log([found.false_match_probability, expected.false_match_probability])
+    assert chance[0] == pytest.approx(chance[1], abs=0.02)
+
+
+# --- The same stars
+
+
+@needs_c
+@pytest.mark.parametrize("method", fast.FEATURES)
+@pytest.mark.parametrize("stated", [{}, {"noise_px": 0.7, "noise_mag": 0.3}, {"noise_mag": 0.5}])
+@pytest.mark.parametrize("magnitudes", [False, True], ids=["places only", "magnitudes"])
+def test_hard_frames_get_the_same_stars(sky, method, stated, magnitudes):
+    in_c, in_numpy = both(sky, method, **stated)
+    identified = 0
+    for frame in frames(sky, 25, HARD, seed=11):
+        mag = frame.mag if magnitudes else None
+        expected = in_numpy.identify(frame.centroids_px, magnitudes=mag)
+        assert_same(in_c.identify(frame.centroids_px, magnitudes=mag), expected)
+        identified += expected.status == "identified"
+    assert identified > 15
+
+
+@needs_c
+@given(
+    seed=st.integers(0, 10_000),
+    noise_px=st.floats(0.05, 0.7),
+    missing=st.floats(0.0, 0.6),
+    false_stars=st.integers(0, 25),
+)
+def test_a_frame_as_noisy_as_stated_gets_the_same_stars(sky, seed, noise_px, missing, false_stars):
+    in_c, in_numpy = both(sky)
+    (frame,) = frames(sky, 1, Noise(noise_px, missing, false_stars, noise_mag=0.5), seed)
+    for mag in (None, frame.mag):
+        expected = in_numpy.identify(frame.centroids_px, magnitudes=mag)
+        assert_same(in_c.identify(frame.centroids_px, magnitudes=mag), expected)
+
+
+LENSES = [
+    Distortion(k1=-0.2),
+    Distortion(k1=0.1, k2=-0.3, k3=0.2, p1=2e-3, p2=-1e-3),
+]
+
+
+@needs_c
+@pytest.mark.parametrize("lens", LENSES, ids=["barrel", "all terms"])
+def test_a_distorted_camera_gets_the_same_stars(sky, lens):
+    camera = Camera(
+        1024, 768, CAMERA.focal_length_px, principal_point_px=(500.0, 400.5), distortion=lens
+    )
+    in_c, in_numpy = both(sky)
+    generator = np.random.default_rng(5)
+    whole = Sky(sky.directions, sky.mag, np.arange(len(sky.mag), dtype=np.int32))
+    for frame in frames(sky, 12):
+        seen = simulate_frame(whole, camera, frame.matrix, Noise(0.3), generator)
+        expected = in_numpy.identify(seen.centroids_px, camera)
+        assert expected.status == "identified"
+        assert_same(in_c.identify(seen.centroids_px, camera), expected)
+
+
+@needs_c
+def test_what_cannot_be_used_is_reported_alike(sky):
+    in_c, in_numpy = both(sky)
+    (frame,) = frames(sky, 1, Noise(0.3))
+    nan = np.nan
+    odd = [[nan, 5], [5, nan], [-1, 5], [1024, 5], [5, 1024], [0, 0], *frame.centroids_px[:3]]
+    given_px = np.concatenate([odd, frame.centroids_px])
+    mag = np.concatenate([[nan, 1, 2, 3, 4, nan, 1.0, 9.0, nan], frame.mag])
+    for magnitudes in (None, mag, np.full(len(mag), nan)):
+        expected = in_numpy.identify(given_px, magnitudes=magnitudes)
+        assert len(expected.dropped) == 8
+        assert_same(in_c.identify(given_px, magnitudes=magnitudes), expected)
+    for count in (0, 3, 4):
+        few = frame.centroids_px[:count]
+        assert_same(in_c.identify(few), in_numpy.identify(few))
+
+
+@needs_c
+def test_a_frame_that_is_too_large_for_the_library_is_answered(sky):
+    (frame,) = frames(sky, 1)
+    false = np.random.default_rng(8).random((600, 2)) * 1024.0
+    mag = np.concatenate([frame.mag, np.full(600, 9.0)])
+    found = Matcher(sky).identify(np.concatenate([frame.centroids_px, false]), magnitudes=mag)
+    assert len(found.star_index) > 600
+
+
+# --- Many frames
+
+
+@needs_c
+def test_answers_do_not_depend_on_threads_or_on_company(sky):
+    matcher = Matcher(sky, engine="c")
+    some = frames(sky, 600, HARD, seed=21)
+    px, mags = [frame.centroids_px for frame in some], [frame.mag for frame in some]
+    one = matcher.identify_many(px, magnitudes=mags, threads=1)
+    four = matcher.identify_many(px, magnitudes=mags, threads=4)
+    assert isinstance(one, MatchResults)
+    assert isinstance(four, MatchResults)
+    assert one.status == four.status
+    np.testing.assert_array_equal(one.q_body_from_icrs, four.q_body_from_icrs)
+    assert (one.seconds > 0.0).all()
+    for number in (0, 255, 256, 599, -1):
+        alone = matcher.identify(px[number], magnitudes=mags[number])
+        for many in (one, four):
+            assert many[number].star_ids.tolist() == alone.star_ids.tolist()
+            assert np.array_equal(
+                many[number].q_body_from_icrs, alone.q_body_from_icrs, equal_nan=True
+            )
+    assert [found.status for found in four[5:8]] == four.status[5:8]
+    with pytest.raises(IndexError):
+        one[600]
+
+
+def test_many_frames_are_answered_without_c(sky, monkeypatch):
+    monkeypatch.setattr(fast, "_onboard", None)
+    matcher = Matcher(sky)
+    some = frames(sky, 3)
+    found = matcher.identify_many([frame.centroids_px for frame in some])
+    assert [answer.status for answer in found] == ["identified"] * 3
+    tracked = matcher.track(some[0].centroids_px, quaternion_from_matrix(some[0].matrix), 0.5)
+    assert tracked.star_ids.tolist() == found[0].star_ids.tolist()
+
+
+def test_many_frames_need_as_many_magnitudes(sky):
+    (frame,) = frames(sky, 1)
+    with pytest.raises(ValueError, match="magnitudes of 1 frames; expected 2"):
+        Matcher(sky).identify_many([frame.centroids_px] * 2, magnitudes=[frame.mag])
+
+
+# --- Tracking
+
+
+def turned(frame: Frame, angle_deg: float, seed: int) -> np.ndarray:
+    """Return an attitude that is wrong by an angle about a random axis."""
+    axis = np.random.default_rng(seed).normal(size=3)
+    half = np.radians(angle_deg) / 2.0
+    axis *= np.sin(half) / np.linalg.norm(axis)
+    error = matrix_from_quaternion(np.append(axis, np.cos(half)))
+    return quaternion_from_matrix(error @ frame.matrix)
+
+
+@needs_c
+@pytest.mark.parametrize("error_deg", [0.0, 0.1, 0.5, 2.0])
+def test_a_tracked_frame_gets_the_stars_that_it_gets_lost_in_space(sky, error_deg):
+    matcher = Matcher(sky, engine="c")
+    same = 0
+    for number, frame in enumerate(frames(sky, 40, HARD, seed=31)):
+        lost = matcher.identify(frame.centroids_px)
+        prior = turned(frame, 0.999 * error_deg, number)
+        found = matcher.track(frame.centroids_px, prior, error_deg or 0.01)
+        if lost.status == found.status == "identified":
+            assert found.star_ids.tolist() == lost.star_ids.tolist()
+            same += 1
+    assert same >= 36
+
+
+@needs_c
+def test_a_wrong_prior_gives_no_answer(sky):
+    matcher = Matcher(sky, engine="c")
+    for number, frame in enumerate(frames(sky, 20)):
+        found = matcher.track(frame.centroids_px, turned(frame, 30.0, number), 2.0)
+        assert found.status == "no_match"
+
+
+@pytest.mark.parametrize(
+    ("prior", "uncertainty_deg", "words"),
+    [
+        ([0.0, 0.0, 0.0, 0.0], 1.0, "not all 0"),
+        ([0.0, 0.0, np.nan, 1.0], 1.0, "expected four numbers"),
+        ([0.0, 0.0, 1.0], 1.0, "expected four numbers"),
+        ([0.0, 0.0, 0.0, 1.0], 0.0, "above 0, at most 20"),
+        ([0.0, 0.0, 0.0, 1.0], 21.0, "above 0, at most 20"),
+        ([0.0, 0.0, 0.0, 1.0], np.nan, "above 0, at most 20"),
+    ],
+)
+def test_a_prior_that_is_none_is_refused(sky, prior, uncertainty_deg, words):
+    with pytest.raises(ValueError, match=words):
+        Matcher(sky).track(np.zeros((5, 2)), prior, uncertainty_deg)
+
+
+# --- Engines
+
+
+def test_engines_that_cannot_serve_say_why(sky, monkeypatch):
+    with pytest.raises(ConfigError, match="choose one of auto, c, numpy"):
+        Matcher(sky, engine="rust")
+    monkeypatch.setattr(fast, "_onboard", None)
+    assert not fast.is_compiled()
+    assert fast.library_version() is None
+    with pytest.raises(ConfigError, match="without a C compiler"):
+        Matcher(sky, engine="c")
+
+
+@needs_c
+def test_the_library_serves_two_methods_as_they_are(sky):
+    with pytest.raises(ConfigError, match="'pairs' is not in C; choose one of triangle, pyramid"):
+        Matcher(sky, "pairs", engine="c")
+    with pytest.raises(ConfigError, match="no other selection"):
+        Matcher(sky, engine="c", selection=TriangleOrder("inradius"))
+    # Whoever asks for neither gets numpy.
+    found = Matcher(sky, selection=TriangleOrder("inradius")).identify(np.zeros((0, 2)))
+    assert found.status == "too_few_stars"
+
+
+# --- Images
+
+
+@needs_c
+def test_an_image_is_matched_as_its_artifact(small_artifact, tmp_path):
+    for method in fast.FEATURES:
+        path = tmp_path / f"{method}.img"
+        export_image(small_artifact, "onboard", path, method=method)
+        ground, flight = Matcher.open(small_artifact, method), Matcher.open(path)
+        assert flight.method == method
+        assert flight.database.name == ground.database.name
+        for frame in frames(ground.database, 10):
+            expected, found = (matcher.identify(frame.centroids_px) for matcher in (ground, flight))
+            assert found.star_ids.tolist() == expected.star_ids.tolist()
+            # A direction is rounded by 0.0001 arcsec; three stars in a line make more of it.
+            np.testing.assert_allclose(
+                found.q_body_from_icrs, expected.q_body_from_icrs, atol=1e-7, equal_nan=True
+            )
+
+
+@needs_c
+def test_an_image_for_another_machine_is_refused(small_artifact, tmp_path):
+    path = tmp_path / "db.img"
+    export_image(small_artifact, "onboard", path, endian="big")
+    with pytest.raises(ProductError, match="the other byte order"):
+        Matcher.open(path)
+    with pytest.raises(ConfigError, match="needs an artifact"):
+        Matcher.open(path, engine="numpy")
+
+
+@needs_c
+def test_an_image_is_not_opened_where_a_field_is_too_full(sky, monkeypatch):
+    crowded = replace(sky, camera=Camera(1024, 1024, fov_x_deg=110.0))
+    monkeypatch.setattr(fast, "most_stars", lambda: 10)
+    assert fast.fast_matcher(crowded, "triangle") is None
+    with pytest.raises(ConfigError, match="too many stars"):
+        Matcher(crowded, engine="c")
