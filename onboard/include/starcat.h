@@ -124,6 +124,9 @@ typedef struct {
 /* Memory that a call works in; its contents are nobody's business and need not be set. */
 typedef struct starcat_workspace starcat_workspace;
 
+/* The library's version, STARCAT_VERSION as it was compiled. */
+const char *starcat_version(void);
+
 /* Fill in the camera that the image was built for, and the options that the ground uses. */
 void starcat_camera_of(const starcat_image *image, starcat_camera *camera);
 void starcat_default_options(starcat_options *options);

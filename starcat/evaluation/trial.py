@@ -274,6 +274,7 @@ def _opened(artifact: Path, trial: Trial) -> tuple[Matcher, Sky]:
         tolerance_px=trial.tolerance_px,
         max_false_match_probability=trial.max_false_match_probability,
         selection=trial.selection,
+        engine="numpy",  # so that records are the same where there is no compiler
     )
     # Stars that noise may lift over the limit belong to the sky.
     sky = _whole_sky(artifact).brighter(trial.noise.limit_mag + 6.0 * trial.noise.noise_mag)

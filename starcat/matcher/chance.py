@@ -8,21 +8,40 @@ many candidates a method has tried.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from starcat.geometry.attitude import determinant
 from starcat.geometry.camera import Camera
+from starcat.matcher.ways import Compatible, log_compatible_ways, log_ways
 
 Array = NDArray[np.float64]
 
 _ALL_ATTITUDES = 8.0 * math.pi**2
 """Volume of the rotations, cubic radians."""
 
+MIN_STARS = 4
+"""Smallest number of matched stars: three determine an attitude, a fourth confirms it."""
+
+NEARLY_CERTAIN = 1e-8
+"""Largest expected number of agreements of true stars that are likely to be answers."""
+
+NEXT_SHARE = 0.1
+"""Share of a number of stars over that of its neighbour on the side of the typical number."""
+
 
 def false_match_probability(
-    square_px: float, body: Array, n_centroids: int, stars_in_frame: int, camera: Camera
+    square_px: float,
+    body: Array,
+    n_centroids: int,
+    stars_in_frame: int,
+    camera: Camera,
+    *,
+    noise_px: float | None = None,
+    compatible: Compatible | None = None,
 ) -> float:
     """Bound the probability that random centroids agree as well with any attitude.
 
@@ -39,6 +58,11 @@ def false_match_probability(
         Stars of the database that the attitude puts on the detector or within reach of it.
     camera : Camera
         The camera, whose detector size and focal length are used.
+    noise_px : float, optional
+        Standard deviation of a centroid on each axis, where it was stated.
+    compatible : ndarray of bool, shape (n_centroids, stars_in_frame), optional
+        Which centroids may be which of these stars by their magnitudes, where the error of
+        magnitudes was stated. Every matched centroid is compatible with its star.
 
     Returns
     -------
@@ -56,6 +80,20 @@ def false_match_probability(
     n bounds the probability. M is counted around the field, so the bound is higher in a crowded
     field, and where most of the field is left unexplained.
 
+    Magnitudes. Assignments of centroids to stars that they are not compatible with are never
+    agreements, so they are not counted (`log_compatible_ways`). The hypothesis is that the
+    places of the centroids are random; it says nothing of their magnitudes. So the expected
+    number is that of random places with the magnitudes that the frame has, whatever they are:
+    it holds also where the magnitudes of false spots are those of the stars, and where the
+    stated error is wrong (then true frames may be missed).
+
+    Noise. Where nothing is stated, each of the N - 3 values of n is allotted the same share of
+    the probability: the expected number is divided by 1 / (N - 3). Any other shares do as well,
+    if they add up to 1 at every attitude and do not depend on where the centroids are. A stated
+    noise tells, before any residual is seen, which n will matter: with one star fewer than n*
+    an agreement of true stars is typically not certain, with one more it is so many times over.
+    So n* has the largest share and every further n a tenth of the one before (`_log_share`).
+
     Examples
     --------
     >>> camera = Camera(1024, 1024, 4871.0)
@@ -70,20 +108,50 @@ def false_match_probability(
     # How places move as the camera turns about its three axes, in units of the focal length.
     turned = np.array([[x * y, -1.0 - x * x, y], [1.0 + y * y, -x * y, -x]])
     information = determinant(np.einsum("ain,ajn->ij", turned, turned))
-    if not information > 0.0:
+    if not information > 0.0 or (noise_px is not None and n < MIN_STARS):
         return 1.0
+    most = n if noise_px is None else min(n_centroids, stars)
+    ways: Callable[[int], float] = partial(log_ways, n_centroids=n_centroids, stars=stars)
+    if compatible is not None:
+        ways = log_compatible_ways(most, compatible).item
+    if noise_px is None:
+        log_values = math.log(max(1, n_centroids - 3))
+    else:
+        log_values = -_log_share(n, most, ways, noise_px, camera)
+    expected = _log_expected(ways(n), n, square_px, information, camera) + log_values
+    return math.exp(min(0.0, expected))
+
+
+def _log_expected(
+    ways: float, n: int, square_px: float, information: float, camera: Camera
+) -> float:
+    """Return the logarithm of the expected number of agreements of n centroids."""
     left = 2 * n - 3
     attitudes = math.log(_ALL_ATTITUDES * camera.focal_length_px**3 * math.sqrt(information))
     unit_ball = 0.5 * left * math.log(math.pi) - math.lgamma(0.5 * left + 1.0)
     ball = unit_ball + 0.5 * left * math.log(max(square_px, 1e-30))
     frames = n * math.log(camera.width_px * camera.height_px)
-    ways = _log_ways(n, n_centroids, stars)
-    expected = ways + attitudes + ball - frames + math.log(max(1, n_centroids - 3))
-    return math.exp(min(0.0, expected))
+    return ways + attitudes + ball - frames
 
 
-def _log_ways(n: int, n_centroids: int, stars: int) -> float:
-    """Return the logarithm of the number of ways to assign n centroids to n stars."""
-    return (
-        math.lgamma(n_centroids + 1) - math.lgamma(n + 1) - math.lgamma(n_centroids - n + 1)
-    ) + (math.lgamma(stars + 1) - math.lgamma(stars - n + 1))
+def _log_share(
+    n: int, most: int, ways: Callable[[int], float], noise_px: float, camera: Camera
+) -> float:
+    """Return the logarithm of the share of n, which is ``most`` at the most.
+
+    The typical number of stars, n*, is the smallest whose agreements are `NEARLY_CERTAIN` where
+    their stars are spread over the whole frame and the squared residuals are what the noise
+    makes on average; the largest possible one where there is none.
+    """
+    numbers = range(MIN_STARS, most + 1)
+    square_of_frame = (camera.width_px**2 + camera.height_px**2) / 12.0
+    spread = square_of_frame / camera.focal_length_px**2
+    typical = numbers[-1]
+    for number in numbers:
+        square_px = (2 * number - 3) * noise_px**2
+        expected = _log_expected(ways(number), number, square_px, number**3 * spread, camera)
+        if expected <= math.log(NEARLY_CERTAIN):
+            typical = number
+            break
+    total = sum(NEXT_SHARE ** abs(number - typical) for number in numbers)
+    return abs(n - typical) * math.log(NEXT_SHARE) - math.log(total)

@@ -1,31 +1,58 @@
 """The matcher: centroids in, identified stars and attitude out.
 
 A method proposes which centroids are which stars; every proposal goes through the same
-verification, and only an agreement that chance does not explain is an answer.
+verification, and only an agreement that chance does not explain is an answer. What stands here is
+the readable reference in numpy; where it can, the C library answers, with the same stars.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from typing import Literal, get_args
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
+from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
+from starcat.geometry.distortion import checked_number
+from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database, open_database, products_in
+from starcat.matcher.fast import FEATURES, FastMatcher, Limits, fast_matcher, is_compiled
+from starcat.matcher.many import MatchResults
 from starcat.matcher.methods.table import METHODS, best_method, method_named
 from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder
-from starcat.matcher.observation import Observation, observe
+from starcat.matcher.observation import Observation, as_frame, observe
 from starcat.matcher.result import MatchResult, identified, unidentified
-from starcat.matcher.verification import MIN_STARS, Agreement, verify
+from starcat.matcher.verification import Agreement, verify
 
 CERTAIN = 1e-9
 """Largest false-match probability of an answer, unless another one is asked for.
 
 Where more is allowed, a hundredth of it ends the search; else the best answer is taken.
 """
+
+TOLERANCE_PX = 2.0
+"""Tolerance where neither it nor the noise of a centroid is stated."""
+
+NOISE_DEVIATIONS = 3.0
+"""Tolerance in standard deviations of a centroid on one axis, where that is stated.
+
+A centroid farther than `REACH` times as many from its star, 4.5, is one of 25,000.
+"""
+
+
+Engine = Literal["auto", "c", "numpy"]
+
+WIDEST_PRIOR_DEG = 20.0
+"""Largest error of the prior attitude of a tracked frame."""
+
+MAX_BATCHES = 200
+"""Batches of candidates that are tried before giving up."""
 
 
 @dataclass(frozen=True)
@@ -39,21 +66,87 @@ class Matcher:
     method : str
         A key of `METHODS`.
     tolerance_px : float
-        Largest error of a centroid, as a radius.
+        Largest error of a centroid, as a radius: 2 px, or three times ``noise_px`` where that is
+        stated.
     max_false_match_probability : float
         Answers that chance would give more often than this are withheld.
     selection : TriangleOrder
         Order and limits of the triangles of centroids, for the methods that use triangles.
     max_batches : int
         Batches of candidates tried before giving up.
+    noise_px : float, optional
+        Standard deviation of a centroid on each axis. Stating it, instead of a tolerance, makes
+        frames of few stars certain that would be withheld.
+    noise_mag : float, optional
+        Standard deviation of the magnitudes of centroids in the band of the database, its zero
+        point included. Where it is stated, a centroid is no star whose magnitude differs by
+        more than 3.5 of it, and agreements of magnitudes count as evidence.
+    engine : {"auto", "c", "numpy"}
+        ``numpy`` is the reference. ``c`` is the library that flies, a hundred times as fast, for
+        the methods ``triangle`` and ``pyramid`` with the default selection. Both name the same
+        stars. ``auto`` is ``c`` where it can serve.
     """
 
     database: Database
     method: str = "triangle"
-    tolerance_px: float = 2.0
+    # None stands for what is not given, which __post_init__ replaces.
+    tolerance_px: float = None  # type: ignore[assignment]
     max_false_match_probability: float = CERTAIN
     selection: TriangleOrder = DEFAULT
-    max_batches: int = 200
+    max_batches: int = MAX_BATCHES
+    noise_px: float | None = None
+    noise_mag: float | None = None
+    engine: Engine = "auto"
+
+    def __post_init__(self) -> None:
+        """Check what was stated, and find the tolerance where it was not given."""
+        for name in ("noise_px", "noise_mag"):
+            if getattr(self, name) is not None:
+                checked_number(name, getattr(self, name), 0.0)
+        of_noise = None if self.noise_px is None else NOISE_DEVIATIONS * self.noise_px
+        if self.tolerance_px is None:
+            object.__setattr__(self, "tolerance_px", of_noise or TOLERANCE_PX)
+        elif of_noise not in (None, self.tolerance_px):
+            text = (
+                f"both tolerance_px, {self.tolerance_px!r}, and noise_px, {self.noise_px!r}, are "
+                f"given; give one of them (the tolerance of a noise is {NOISE_DEVIATIONS:g} times "
+                "as large)"
+            )
+            raise ConfigError(text, key="noise_px", value=self.noise_px)
+        if self.engine not in get_args(Engine):
+            choices = ", ".join(get_args(Engine))
+            text = f"engine is {self.engine!r}; choose one of {choices}"
+            raise ConfigError(text, key="engine", value=self.engine)
+        if self.engine == "c" and self._fast is None:
+            raise ConfigError(f"engine 'c': {self._without_c()}", key="engine", value="c")
+
+    def _without_c(self) -> str:
+        """Return why the C library does not serve this matcher."""
+        if not is_compiled():
+            return (
+                "this starcat was installed without a C compiler; install one, then starcat again"
+            )
+        if self.method not in FEATURES:
+            return f"method {self.method!r} is not in C; choose one of {', '.join(FEATURES)}"
+        if not self._is_default:
+            return "it has no other selection and number of batches than the default ones"
+        return f"{self.database.name} has too many stars or features for an onboard image"
+
+    @property
+    def _is_default(self) -> bool:
+        return self.selection == DEFAULT and self.max_batches == MAX_BATCHES
+
+    @property
+    def _fast(self) -> FastMatcher | None:
+        """The C library with this matcher's image, where it serves."""
+        if self.engine == "numpy" or not self._is_default:
+            return None
+        return fast_matcher(self.database, self.method, self.engine == "c")
+
+    @property
+    def _limits(self) -> Limits:
+        noises = self.noise_px or 0.0, self.noise_mag or 0.0
+        return Limits(self.tolerance_px, *noises, self.max_false_match_probability)
 
     def __repr__(self) -> str:
         """Return database, method and limits in one line."""
@@ -68,9 +161,12 @@ class Matcher:
         artifact: str | os.PathLike[str],
         method: str | None = "triangle",
         *,
-        tolerance_px: float = 2.0,
+        tolerance_px: float | None = None,
         max_false_match_probability: float = CERTAIN,
         selection: TriangleOrder = DEFAULT,
+        noise_px: float | None = None,
+        noise_mag: float | None = None,
+        engine: Engine = "auto",
     ) -> Matcher:
         """Open the database of an artifact.
 
@@ -80,7 +176,7 @@ class Matcher:
             The artifact's folder.
         method : str, default "triangle"
             A key of `METHODS`; None for the best one that the artifact's products allow.
-        tolerance_px, max_false_match_probability, selection
+        tolerance_px, max_false_match_probability, selection, noise_px, noise_mag, engine
             As the attributes.
 
         Returns
@@ -91,14 +187,24 @@ class Matcher:
         Raises
         ------
         ConfigError
-            If there is no such method.
+            If there is no such method or engine, both ``tolerance_px`` and ``noise_px`` are
+            given, or a noise is not a finite number above 0.
         ProductError, SchemaVersionError
             If the artifact cannot be read, or lacks a product that the method needs.
         """
         path = Path(artifact)
         method = best_method(products_in(path)) if method is None else method
         database = open_database(path, method_named(method).products)
-        return cls(database, method, tolerance_px, max_false_match_probability, selection)
+        return cls(
+            database,
+            method,
+            tolerance_px,  # type: ignore[arg-type]
+            max_false_match_probability,
+            selection,
+            noise_px=noise_px,
+            noise_mag=noise_mag,
+            engine=engine,
+        )
 
     def identify(
         self,
@@ -117,8 +223,8 @@ class Matcher:
         camera : Camera, optional
             The database's own by default.
         magnitudes : array_like of float64, shape (N,), optional
-            Magnitudes with any zero point; they decide what is tried first, never what is
-            accepted.
+            Magnitudes; they decide what is tried first. With ``noise_mag`` they also decide
+            what is accepted, and their zero point has to be that of the database.
 
         Returns
         -------
@@ -131,7 +237,121 @@ class Matcher:
             If the centroids are not pairs of numbers, or the magnitudes are not one each.
         """
         camera = camera or self.database.camera
-        observation = observe(centroids_px, camera, self.tolerance_px, magnitudes)
+        frame, mag = as_frame(centroids_px, magnitudes)
+        fast = self._fast
+        if fast is None or not fast.takes(len(frame)):
+            return self._identify(frame, camera, mag)
+        found = fast.identify([frame], camera, self._limits, None if mag is None else [mag])
+        return MatchResults(found, self.database.star_id)[0]
+
+    def identify_many(
+        self,
+        frames: Sequence[ArrayLike],
+        camera: Camera | None = None,
+        *,
+        magnitudes: Sequence[ArrayLike] | None = None,
+        threads: int | None = None,
+    ) -> Sequence[MatchResult]:
+        """Identify the stars of many frames of one camera.
+
+        Parameters
+        ----------
+        frames : sequence of array_like of float64, shape (n, 2)
+            Centroids of each frame, as `identify` takes them.
+        camera : Camera, optional
+            The database's own by default.
+        magnitudes : sequence of array_like of float64, shape (n,), optional
+            Those of each frame.
+        threads : int, optional
+            Threads that the C library runs in at once; all cores by default. The answers do not
+            depend on it.
+
+        Returns
+        -------
+        sequence of MatchResult
+            One a frame. `MatchResults`, with arrays over all frames, where the library took them
+            all.
+
+        Raises
+        ------
+        ValueError
+            As `identify`, or if there are not as many arrays of magnitudes as frames.
+        """
+        camera = camera or self.database.camera
+        if magnitudes is not None and len(magnitudes) != len(frames):
+            raise ValueError(f"magnitudes of {len(magnitudes)} frames; expected {len(frames)}")
+        given = [
+            as_frame(frame, None if magnitudes is None else magnitudes[n])
+            for n, frame in enumerate(frames)
+        ]
+        fast = self._fast
+        if fast is None or not all(fast.takes(len(frame)) for frame, _ in given):
+            return [self._identify(frame, camera, mag) for frame, mag in given]
+        mags = None if magnitudes is None else [np.asarray(mag) for _, mag in given]
+        workers = threads or os.cpu_count() or 1
+        px = [frame for frame, _ in given]
+        found = fast.identify(px, camera, self._limits, mags, threads=workers)
+        return MatchResults(found, self.database.star_id)
+
+    def track(
+        self,
+        centroids_px: ArrayLike,
+        q_body_from_icrs: ArrayLike,
+        uncertainty_deg: float,
+        camera: Camera | None = None,
+        *,
+        magnitudes: ArrayLike | None = None,
+    ) -> MatchResult:
+        """Identify the stars of a frame near a prior attitude.
+
+        Parameters
+        ----------
+        centroids_px, camera, magnitudes
+            As for `identify`.
+        q_body_from_icrs : array_like of float64, shape (4,)
+            Prior attitude, scalar last.
+        uncertainty_deg : float
+            Largest error of the prior, as an angle of rotation; above 0, at most 20.
+
+        Returns
+        -------
+        MatchResult
+            ``no_match`` where no attitude as near as that explains the frame. The verification is
+            the same as without a prior. Without the C library the whole sky is searched.
+
+        Raises
+        ------
+        ValueError
+            As `identify`, or if the prior is no quaternion or its error out of range.
+        """
+        camera = camera or self.database.camera
+        frame, mag = as_frame(centroids_px, magnitudes)
+        prior = np.asarray(q_body_from_icrs, dtype=np.float64)
+        if prior.shape != (4,) or not np.isfinite(prior).all() or not prior.any():
+            raise ValueError(f"q_body_from_icrs is {prior}; expected four numbers, not all 0")
+        if not 0.0 < uncertainty_deg <= WIDEST_PRIOR_DEG:
+            raise ValueError(
+                f"uncertainty_deg is {uncertainty_deg}; expected above 0, at most "
+                f"{WIDEST_PRIOR_DEG:g}"
+            )
+        fast = self._fast
+        if fast is None or not fast.takes(len(frame)):
+            return self._identify(frame, camera, mag)
+        found = fast.identify(
+            [frame],
+            camera,
+            self._limits,
+            None if mag is None else [mag],
+            priors=(prior[None], float(np.radians(uncertainty_deg))),
+        )
+        return MatchResults(found, self.database.star_id)[0]
+
+    def _identify(
+        self, frame: NDArray[np.float64], camera: Camera, mag: NDArray[np.float64] | None
+    ) -> MatchResult:
+        """Identify a frame with numpy."""
+        stated = {"noise_px": self.noise_px, "noise_mag": self.noise_mag}
+        observation = observe(frame, camera, self.tolerance_px, mag, **stated)
         if len(observation) < MIN_STARS:
             return unidentified("too_few_stars", observation)
         found = self._search(observation)

@@ -35,6 +35,10 @@ class Observation:
     dropped : tuple of (int, str)
         Row and reason of every centroid that is not used: ``not_finite``, ``out_of_frame`` or
         ``duplicate``.
+    noise_px : float or None
+        Standard deviation of a centroid on each axis, where it was stated.
+    noise_mag : float or None
+        Standard deviation of a magnitude in the band of the database, where it was stated.
     """
 
     rows: NDArray[np.int64]
@@ -44,6 +48,8 @@ class Observation:
     camera: Camera
     tolerance_px: float
     dropped: tuple[tuple[int, str], ...] = ()
+    noise_px: float | None = None
+    noise_mag: float | None = None
 
     def __len__(self) -> int:
         """Return the number of usable centroids."""
@@ -68,6 +74,9 @@ def observe(
     camera: Camera,
     tolerance_px: float,
     magnitudes: ArrayLike | None = None,
+    *,
+    noise_px: float | None = None,
+    noise_mag: float | None = None,
 ) -> Observation:
     """Prepare a frame for identification.
 
@@ -80,13 +89,53 @@ def observe(
     tolerance_px : float
         Largest error of a centroid, as a radius.
     magnitudes : array_like of float64, shape (N,), optional
-        Magnitudes with any zero point, larger is fainter; NaN where unknown.
+        Magnitudes, larger is fainter; NaN where unknown. The zero point may be any one, unless
+        ``noise_mag`` is stated.
+    noise_px, noise_mag : float, optional
+        As the attributes of `Observation`.
 
     Returns
     -------
     Observation
         The frame with the centroids that can be used. Where several lie at exactly the same
         place, one is kept: the brightest, if magnitudes are known.
+
+    Raises
+    ------
+    ValueError
+        If the centroids are not pairs of numbers, or the magnitudes are not one a centroid.
+    """
+    given, mag = as_frame(centroids_px, magnitudes)
+    usable = camera.contains(given)
+    rows, dropped = np.flatnonzero(usable), _unusable(given, usable)
+    rows = rows[_own_order(given[rows], None if mag is None else mag[rows], camera)]
+    rows, repeats = _without_repeats(rows, given)
+    kept = given[rows]
+    known = None if mag is None or not np.isfinite(mag[rows]).any() else mag[rows]
+    body = camera.directions_from_pixels(kept)
+    return Observation(
+        rows, kept, body, known, camera, tolerance_px, (*dropped, *repeats), noise_px, noise_mag
+    )
+
+
+def as_frame(
+    centroids_px: ArrayLike, magnitudes: ArrayLike | None = None
+) -> tuple[Array, Array | None]:
+    """Return what a caller gives as arrays.
+
+    Parameters
+    ----------
+    centroids_px : array_like of float64, shape (N, 2)
+        Pixels.
+    magnitudes : array_like of float64, shape (N,), optional
+        One a centroid.
+
+    Returns
+    -------
+    centroids_px : ndarray of float64, shape (N, 2)
+        The same.
+    magnitudes : ndarray of float64, shape (N,), or None
+        The same.
 
     Raises
     ------
@@ -100,14 +149,7 @@ def observe(
     mag = None if magnitudes is None else np.asarray(magnitudes, dtype=np.float64)
     if mag is not None and mag.shape != (len(given),):
         raise ValueError(f"magnitudes have shape {mag.shape}; expected ({len(given)},)")
-    usable = camera.contains(given)
-    rows, dropped = np.flatnonzero(usable), _unusable(given, usable)
-    rows = rows[_own_order(given[rows], None if mag is None else mag[rows], camera)]
-    rows, repeats = _without_repeats(rows, given)
-    kept = given[rows]
-    known = None if mag is None or not np.isfinite(mag[rows]).any() else mag[rows]
-    body = camera.directions_from_pixels(kept)
-    return Observation(rows, kept, body, known, camera, tolerance_px, (*dropped, *repeats))
+    return given, mag
 
 
 def _unusable(given: Array, usable: NDArray[np.bool_]) -> list[tuple[int, str]]:

@@ -15,17 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.geometry.attitude import solve_wahba_svd
-from starcat.matcher.chance import false_match_probability
+from starcat.matcher.chance import MIN_STARS, false_match_probability
 from starcat.matcher.database import Database
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.observation import Observation
 from starcat.matcher.spread import is_scaled, share_of_frame
 from starcat.matcher.star_cells import StarCells, star_cells
+from starcat.matcher.ways import Compatible, compatible_pairs
 
 Array = NDArray[np.float64]
-
-MIN_STARS = 4
-"""Smallest number of matched stars: three determine an attitude, a fourth confirms it."""
 
 MIN_SHARE = 1.0 / 3.0
 """Smallest share of a frame that the attitude of an answer explains.
@@ -201,6 +199,7 @@ class _Fit:
     matrix: Array
     near: NDArray[np.int64]
     icrs: Array
+    compatible: Compatible | None
     predicted_px: Array
     star: NDArray[np.int64]
     matched: NDArray[np.int64]
@@ -217,17 +216,20 @@ def _refined(
     camera, body = observation.camera, observation.body
     near = np.flatnonzero(database.directions @ matrix[2] >= math.cos(camera.radius_rad))
     u = database.directions[near]
+    compatible = None
+    if observation.mag is not None and observation.noise_mag is not None:
+        compatible = compatible_pairs(observation.mag, database.mag[near], observation.noise_mag)
     before: NDArray[np.int64] = np.empty(0, dtype=np.int64)
     for factor in (*wider, *MAX_REFINEMENTS * (1.0,)):
         predicted = camera.pixels_from_directions(u @ matrix.T)
         reach_px = factor * REACH * observation.tolerance_px
-        star, square_px = _mutually_nearest(predicted, observation, reach_px)
+        star, square_px = _mutually_nearest(predicted, observation, reach_px, compatible)
         matched = np.flatnonzero(star >= 0)
         if len(matched) < MIN_STARS or (factor == 1.0 and np.array_equal(star, before)):
             break
         before = star
         matrix = solve_wahba_svd(body[matched], u[star[matched]])
-    return _Fit(matrix, near, u, predicted, star, matched, square_px)
+    return _Fit(matrix, near, u, compatible, predicted, star, matched, square_px)
 
 
 def _judged(fit: _Fit, observation: Observation) -> tuple[Agreement, float]:
@@ -245,7 +247,15 @@ def _judged(fit: _Fit, observation: Observation) -> tuple[Agreement, float]:
     residual_rad = math.sqrt(float(np.vdot(difference, difference)) / len(matched))
     within = _within_reach_of_frame(fit.predicted_px, observation)
     square_px = float(fit.square_px[matched].sum())
-    chance = false_match_probability(square_px, seen, len(observation), len(within), camera)
+    chance = false_match_probability(
+        square_px,
+        seen,
+        len(observation),
+        len(within),
+        camera,
+        noise_px=observation.noise_px,
+        compatible=None if fit.compatible is None else fit.compatible[:, within],
+    )
     share = 1.0
     if chance < 1.0 and len(matched) < len(within):
         stars = fit.icrs[within] @ fit.matrix.T
@@ -267,11 +277,15 @@ def _within_reach_of_frame(predicted_px: Array, observation: Observation) -> NDA
 
 
 def _mutually_nearest(
-    predicted_px: Array, observation: Observation, reach_px: float
+    predicted_px: Array,
+    observation: Observation,
+    reach_px: float,
+    compatible: Compatible | None,
 ) -> tuple[NDArray[np.int64], Array]:
     """Return the star of each centroid, -1 where it has none, and the squared distances.
 
-    A centroid has a star if each of the two is the nearest to the other, within reach.
+    A centroid has a star if each of the two is the nearest to the other, within reach, among
+    those whose magnitudes are compatible.
     """
     count = len(observation)
     if not len(predicted_px):
@@ -280,6 +294,8 @@ def _mutually_nearest(
     dx, dy = x[:, None] - predicted_px[:, 0], y[:, None] - predicted_px[:, 1]
     # The distance is NaN where the lens forms no image of a star; it must not be the minimum.
     square = np.fmin(dx * dx + dy * dy, np.inf)
+    if compatible is not None:
+        square[~compatible] = np.inf
     star, rows = square.argmin(axis=1), np.arange(count)
     nearest = square[rows, star]
     mutual = (square.argmin(axis=0)[star] == rows) & (nearest <= reach_px * reach_px)

@@ -372,7 +372,7 @@ def run_self_test(folder: Path, spec: BuildSpec, progress: Progress) -> tuple[Ra
         How they fared.
     """
     test = spec.self_test
-    matcher = Matcher.open(folder, None, tolerance_px=max(0.5, 4.0 * test.noise_px))
+    matcher = Matcher.open(folder, None, tolerance_px=max(0.5, 4.0 * test.noise_px), engine="numpy")
     return self_test(matcher, test.frames, test.noise_px, test.seed, progress)
 
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from starcat.geometry.attitude import matrix_from_quaternion
+from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
-from starcat.matcher.verification import MIN_STARS
 from starcat.progress import Progress, no_progress
 from starcat.simulation.simulate import Frame, Noise, simulate_frames
 

@@ -6,8 +6,9 @@ with p = 0.1, and 3 spots are false, their magnitudes drawn from the stars' own.
 of the attitudes, and what it takes to open the database.
 
 The peers are no dependencies of starcat: each is installed from PyPI into dist/bench-peers/,
-which is kept. Run with ``make bench``; ``--frames N`` for a shorter one. The catalog is sought
-in $STARCAT_CATALOGS. All figures also go into dist/matcher-bench.json.
+which is kept. Run with ``make bench``; ``--frames N`` for a shorter one, ``--only NAME`` for the
+rows whose name begins so. The catalog is sought in $STARCAT_CATALOGS. All figures also go into
+dist/matcher-bench.json. Where valgrind is, the instructions of the C library are counted.
 """
 
 from __future__ import annotations
@@ -30,10 +31,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+import instructions
 import peers
 from synthetic import catalogs_folder
 
-from starcat.geometry.attitude import matrix_from_quaternion
+from starcat.geometry.attitude import matrix_from_quaternion, quaternion_from_matrix
 from starcat.matcher.database import Database, open_database
 from starcat.matcher.matcher import MIN_STARS, Matcher
 from starcat.matcher.methods.table import METHODS
@@ -44,6 +46,13 @@ from starcat.specs.reading import preset
 SEED = 86_028_121
 NOISE_PX = 0.5
 NOISE_MAG = 0.3
+STATED = {
+    "clean": {"noise_px": NOISE_PX, "noise_mag": 0.05},
+    "hard": {"noise_px": NOISE_PX, "noise_mag": NOISE_MAG},
+}
+"""What the caller states of the frames in the rows that say so. The magnitudes of clean frames are
+exact; nobody would state that."""
+
 KINDS = {"clean": Noise(NOISE_PX), "hard": Noise(NOISE_PX, 0.1, 3)}
 BORESIGHT_DEG, ROLL_DEG = 0.05, 0.5
 """An answer is right if its attitude is within both."""
@@ -51,9 +60,11 @@ BORESIGHT_DEG, ROLL_DEG = 0.05, 0.5
 ARCSEC = np.pi / 648_000.0
 
 NOTES = f"""
+*: starcat; C: the library that flies, else numpy. stated: the caller states noises, 0.5 px and 0.05
+mag (clean) or 0.3 (hard); track: a prior attitude that is wrong by up to {peers.PRIOR_DEG} deg.
 right: boresight within {BORESIGHT_DEG} deg and roll within {ROLL_DEG} deg; wrong: another answer.
 ms: processor time of the call alone, one thread, a process each. x cedar: medians over those of
-cedar-solve, clean and hard. *: over {peers.SLOW_S * 1e3:.0f} ms, so {peers.SLOW_FRAMES} frames.
+cedar-solve, clean and hard. !: over {peers.SLOW_S * 1e3:.0f} ms, so {peers.SLOW_FRAMES} frames.
 All know the camera; centroids come brightest first by noisy magnitude, an order that starcat
 does not look at. The peers' databases hold the same stars, with their own default settings:
 cedar-solve 12 deg +- 1 %, stars as a hip_main.dat of its layout, its logging off; tetra3rs 12
@@ -70,6 +81,7 @@ class Row:
     version: str = ""
     counts: dict[str, list[int]] | None = None
     milliseconds: dict[str, list[float]] | None = None
+    inside_us: dict[str, list[float]] | None = None
     build_s: float = np.nan
     database_mb: float = np.nan
     peak_mib: float = np.nan
@@ -97,6 +109,7 @@ def make_frames(database: Database, count: int, path: Path) -> dict[str, list[Fr
             mag.append(m[order])
         given[f"{kind}_starts"] = np.cumsum([0, *(len(m) for m in mag[:-1])])
         given[f"{kind}_px"], given[f"{kind}_mag"] = np.concatenate(px), np.concatenate(mag)
+        given[f"{kind}_priors"] = priors([frame.matrix for frame in made[kind]])
     np.savez(
         path,
         directions=database.directions,
@@ -105,6 +118,21 @@ def make_frames(database: Database, count: int, path: Path) -> dict[str, list[Fr
         **given,
     )
     return made
+
+
+def priors(matrices: list[np.ndarray]) -> np.ndarray:
+    """Return attitudes that are wrong by up to `peers.PRIOR_DEG`, as quaternions."""
+    generator = np.random.default_rng(SEED)
+    turn = generator.normal(size=(len(matrices), 3))
+    turn /= np.linalg.norm(turn, axis=1)[:, None]
+    turn *= np.radians(peers.PRIOR_DEG) * generator.uniform(size=(len(turn), 1)) ** (1.0 / 3.0)
+    found = []
+    for matrix, (x, y, z) in zip(matrices, turn, strict=True):
+        half = 0.5 * np.sqrt(x * x + y * y + z * z)
+        axis = np.array([x, y, z]) * np.sin(half) / (2.0 * half)
+        error = matrix_from_quaternion(np.append(axis, np.cos(half)))
+        found.append(quaternion_from_matrix(error @ matrix))
+    return np.array(found).reshape(-1, 4)
 
 
 def errors_rad(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -142,23 +170,45 @@ def drive(
         return Row(who, failure=f"{stage}: {error}")
     with np.load(answers) as file:
         found = dict(file)
-    counts, milliseconds = {}, {}
+    counts, milliseconds, inside_us = {}, {}, {}
     for kind in KINDS:
         matrices, ms = found[f"{kind}_matrices"], found[f"{kind}_seconds"] * 1e3
         counts[kind] = count_answers(matrices, truth[: len(matrices)])
         milliseconds[kind] = [float(np.median(ms)), float(np.percentile(ms, 95))]
+        inside = found[f"{kind}_inside"] * 1e6
+        inside_us[kind] = [float(np.percentile(inside, part)) for part in (50, 95, 99, 100)]
     facts = {key: float(found[key]) for key in ("build_s", "database_mb", "peak_mib")}
-    return Row(who, str(found["version"]), counts, milliseconds, **facts)
+    return Row(who, str(found["version"]), counts, milliseconds, inside_us, **facts)
 
 
-def drive_all(artifact: Path, build_s: float, frames: Path, truth: np.ndarray) -> list[Row]:
-    """Return a row for every method of starcat, one without magnitudes, and every peer."""
+def asked() -> dict[str, dict[str, Any]]:
+    """Return how starcat is asked, by name of the row: in C first, then every method in numpy."""
+    c = {"method": "triangle", "magnitudes": True, "engine": "c"}
+    rows: dict[str, dict[str, Any]] = {
+        "C triangle, stated": c | {"stated": STATED},
+        "C triangle": c,
+        "C triangle, no mag.": c | {"magnitudes": False},
+        "C pyramid": c | {"method": "pyramid"},
+        "C track, stated": c | {"track": True, "stated": STATED},
+        "C track, no mag.": c | {"track": True, "magnitudes": False},
+        "triangle, stated": {"method": "triangle", "magnitudes": True, "stated": STATED},
+        "triangle, no mag.": {"method": "triangle", "magnitudes": False},
+    }
+    return rows | {name: {"method": name, "magnitudes": True} for name in METHODS}
+
+
+def drive_all(
+    artifact: Path, build_s: float, frames: Path, truth: np.ndarray, only: str
+) -> list[Row]:
+    """Return a row for every way to ask starcat, and every peer."""
     rows = []
-    for method, magnitudes in [("triangle", False), *((name, True) for name in METHODS)]:
-        options = {"artifact": str(artifact), "method": method, "magnitudes": magnitudes}
-        who = f"starcat {method}" + ("" if magnitudes else ", no mag.")
-        row = drive(who, "starcat", frames, truth, options)
-        rows.append(replace(row, build_s=build_s, database_mb=stored_mb(artifact, method)))
+    for name, options in asked().items():
+        if name.startswith(only):
+            row = drive(
+                f"* {name}", "starcat", frames, truth, options | {"artifact": str(artifact)}
+            )
+            size = stored_mb(artifact, options["method"])
+            rows.append(replace(row, build_s=build_s, database_mb=size))
     return rows + [drive(name, name, frames, truth) for name in peers.REQUIREMENTS]
 
 
@@ -181,12 +231,19 @@ def print_table(rows: list[Row], frames: int) -> None:
         line = f"{row.who if row.who not in peers.REQUIREMENTS else f'{row.who} {row.version}':<25}"
         for kind in KINDS:
             counts, ms = row.counts[kind], row.milliseconds[kind]
-            mark = "*" if sum(counts) < frames else " "
+            mark = "!" if sum(counts) < frames else " "
             line += f"{'/'.join(map(str, counts)):>10}{mark}{number(ms[0]):>6}{number(ms[1]):>7} "
         line += f"{number(row.build_s):>7}{number(row.database_mb):>6}"
         ratios = [row.milliseconds[kind][0] / base[kind][0] for kind in KINDS] if base else []
         print(line + "".join(f"{number(ratio):>6}" for ratio in ratios))
     print(NOTES)
+    print("\nC library, microseconds without the call: median, p95, p99, most")
+    for row in rows:
+        if row.inside_us is not None and np.isfinite(row.inside_us["clean"][0]):
+            parts = (
+                f"{kind} " + " ".join(f"{us:8.1f}" for us in row.inside_us[kind]) for kind in KINDS
+            )
+            print(f"  {row.who:<23}" + "   ".join(parts))
 
 
 def number(value: float) -> str:
@@ -263,7 +320,9 @@ def main() -> None:
     """Build, simulate, let everybody answer, print; write dist/matcher-bench.json."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--frames", type=int, default=1000)
-    count = parser.parse_args().frames
+    parser.add_argument("--only", default="", help="rows of starcat whose name begins so")
+    given = parser.parse_args()
+    count = given.frames
     with tempfile.TemporaryDirectory() as folder:
         scratch, frames = Path(folder), Path(folder, "frames.npz")
         inputs = {"sao": [catalogs_folder() / "sao.dat.gz"]}
@@ -278,8 +337,10 @@ def main() -> None:
             few = sum(frame.n_stars < MIN_STARS for frame in simulated)
             print(f"  {kind}: median of {spots:g} centroids, fewer than {MIN_STARS} stars in {few}")
         truth = np.array([frame.matrix for frame in made["clean"]])
-        rows = drive_all(built.folder, times["products"] + times["write"], frames, truth)
+        build_s = times["products"] + times["write"]
+        rows = drive_all(built.folder, build_s, frames, truth, given.only)
         print_table(rows, count)
+        instructions.print_all(built.folder, frames, KINDS, scratch)
         facts = accuracy(Matcher.open(built.folder), made["clean"]) | opening(built.folder, scratch)
         print_accuracy(facts)
     machine = {"platform": platform.platform(), "cores": os.cpu_count(), "load": os.getloadavg()}

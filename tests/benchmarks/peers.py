@@ -32,6 +32,9 @@ SLOW_S = 0.02
 TOLERANCE_PX = 2.0
 """starcat's own default."""
 
+PRIOR_DEG = 0.5
+"""Largest error of the prior attitudes of tracked frames."""
+
 REQUIREMENTS = {
     "cedar-solve": ("cedar-solve==0.5.1",),
     "tetra3rs": ("tetra3rs==0.14.0",),
@@ -65,32 +68,74 @@ class Sky:
 class Driver:
     """How one identifier is asked. Only ``solve`` is timed.
 
-    ``attitude`` turns its answer into a matrix, ``body = matrix @ icrs`` with x right and y
-    down, or None.
+    ``prepare`` gets centroids, magnitudes and a prior attitude; ``attitude`` turns an answer into
+    a matrix, ``body = matrix @ icrs`` with x right and y down, or None. ``begin`` is told the kind
+    of frames that follows. ``inside_s`` asks once more, and says how long compiled code takes
+    without the call from Python.
     """
 
-    prepare: Callable[[np.ndarray, np.ndarray], Any]
+    prepare: Callable[[np.ndarray, np.ndarray, np.ndarray], Any]
     solve: Callable[[Any], Any]
     attitude: Callable[[Any], np.ndarray | None]
     build_s: float = math.nan
     database_bytes: float = math.nan
+    begin: Callable[[str], object] = str
+    inside_s: Callable[[Any], float] = lambda given: math.nan
 
 
-def drive_starcat(sky: Sky, artifact: str, method: str, magnitudes: bool) -> Driver:
-    """Its database is built already."""
+def drive_starcat(
+    sky: Sky,
+    artifact: str,
+    method: str,
+    magnitudes: bool,
+    engine: str = "numpy",
+    stated: dict[str, dict[str, float]] | None = None,
+    track: bool = False,
+) -> Driver:
+    """Its database is built already. ``stated`` are the noises that each kind of frames has."""
     from starcat.geometry.attitude import matrix_from_quaternion
+    from starcat.matcher.fast import Limits, fast_matcher
     from starcat.matcher.matcher import Matcher
 
-    matcher = Matcher.open(Path(artifact), method)
+    of_kind = {
+        kind: Matcher.open(Path(artifact), method, engine=engine, **(stated or {}).get(kind, {}))
+        for kind in KINDS
+    }
+    matcher = of_kind[KINDS[0]]
+    # The image is made before the clock runs.
+    for other in of_kind.values():
+        other.identify(np.zeros((0, 2)))
+
+    def begin(kind: str) -> None:
+        nonlocal matcher
+        matcher = of_kind[kind]
 
     def attitude(found: Any) -> np.ndarray | None:
         is_answer = found.status == "identified"
         return matrix_from_quaternion(found.q_body_from_icrs) if is_answer else None
 
     def solve(given: Any) -> Any:
-        return matcher.identify(given[0], magnitudes=given[1])
+        px, mag, prior = given
+        if track:
+            return matcher.track(px, prior, PRIOR_DEG, magnitudes=mag)
+        return matcher.identify(px, magnitudes=mag)
 
-    return Driver(lambda px, mag: (px, mag if magnitudes else None), solve, attitude)
+    def prepare(px: np.ndarray, mag: np.ndarray, prior: np.ndarray) -> Any:
+        return px, mag if magnitudes else None, prior
+
+    def inside_s(given: Any) -> float:
+        fast = fast_matcher(matcher.database, method) if engine == "c" else None
+        if fast is None:
+            return math.nan
+        px, mag, prior = given
+        noises = matcher.noise_px or 0.0, matcher.noise_mag or 0.0
+        limits = Limits(matcher.tolerance_px, *noises, matcher.max_false_match_probability)
+        mags = None if mag is None else [mag]
+        priors = (prior[None], math.radians(PRIOR_DEG)) if track else None
+        found = fast.identify([px], matcher.database.camera, limits, mags, priors)
+        return float(found.frames["seconds"][0])
+
+    return Driver(prepare, solve, attitude, begin=begin, inside_s=inside_s)
 
 
 def drive_cedar_solve(sky: Sky) -> Driver:
@@ -126,7 +171,7 @@ def drive_cedar_solve(sky: Sky) -> Driver:
             return None
         return matrix_from_radec_roll(found["RA"], found["Dec"], found["Roll"])
 
-    def rows_first(px: np.ndarray, _: np.ndarray) -> np.ndarray:
+    def rows_first(px: np.ndarray, *_: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(px[:, ::-1])
 
     return Driver(rows_first, solve, attitude, build_s, size)
@@ -160,7 +205,7 @@ def drive_tetra3rs(sky: Sky) -> Driver:
     def solve(centroids: np.ndarray) -> Any:
         return database.solve_from_centroids(centroids, **known)
 
-    def from_middle(px: np.ndarray, mag: np.ndarray) -> np.ndarray:
+    def from_middle(px: np.ndarray, mag: np.ndarray, _: np.ndarray) -> np.ndarray:
         return np.column_stack([px - middle, 10.0 ** (-0.4 * mag)])
 
     def attitude(found: Any) -> np.ndarray | None:
@@ -195,7 +240,7 @@ def drive_ruststartracker(sky: Sky) -> Driver:
     def attitude(found: Any) -> np.ndarray | None:
         return None if found is None else matrix_from_rotation(found.quat).T
 
-    return Driver(lambda px, _: np.float32(px), solve, attitude, build_s)
+    return Driver(lambda px, *_: np.float32(px), solve, attitude, build_s)
 
 
 DRIVERS: dict[str, Callable[..., Driver]] = {
@@ -229,24 +274,27 @@ def matrix_from_rotation(quaternion: np.ndarray) -> np.ndarray:
     return np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
 
 
-def solve_frames(driver: Driver, frames: Any, kind: str) -> tuple[np.ndarray, np.ndarray]:
+def solve_frames(driver: Driver, frames: Any, kind: str) -> dict[str, np.ndarray]:
     """Return attitudes, NaN where there is none, and seconds of processor time.
 
     On an idle machine they pass as they do on the wall; on a busy one waiting is left out.
     """
     starts = frames[f"{kind}_starts"]
     centroids, mag = (np.split(frames[f"{kind}_{key}"], starts[1:]) for key in ("px", "mag"))
-    matrices, seconds = [], []
-    for px, m in zip(centroids, mag, strict=True):
-        given = driver.prepare(px, m)
+    matrices, seconds, inside = [], [], []
+    driver.begin(kind)
+    for px, m, prior in zip(centroids, mag, frames[f"{kind}_priors"], strict=True):
+        given = driver.prepare(px, m, prior)
         start = time.process_time()
         found = driver.solve(given)
         seconds.append(time.process_time() - start)
+        inside.append(driver.inside_s(given))
         matrix = driver.attitude(found)
         matrices.append(np.full((3, 3), np.nan) if matrix is None else matrix)
         if len(seconds) == SLOW_FRAMES and np.median(seconds) > SLOW_S:
             break
-    return np.array(matrices), np.array(seconds)
+    found = {"matrices": matrices, "seconds": seconds, "inside": inside}
+    return {f"{kind}_{key}": np.array(values) for key, values in found.items()}
 
 
 def peak_memory_mib() -> float:
@@ -287,7 +335,7 @@ def main(name: str, frames: str, answers: str, options: str) -> None:
     driver = DRIVERS[name](sky, **json.loads(options))
     written = {}
     for kind in KINDS:
-        written[f"{kind}_matrices"], written[f"{kind}_seconds"] = solve_frames(driver, given, kind)
+        written |= solve_frames(driver, given, kind)
     facts = {"build_s": driver.build_s, "database_mb": driver.database_bytes / 1e6}
     np.savez(answers, version=version(name), peak_mib=peak_memory_mib(), **facts, **written)
 

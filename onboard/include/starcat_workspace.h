@@ -1,0 +1,67 @@
+/* The memory that a call works in. Included by starcat.h; here so that its size is known.
+ *
+ * SPDX-License-Identifier: MIT
+ */
+#ifndef STARCAT_WORKSPACE_H
+#define STARCAT_WORKSPACE_H
+
+/* Centroids that take part in triangles: the first ones in the frame's own order. */
+#define STARCAT_MOST_CENTROIDS 32
+#define STARCAT_MOST_PAIRS (STARCAT_MOST_CENTROIDS * (STARCAT_MOST_CENTROIDS - 1) / 2)
+
+/* Which star each centroid of a frame is under an attitude. */
+typedef struct {
+  starcat_real matrix[9];
+  starcat_real residual_rad;
+  starcat_real log_chance;
+  uint32_t n_matched;
+  int32_t star[STARCAT_MAX_CENTROIDS]; /* row in the image, -1: none */
+} starcat_agreement;
+
+struct starcat_workspace {
+  /* The usable centroids in their own order: brightest first, or nearest to the centre first. */
+  uint32_t count;
+  uint32_t has_magnitudes;
+  uint32_t row[STARCAT_MAX_CENTROIDS];
+  starcat_real x[STARCAT_MAX_CENTROIDS];
+  starcat_real y[STARCAT_MAX_CENTROIDS];
+  starcat_real magnitude[STARCAT_MAX_CENTROIDS];
+  starcat_real body[STARCAT_MAX_CENTROIDS][3];
+
+  /* Separations of pairs of centroids k > i, at k (k - 1) / 2 + i. */
+  starcat_real separation_rad[STARCAT_MOST_PAIRS];
+  uint16_t heap[STARCAT_MOST_PAIRS];
+
+  /* The stars around the field of an attitude, and where it puts them. */
+  uint32_t n_near;
+  uint32_t n_within;
+  uint32_t near_row[STARCAT_MAX_STARS];
+  starcat_real near_icrs[STARCAT_MAX_STARS][3];
+
+  /* Those on the detector or within reach of it: their places among the near ones, where they
+   * are on the detector, and the centroid nearest to each. */
+  uint16_t within[STARCAT_MAX_STARS];
+  starcat_real x_of[STARCAT_MAX_STARS];
+  starcat_real y_of[STARCAT_MAX_STARS];
+  uint16_t nearest[STARCAT_MAX_STARS];
+  starcat_real nearest_square[STARCAT_MAX_STARS];
+
+  /* Which of those each centroid is, -1: none; by place among the near ones one step before. */
+  int16_t match[STARCAT_MAX_CENTROIDS];
+  int16_t before[STARCAT_MAX_CENTROIDS];
+  starcat_real match_square[STARCAT_MAX_CENTROIDS];
+
+  /* Stars that each centroid may be by its magnitude; bounds of the ways to assign n of them. */
+  uint16_t compatible[STARCAT_MAX_CENTROIDS];
+  starcat_real log_ways[STARCAT_MAX_CENTROIDS + 1];
+  starcat_real sums[STARCAT_MAX_CENTROIDS + 1];
+
+  starcat_agreement found;
+  starcat_agreement wider;
+  starcat_agreement best;
+
+  uint32_t steps_left;
+  uint32_t n_tried;
+};
+
+#endif

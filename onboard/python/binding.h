@@ -1,0 +1,46 @@
+/* What Python uses of starcat.h and many.h, for cffi. The compiler checks it against both. */
+typedef struct {
+  uint32_t total_bytes, data_bytes, method, n_stars, n_features, n_kvector, index_bytes;
+  uint32_t grid_bands, grid_sectors;
+  ...;
+} starcat_image;
+typedef struct {
+  double width_px, height_px, focal_length_px;
+  double x0_px, y0_px;
+  double k1, k2, k3, p1, p2;
+  double fold_radius;
+} starcat_camera;
+typedef struct {
+  double tolerance_px, noise_px, noise_mag, log_chance;
+  uint32_t max_steps;
+} starcat_options;
+typedef struct { ...; } starcat_result;
+struct starcat_workspace { ...; };
+typedef struct starcat_workspace starcat_workspace;
+typedef struct {
+  uint32_t count;
+  const int64_t *starts;
+  const double *x_px;
+  const double *y_px;
+  const double *magnitudes;
+  const double *q_prior;
+  double uncertainty_rad;
+  const double *directions;
+} starcat_frames;
+typedef struct {
+  int32_t status;
+  int32_t n_matched;
+  int64_t steps;
+  double q_body_from_icrs[4];
+  double matrix[9];
+  double residual_rad;
+  double log_chance;
+  double seconds;
+} starcat_answer;
+#define STARCAT_MAX_CENTROIDS ...
+#define STARCAT_MAX_STARS ...
+const char *starcat_version(void);
+int starcat_open(starcat_image *image, const void *bytes, size_t size, uint32_t flags);
+int starcat_scrub(const void *bytes, size_t size, uint32_t first, uint32_t count, uint32_t *bad_block);
+int starcat_attitude(const double (*body)[3], const double (*icrs)[3], uint32_t count, double q_body_from_icrs[4]);
+void starcat_many(const starcat_image *image, const starcat_camera *camera, const starcat_options *options, const starcat_frames *frames, starcat_answer *answers, int32_t *stars, starcat_workspace *work, starcat_result *result);

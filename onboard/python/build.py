@@ -1,0 +1,82 @@
+"""Compile the C matcher for Python when a wheel is built or starcat is installed in place.
+
+Hatchling runs the hook. Where there is no compiler, or ``STARCAT_WITHOUT_C`` is set, the wheel is
+a pure one, and the matcher of numpy serves alone.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import sysconfig
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+
+ROOT = Path(__file__).resolve().parents[2]
+ONBOARD = ROOT / "onboard"
+MODULE = "starcat.matcher._onboard"
+DEFINED = {"STARCAT_MAX_CENTROIDS": "512", "STARCAT_MAX_STARS": "8192"}
+"""The ground has memory for wider and denser fields than an onboard computer."""
+
+
+class CompileHook(BuildHookInterface):  # type: ignore[type-arg]
+    """Compiles the extension beside the module that imports it."""
+
+    PLUGIN_NAME = "custom"
+
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        """Compile, and make the wheel one for this platform if that went well."""
+        if self.target_name != "wheel":
+            return
+        try:
+            compiled = compile_binding()
+        except Exception as error:
+            self.app.display_warning(
+                f"starcat: the C matcher was not compiled ({error}); that of numpy serves"
+            )
+            return
+        build_data["pure_python"] = False
+        build_data["tag"] = f"cp311-abi3-{re.sub('[-.]', '_', sysconfig.get_platform())}"
+        build_data["artifacts"].append(compiled.relative_to(ROOT).as_posix())
+
+
+def compile_binding() -> Path:
+    """Compile the extension into the source tree.
+
+    Returns
+    -------
+    Path
+        The file, which any CPython from 3.11 on can import.
+
+    Raises
+    ------
+    Exception
+        Whatever a compiler that is missing or fails makes cffi or setuptools raise.
+    """
+    if os.environ.get("STARCAT_WITHOUT_C"):
+        raise RuntimeError("STARCAT_WITHOUT_C is set")
+    from cffi import FFI
+
+    ffi = FFI()
+    # The parser of cffi knows no #include: the few lines of the headers that Python uses.
+    ffi.cdef((ONBOARD / "python" / "binding.h").read_text(encoding="utf-8"))
+    sources = [*sorted((ONBOARD / "src").glob("*.c")), ONBOARD / "python" / "many.c"]
+    ffi.set_source(
+        MODULE,
+        '#include "many.h"',
+        sources=[str(source) for source in sources],
+        include_dirs=[str(ONBOARD / "include"), str(ONBOARD / "src"), str(ONBOARD / "python")],
+        define_macros=list(DEFINED.items()),
+        extra_compile_args=[] if sys.platform == "win32" else ["-O3", "-std=gnu99"],
+        py_limited_api=True,
+    )
+    target = ROOT.joinpath(*MODULE.split("."))
+    with tempfile.TemporaryDirectory() as folder:
+        built = Path(ffi.compile(tmpdir=folder, verbose=False))
+        compiled = target.with_name(built.name)
+        compiled.write_bytes(built.read_bytes())
+    return compiled

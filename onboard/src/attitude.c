@@ -1,0 +1,183 @@
+/* Attitudes from pairs of directions: Wahba's problem.
+ *
+ * SPDX-License-Identifier: MIT
+ */
+#include "internal.h"
+
+/* The attitude that turns a1 into b1 exactly, and a2 into the plane of b1 and b2 (TRIAD; Black
+ * 1964). Returns 0 if two directions coincide. */
+int sc_triad(const real b1[3], const real b2[3], const real a1[3], const real a2[3], real m[9]) {
+  real bn[3], an[3], bt[3], at[3];
+  sc_cross(b1, b2, bn);
+  sc_cross(a1, a2, an);
+  const real b = sc_dot(bn, bn), a = sc_dot(an, an);
+  if (!(b > R(1e-14)) || !(a > R(1e-14))) {
+    return 0;
+  }
+  const real scale = R(1.0) / STARCAT_SQRT(a * b);
+  sc_cross(bn, b1, bt);
+  sc_cross(an, a1, at);
+  for (uint32_t i = 0; i < 3u; i++) {
+    for (uint32_t j = 0; j < 3u; j++) {
+      m[3u * i + j] = b1[i] * a1[j] + scale * (bn[i] * an[j] + bt[i] * at[j]);
+    }
+  }
+  return 1;
+}
+
+/* Solve a symmetric system of three: m is xx, xy, xz, yy, yz, zz, and so is its inverse.
+ * Returns 0 if the matrix is not positive definite. */
+int sc_solve(const real m[6], const real v[3], real x[3], real inverse[6]) {
+  const real xx = m[3] * m[5] - m[4] * m[4];
+  const real xy = m[2] * m[4] - m[1] * m[5];
+  const real xz = m[1] * m[4] - m[2] * m[3];
+  const real determinant = m[0] * xx + m[1] * xy + m[2] * xz;
+  if (!(determinant > R(0.0))) {
+    return 0;
+  }
+  const real scale = R(1.0) / determinant;
+  inverse[0] = xx * scale;
+  inverse[1] = xy * scale;
+  inverse[2] = xz * scale;
+  inverse[3] = (m[0] * m[5] - m[2] * m[2]) * scale;
+  inverse[4] = (m[1] * m[2] - m[0] * m[4]) * scale;
+  inverse[5] = (m[0] * m[3] - m[1] * m[1]) * scale;
+  x[0] = inverse[0] * v[0] + inverse[1] * v[1] + inverse[2] * v[2];
+  x[1] = inverse[1] * v[0] + inverse[3] * v[1] + inverse[4] * v[2];
+  x[2] = inverse[2] * v[0] + inverse[4] * v[1] + inverse[5] * v[2];
+  return 1;
+}
+
+/* Turn an attitude by the small angles w about the camera's axes (Cayley's rotation). */
+static void turn_by(real m[9], const real w[3]) {
+  const real h[3] = {R(0.5) * w[0], R(0.5) * w[1], R(0.5) * w[2]};
+  const real scale = R(2.0) / (R(1.0) + sc_dot(h, h));
+  for (uint32_t k = 0; k < 3u; k++) {
+    const real v[3] = {m[k], m[k + 3u], m[k + 6u]};
+    real first[3], second[3];
+    sc_cross(h, v, first);
+    sc_cross(h, first, second);
+    m[k] += scale * (first[0] + second[0]);
+    m[k + 3u] += scale * (first[1] + second[1]);
+    m[k + 6u] += scale * (first[2] + second[2]);
+  }
+}
+
+/* Refine an attitude on pairs of directions until it is the best in the sense of least squares:
+ * Newton's method on Wahba's loss, whose steps square the error. body[i] belongs to
+ * icrs[which[i]], or to icrs[i] where which is null. It works with differences of directions, so
+ * that narrow fields lose no digits. */
+void sc_refine(real m[9], const real *body, const real *icrs, const uint16_t *which,
+               uint32_t count, uint32_t most) {
+  for (uint32_t step = 0; step < most; step++) {
+    real h[6] = {0}, g[3] = {0}, w[3], inverse[6];
+    for (uint32_t i = 0; i < count; i++) {
+      const real *b = body + 3u * i;
+      real a[3], e[3], c[3];
+      sc_turn(m, icrs + 3u * (which != NULL ? which[i] : i), a);
+      e[0] = b[0] - a[0];
+      e[1] = b[1] - a[1];
+      e[2] = b[2] - a[2];
+      sc_cross(a, e, c);
+      const real d = sc_dot(a, b);
+      g[0] += c[0];
+      g[1] += c[1];
+      g[2] += c[2];
+      h[0] += d - a[0] * b[0];
+      h[1] -= R(0.5) * (a[0] * b[1] + a[1] * b[0]);
+      h[2] -= R(0.5) * (a[0] * b[2] + a[2] * b[0]);
+      h[3] += d - a[1] * b[1];
+      h[4] -= R(0.5) * (a[1] * b[2] + a[2] * b[1]);
+      h[5] += d - a[2] * b[2];
+    }
+    if (!sc_solve(h, g, w, inverse)) {
+      return;
+    }
+    turn_by(m, w);
+    if (sc_dot(w, w) < R(1e-12)) {
+      return;
+    }
+  }
+}
+
+/* Quaternion of a rotation matrix; the largest component first (Shepperd 1978). */
+void sc_quaternion(const real m[9], real q[4]) {
+  const real trace = m[0] + m[4] + m[8];
+  uint32_t i = 0;
+  real largest = m[0];
+  if (m[4] > largest) {
+    largest = m[4];
+    i = 1;
+  }
+  if (m[8] > largest) {
+    largest = m[8];
+    i = 2;
+  }
+  if (trace >= largest) {
+    q[0] = m[5] - m[7];
+    q[1] = m[6] - m[2];
+    q[2] = m[1] - m[3];
+    q[3] = R(1.0) + trace;
+  } else {
+    const uint32_t j = (i + 1u) % 3u, k = (i + 2u) % 3u;
+    q[i] = R(1.0) - trace + R(2.0) * m[4u * i];
+    q[j] = m[3u * j + i] + m[3u * i + j];
+    q[k] = m[3u * k + i] + m[3u * i + k];
+    q[3] = m[3u * j + k] - m[3u * k + j];
+  }
+  real scale =
+      R(1.0) / STARCAT_SQRT(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+  if (q[3] < R(0.0)) {
+    scale = -scale;
+  }
+  for (uint32_t n = 0; n < 4u; n++) {
+    q[n] *= scale;
+  }
+}
+
+/* Rotation matrix of a unit quaternion. */
+void sc_matrix(const real q[4], real m[9]) {
+  const real x = q[0], y = q[1], z = q[2], w = q[3];
+  m[0] = R(1.0) - R(2.0) * (y * y + z * z);
+  m[1] = R(2.0) * (x * y + z * w);
+  m[2] = R(2.0) * (x * z - y * w);
+  m[3] = R(2.0) * (x * y - z * w);
+  m[4] = R(1.0) - R(2.0) * (x * x + z * z);
+  m[5] = R(2.0) * (y * z + x * w);
+  m[6] = R(2.0) * (x * z + y * w);
+  m[7] = R(2.0) * (y * z - x * w);
+  m[8] = R(1.0) - R(2.0) * (x * x + y * y);
+}
+
+/* How well two pairs determine an attitude: the sine of the angle between their directions. */
+static real spread(const real (*v)[3], uint32_t i, uint32_t j) {
+  real normal[3];
+  sc_cross(v[i], v[j], normal);
+  return sc_dot(normal, normal);
+}
+
+starcat_status starcat_attitude(const starcat_real (*body)[3], const starcat_real (*icrs)[3],
+                                uint32_t count, starcat_real q_body_from_icrs[4]) {
+  real m[9], widest = R(0.0);
+  uint32_t second = 0;
+  if ((body == NULL) || (icrs == NULL) || (q_body_from_icrs == NULL)) {
+    return STARCAT_E_NULL;
+  }
+  for (uint32_t i = 0; i < count; i++) {
+    const real sum = body[i][0] + body[i][1] + body[i][2] + icrs[i][0] + icrs[i][1] + icrs[i][2];
+    if (!(sum - sum == R(0.0))) {
+      return STARCAT_E_NOT_FINITE;
+    }
+    const real apart = spread(body, 0, i);
+    if (apart > widest) {
+      widest = apart;
+      second = i;
+    }
+  }
+  if ((count < 2u) || !sc_triad(body[0], body[second], icrs[0], icrs[second], m)) {
+    return STARCAT_TOO_FEW_STARS;
+  }
+  sc_refine(m, &body[0][0], &icrs[0][0], NULL, count, 16);
+  sc_quaternion(m, q_body_from_icrs);
+  return STARCAT_IDENTIFIED;
+}

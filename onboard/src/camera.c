@@ -1,0 +1,154 @@
+/* The camera: directions of pixels and back, with Brown's distortion as the ground has it.
+ *
+ * SPDX-License-Identifier: MIT
+ */
+#include "internal.h"
+
+#define NEWTON_STEPS 50u
+#define LARGEST_PX R(1e6)
+
+/* Square of the last step over that of the distance; the error left is about its square. */
+#ifdef STARCAT_SINGLE
+#define SMALL_STEP R(1e-11)
+#else
+#define SMALL_STEP R(1e-16)
+#endif
+
+static real absolute(real x) { return x < R(0.0) ? -x : x; }
+
+/* Where the lens puts the direction x/z = u, y/z = v, in focal lengths. Returns 0 from the fold
+ * outwards. */
+static int distort(const starcat_camera *c, real u, real v, real *x, real *y) {
+  const real s = u * u + v * v;
+  if ((c->fold_radius > R(0.0)) && !(s < c->fold_radius * c->fold_radius)) {
+    return 0;
+  }
+  const real factor = R(1.0) + s * (c->k1 + s * (c->k2 + s * c->k3)) +
+                      R(2.0) * (c->p2 * u + c->p1 * v);
+  *x = u * factor + s * c->p2;
+  *y = v * factor + s * c->p1;
+  return 1;
+}
+
+/* The direction that the lens puts at the image x, y: Newton's method in the plane, started at
+ * the image. Returns 0 if there is none inside the fold. */
+static int undistort(const starcat_camera *c, real x, real y, real *u, real *v) {
+  *u = x;
+  *v = y;
+  for (uint32_t step = 0; step < NEWTON_STEPS; step++) {
+    const real s = *u * *u + *v * *v;
+    const real slope = c->k1 + s * (R(2.0) * c->k2 + R(3.0) * s * c->k3);
+    const real factor = R(1.0) + s * (c->k1 + s * (c->k2 + s * c->k3)) +
+                        R(2.0) * (c->p2 * *u + c->p1 * *v);
+    const real miss_x = *u * factor + s * c->p2 - x;
+    const real miss_y = *v * factor + s * c->p1 - y;
+    const real du = R(2.0) * (*u * slope + c->p2), dv = R(2.0) * (*v * slope + c->p1);
+    const real a = factor + *u * du + R(2.0) * *u * c->p2;
+    const real b = *u * dv + R(2.0) * *v * c->p2;
+    const real d = *v * du + R(2.0) * *u * c->p1;
+    const real e = factor + *v * dv + R(2.0) * *v * c->p1;
+    const real determinant = a * e - b * d;
+    if (!(absolute(determinant) > R(1e-12))) {
+      return 0;
+    }
+    const real step_u = (e * miss_x - b * miss_y) / determinant;
+    const real step_v = (a * miss_y - d * miss_x) / determinant;
+    *u -= step_u;
+    *v -= step_v;
+    const real size = *u * *u + *v * *v;
+    const real fold = c->fold_radius * c->fold_radius;
+    if ((fold > R(0.0)) && !(size < fold)) {
+      /* The solution lies within the fold: go on from its edge. */
+      const real scale = c->fold_radius / STARCAT_SQRT(size);
+      *u *= scale;
+      *v *= scale;
+    } else if (step_u * step_u + step_v * step_v <= SMALL_STEP * size + R(1e-30)) {
+      return 1;
+    }
+  }
+  return 0;
+}
+
+int sc_direction(const sc_camera *camera, real x_px, real y_px, real body[3]) {
+  const starcat_camera *c = &camera->given;
+  const real x = (x_px - c->x0_px) / c->focal_length_px;
+  const real y = (y_px - c->y0_px) / c->focal_length_px;
+  real u = x, v = y;
+  if (camera->distorted && !undistort(c, x, y, &u, &v)) {
+    return 0;
+  }
+  const real scale = R(1.0) / STARCAT_SQRT(R(1.0) + u * u + v * v);
+  body[0] = u * scale;
+  body[1] = v * scale;
+  body[2] = scale;
+  return 1;
+}
+
+int sc_pixel(const sc_camera *camera, const real body[3], real *x_px, real *y_px) {
+  const starcat_camera *c = &camera->given;
+  if (!(body[2] > R(0.0))) {
+    return 0;
+  }
+  const real scale = R(1.0) / body[2];
+  real x = body[0] * scale, y = body[1] * scale;
+  if (camera->distorted && !distort(c, x, y, &x, &y)) {
+    return 0;
+  }
+  *x_px = x * c->focal_length_px + c->x0_px;
+  *y_px = y * c->focal_length_px + c->y0_px;
+  return 1;
+}
+
+static int is_between(real x, real low, real high) { return (x >= low) && (x <= high); }
+
+static int is_possible(const starcat_camera *c) {
+  return is_between(c->width_px, R(1.0), LARGEST_PX) &&
+         is_between(c->height_px, R(1.0), LARGEST_PX) &&
+         is_between(c->focal_length_px, R(1e-2), R(1e9)) &&
+         is_between(c->x0_px, -LARGEST_PX, LARGEST_PX) &&
+         is_between(c->y0_px, -LARGEST_PX, LARGEST_PX) && is_between(c->k1, R(-1e9), R(1e9)) &&
+         is_between(c->k2, R(-1e9), R(1e9)) && is_between(c->k3, R(-1e9), R(1e9)) &&
+         is_between(c->p1, R(-1e9), R(1e9)) &&
+         is_between(c->p2, R(-1e9), R(1e9)) && is_between(c->fold_radius, R(0.0), R(1e9));
+}
+
+starcat_status sc_prepare_camera(const starcat_camera *given, sc_camera *camera) {
+  real widest = R(1.0);
+  if (!is_possible(given)) {
+    return STARCAT_E_CAMERA;
+  }
+  camera->given = *given;
+  camera->half_width = R(0.5) * given->width_px;
+  camera->half_height = R(0.5) * given->height_px;
+  camera->distorted = (absolute(given->k1) + absolute(given->k2) + absolute(given->k3) + absolute(given->p1) +
+                       absolute(given->p2)) > R(0.0);
+  for (uint32_t n = 0; n < 4u; n++) {
+    const real x = (n & 1u) != 0u ? given->width_px : R(0.0);
+    const real y = (n & 2u) != 0u ? given->height_px : R(0.0);
+    if (!sc_direction(camera, x, y, camera->corner[n])) {
+      return STARCAT_E_CAMERA;
+    }
+    if (camera->corner[n][2] < widest) {
+      widest = camera->corner[n][2];
+    }
+  }
+  camera->cos_radius = widest;
+  camera->sin_radius = STARCAT_SQRT(R(1.0) - widest * widest);
+  camera->log_area = STARCAT_LOG(given->width_px * given->height_px);
+  camera->log_focal = STARCAT_LOG(given->focal_length_px);
+  return STARCAT_IDENTIFIED;
+}
+
+void starcat_camera_of(const starcat_image *image, starcat_camera *camera) {
+  camera->width_px = image->width_px;
+  camera->height_px = image->height_px;
+  camera->focal_length_px = image->focal_length_px;
+  camera->x0_px = R(0.5) * image->width_px;
+  camera->y0_px = R(0.5) * image->height_px;
+  camera->k1 = R(0.0);
+  camera->k2 = R(0.0);
+  camera->k3 = R(0.0);
+  camera->p1 = R(0.0);
+  camera->p2 = R(0.0);
+  camera->fold_radius = R(0.0);
+}

@@ -1,0 +1,202 @@
+/* The frame: usable centroids in their own order, what a call needs before it, its answer after it.
+ *
+ * SPDX-License-Identifier: MIT
+ */
+#include "internal.h"
+
+#define LOG_CERTAIN R(-20.723265836946411156) /* of 1e-9 */
+#define LOG_HUNDREDTH R(-4.6051701859880913680)
+
+void starcat_default_options(starcat_options *options) {
+  options->tolerance_px = R(2.0);
+  options->noise_px = R(0.0);
+  options->noise_mag = R(0.0);
+  options->log_chance = LOG_CERTAIN;
+  options->max_steps = 4000000u;
+}
+
+static int is_finite(real x) { return x - x == R(0.0); }
+
+static starcat_status check_options(const starcat_options *o) {
+  if (!is_finite(o->tolerance_px) || !is_finite(o->noise_px) || !is_finite(o->noise_mag) ||
+      !is_finite(o->log_chance)) {
+    return STARCAT_E_NOT_FINITE;
+  }
+  if ((o->noise_px < R(0.0)) || (o->noise_mag < R(0.0)) || (o->max_steps == 0u) ||
+      ((o->noise_px <= R(0.0)) && (o->tolerance_px <= R(0.0)))) {
+    return STARCAT_E_OPTIONS;
+  }
+  return STARCAT_IDENTIFIED;
+}
+
+/* Whether centroid a of the frame comes before b: the brighter one, those without magnitude
+ * last; then the nearer to the centre; then by x and y. Differences decide, the first that is not
+ * zero. */
+static int comes_before(const starcat_workspace *w, const real keys_a[4], const real keys_b[4]) {
+  for (uint32_t k = w->has_magnitudes != 0u ? 0u : 1u; k < 4u; k++) {
+    if (keys_a[k] < keys_b[k]) {
+      return 1;
+    }
+    if (keys_a[k] > keys_b[k]) {
+      return 0;
+    }
+  }
+  return 0;
+}
+
+static void keys_of(const sc_camera *camera, real magnitude, real x, real y, real keys[4]) {
+  const real dx = x - camera->half_width, dy = y - camera->half_height;
+  keys[0] = is_finite(magnitude) ? magnitude : R(1e30);
+  keys[1] = dx * dx + dy * dy;
+  keys[2] = dx;
+  keys[3] = dy;
+}
+
+/* Put a centroid where it belongs among those that are in order. */
+static void insert(const sc_call *call, uint32_t row, real magnitude, real x, real y) {
+  starcat_workspace *w = call->work;
+  uint32_t at = w->count;
+  real keys[4], others[4];
+  keys_of(&call->camera, magnitude, x, y, keys);
+  while (at > 0u) {
+    keys_of(&call->camera, w->magnitude[at - 1u], w->x[at - 1u], w->y[at - 1u], others);
+    if (!comes_before(w, keys, others)) {
+      break;
+    }
+    w->row[at] = w->row[at - 1u];
+    w->magnitude[at] = w->magnitude[at - 1u];
+    w->x[at] = w->x[at - 1u];
+    w->y[at] = w->y[at - 1u];
+    at--;
+  }
+  w->row[at] = row;
+  w->magnitude[at] = magnitude;
+  w->x[at] = x;
+  w->y[at] = y;
+  w->count++;
+}
+
+/* Which centroids can be used; the others get their reason as their result. */
+static void take_usable(const sc_call *call, const starcat_frame *frame, starcat_result *result) {
+  const starcat_camera *camera = &call->camera.given;
+  starcat_workspace *w = call->work;
+  w->has_magnitudes = 0;
+  for (uint32_t i = 0; i < frame->count; i++) {
+    const real x = frame->x_px[i], y = frame->y_px[i];
+    result->star[i] = STARCAT_NO_STAR;
+    if (!is_finite(x) || !is_finite(y)) {
+      result->star[i] = STARCAT_DROPPED_NOT_FINITE;
+    } else if ((x < R(0.0)) || (x >= camera->width_px) || (y < R(0.0)) ||
+               (y >= camera->height_px)) {
+      result->star[i] = STARCAT_DROPPED_OUT_OF_FRAME;
+    } else if ((frame->magnitudes != NULL) && is_finite(frame->magnitudes[i])) {
+      w->has_magnitudes = 1;
+    }
+  }
+}
+
+/* Leave out centroids at exactly the place of an earlier one. */
+static void drop_repeats(starcat_workspace *w, starcat_result *result) {
+  uint32_t kept = 0;
+  for (uint32_t i = 0; i < w->count; i++) {
+    uint32_t k = 0;
+    while ((k < kept) && !((w->x[k] == w->x[i]) && (w->y[k] == w->y[i]))) {
+      k++;
+    }
+    if (k < kept) {
+      result->star[w->row[i]] = STARCAT_DROPPED_DUPLICATE;
+    } else {
+      w->row[kept] = w->row[i];
+      w->x[kept] = w->x[i];
+      w->y[kept] = w->y[i];
+      w->magnitude[kept] = w->magnitude[i];
+      kept++;
+    }
+  }
+  w->count = kept;
+}
+
+static void set_limits(sc_call *call, const starcat_options *options) {
+  const starcat_workspace *w = call->work;
+  call->tolerance_px = options->noise_px > R(0.0) ? SC_SIGMAS_OF_TOLERANCE * options->noise_px
+                                                  : options->tolerance_px;
+  call->noise_px = options->noise_px;
+  call->tolerance_rad = call->tolerance_px / call->camera.given.focal_length_px;
+  call->reach_px = SC_REACH * call->tolerance_px;
+  call->mag_reach = w->has_magnitudes != 0u ? SC_MAG_DEVIATIONS * options->noise_mag : R(0.0);
+  call->log_limit = options->log_chance;
+  /* Where more is allowed, a hundredth of it ends the search; else the best answer is taken. */
+  call->log_certain = options->log_chance;
+  if (options->log_chance > LOG_CERTAIN) {
+    call->log_certain = options->log_chance + LOG_HUNDREDTH;
+    if (call->log_certain < LOG_CERTAIN) {
+      call->log_certain = LOG_CERTAIN;
+    }
+  }
+}
+
+starcat_status sc_begin(sc_call *call, const starcat_image *image, const starcat_camera *camera,
+                        const starcat_options *options, const starcat_frame *frame,
+                        starcat_workspace *work, starcat_result *result) {
+  if ((image == NULL) || (camera == NULL) || (options == NULL) || (frame == NULL) ||
+      (work == NULL) || (result == NULL)) {
+    return STARCAT_E_NULL;
+  }
+  result->n_matched = 0;
+  result->steps = 0;
+  result->n_tried = 0;
+  result->log_chance = R(0.0);
+  if ((frame->count > 0u) && ((frame->x_px == NULL) || (frame->y_px == NULL))) {
+    return STARCAT_E_NULL;
+  }
+  if (frame->count > STARCAT_MAX_CENTROIDS) {
+    return STARCAT_E_TOO_MANY_CENTROIDS;
+  }
+  starcat_status status = check_options(options);
+  if (status == STARCAT_IDENTIFIED) {
+    status = sc_prepare_camera(camera, &call->camera);
+  }
+  if (status != STARCAT_IDENTIFIED) {
+    return status;
+  }
+  call->image = image;
+  call->work = work;
+  work->count = 0;
+  work->n_tried = 0;
+  work->steps_left = options->max_steps;
+  work->best.log_chance = R(0.0);
+  work->best.n_matched = 0;
+  take_usable(call, frame, result);
+  for (uint32_t i = 0; i < frame->count; i++) {
+    if (result->star[i] == STARCAT_NO_STAR) {
+      insert(call, i, work->has_magnitudes != 0u ? frame->magnitudes[i] : R(0.0), frame->x_px[i],
+             frame->y_px[i]);
+    }
+  }
+  drop_repeats(work, result);
+  for (uint32_t i = 0; i < work->count; i++) {
+    if (!sc_direction(&call->camera, work->x[i], work->y[i], work->body[i])) {
+      return STARCAT_E_CAMERA;
+    }
+  }
+  set_limits(call, options);
+  return work->count < SC_MIN_STARS ? STARCAT_TOO_FEW_STARS : STARCAT_IDENTIFIED;
+}
+
+starcat_status sc_end(const sc_call *call, const starcat_options *options, starcat_result *result) {
+  const starcat_workspace *w = call->work;
+  result->steps = options->max_steps - w->steps_left;
+  result->n_tried = w->n_tried;
+  if ((w->best.n_matched < SC_MIN_STARS) || !(w->best.log_chance <= call->log_limit)) {
+    return w->steps_left == 0u ? STARCAT_E_BUDGET : STARCAT_NO_MATCH;
+  }
+  sc_quaternion(w->best.matrix, result->q_body_from_icrs);
+  sc_matrix(result->q_body_from_icrs, result->matrix);
+  result->residual_rad = w->best.residual_rad;
+  result->log_chance = w->best.log_chance;
+  result->n_matched = w->best.n_matched;
+  for (uint32_t i = 0; i < w->count; i++) {
+    result->star[w->row[i]] = w->best.star[i];
+  }
+  return STARCAT_IDENTIFIED;
+}

@@ -1,0 +1,188 @@
+/* The two ways to an attitude: lost in space, and from a prior attitude.
+ *
+ * SPDX-License-Identifier: MIT
+ */
+#include "internal.h"
+
+#define WIDEST_PRIOR_RAD R(0.35)
+#define MOST_ANCHORS 8u
+
+starcat_status starcat_identify(const starcat_image *image, const starcat_camera *camera,
+                                const starcat_options *options, const starcat_frame *frame,
+                                starcat_workspace *work, starcat_result *result) {
+  sc_call call;
+  const starcat_status status = sc_begin(&call, image, camera, options, frame, work, result);
+  if (status != STARCAT_IDENTIFIED) {
+    return status;
+  }
+  sc_each_triangle(&call, image->method == SC_TRIANGLE ? sc_triangle : sc_pyramid);
+  return sc_end(&call, options, result);
+}
+
+/* A prior attitude and how far from their predicted places it may put stars. */
+typedef struct {
+  real matrix[9];
+  real cos_radius, sin_radius; /* of the cap that holds the frame, wherever it is */
+  real shift_px;               /* of one star */
+  real turn;                   /* of two stars against each other, of their distance */
+  int is_stale;                /* whether a verification has used the workspace since */
+} prior;
+
+static starcat_status set_prior(const sc_call *call, const real q[4], real uncertainty_rad,
+                                prior *p) {
+  const sc_camera *camera = &call->camera;
+  const real square = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
+  real unit[4];
+  if (!(square - square == R(0.0)) || !(uncertainty_rad - uncertainty_rad == R(0.0))) {
+    return STARCAT_E_NOT_FINITE;
+  }
+  if (!(square > R(0.0)) || !(uncertainty_rad > R(0.0)) || (uncertainty_rad > WIDEST_PRIOR_RAD)) {
+    return STARCAT_E_OPTIONS;
+  }
+  for (uint32_t n = 0; n < 4u; n++) {
+    unit[n] = q[n] / STARCAT_SQRT(square);
+  }
+  sc_matrix(unit, p->matrix);
+  const real c = STARCAT_COS(uncertainty_rad), s = STARCAT_SIN(uncertainty_rad);
+  p->cos_radius = camera->cos_radius * c - camera->sin_radius * s;
+  p->sin_radius = camera->sin_radius * c + camera->cos_radius * s;
+  if (!(p->cos_radius > R(0.0))) {
+    return STARCAT_E_OPTIONS;
+  }
+  const real stretch = R(1.0) / (p->cos_radius * p->cos_radius);
+  p->shift_px = uncertainty_rad * stretch * camera->given.focal_length_px + call->reach_px;
+  p->turn = R(2.0) * uncertainty_rad * stretch;
+  p->is_stale = 1;
+  return STARCAT_IDENTIFIED;
+}
+
+/* Put the stars around the prior's frame where the prior predicts them. Returns 0 if they are too
+ * many, or the budget is used up. */
+static int predict(const sc_call *call, prior *p) {
+  starcat_workspace *w = call->work;
+  if (p->is_stale != 0) {
+    w->n_near = sc_gather(call, p->matrix + 6, p->cos_radius, p->sin_radius, STARCAT_MAX_STARS,
+                          w->near_row, w->near_icrs);
+    if ((w->n_near > STARCAT_MAX_STARS) || !sc_spend(w, w->n_near)) {
+      return 0;
+    }
+    sc_project(call, p->matrix, p->shift_px);
+    p->is_stale = 0;
+  }
+  return 1;
+}
+
+static real square_from(const starcat_workspace *w, uint32_t star, real x, real y) {
+  const real dx = w->x_of[star] - x, dy = w->y_of[star] - y;
+  return dx * dx + dy * dy;
+}
+
+/* The star predicted next farther from a centroid than `past`; -1 if none is within the slack. */
+static int32_t next_star(const sc_call *call, const prior *p, uint32_t centroid, real *past) {
+  const starcat_workspace *w = call->work;
+  real least = p->shift_px * p->shift_px;
+  int32_t found = -1;
+  for (uint32_t k = 0; k < w->n_within; k++) {
+    const real square = square_from(w, k, w->x[centroid], w->y[centroid]);
+    if ((square > *past) && (square <= least) &&
+        sc_compatible(call, centroid, w->near_row[w->within[k]])) {
+      least = square;
+      found = (int32_t)k;
+    }
+  }
+  *past = least;
+  return found;
+}
+
+/* The centroid farthest from another one: the two determine the attitude best. */
+static uint32_t farthest(const starcat_workspace *w, uint32_t from) {
+  uint32_t best = from;
+  real most = R(0.0);
+  for (uint32_t i = 0; i < w->count; i++) {
+    const real dx = w->x[i] - w->x[from], dy = w->y[i] - w->y[from];
+    if (dx * dx + dy * dy > most) {
+      most = dx * dx + dy * dy;
+      best = i;
+    }
+  }
+  return best;
+}
+
+/* If centroid a is a star, verify the attitude in which centroid b is the star nearest to where it
+ * then has to be. Returns 1 if the search can end. */
+static int try_pair(sc_call *call, prior *p, uint32_t a, uint32_t star, uint32_t b) {
+  starcat_workspace *w = call->work;
+  const real error = SC_SIDE_TOLERANCE * call->tolerance_rad;
+  const real apart = sc_angle_of_chord(sc_chord_square(w->body[a], w->body[b]));
+  const real low = sc_chord_of_angle(apart - error), high = sc_chord_of_angle(apart + error);
+  const real dx = w->x[b] - w->x[a], dy = w->y[b] - w->y[a];
+  const real slack = R(2.0) * call->reach_px + p->turn * STARCAT_SQRT(dx * dx + dy * dy);
+  const real *first = w->near_icrs[w->within[star]];
+  real least = slack * slack, m[9];
+  int32_t partner = -1;
+  for (uint32_t k = 0; k < w->n_within; k++) {
+    const real square = square_from(w, k, w->x_of[star] + dx, w->y_of[star] + dy);
+    if (square <= least) {
+      const real chord = sc_chord_square(first, w->near_icrs[w->within[k]]);
+      if ((chord >= low * low) && (chord <= high * high)) {
+        least = square;
+        partner = (int32_t)k;
+      }
+    }
+  }
+  if (!sc_spend(w, w->n_within + 1u)) {
+    return 1;
+  }
+  if ((partner < 0) ||
+      !sc_triad(w->body[a], w->body[b], first, w->near_icrs[w->within[partner]], m)) {
+    return 0;
+  }
+  p->is_stale = 1;
+  return sc_try(call, m);
+}
+
+/* Try the stars that one centroid may be, the nearest first, with one other centroid. Returns 1 if
+ * the search can end. */
+static int try_anchor(sc_call *call, prior *p, uint32_t a, uint32_t b) {
+  starcat_workspace *w = call->work;
+  real past = R(-1.0);
+  for (uint32_t n = 0; n < STARCAT_MAX_STARS; n++) {
+    if (!predict(call, p) || !sc_spend(w, w->n_within + 1u)) {
+      return 1;
+    }
+    const int32_t star = next_star(call, p, a, &past);
+    if (star < 0) {
+      return 0;
+    }
+    if (try_pair(call, p, a, (uint32_t)star, b)) {
+      return 1;
+    }
+  }
+  return 0;
+}
+
+starcat_status starcat_track(const starcat_image *image, const starcat_camera *camera,
+                             const starcat_options *options, const starcat_frame *frame,
+                             const starcat_real q_prior[4], starcat_real uncertainty_rad,
+                             starcat_workspace *work, starcat_result *result) {
+  sc_call call;
+  prior p;
+  if (q_prior == NULL) {
+    return STARCAT_E_NULL;
+  }
+  starcat_status status = sc_begin(&call, image, camera, options, frame, work, result);
+  if (status == STARCAT_IDENTIFIED) {
+    status = set_prior(&call, q_prior, uncertainty_rad, &p);
+  }
+  if (status != STARCAT_IDENTIFIED) {
+    return status;
+  }
+  for (uint32_t a = 0; (a < work->count) && (a < MOST_ANCHORS); a++) {
+    const uint32_t b = farthest(work, a);
+    /* A false spot may be the farthest one; then the next one in order serves. */
+    if (try_anchor(&call, &p, a, b) || try_anchor(&call, &p, a, (a + 1u) % work->count)) {
+      break;
+    }
+  }
+  return sc_end(&call, options, result);
+}

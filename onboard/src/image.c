@@ -1,0 +1,241 @@
+/* The image: opening it in place, and finding damaged blocks. docs/onboard-format.md describes
+ * every byte.
+ *
+ * SPDX-License-Identifier: MIT
+ */
+#include "internal.h"
+
+#define N_SECTIONS 16u
+#define N_KINDS 9u
+#define SECTION_TABLE 256u
+#define SECTION_ALIGNMENT 64u
+#define MANIFEST_AT 128u
+#define NAME_AT 160u
+#define WHOLE_AT 4088u
+#define OWN_AT 4092u
+
+enum { DIRECTIONS = 1, MAGNITUDES, STAR_IDS, GRID, KVECTOR, TRIANGLES, RADII, PAIRS };
+
+const char *starcat_version(void) { return STARCAT_VERSION; }
+
+static uint16_t u16_at(const uint8_t *bytes, size_t offset) {
+  return *(const uint16_t *)(const void *)(bytes + offset);
+}
+
+static uint32_t u32_at(const uint8_t *bytes, size_t offset) {
+  return *(const uint32_t *)(const void *)(bytes + offset);
+}
+
+static real f64_at(const uint8_t *bytes, size_t offset) {
+  return (real) * (const double *)(const void *)(bytes + offset);
+}
+
+/* CRC-32 of zlib, PNG and Ethernet, four bits at a time. */
+static uint32_t crc32(uint32_t crc, const uint8_t *bytes, size_t count) {
+  static const uint32_t table[16] = {
+      0x00000000u, 0x1db71064u, 0x3b6e20c8u, 0x26d930acu, 0x76dc4190u, 0x6b6b51f4u,
+      0x4db26158u, 0x5005713cu, 0xedb88320u, 0xf00f9344u, 0xd6d6a3e8u, 0xcb61b38cu,
+      0x9b64c2b0u, 0x86d3d2d4u, 0xa00ae278u, 0xbdbdf21cu};
+  uint32_t left = ~crc;
+  for (size_t n = 0; n < count; n++) {
+    left ^= bytes[n];
+    left = (left >> 4) ^ table[left & 15u];
+    left = (left >> 4) ^ table[left & 15u];
+  }
+  return ~left;
+}
+
+/* Check what stands in the first bytes, so that sizes can be believed. */
+static starcat_status check_start(const void *bytes, size_t size) {
+  const uint8_t *image = bytes;
+  const char magic[8] = SC_MAGIC;
+  if (bytes == NULL) {
+    return STARCAT_E_NULL;
+  }
+  if (((uintptr_t)bytes & 7u) != 0u) {
+    return STARCAT_E_ALIGNMENT;
+  }
+  if (size < SC_HEADER_BYTES) {
+    return STARCAT_E_SHORT;
+  }
+  for (uint32_t n = 0; n < 8u; n++) {
+    if (image[n] != (uint8_t)magic[n]) {
+      return STARCAT_E_MAGIC;
+    }
+  }
+  if (u32_at(image, 8) != SC_BYTE_ORDER) {
+    return u32_at(image, 8) == SC_BYTE_ORDER_SWAPPED ? STARCAT_E_BYTE_ORDER : STARCAT_E_MAGIC;
+  }
+  if (u16_at(image, 12) != SC_VERSION_MAJOR) {
+    return STARCAT_E_VERSION;
+  }
+  const uint32_t total = u32_at(image, 20), data = u32_at(image, 24);
+  if (size < total) {
+    return STARCAT_E_SHORT;
+  }
+  const uint32_t blocks = data / SC_BLOCK_BYTES;
+  const uint32_t checks = (blocks + SC_CRCS_OF_BLOCK - 1u) / SC_CRCS_OF_BLOCK;
+  if ((u32_at(image, 16) != SC_HEADER_BYTES) || (data % SC_BLOCK_BYTES != 0u) || (data == 0u) ||
+      (total < data) || (total - data != checks * SC_BLOCK_BYTES)) {
+    return STARCAT_E_LAYOUT;
+  }
+  return STARCAT_IDENTIFIED;
+}
+
+/* A check block is damaged if the CRC of its own bytes is not its last four. */
+static int is_sound(const uint8_t *block) {
+  return crc32(0, block, OWN_AT) == u32_at(block, OWN_AT);
+}
+
+static int block_is_sound(const uint8_t *image, uint32_t data, uint32_t block) {
+  const uint32_t blocks = data / SC_BLOCK_BYTES;
+  const uint8_t *at = image + (size_t)block * SC_BLOCK_BYTES;
+  if (block >= blocks) {
+    return is_sound(at);
+  }
+  const uint8_t *check = image + data + (size_t)(block / SC_CRCS_OF_BLOCK) * SC_BLOCK_BYTES;
+  /* Where the check block itself is damaged it is the one to be named, not this one. */
+  return (crc32(0, at, SC_BLOCK_BYTES) ==
+          u32_at(check, 4u * (size_t)(block % SC_CRCS_OF_BLOCK))) ||
+         !is_sound(check);
+}
+
+starcat_status starcat_scrub(const void *bytes, size_t size, uint32_t first, uint32_t count,
+                             uint32_t *bad_block) {
+  const uint8_t *image = bytes;
+  const starcat_status status = check_start(bytes, size);
+  if (bad_block == NULL) {
+    return STARCAT_E_NULL;
+  }
+  *bad_block = 0;
+  if (status != STARCAT_IDENTIFIED) {
+    return status;
+  }
+  const uint32_t data = u32_at(image, 24);
+  const uint32_t blocks = u32_at(image, 20) / SC_BLOCK_BYTES;
+  const uint32_t end = (count == 0u) || (count > blocks - (first < blocks ? first : blocks))
+                           ? blocks
+                           : first + count;
+  for (uint32_t block = first; block < end; block++) {
+    if (!block_is_sound(image, data, block)) {
+      *bad_block = block;
+      return STARCAT_E_CRC;
+    }
+  }
+  return STARCAT_IDENTIFIED;
+}
+
+/* Sections of an image, found and checked. */
+typedef struct {
+  const uint8_t *at[N_KINDS];
+  uint32_t bytes[N_KINDS];
+} sections;
+
+static int find_sections(const uint8_t *image, uint32_t data, sections *found) {
+  const uint32_t count = u32_at(image, 60);
+  if (count > N_SECTIONS) {
+    return 0;
+  }
+  for (uint32_t kind = 0; kind < N_KINDS; kind++) {
+    found->at[kind] = NULL;
+    found->bytes[kind] = 0;
+  }
+  for (uint32_t n = 0; n < count; n++) {
+    const size_t entry = SECTION_TABLE + 16u * (size_t)n;
+    const uint32_t kind = u32_at(image, entry), offset = u32_at(image, entry + 4u);
+    const uint32_t bytes = u32_at(image, entry + 8u);
+    if ((offset % SECTION_ALIGNMENT != 0u) || (offset < SC_HEADER_BYTES) || (offset > data) ||
+        (bytes > data - offset)) {
+      return 0;
+    }
+    if (kind < N_KINDS) { /* a later minor version may have others */
+      found->at[kind] = image + offset;
+      found->bytes[kind] = bytes;
+    }
+  }
+  return 1;
+}
+
+static int has(const sections *found, uint32_t kind, uint64_t count, uint64_t element) {
+  return (found->at[kind] != NULL) && ((uint64_t)found->bytes[kind] == count * element);
+}
+
+static int is_complete(const starcat_image *image, const sections *found) {
+  const uint64_t cells = (uint64_t)image->grid_bands * image->grid_sectors + 1u;
+  const uint64_t stars = image->n_stars, index = image->index_bytes;
+  const int common = has(found, DIRECTIONS, stars, 12) && has(found, MAGNITUDES, stars, 2) &&
+                     has(found, STAR_IDS, stars, 8) && has(found, GRID, cells, 4) &&
+                     has(found, KVECTOR, image->n_kvector, 4);
+  if (image->method == SC_TRIANGLE) {
+    return common && has(found, TRIANGLES, image->n_features, 3u * index) &&
+           has(found, RADII, image->n_features, 2) && (image->radius_quantum_rad > R(0.0));
+  }
+  return common && (image->method == SC_PYRAMID) && has(found, PAIRS, image->n_features, 2u * index);
+}
+
+static void read_numbers(const uint8_t *bytes, starcat_image *image) {
+  image->bytes = bytes;
+  image->total_bytes = u32_at(bytes, 20);
+  image->data_bytes = u32_at(bytes, 24);
+  image->method = u32_at(bytes, 28);
+  image->n_stars = u32_at(bytes, 32);
+  image->n_features = u32_at(bytes, 36);
+  image->n_kvector = u32_at(bytes, 40);
+  image->index_bytes = u32_at(bytes, 44);
+  image->grid_bands = u32_at(bytes, 48);
+  image->grid_sectors = u32_at(bytes, 52);
+  image->width_px = (real)u32_at(bytes, 64);
+  image->height_px = (real)u32_at(bytes, 68);
+  image->focal_length_px = f64_at(bytes, 72);
+  image->epoch_jyear = f64_at(bytes, 80);
+  image->kvector_intercept = f64_at(bytes, 88);
+  image->kvector_slope = f64_at(bytes, 96);
+  image->radius_quantum_rad = f64_at(bytes, 104);
+  image->longest_rad = f64_at(bytes, 112);
+  image->manifest_sha256 = bytes + MANIFEST_AT;
+  image->name = (const char *)(bytes + NAME_AT);
+}
+
+static starcat_status check_numbers(const starcat_image *image) {
+  if ((image->index_bytes != 2u) && (image->index_bytes != 4u)) {
+    return STARCAT_E_LAYOUT;
+  }
+  if ((image->grid_bands == 0u) || (image->grid_sectors == 0u) || (image->n_kvector < 2u) ||
+      (image->grid_bands > 65535u) || (image->grid_sectors > 65535u) ||
+      !(image->kvector_slope > R(0.0)) || !(image->kvector_slope < R(1e6)) ||
+      !(image->kvector_intercept > R(-1e6)) || !(image->kvector_intercept < R(1e6))) {
+    return STARCAT_E_LAYOUT;
+  }
+  return u32_at(image->bytes, 56) > STARCAT_MAX_STARS ? STARCAT_E_CAPACITY : STARCAT_IDENTIFIED;
+}
+
+starcat_status starcat_open(starcat_image *image, const void *bytes, size_t size, uint32_t flags) {
+  uint32_t bad = 0;
+  sections found;
+  if (image == NULL) {
+    return STARCAT_E_NULL;
+  }
+  starcat_status status = check_start(bytes, size);
+  if ((status == STARCAT_IDENTIFIED) && ((flags & STARCAT_SKIP_CRC) == 0u)) {
+    status = starcat_scrub(bytes, size, 0, 0, &bad);
+  }
+  if (status != STARCAT_IDENTIFIED) {
+    return status;
+  }
+  read_numbers(bytes, image);
+  status = check_numbers(image);
+  if (status != STARCAT_IDENTIFIED) {
+    return status;
+  }
+  if (!find_sections(image->bytes, image->data_bytes, &found) || !is_complete(image, &found)) {
+    return STARCAT_E_LAYOUT;
+  }
+  image->directions = (const int32_t *)(const void *)found.at[DIRECTIONS];
+  image->magnitudes = (const int16_t *)(const void *)found.at[MAGNITUDES];
+  image->star_ids = (const int64_t *)(const void *)found.at[STAR_IDS];
+  image->grid = (const uint32_t *)(const void *)found.at[GRID];
+  image->kvector = (const uint32_t *)(const void *)found.at[KVECTOR];
+  image->features = found.at[image->method == SC_TRIANGLE ? TRIANGLES : PAIRS];
+  image->radii = (const uint16_t *)(const void *)found.at[RADII];
+  return STARCAT_IDENTIFIED;
+}

@@ -1,0 +1,116 @@
+/* What the library's own files share.
+ *
+ * SPDX-License-Identifier: MIT
+ */
+#ifndef STARCAT_INTERNAL_H
+#define STARCAT_INTERNAL_H
+
+#include "vectors.h"
+
+/* Image format, docs/onboard-format.md. */
+#define SC_MAGIC "STARCAT"
+#define SC_VERSION_MAJOR 1u
+#define SC_BYTE_ORDER 0x01020304u
+#define SC_BYTE_ORDER_SWAPPED 0x04030201u
+#define SC_HEADER_BYTES 512u
+#define SC_BLOCK_BYTES 4096u
+#define SC_CRCS_OF_BLOCK 1022u
+#define SC_TRIANGLE 1u
+#define SC_PYRAMID 2u
+#define SC_RADIUS_OVERFLOW 65535u
+#define SC_UNIT R(4.656612875245796924105750827168e-10) /* 1 / 2147483647 */
+
+/* The same rules as the ground's, starcat/matcher/. */
+#define SC_MIN_STARS 4u
+#define SC_MIN_SHARE (R(1.0) / R(3.0))
+#define SC_SURE_SHARE (R(2.0) / R(3.0))
+#define SC_REACH R(1.5)          /* largest distance of a match, in tolerances */
+#define SC_REFINEMENTS 4u
+#define SC_SIDE_TOLERANCE R(1.5) /* largest error of a side, in tolerances */
+#define SC_SCALE_DEVIATIONS R(3.0)
+#define SC_SIGMAS_OF_TOLERANCE R(3.0)
+#define SC_MAG_DEVIATIONS R(3.5)
+#define SC_MIN_SIDE_PX R(10.0)
+#define SC_COS_MIN_ANGLE R(0.96592582628906828675) /* 15 degrees */
+#define SC_COS_LEAST_ANGLE R(0.99756405025982424761) /* 4 degrees */
+#define SC_FEW_CENTROIDS 12u
+
+/* A camera as a call uses it. */
+typedef struct {
+  starcat_camera given;
+  real half_width, half_height; /* of the detector, pixels */
+  real cos_radius, sin_radius;  /* of the largest angle from the axis to a corner */
+  real log_area, log_focal;     /* of the detector, square pixels; of the focal length */
+  real corner[4][3];
+  int distorted;
+} sc_camera;
+
+/* One call: what does not change while it lasts. */
+typedef struct {
+  const starcat_image *image;
+  sc_camera camera;
+  real tolerance_px, tolerance_rad, reach_px;
+  real noise_px;  /* standard deviation of a centroid on each axis; 0: not stated */
+  real mag_reach; /* largest difference of magnitudes of a match; 0: any */
+  real log_limit; /* largest accepted chance */
+  real log_certain;
+  starcat_workspace *work;
+} sc_call;
+
+/* The direction of a star. */
+static inline void sc_star(const starcat_image *image, uint32_t row, real icrs[3]) {
+  const int32_t *direction = image->directions + 3u * (size_t)row;
+  icrs[0] = SC_UNIT * (real)direction[0];
+  icrs[1] = SC_UNIT * (real)direction[1];
+  icrs[2] = SC_UNIT * (real)direction[2];
+}
+
+/* attitude.c */
+int sc_triad(const real b1[3], const real b2[3], const real a1[3], const real a2[3], real m[9]);
+int sc_solve(const real m[6], const real v[3], real x[3], real inverse[6]);
+void sc_refine(real m[9], const real *body, const real *icrs, const uint16_t *which,
+               uint32_t count, uint32_t most);
+void sc_quaternion(const real m[9], real q[4]);
+void sc_matrix(const real q[4], real m[9]);
+
+/* camera.c */
+starcat_status sc_prepare_camera(const starcat_camera *given, sc_camera *camera);
+int sc_direction(const sc_camera *camera, real x_px, real y_px, real body[3]);
+int sc_pixel(const sc_camera *camera, const real body[3], real *x_px, real *y_px);
+
+/* sky.c */
+uint32_t sc_gather(const sc_call *call, const real centre[3], real cos_r, real sin_r,
+                   uint32_t most, uint32_t *rows, real (*icrs)[3]);
+
+/* ways.c */
+real sc_log_factorial(uint32_t n);
+void sc_count_ways(const sc_call *call, uint32_t most);
+
+/* chance.c */
+real sc_log_chance(const sc_call *call, real square_px, uint32_t n_matched);
+real sc_share(const sc_call *call, const real m[9], real residual_rad, uint32_t n_matched);
+int sc_is_scaled(const sc_call *call, uint32_t n_matched);
+
+/* verify.c */
+int sc_spend(starcat_workspace *work, uint32_t steps);
+int sc_compatible(const sc_call *call, uint32_t centroid, uint32_t row);
+int sc_try(sc_call *call, const real m[9]);
+void sc_project(const sc_call *call, const real m[9], real margin_px);
+
+/* frame.c */
+starcat_status sc_begin(sc_call *call, const starcat_image *image, const starcat_camera *camera,
+                        const starcat_options *options, const starcat_frame *frame,
+                        starcat_workspace *work, starcat_result *result);
+starcat_status sc_end(const sc_call *call, const starcat_options *options, starcat_result *result);
+
+/* triangles.c, pyramids.c */
+typedef int (*sc_look_up)(sc_call *call, const uint32_t triple[3], const real sides[3]);
+real sc_side(const sc_call *call, uint32_t i, uint32_t j);
+void sc_each_triangle(sc_call *call, sc_look_up look_up);
+void sc_rows_between(const starcat_image *image, real low, real high, uint32_t *start,
+                     uint32_t *stop);
+void sc_rows_of(const starcat_image *image, uint32_t feature, uint32_t width, uint32_t rows[3]);
+int sc_triangle(sc_call *call, const uint32_t triple[3], const real sides[3]);
+int sc_pyramid(sc_call *call, const uint32_t triple[3], const real sides[3]);
+
+#endif

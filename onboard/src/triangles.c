@@ -1,0 +1,351 @@
+/* Triangles of centroids, one after the other, and the triangles of stars that they may be.
+ *
+ * SPDX-License-Identifier: MIT
+ */
+#include "internal.h"
+
+#define BLOCK 16u
+
+/* What the triangles of one frame are tried with. */
+typedef struct {
+  sc_look_up look_up;
+  uint32_t count;
+  real least_side_rad, least_poor_side_rad;
+  int poor; /* in the second round, those that the first has left out */
+} search;
+
+static uint32_t pair_of(uint32_t i, uint32_t j) {
+  return i < j ? j * (j - 1u) / 2u + i : i * (i - 1u) / 2u + j;
+}
+
+real sc_side(const sc_call *call, uint32_t i, uint32_t j) {
+  return call->work->separation_rad[pair_of(i, j)];
+}
+
+/* Whether a triangle has no side as short as `least` and no angle as narrow as one of a cosine
+ * (the thresholds of Li et al. 2015). */
+static int is_well_shaped(const real sides[3], real least, real cosine) {
+  real a = sides[0], b = sides[1], c = sides[2], swap;
+  if (a > b) {
+    swap = a;
+    a = b;
+    b = swap;
+  }
+  if (a > c) {
+    swap = a;
+    a = c;
+    c = swap;
+  }
+  /* The law of cosines for the angle opposite the shortest side. */
+  return (a > least) && (b * b + c * c - a * a < R(2.0) * cosine * b * c);
+}
+
+/* Look a triangle up if it is of this round. Returns 1 if the search can end. */
+static int take(sc_call *call, const search *s, uint32_t i, uint32_t j, uint32_t k) {
+  const uint32_t triple[3] = {i, j, k};
+  const real sides[3] = {sc_side(call, j, k), sc_side(call, i, k), sc_side(call, i, j)};
+  const int good = is_well_shaped(sides, s->least_side_rad, SC_COS_MIN_ANGLE);
+  if (!sc_spend(call->work, 1)) {
+    return 1;
+  }
+  if ((s->poor != 0) == (good != 0)) {
+    return 0;
+  }
+  if ((s->poor != 0) && !is_well_shaped(sides, s->least_poor_side_rad, SC_COS_LEAST_ANGLE)) {
+    return 0;
+  }
+  return s->look_up(call, triple, sides);
+}
+
+/* Separations of a centroid from all earlier ones. */
+static void separate(sc_call *call, uint32_t k) {
+  starcat_workspace *w = call->work;
+  for (uint32_t i = 0; i < k; i++) {
+    w->separation_rad[pair_of(i, k)] = sc_angle_of_chord(sc_chord_square(w->body[i], w->body[k]));
+  }
+}
+
+/* Triangles by brightness: those whose faintest centroid is the brightest come first. */
+static int by_brightness(sc_call *call, const search *s) {
+  for (uint32_t k = 0; k < s->count; k++) {
+    if (s->poor == 0) {
+      separate(call, k);
+    }
+    for (uint32_t j = 1; j < k; j++) {
+      for (uint32_t i = 0; i < j; i++) {
+        if (take(call, s, i, j, k)) {
+          return 1;
+        }
+      }
+    }
+  }
+  return 0;
+}
+
+/* Whether pair a is to come before pair b: the closer one, else that of the earlier place. */
+static int is_closer(const starcat_workspace *w, uint16_t a, uint16_t b) {
+  const real x = w->separation_rad[a], y = w->separation_rad[b];
+  return (x < y) || (!(y < x) && (a < b));
+}
+
+/* Restore the order of the heap of pairs below a place. */
+static void sift(starcat_workspace *w, uint32_t at, uint32_t count) {
+  const uint16_t moved = w->heap[at];
+  uint32_t child = 2u * at + 1u;
+  while (child < count) {
+    if ((child + 1u < count) && is_closer(w, w->heap[child + 1u], w->heap[child])) {
+      child++;
+    }
+    if (!is_closer(w, w->heap[child], moved)) {
+      break;
+    }
+    w->heap[at] = w->heap[child];
+    at = child;
+    child = 2u * at + 1u;
+  }
+  w->heap[at] = moved;
+}
+
+/* All triangles whose longest side is that of a pair. */
+static int with_longest_side(sc_call *call, const search *s, uint16_t pair) {
+  const starcat_workspace *w = call->work;
+  uint32_t q = 1;
+  while ((q + 1u) * q / 2u <= pair) {
+    q++;
+  }
+  const uint32_t p = pair - q * (q - 1u) / 2u;
+  for (uint32_t r = 0; r < s->count; r++) {
+    if ((r != p) && (r != q) && is_closer(w, (uint16_t)pair_of(r, p), pair) &&
+        is_closer(w, (uint16_t)pair_of(r, q), pair)) {
+      const uint32_t i = r < p ? r : p, k = r > q ? r : q;
+      if (take(call, s, i, p + q + r - i - k, k)) {
+        return 1;
+      }
+    }
+  }
+  return 0;
+}
+
+/* Triangles by their longest side, the shortest first: the most fields hold these whole. The
+ * pairs are sorted no further than they are needed. */
+static int by_longest_side(sc_call *call, const search *s) {
+  starcat_workspace *w = call->work;
+  uint32_t count = s->count * (s->count - 1u) / 2u;
+  if (s->poor == 0) {
+    for (uint32_t k = 1; k < s->count; k++) {
+      separate(call, k);
+    }
+  }
+  for (uint32_t n = 0; n < count; n++) {
+    w->heap[n] = (uint16_t)n;
+  }
+  for (uint32_t n = count / 2u; n > 0u; n--) {
+    sift(w, n - 1u, count);
+  }
+  if (!sc_spend(w, 2u * count)) {
+    return 1;
+  }
+  while (count > 0u) {
+    const uint16_t closest = w->heap[0];
+    count--;
+    w->heap[0] = w->heap[count];
+    sift(w, 0, count);
+    if (with_longest_side(call, s, closest)) {
+      return 1;
+    }
+  }
+  return 0;
+}
+
+void sc_each_triangle(sc_call *call, sc_look_up look_up) {
+  const starcat_workspace *w = call->work;
+  search s = {look_up, w->count, R(0.0), call->tolerance_rad, 0};
+  s.least_side_rad = SC_MIN_SIDE_PX / call->camera.given.focal_length_px;
+  if (s.count > STARCAT_MOST_CENTROIDS) {
+    s.count = STARCAT_MOST_CENTROIDS;
+  }
+  const int rounds = s.count <= SC_FEW_CENTROIDS ? 2 : 1;
+  for (s.poor = 0; s.poor < rounds; s.poor++) {
+    if (w->has_magnitudes != 0u ? by_brightness(call, &s) : by_longest_side(call, &s)) {
+      return;
+    }
+  }
+}
+
+/* The rows of the features whose value is between two numbers, and few others. */
+void sc_rows_between(const starcat_image *image, real low, real high, uint32_t *start,
+                     uint32_t *stop) {
+  const real end = (real)(image->n_kvector - 1u);
+  const real first = (low - image->kvector_intercept) / image->kvector_slope - R(0.001);
+  const real last = (high - image->kvector_intercept) / image->kvector_slope + R(1.001);
+  *start = 0;
+  if (first >= R(0.0)) {
+    *start = image->kvector[first < end ? (uint32_t)first : image->n_kvector - 1u];
+  }
+  *stop = 0;
+  if (last >= R(0.0)) {
+    *stop = last < end ? image->kvector[(uint32_t)last] : image->n_features;
+  }
+  if (*stop > image->n_features) { /* a damaged image */
+    *stop = image->n_features;
+  }
+}
+
+/* The rows of the stars of a feature. */
+void sc_rows_of(const starcat_image *image, uint32_t feature, uint32_t width, uint32_t rows[3]) {
+  const size_t at = (size_t)feature * width;
+  if (image->index_bytes == 2u) {
+    const uint16_t *indices = image->features;
+    for (uint32_t n = 0; n < width; n++) {
+      rows[n] = indices[at + n];
+    }
+  } else {
+    const uint32_t *indices = image->features;
+    for (uint32_t n = 0; n < width; n++) {
+      rows[n] = indices[at + n];
+    }
+  }
+}
+
+/* An observed triangle as it is compared with those of stars. */
+typedef struct {
+  uint32_t triple[3];
+  real low[3], high[3]; /* squares of the chords that each side may be */
+  int is_right_handed;
+} observed;
+
+static void observe(const sc_call *call, const uint32_t triple[3], const real sides[3],
+                    observed *o) {
+  const starcat_workspace *w = call->work;
+  const real error = SC_SIDE_TOLERANCE * call->tolerance_rad;
+  real normal[3];
+  for (uint32_t n = 0; n < 3u; n++) {
+    const real low = sc_chord_of_angle(sides[n] - error), high = sc_chord_of_angle(sides[n] + error);
+    o->triple[n] = triple[n];
+    o->low[n] = low * low;
+    o->high[n] = high * high;
+  }
+  sc_cross(w->body[triple[0]], w->body[triple[1]], normal);
+  o->is_right_handed = sc_dot(normal, w->body[triple[2]]) > R(0.0);
+}
+
+/* Try a triangle of stars in one order of its corners. Returns 1 if the search can end. */
+static int try_order(sc_call *call, const observed *o, const real stars[3][3],
+                     const uint8_t order[3]) {
+  const starcat_workspace *w = call->work;
+  const uint32_t *t = o->triple;
+  real m[9], body[3][3], icrs[3][3];
+  for (uint32_t n = 0; n < 3u; n++) {
+    for (uint32_t k = 0; k < 3u; k++) {
+      body[n][k] = w->body[t[n]][k];
+      icrs[n][k] = stars[order[n]][k];
+    }
+  }
+  if (!sc_triad(body[0], body[1], icrs[0], icrs[1], m)) {
+    return 0;
+  }
+  sc_refine(m, &body[0][0], &icrs[0][0], NULL, 3, 1);
+  return sc_try(call, m);
+}
+
+/* Compare one triangle of stars with the observed one. Returns 1 if the search can end. */
+static int compare(sc_call *call, const observed *o, uint32_t feature) {
+  static const uint8_t orders[6][3] = {{0, 1, 2}, {0, 2, 1}, {1, 0, 2},
+                                       {1, 2, 0}, {2, 0, 1}, {2, 1, 0}};
+  uint32_t rows[3];
+  real stars[3][3], normal[3], chords[3];
+  sc_rows_of(call->image, feature, 3, rows);
+  for (uint32_t n = 0; n < 3u; n++) {
+    if (rows[n] >= call->image->n_stars) { /* a damaged image */
+      return 0;
+    }
+    sc_star(call->image, rows[n], stars[n]);
+  }
+  chords[0] = sc_chord_square(stars[1], stars[2]);
+  chords[1] = sc_chord_square(stars[0], stars[2]);
+  chords[2] = sc_chord_square(stars[0], stars[1]);
+  sc_cross(stars[0], stars[1], normal);
+  const int is_right_handed = sc_dot(normal, stars[2]) > R(0.0);
+  for (uint32_t k = 0; k < 6u; k++) {
+    const uint8_t *order = orders[k];
+    int fits = 1;
+    for (uint32_t n = 0; n < 3u; n++) {
+      const real chord = chords[order[n]];
+      fits = fits && (chord >= o->low[n]) && (chord <= o->high[n]);
+    }
+    /* The first, fourth and fifth orders keep the handedness. */
+    const int is_even = (k == 0u) || (k == 3u) || (k == 4u);
+    if (fits && ((is_even == is_right_handed) == o->is_right_handed)) {
+      if (try_order(call, o, (const real(*)[3])stars, order)) {
+        return 1;
+      }
+    }
+  }
+  return 0;
+}
+
+/* Area and circumradius of a plane triangle and the errors that those of its sides cause. */
+static void features_of(const real sides[3], real error, real *area, real *area_error,
+                        real *radius, real *radius_error) {
+  const real a = sides[0], b = sides[1], c = sides[2];
+  const real a2 = a * a, b2 = b * b, c2 = c * c;
+  const real u = b2 + c2 - a2, v = a2 + c2 - b2, t = a2 + b2 - c2;
+  const real square = a2 * u + b2 * v + c2 * t;
+  *area = R(0.25) * STARCAT_SQRT(square > R(1e-30) ? square : R(1e-30));
+  const real scale = R(0.125) / *area;
+  const real x = scale * a * u, y = scale * b * v, z = scale * c * t;
+  *radius = R(0.25) * a * b * c / *area;
+  *area_error = error * STARCAT_SQRT(x * x + y * y + z * z);
+  const real p = R(1.0) / a - x / *area, q = R(1.0) / b - y / *area, r = R(1.0) / c - z / *area;
+  *radius_error = error * *radius * STARCAT_SQRT(p * p + q * q + r * r);
+}
+
+static uint16_t quantised(real radius, real quantum) {
+  const real scaled = radius / quantum;
+  if (!(scaled > R(0.0))) {
+    return 0;
+  }
+  return scaled < R(65535.0) ? (uint16_t)scaled : (uint16_t)SC_RADIUS_OVERFLOW;
+}
+
+/* Whether one of a block of radii is in a range; written so that compilers use vectors. */
+static int has_radius(const uint16_t *radii, uint16_t low, uint16_t width) {
+  uint16_t found = 0;
+  for (uint32_t n = 0; n < BLOCK; n++) {
+    found |= (uint16_t)((uint16_t)(radii[n] - low) <= width);
+  }
+  return found != 0u;
+}
+
+/* Look up the triangles of stars with the area and circumradius of an observed one. */
+int sc_triangle(sc_call *call, const uint32_t triple[3], const real sides[3]) {
+  const starcat_image *image = call->image;
+  real area, area_error, radius, radius_error;
+  uint32_t start, stop;
+  observed o;
+  features_of(sides, SC_SIDE_TOLERANCE * call->tolerance_rad, &area, &area_error, &radius,
+              &radius_error);
+  sc_rows_between(image, area - area_error, area + area_error, &start, &stop);
+  if (start >= stop) {
+    return 0;
+  }
+  observe(call, triple, sides, &o);
+  const real quantum = image->radius_quantum_rad;
+  const uint16_t low = quantised(radius - radius_error - quantum, quantum);
+  const uint16_t width =
+      (uint16_t)(quantised(radius + radius_error + R(2.0) * quantum, quantum) - low);
+  for (uint32_t row = start; row < stop; row += BLOCK) {
+    const uint32_t count = stop - row < BLOCK ? stop - row : BLOCK;
+    if (!sc_spend(call->work, count)) {
+      return 1;
+    }
+    if ((count < BLOCK) || has_radius(image->radii + row, low, width)) {
+      for (uint32_t n = 0; n < count; n++) {
+        if (((uint16_t)(image->radii[row + n] - low) <= width) && compare(call, &o, row + n)) {
+          return 1;
+        }
+      }
+    }
+  }
+  return 0;
+}

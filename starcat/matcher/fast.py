@@ -1,0 +1,373 @@
+"""The matcher's fast path: the C library that flies (``onboard/``), called with an onboard image.
+
+It is compiled when a wheel is built. Where it is missing, or cannot take a frame, the matcher of
+numpy serves, with the same rules and the same stars.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.errors import ConfigError, ProductError
+from starcat.geometry.camera import Camera
+from starcat.matcher.database import Database
+from starcat.matcher.result import Status
+from starcat.onboard.image import Contents, make_image
+
+try:
+    _onboard: Any = import_module("starcat.matcher._onboard")
+except ImportError:  # the wheel was built without a compiler
+    _onboard = None
+
+Array = NDArray[np.float64]
+
+FEATURES = {"triangle": ("triangles", ("i", "j", "k")), "pyramid": ("pairs", ("i", "j"))}
+"""For each method that an image can hold, the product and the columns that it is made of."""
+
+MAX_STEPS = 2_000_000_000
+"""Steps for one frame: on the ground the limit is the matcher's patience, not a clock."""
+
+CHUNK = 256
+"""Frames that one thread takes at a time."""
+
+WORDS: dict[int, Status] = {0: "identified", 1: "no_match", 2: "too_few_stars", -14: "no_match"}
+"""What a frame came to, by the number that the library returns. The last one is a budget that
+was used up."""
+
+DROPPED = {-2: "not_finite", -3: "out_of_frame", -4: "duplicate"}
+"""Why a centroid was not used, by the number that the library gives it."""
+
+
+ANSWER = np.dtype(
+    [
+        ("status", np.int32),
+        ("n_matched", np.int32),
+        ("steps", np.int64),
+        ("q_body_from_icrs", np.float64, 4),
+        ("matrix", np.float64, (3, 3)),
+        ("residual_rad", np.float64),
+        ("log_chance", np.float64),
+        ("seconds", np.float64),
+    ]
+)
+"""A frame's answer as the library writes it: a key of `WORDS`, the attitude, the natural
+logarithm of the false-match probability, and the time that the library took."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the caller states, as `Matcher` has it.
+
+    Attributes
+    ----------
+    tolerance_px : float
+        Largest error of a centroid, as a radius.
+    noise_px, noise_mag : float
+        Standard deviations of a centroid on each axis and of a magnitude; 0 where not stated.
+    max_false_match_probability : float
+        Answers that chance would give more often than this are withheld.
+    """
+
+    tolerance_px: float
+    noise_px: float
+    noise_mag: float
+    max_false_match_probability: float
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What the library found in N frames with K centroids in all.
+
+    Attributes
+    ----------
+    starts : ndarray of int64, shape (N + 1,)
+        The centroids of frame n are rows ``starts[n]`` to ``starts[n + 1]``.
+    frames : ndarray of `ANSWER`, shape (N,)
+        A record a frame; attitudes are zeros unless it is identified.
+    star_index : ndarray of int32, shape (K,)
+        Row of the database; -1 where none; a key of `DROPPED` where the centroid was not used.
+    """
+
+    starts: NDArray[np.int64]
+    frames: NDArray[np.void]
+    star_index: NDArray[np.int32]
+
+
+def is_compiled() -> bool:
+    """Return whether the C library is there.
+
+    Returns
+    -------
+    bool
+        False where starcat was installed without a compiler.
+    """
+    return _onboard is not None
+
+
+def library_version() -> str | None:
+    """Return the version of the C library.
+
+    Returns
+    -------
+    str or None
+        None where it is not compiled.
+    """
+    if _onboard is None:
+        return None
+    return str(_onboard.ffi.string(_onboard.lib.starcat_version()).decode())
+
+
+class FastMatcher:
+    """An onboard image in memory, and the C library that reads it.
+
+    Parameters
+    ----------
+    data : bytes
+        The image.
+    rows : ndarray of int64, shape (N,), optional
+        Row of the database for each star of the image; the image's own rows by default.
+    directions : ndarray of float64, shape (N, 3), optional
+        Directions of the image's stars before they were rounded, for attitudes without that
+        error; the image's own by default, as in flight.
+
+    Raises
+    ------
+    ProductError
+        If the library does not open the image.
+    """
+
+    def __init__(
+        self,
+        data: bytes,
+        rows: NDArray[np.int64] | None = None,
+        directions: Array | None = None,
+    ) -> None:
+        ffi, lib = _onboard.ffi, _onboard.lib
+        # Memory of numpy begins at a multiple of 16, as the library wants it; bytes need not.
+        words = np.zeros(-(-len(data) // 8), dtype=np.uint64)
+        words.view(np.uint8)[: len(data)] = np.frombuffer(data, dtype=np.uint8)
+        self._words, self._image = words, ffi.new("starcat_image *")
+        status = lib.starcat_open(self._image, ffi.from_buffer(words), len(data), 0)
+        if status != 0:
+            raise ProductError(
+                f"an onboard image of {len(data):,} bytes: the C library refuses it ({status})"
+            )
+        count = int(self._image.n_stars)
+        own = np.arange(count) if rows is None else rows
+        self._directions = directions
+        # Numbers below 0 say why a centroid has no star; they index this table from its end.
+        self._rows = np.concatenate([own, [-4, -3, -2, -1]]).astype(np.int32)
+
+    def takes(self, count: int) -> bool:
+        """Return whether a frame of so many centroids is small enough.
+
+        Parameters
+        ----------
+        count : int
+            Centroids.
+
+        Returns
+        -------
+        bool
+            False where the matcher of numpy has to serve.
+        """
+        return count <= int(_onboard.lib.STARCAT_MAX_CENTROIDS)
+
+    def identify(
+        self,
+        frames: Sequence[Array],
+        camera: Camera,
+        limits: Limits,
+        magnitudes: Sequence[Array] | None = None,
+        priors: tuple[Array, float] | None = None,
+        threads: int = 1,
+    ) -> Answers:
+        """Identify the stars of many frames.
+
+        Parameters
+        ----------
+        frames : sequence of ndarray of float64, shape (n, 2)
+            Centroids, pixels.
+        camera : Camera
+            The camera of all of them.
+        limits : Limits
+            What the caller states.
+        magnitudes : sequence of ndarray of float64, shape (n,), optional
+            One array a frame.
+        priors : (ndarray of float64, shape (N, 4), float), optional
+            Prior attitudes and the radians that they may be wrong by; lost in space by default.
+        threads : int, default 1
+            The library runs without the interpreter's lock.
+
+        Returns
+        -------
+        Answers
+            In the order of the frames, whatever the number of threads.
+        """
+        starts = np.zeros(len(frames) + 1, dtype=np.int64)
+        if len(frames) == 1:  # by far the most frequent call
+            starts[1], px = len(frames[0]), frames[0]
+            mag = None if magnitudes is None else np.ascontiguousarray(magnitudes[0])
+        else:
+            np.cumsum([len(frame) for frame in frames], out=starts[1:])
+            px = np.concatenate([*frames, np.empty((0, 2))])
+            mag = None if magnitudes is None else np.concatenate([*magnitudes, np.empty(0)])
+        x, y = np.ascontiguousarray(px.T)
+        work = _Work(self._image, self._directions, camera, limits, x, y, mag, priors)
+        answers = Answers(starts, np.zeros(len(frames), ANSWER), np.full(len(px), -1, np.int32))
+        if threads <= 1 or len(frames) <= CHUNK:
+            work.run(range(len(frames)), answers)
+        else:
+            slices = [range(n, min(n + CHUNK, len(frames))) for n in range(0, len(frames), CHUNK)]
+            with ThreadPoolExecutor(min(threads, os.cpu_count() or 1)) as pool:
+                list(pool.map(lambda part: work.run(part, answers), slices))
+        return Answers(starts, answers.frames, self._rows[answers.star_index])
+
+
+@dataclass(frozen=True)
+class _Work:
+    """What the calls for the parts of many frames share."""
+
+    image: Any
+    directions: Array | None
+    camera: Camera
+    limits: Limits
+    x: Array
+    y: Array
+    mag: Array | None
+    priors: tuple[Array, float] | None
+
+    def run(self, part: range, answers: Answers) -> None:
+        """Let the library answer some of the frames, in memory of its own."""
+        ffi, lib = _onboard.ffi, _onboard.lib
+        prior, uncertainty_rad = self.priors or (None, 0.0)
+        arrays = (
+            ("int64_t[]", answers.starts[part.start :]),
+            ("double[]", self.x),
+            ("double[]", self.y),
+            ("double[]", self.mag),
+            ("double[]", None if prior is None else prior[part.start :]),
+            ("double[]", self.directions),
+        )
+        *pointers, directions = (
+            ffi.NULL if array is None else ffi.from_buffer(kind, array) for kind, array in arrays
+        )
+        lib.starcat_many(
+            self.image,
+            _camera(self.camera),
+            _options(self.limits),
+            ffi.new("starcat_frames *", [len(part), *pointers, uncertainty_rad, directions]),
+            ffi.from_buffer("starcat_answer[]", answers.frames[part.start :]),
+            ffi.from_buffer("int32_t[]", answers.star_index),
+            *_memory(),
+        )
+
+
+_OF_THREAD = threading.local()
+
+
+def _memory() -> tuple[Any, Any]:
+    """Return the memory that this thread's calls work in; half a megabyte, made once."""
+    if not hasattr(_OF_THREAD, "memory"):
+        ffi = _onboard.ffi
+        _OF_THREAD.memory = ffi.new("starcat_workspace *"), ffi.new("starcat_result *")
+    found: tuple[Any, Any] = _OF_THREAD.memory
+    return found
+
+
+@lru_cache(maxsize=16)
+def _camera(camera: Camera) -> Any:
+    """Return a camera as the library has it."""
+    lens = camera.distortion
+    return _onboard.ffi.new(
+        "starcat_camera *",
+        [
+            camera.width_px,
+            camera.height_px,
+            camera.focal_length_px,
+            *camera.principal_point_px,
+            *(lens.k1, lens.k2, lens.k3, lens.p1, lens.p2),
+            0.0 if lens.is_none else lens.fold_radius,
+        ],
+    )
+
+
+@lru_cache(maxsize=16)
+def _options(limits: Limits) -> Any:
+    chance = math.log(max(limits.max_false_match_probability, 1e-300))
+    stated = limits.noise_px, limits.noise_mag
+    options = [limits.tolerance_px, *stated, chance, MAX_STEPS]
+    return _onboard.ffi.new("starcat_options *", options)
+
+
+MOST_FEATURES = 4_000_000
+"""Triangles or pairs of a database that are made an image unasked: that takes a second."""
+
+
+def fast_matcher(database: Database, method: str, always: bool = True) -> FastMatcher | None:
+    """Return the fast path of a database, made once.
+
+    Parameters
+    ----------
+    database : Database
+        With the product that the method needs.
+    method : str
+        A key of `METHODS`.
+    always : bool, default True
+        Whether an image is made however long that takes.
+
+    Returns
+    -------
+    FastMatcher or None
+        None where the library is not compiled, the method has no image, or the database is too
+        dense or too large for one.
+    """
+    if _onboard is None or method not in FEATURES:
+        return None
+    product, columns = FEATURES[method]
+    if not always and len(database.products[product][columns[0]]) > MOST_FEATURES:
+        return None
+    return database.derived(_of_triangles if method == "triangle" else _of_pairs)
+
+
+def _of_triangles(database: Database) -> FastMatcher | None:
+    return _made(database, "triangle")
+
+
+def _of_pairs(database: Database) -> FastMatcher | None:
+    return _made(database, "pyramid")
+
+
+def _made(database: Database, method: str) -> FastMatcher | None:
+    product, columns = FEATURES[method]
+    arrays = database.products[product]
+    features = np.stack([arrays[column] for column in columns], axis=-1)
+    contents = Contents(
+        database.name,
+        database.epoch_jyear,
+        database.camera,
+        database.star_id,
+        database.directions,
+        database.mag,
+        method,
+        features,
+    )
+    try:
+        made = make_image(contents)
+    except ConfigError:  # larger than an image can say
+        return None
+    if made.most_near > int(_onboard.lib.STARCAT_MAX_STARS):
+        return None
+    exact = np.ascontiguousarray(database.directions[made.star_rows])
+    return FastMatcher(made.data, made.star_rows, exact)

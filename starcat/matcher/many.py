@@ -1,0 +1,95 @@
+"""Answers to many frames at once, kept as arrays and read one by one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.geometry.attitude import radec_roll_from_matrix
+from starcat.matcher.fast import DROPPED, WORDS, Answers
+from starcat.matcher.result import MatchResult, Status
+
+
+@dataclass(frozen=True)
+class MatchResults(Sequence[MatchResult]):
+    """The answers of the C library to many frames.
+
+    Attributes
+    ----------
+    answers : Answers
+        All of them, as arrays.
+    star_id : ndarray of int64, shape (S,)
+        Permanent numbers of the database's stars.
+    """
+
+    answers: Answers
+    star_id: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.answers.frames)
+
+    def __iter__(self) -> Iterator[MatchResult]:
+        """Return the answers one after the other."""
+        return (self[n] for n in range(len(self)))
+
+    @property
+    def status(self) -> list[Status]:
+        """What each frame came to."""
+        return [WORDS[code] for code in self.answers.frames["status"].tolist()]
+
+    @property
+    def seconds(self) -> NDArray[np.float64]:
+        """Time that each frame took, without the call."""
+        return np.asarray(self.answers.frames["seconds"])
+
+    @property
+    def q_body_from_icrs(self) -> NDArray[np.float64]:
+        """Scalar-last attitudes, shape (N, 4); NaN unless identified."""
+        found = self.answers.frames
+        return np.where(found["status"][:, None] == 0, found["q_body_from_icrs"], np.nan)
+
+    @overload
+    def __getitem__(self, frame: int) -> MatchResult: ...
+    @overload
+    def __getitem__(self, frame: slice) -> list[MatchResult]: ...
+    def __getitem__(self, frame: int | slice) -> MatchResult | list[MatchResult]:
+        """Return the answer to one frame, or those to some."""
+        if isinstance(frame, slice):
+            return [self[n] for n in range(*frame.indices(len(self)))]
+        frame = range(len(self))[frame]
+        answers = self.answers
+        found = answers.frames[frame]
+        star = answers.star_index[answers.starts[frame] : answers.starts[frame + 1]]
+        status = WORDS[int(found["status"])]
+        dropped = _dropped(star)
+        index = np.maximum(star, -1)
+        if status != "identified":
+            none, nan = np.full(len(index), -1, dtype=np.int64), math.nan
+            quaternion = np.full(4, nan)
+            return MatchResult(status, none, index, quaternion, nan, nan, nan, 0, nan, 1.0, dropped)
+        return MatchResult(
+            status,
+            np.where(index >= 0, self.star_id[index], -1),
+            index,
+            found["q_body_from_icrs"].copy(),
+            *radec_roll_from_matrix(found["matrix"]),
+            int(found["n_matched"]),
+            math.degrees(float(found["residual_rad"])) * 3600.0,
+            math.exp(float(found["log_chance"])),
+            dropped,
+        )
+
+
+def _dropped(star: NDArray[np.int32]) -> tuple[tuple[int, str], ...]:
+    """Return row and reason of every centroid that was not used, repeats last."""
+    if not (star < -1).any():
+        return ()
+    rows = np.flatnonzero(star < -1)
+    reasons = [(int(row), DROPPED[int(star[row])]) for row in rows]
+    return tuple(sorted(reasons, key=lambda item: item[1] == "duplicate"))
