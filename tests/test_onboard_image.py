@@ -202,6 +202,7 @@ def sealed(image: bytes, name: str, value: int | float) -> bytes:
         ("focal_length_px", 0.0, "focal_length_px is 0.0; expected more than 0"),
         ("focal_length_px", float("nan"), "focal_length_px is nan; expected a finite number"),
         ("kvector_slope", -1.0, "kvector_slope is -1.0"),
+        ("radius_quantum_rad", 0.0, "radius_quantum_rad is 0.0; expected more than 0"),
         ("longest_rad", float("inf"), "longest_rad is inf"),
     ],
 )
@@ -265,6 +266,24 @@ def test_rows_and_orders_that_cannot_be_are_refused(section, at, words):
         read_image(data + check_blocks(data, "little"))
 
 
+@given(st.integers(0, 2**32 - 1), st.sampled_from(["triangle", "pyramid"]), st.integers(1, 8))
+def test_whatever_is_written_in_an_image_it_is_read_or_refused(seed, method, changes):
+    """Bytes change anywhere, half of them in header and section table, and the CRCs fit again."""
+    generator = np.random.default_rng(seed)
+    sound = make_image(sky(30, 1, method)).data
+    data = bytearray(sound[: data_blocks(len(sound)) * 4096])
+    for _ in range(changes):
+        end = 512 if generator.integers(2) else len(data)
+        data[generator.integers(8, end)] = generator.choice([0, 1, 2, 127, 128, 255])
+    try:
+        image = read_image(bytes(data) + check_blocks(bytes(data), "little"))
+    except (OnboardImageError, SchemaVersionError):
+        return
+    found = [*value_problems(image), *capacity_problems(image)]
+    found += artifact_problems(image, sky(30, 1, method))
+    assert all(isinstance(problem, str) for problem in found)
+
+
 @pytest.mark.parametrize(
     ("section", "mask", "words"),
     [
@@ -288,6 +307,8 @@ def test_values_that_are_not_those_of_the_stars_are_found(real, section, mask, w
 
 def test_a_header_that_says_too_little_is_found(real):
     image = make_image(real[0]).data
+    steep = read_image(sealed(image, "kvector_slope", 1e308))
+    assert next(value_problems(steep)).startswith("section kvector: not the numbers of values")
     near = read_image(sealed(image, "most_near", 3))
     assert next(capacity_problems(near)).startswith("most_near is 3; ")
     short = read_image(sealed(image, "longest_rad", 0.01))

@@ -44,13 +44,7 @@ def value_problems(image: OnboardImage) -> Iterator[str]:
     if (np.diff(values) < -VALUE_TOLERANCE).any():
         yield f"section {_features(image)}: not by ascending value"
         return
-    counts = image.sections["kvector"].astype(np.int64)
-    line = image.header["kvector_intercept"] + image.header["kvector_slope"] * np.arange(
-        len(counts), dtype=np.float64
-    )
-    fenced = np.concatenate([[-np.inf], values, [np.inf]])
-    below, above = fenced[counts] - line, fenced[counts + 1] - line
-    if (below > VALUE_TOLERANCE).any() or (above < -VALUE_TOLERANCE).any():
+    if not _fits_line(image, values):
         yield "section kvector: not the numbers of values below its line"
     if "radii" in image.sections:
         steps = radii / image.header["radius_quantum_rad"]
@@ -62,6 +56,18 @@ def value_problems(image: OnboardImage) -> Iterator[str]:
             yield f"section radii: row {far[0]} is {found:.0f}; expected {wanted:.1f}"
     if longest > image.header["longest_rad"] + VALUE_TOLERANCE:
         yield f"longest_rad is {image.header['longest_rad']:.9g}; a side has {longest:.9g} rad"
+
+
+def _fits_line(image: OnboardImage, values: Array) -> bool:
+    """Return whether the K-vector counts the values on or below its line."""
+    counts = image.sections["kvector"].astype(np.int64)
+    with np.errstate(over="ignore"):  # a line that leads to infinity does not fit
+        steps = image.header["kvector_slope"] * np.arange(len(counts), dtype=np.float64)
+        line = image.header["kvector_intercept"] + steps
+    below = np.concatenate([[-np.inf], values])[counts]
+    above = np.concatenate([values, [np.inf]])[counts]
+    fits = (below <= line + VALUE_TOLERANCE) & (above >= line - VALUE_TOLERANCE)
+    return bool(fits.all() and np.isfinite(line).all())
 
 
 def capacity_problems(image: OnboardImage) -> Iterator[str]:

@@ -96,7 +96,10 @@ def header_problems(header: Numbers, size_bytes: int) -> Iterator[str]:
     for name, (least, most) in ranges.items():
         if not least <= header[name] <= most:
             yield f"{name} is {header[name]}; expected {least} to {most}"
-    for name in ("focal_length_px", "kvector_slope"):
+    positive = ["focal_length_px", "kvector_slope"]
+    if header["method"] == METHOD_NUMBERS["triangle"]:
+        positive.append("radius_quantum_rad")
+    for name in positive:
         if not header[name] > 0.0:
             yield f"{name} is {header[name]}; expected more than 0"
     for name in ("radius_quantum_rad", "longest_rad"):
