@@ -37,6 +37,7 @@ from starcat.errors import StarcatError
 from starcat.exchange.formats import format_of
 from starcat.geometry.camera import Camera
 from starcat.images.image_file import write_image
+from starcat.matcher.matcher import Matcher
 from starcat.onboard.blocks import check_blocks
 from starcat.onboard.image import Contents, make_image
 from starcat.onboard.reading import read_image
@@ -617,6 +618,22 @@ def _(place: Place) -> Call:
 @case("option out of range", 2)
 def _(place: Place) -> Call:
     return ["identify", place.artifact, place.folder / "frame.csv", "--tolerance-px", "1e9"]
+
+
+@case("noise and tolerance of centroids", 2)
+def _(place: Place) -> Call:
+    frame = place.write("frame.csv", "x_px,y_px\n1,2\n")
+    return ["identify", place.artifact, frame, "--tolerance-px", "2", "--noise-px", "0.5"]
+
+
+@case("noise of centroids that is none", 2)
+def _(place: Place) -> Call:
+    return lambda: Matcher.open(place.artifact, noise_px=0.0)
+
+
+@case("noise of magnitudes that is none", 2)
+def _(place: Place) -> Call:
+    return lambda: Matcher.open(place.artifact, noise_mag=float("nan"))
 
 
 @case("option unknown", 2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -11,13 +12,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from starcat.geometry.attitude import solve_wahba_svd
+from starcat.geometry.attitude import matrix_from_quaternion, random_attitudes, solve_wahba_svd
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
 from starcat.matcher.chance import false_match_probability
 from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.observation import observe
+from starcat.matcher.verification import agree
+from starcat.matcher.ways import compatible_pairs, log_compatible_ways, log_ways
 from starcat.products.pairs import find_pairs
+from starcat.simulation.simulate import Frame, Noise, simulate_frame
+from starcat.simulation.sky import Sky
 
 CAMERA = Camera(1024, 1024, fov_x_deg=30.0)
 
@@ -29,8 +35,8 @@ def rays(centroids_px: list[list[float]]) -> np.ndarray:
 FOUR = rays([[100, 150], [900, 80], [500, 980], [60, 800]])
 
 
-def sky_of(u: np.ndarray) -> Database:
-    pairs = find_pairs(u, 0.0, CAMERA.diagonal_rad)
+def sky_of(u: np.ndarray, camera: Camera = CAMERA, mag: np.ndarray | None = None) -> Database:
+    pairs = find_pairs(u, 0.0, camera.diagonal_rad)
     columns = {
         "i": pairs.i,
         "j": pairs.j,
@@ -39,11 +45,11 @@ def sky_of(u: np.ndarray) -> Database:
     }
     return Database(
         name="sky-1.0.0",
-        camera=CAMERA,
+        camera=camera,
         epoch_jyear=2026.0,
         star_id=np.arange(len(u)),
         directions=u,
-        mag=np.zeros(len(u)),
+        mag=np.zeros(len(u)) if mag is None else mag,
         designation=np.full(len(u), b"star"),
         products={"pairs": ProductArrays(columns, pairs.index.attributes)},
     )
@@ -99,6 +105,75 @@ def test_a_wider_detector_has_room_for_more_frames():
     wide = Camera(2048, 1024, CAMERA.focal_length_px)
     found = false_match_probability(1.0, FOUR, 6, 9, wide)
     assert found == pytest.approx(false_match_probability(1.0, FOUR, 6, 9, CAMERA) / 2**4)
+
+
+# --- What is stated
+
+
+def shares(noise_px: float, n_centroids: int, stars: int, **stated) -> dict[int, float]:
+    """Return the share of each number of stars: what is expected, over the bound."""
+    found = {}
+    for n in range(4, min(n_centroids, stars) + 1):
+        frame = 1e-6, directions(n, n), n_centroids, stars, CAMERA
+        evenly = false_match_probability(*frame, **stated) / (n_centroids - 3)
+        found[n] = evenly / false_match_probability(*frame, noise_px=noise_px, **stated)
+    return found
+
+
+@pytest.mark.parametrize(("n_centroids", "stars"), [(4, 4), (9, 12), (9, 5), (12, 9), (30, 40)])
+@pytest.mark.parametrize("noise_px", [1e-3, 0.3, 1.0, 30.0])
+def test_the_shares_of_all_numbers_add_up_to_one(noise_px, n_centroids, stars):
+    compatible = np.random.default_rng(stars).random((n_centroids, stars)) < 0.8
+    compatible[range(min(n_centroids, stars)), range(min(n_centroids, stars))] = True
+    for stated in ({}, {"compatible": compatible}):
+        found = shares(noise_px, n_centroids, stars, **stated)
+        assert sum(found.values()) == pytest.approx(1.0, rel=1e-9)
+
+
+@pytest.mark.parametrize(("noise_px", "typical"), [(0.01, 4), (0.3, 5), (2.0, 6), (30.0, 9)])
+def test_the_largest_share_is_that_of_the_number_of_stars_that_a_noise_asks_for(noise_px, typical):
+    # Frames of 9 centroids and 12 stars, four to nine of which agree as well as noise lets them:
+    # the fewest that chance would give once in ten million frames.
+    found = shares(noise_px, 9, 12)
+    places = {n: np.random.default_rng(n).random((200, n, 2)) * 1024.0 for n in found}
+    expected = {
+        n: np.median(
+            [
+                by_hand((2 * n - 3) * noise_px**2, CAMERA.directions_from_pixels(px), 9, 12) / 6
+                for px in places[n]
+            ]
+        )
+        for n in found
+    }
+    assert next((n for n in found if expected[n] <= 1e-7), 9) == typical
+    for n, share in found.items():
+        assert share == pytest.approx(found[typical] * 0.1 ** abs(n - typical), rel=1e-9)
+
+
+def test_frames_of_four_are_what_they_were():
+    # There is one number only: nothing to share.
+    for noise_px in (0.1, 2.0):
+        found = false_match_probability(1.0, FOUR, 4, 9, CAMERA, noise_px=noise_px)
+        assert found == pytest.approx(false_match_probability(1.0, FOUR, 4, 9, CAMERA), rel=1e-12)
+
+
+def test_three_stars_are_no_agreement_where_the_noise_is_stated():
+    assert false_match_probability(1e-9, FOUR[:3], 5, 9, CAMERA, noise_px=0.5) == 1.0
+
+
+@given(st.integers(4, 9), st.integers(0, 6), st.integers(0, 6), st.integers(0, 99))
+def test_magnitudes_divide_the_bound_by_the_ways_they_leave(n, more, others, seed):
+    compatible = np.random.default_rng(seed).random((n + more, n + others)) < 0.7
+    compatible[range(n), range(n)] = True
+    frame = 0.1 * n, directions(n, seed), n + more, n + others, CAMERA
+    without, found = (
+        false_match_probability(*frame),
+        false_match_probability(*frame, compatible=compatible),
+    )
+    ways = log_compatible_ways(n, compatible)[n] - log_ways(n, n + more, n + others)
+    if without < 1.0:
+        assert found == pytest.approx(without * math.exp(ways), rel=1e-9)
+    assert found <= without * (1.0 + 1e-12)
 
 
 @pytest.mark.parametrize("square_px", [0.0, 1e-300, 1e9, 1e300])
@@ -163,16 +238,16 @@ def test_more_matched_of_the_same_frame_are_less_likely(frame, rms_px):
 
 
 def assignments(
-    apart: np.ndarray, stars_apart: np.ndarray, reach_rad: float
+    apart: np.ndarray, stars_apart: np.ndarray, reach_rad: float, joined: np.ndarray
 ) -> Iterator[tuple[list[int], np.ndarray]]:
     """Yield every choice of four or more centroids with all stars that they may be."""
-    waiting = [([n], np.arange(len(stars_apart))[:, None]) for n in range(len(apart))]
+    waiting = [([n], np.flatnonzero(joined[n])[:, None]) for n in range(len(apart))]
     while waiting:
         chosen, stars = waiting.pop()
         if len(chosen) >= 4 and len(stars):
             yield chosen, stars
         for further in range(chosen[-1] + 1, len(apart)):
-            fits = np.ones((len(stars), len(stars_apart)), dtype=bool)
+            fits = np.tile(joined[further], (len(stars), 1))
             for place, centroid in enumerate(chosen):
                 miss = stars_apart[stars[:, place]] - apart[centroid, further]
                 fits &= np.abs(miss) <= reach_rad
@@ -180,12 +255,35 @@ def assignments(
             waiting.append(([*chosen, further], np.column_stack([stars[row], star])))
 
 
-def lowest_bound(centroids_px: np.ndarray, u: np.ndarray, apart: np.ndarray, reach_px: float):
+@dataclass(frozen=True)
+class Stated:
+    """What is known of the centroids, and the magnitudes of the stars."""
+
+    noise_px: float | None = None
+    noise_mag: float | None = None
+    star_mag: np.ndarray | None = None
+
+    def compatible(self, mag: np.ndarray) -> np.ndarray | None:
+        if self.noise_mag is None:
+            return None
+        return compatible_pairs(mag, self.star_mag, self.noise_mag)
+
+
+def lowest_bound(
+    centroids_px: np.ndarray,
+    u: np.ndarray,
+    apart: np.ndarray,
+    reach_px: float,
+    stated: Stated,
+    mag: np.ndarray,
+) -> float:
     """Return the least bound that any attitude has, whatever stars the centroids are."""
     body = CAMERA.directions_from_pixels(centroids_px)
     seen = separation(body[:, None], body[None])
+    joined = stated.compatible(mag)
+    all_joined = np.ones((len(body), len(u)), dtype=bool) if joined is None else joined
     least = 1.0
-    for chosen, stars in assignments(seen, apart, reach_px / CAMERA.focal_length_px):
+    for chosen, stars in assignments(seen, apart, reach_px / CAMERA.focal_length_px, all_joined):
         rays = np.broadcast_to(body[chosen], (len(stars), len(chosen), 3))
         matrices = solve_wahba_svd(rays, u[stars])
         turned = np.einsum("kij,knj->kni", matrices, u[stars]).reshape(-1, 3)
@@ -193,21 +291,42 @@ def lowest_bound(centroids_px: np.ndarray, u: np.ndarray, apart: np.ndarray, rea
         square = ((place - centroids_px[chosen]) ** 2).sum(axis=(1, 2))
         # Two separations err by more than sqrt(2 Q) for no assignment with less than Q.
         for row in np.flatnonzero(square <= 0.5 * reach_px**2):
-            near = u[u @ matrices[row, 2] > np.cos(CAMERA.radius_rad)]
-            inside = CAMERA.contains(CAMERA.pixels_from_directions(near @ matrices[row].T))
+            near = np.flatnonzero(u @ matrices[row, 2] > np.cos(CAMERA.radius_rad))
+            inside = CAMERA.contains(CAMERA.pixels_from_directions(u[near] @ matrices[row].T))
+            around = near[inside]
             bound = false_match_probability(
-                float(square[row]), body[chosen], len(body), int(inside.sum()), CAMERA
+                float(square[row]),
+                body[chosen],
+                len(body),
+                len(around),
+                CAMERA,
+                noise_px=stated.noise_px,
+                compatible=None if joined is None else joined[:, np.union1d(around, stars[row])],
             )
             least = min(least, bound)
     return least
 
 
-def lowest_bounds(u: np.ndarray, n_centroids: int, count: int, reach_px: float) -> np.ndarray:
+NOTHING = Stated()
+
+
+def lowest_bounds(
+    u: np.ndarray, n_centroids: int, count: int, reach_px: float, stated: Stated = NOTHING
+) -> np.ndarray:
     apart = separation(u[:, None], u[None])
     np.fill_diagonal(apart, np.inf)
     generator = np.random.default_rng(12)
     frames = generator.random((count, n_centroids, 2)) * 1024.0
-    return np.array([lowest_bound(frame, u, apart, reach_px) for frame in frames])
+    # The magnitudes of false spots may well be those of the stars.
+    mags = generator.choice(
+        np.zeros(1) if stated.star_mag is None else stated.star_mag, (count, n_centroids)
+    )
+    return np.array(
+        [
+            lowest_bound(frame, u, apart, reach_px, stated, mag)
+            for frame, mag in zip(frames, mags, strict=True)
+        ]
+    )
 
 
 def test_as_many_random_frames_agree_as_the_bound_says(random_directions):
@@ -229,6 +348,38 @@ def test_no_more_random_frames_agree_where_any_number_may_match(random_direction
     assert (found <= 0.3).any()
 
 
+def magnitudes(count: int) -> np.ndarray:
+    """Return magnitudes up to 6 as stars have them: three times as many in each further one."""
+    return 6.0 + np.log10(1.0 - np.random.default_rng(count).random(count)) / 0.5
+
+
+@pytest.mark.parametrize(("noise_mag", "reach_px"), [(0.05, 180.0), (0.6, 60.0)])
+def test_no_more_random_frames_agree_with_the_magnitudes_of_stars(
+    random_directions, noise_mag, reach_px
+):
+    # With the smaller error an agreement of the same bound has larger residuals.
+    stated = Stated(noise_mag=noise_mag, star_mag=magnitudes(374))
+    found = lowest_bounds(random_directions(374, 11), 4, 150, reach_px, stated)
+    for limit in (0.003, 0.01, 0.03, 0.1, 0.3):
+        expected = len(found) * limit
+        assert (found <= limit).sum() <= expected + 4.0 * math.sqrt(expected)
+    assert (found <= 0.3).any()
+
+
+@pytest.mark.parametrize(("noise_px", "noise_mag"), [(0.01, None), (0.2, None), (0.01, 0.3)])
+def test_no_more_random_frames_agree_where_noises_are_stated(
+    random_directions, noise_px, noise_mag
+):
+    # The first noise gives the largest share to four stars, which is what chance agrees with;
+    # with the second one this depends on how many stars there are around an attitude.
+    stated = Stated(noise_px, noise_mag, magnitudes(230))
+    found = lowest_bounds(random_directions(230, 13), 6, 100, 45.0, stated)
+    for limit in (0.01, 0.03, 0.1, 0.3):
+        expected = len(found) * limit
+        assert (found <= limit).sum() <= expected + 4.0 * math.sqrt(expected)
+    assert (found <= 0.3).any() or noise_px > 0.01
+
+
 def test_a_matcher_is_wrong_no_oftener_than_it_is_allowed_to(random_directions):
     lenient = Matcher(
         sky_of(random_directions(374, 14)),
@@ -242,3 +393,78 @@ def test_a_matcher_is_wrong_no_oftener_than_it_is_allowed_to(random_directions):
     assert all(found.false_match_probability <= 0.1 for found in wrong)
     # A matcher that is allowed so much does answer some of them.
     assert 1 <= len(wrong) <= 15 + 4.0 * math.sqrt(15)
+
+
+# --- Frames that are withheld where nothing is stated
+
+NARROW = Camera(1024, 1024, fov_x_deg=12.0)
+NOISE_MAG = 0.3
+
+
+@pytest.fixture(scope="module")
+def narrow_sky(random_directions) -> Database:
+    return sky_of(random_directions(4500, 16), NARROW, magnitudes(4500))
+
+
+def six_of_nine(sky: Database, noise_px: float, astray_px: float, seed: int) -> Iterator[Frame]:
+    """Yield frames of six true spots and three false ones, one of the six out of its place."""
+    generator = np.random.default_rng(seed)
+    stars = Sky(sky.directions, sky.mag, np.arange(len(sky.mag)))
+    noise = Noise(noise_px, noise_mag=NOISE_MAG)
+    while True:
+        [matrix] = random_attitudes(1, generator)
+        whole = simulate_frame(stars, sky.camera, matrix, noise, generator)
+        kept = generator.permutation(len(whole.mag))[:6]
+        true_px, angle = whole.centroids_px[kept], generator.uniform(0.0, 2.0 * math.pi)
+        true_px[:1] += astray_px * np.array([math.cos(angle), math.sin(angle)])
+        centroids_px = np.concatenate([true_px, generator.random((3, 2)) * 1024.0])
+        mag = np.concatenate([whole.mag[kept], generator.choice(sky.mag, 3)])
+        if len(kept) == 6 and sky.camera.contains(centroids_px).all():
+            star = np.concatenate([whole.star_index[kept], np.full(3, -1)])
+            yield Frame(matrix, centroids_px, star, mag, star < 0)
+
+
+def withheld(
+    sky: Database, count: int, noise_px: float, astray_px: float, most: float
+) -> list[Frame]:
+    """Return such frames of which five spots match, with a bound from 1e-9 to another one."""
+    found: list[Frame] = []
+    for frame in six_of_nine(sky, noise_px, astray_px, 17):
+        right = agree(frame.matrix, observe(frame.centroids_px, sky.camera, 2.0), sky)
+        if right.n_matched == 5 and 1e-9 < right.false_match_probability <= most:
+            found.append(frame)
+            if len(found) == count:
+                break
+    return found
+
+
+def accepted(matcher: Matcher, frames: list[Frame]) -> int:
+    """Return how many frames are identified, all of them rightly."""
+    count = 0
+    for frame in frames:
+        found = matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+        if found.status == "identified":
+            count += 1
+            turned = matrix_from_quaternion(found.q_body_from_icrs) @ frame.matrix.T
+            assert Rotation.from_matrix(turned).magnitude() < math.radians(0.2)
+            named = (found.star_index >= 0) & (frame.star_index >= 0)
+            assert (found.star_index[named] == frame.star_index[named]).all()
+    return count
+
+
+def test_frames_that_are_withheld_are_identified_where_both_noises_are_stated(narrow_sky):
+    # One of six is 12 px out of its place, whatever the noise: five of nine have to do.
+    frames = withheld(narrow_sky, 15, 0.5, 12.0, 1e-8)
+    assert accepted(Matcher(narrow_sky, "pairs"), frames[:2]) == 0
+    by_noise = accepted(Matcher(narrow_sky, "pairs", noise_px=0.5), frames)
+    by_mag = accepted(Matcher(narrow_sky, "pairs", noise_mag=NOISE_MAG), frames)
+    by_both = accepted(Matcher(narrow_sky, "pairs", noise_px=0.5, noise_mag=NOISE_MAG), frames)
+    assert by_noise >= 5
+    assert by_mag >= 5
+    assert by_both >= 14
+
+
+def test_a_star_beyond_the_usual_reach_is_within_that_of_its_noise(narrow_sky):
+    # Of six true spots with 1 px of noise one is farther than 3 px from its star.
+    frames = withheld(narrow_sky, 10, 1.0, 0.0, 1e-6)
+    assert accepted(Matcher(narrow_sky, "pairs", noise_px=1.0), frames) >= 9

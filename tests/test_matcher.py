@@ -847,3 +847,57 @@ def test_the_limits_of_open_reach_the_matcher(small_artifact):
     )  # fmt: skip
     assert (found.tolerance_px, found.max_false_match_probability) == (1.5, 1e-6)
     assert found.selection is selection
+
+
+def test_a_stated_noise_is_three_of_the_tolerance(small_artifact):
+    found = Matcher.open(small_artifact, noise_px=0.5, noise_mag=0.25)
+    assert (found.tolerance_px, found.noise_px, found.noise_mag) == (1.5, 0.5, 0.25)
+    assert Matcher.open(small_artifact, noise_mag=0.25).tolerance_px == 2.0
+    again = replace(found, max_batches=7)
+    assert (again.tolerance_px, again.noise_px, again.noise_mag) == (1.5, 0.5, 0.25)
+
+
+def test_noise_and_tolerance_are_not_both_given(small_artifact):
+    with pytest.raises(
+        ConfigError, match=r"both tolerance_px, 2\.0, and noise_px, 0\.5, are given"
+    ):
+        Matcher.open(small_artifact, tolerance_px=2.0, noise_px=0.5)
+
+
+@pytest.mark.parametrize("name", ["noise_px", "noise_mag"])
+@pytest.mark.parametrize("value", [0.0, -0.5, np.nan, np.inf, "0.5", True])
+def test_a_noise_that_is_none_is_refused(triangles, name, value):
+    with pytest.raises(ConfigError, match=f"{name} is .*; expected a finite number above 0"):
+        replace(triangles, **{name: value, "tolerance_px": None})
+
+
+def test_centroids_take_no_star_of_another_magnitude(sky):
+    frame = frames(sky, 1, Noise(0.3))[0]
+    mag = sky.mag[frame.star_index].astype(np.float64)
+    mag[0], mag[1] = mag[0] + 0.36, np.nan
+    seen = observe(frame.centroids_px, CAMERA, 2.0, mag, noise_mag=0.1)
+    found = np.empty(len(seen), dtype=np.int64)
+    found[seen.rows] = agree(frame.matrix, seen, sky).star_index
+    assert found[0] == -1
+    assert (found[1:] == frame.star_index[1:]).all()
+    # Without a stated error the zero point may be any one.
+    seen = observe(frame.centroids_px, CAMERA, 2.0, mag + 9.0)
+    found[seen.rows] = agree(frame.matrix, seen, sky).star_index
+    assert (found == frame.star_index).all()
+
+
+def test_a_star_of_another_magnitude_hides_no_star_behind_it(sky):
+    # The star that is nearest to a centroid is too faint; the next one within reach is taken.
+    frame = frames(sky, 1, Noise())[0]
+    star, moved = int(frame.star_index[0]), frame.centroids_px.copy()
+    moved[0, 0] += 1.0
+    [near] = CAMERA.directions_from_pixels(moved[:1]) @ frame.matrix
+    crowded = replace(
+        sky,
+        directions=np.vstack([sky.directions, near]),
+        mag=np.append(sky.mag, sky.mag[star] + 2.0),
+    )
+    for noise_mag, expected in ((0.3, star), (None, len(sky.mag))):
+        seen = observe(moved, CAMERA, 2.0, sky.mag[frame.star_index], noise_mag=noise_mag)
+        [row] = np.flatnonzero(seen.rows == 0)
+        assert agree(frame.matrix, seen, crowded).star_index[row] == expected

@@ -61,8 +61,17 @@ def identify(
         Path | None, typer.Option(help="Camera file (TOML); default: the database's camera.")
     ] = None,
     tolerance_px: Annotated[
-        float, typer.Option(min=0.01, max=200, help="Largest error of a centroid.")
-    ] = 2.0,
+        float | None,
+        typer.Option(min=0.01, max=200, help="Largest error of a centroid; default: 2."),
+    ] = None,
+    noise_px: Annotated[
+        float | None,
+        typer.Option(min=0.01, max=50, help="Noise of a centroid, each axis; for --tolerance-px."),
+    ] = None,
+    noise_mag: Annotated[
+        float | None,
+        typer.Option(min=0.001, max=10, help="Noise of magnitudes in the database's band."),
+    ] = None,
     max_false_match_probability: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Less certain answers are withheld.")
     ] = 1e-9,
@@ -89,6 +98,8 @@ def identify(
         method,
         tolerance_px=tolerance_px,
         max_false_match_probability=max_false_match_probability,
+        noise_px=noise_px,
+        noise_mag=noise_mag,
     )
     eye = read_camera(camera) if camera else matcher.database.camera
     measured = measure(file, flip=flip)

@@ -26,7 +26,7 @@ _ALL_ATTITUDES = 8.0 * math.pi**2
 MIN_STARS = 4
 """Smallest number of matched stars: three determine an attitude, a fourth confirms it."""
 
-NEARLY_CERTAIN = 1e-8
+NEARLY_CERTAIN = 1e-7
 """Largest expected number of agreements of true stars that are likely to be answers."""
 
 NEXT_SHARE = 0.1
