@@ -31,11 +31,12 @@ SINGLE_MODULES = {
 }
 
 GEOMETRY = ("attitude", "camera", "distortion", "kvector", "patterns", "sphere")
+ONBOARD = ("blocks", "grid", "image", "layout", "reading", "structure")
 LIGHT = {
     "starcat.errors",
     "starcat.storage.hdf5",
     *(f"starcat.geometry.{name}" for name in GEOMETRY),
-    *(f"starcat.onboard.{name}" for name in ("blocks", "grid", "image", "layout")),
+    *(f"starcat.onboard.{name}" for name in ONBOARD),
 }
 """What a small machine carries along with the matcher."""
 
