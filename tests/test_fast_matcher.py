@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -263,6 +264,15 @@ def test_the_library_serves_two_methods_as_they_are(sky):
     # Whoever asks for neither gets numpy.
     found = Matcher(sky, selection=TriangleOrder("inradius")).identify(np.zeros((0, 2)))
     assert found.status == "too_few_stars"
+
+
+@needs_c
+def test_a_matcher_goes_to_another_process(sky):
+    (frame,) = frames(sky, 1)
+    matcher = Matcher(sky, engine="c")
+    expected = matcher.identify(frame.centroids_px)
+    found = pickle.loads(pickle.dumps(matcher)).identify(frame.centroids_px)
+    assert found.star_ids.tolist() == expected.star_ids.tolist()
 
 
 # --- Images

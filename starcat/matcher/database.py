@@ -97,6 +97,10 @@ class Database:
         opened = ", ".join(self.products) or "no product"
         return f"<Database {self.name}: {len(self.mag):,} stars at J{self.epoch_jyear:g}, {opened}>"
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what goes to another process: all but what can be made again there."""
+        return {**vars(self), "_derived": {}}
+
     def derived(self, make: Callable[..., Made], *arguments: float) -> Made:
         """Return what a method makes of the database before it can use it, made once.
 
