@@ -148,6 +148,18 @@ def test_a_frame_that_is_too_large_for_the_library_is_answered(sky):
     assert len(found.star_index) > 600
 
 
+@needs_c
+def test_a_camera_that_is_too_wide_for_the_library_is_answered(sky):
+    in_c, in_numpy = both(sky)
+    (frame,) = frames(sky, 1)
+    wide = Camera(1024, 1024, 1e-3)
+    expected = in_numpy.identify(frame.centroids_px, wide)
+    assert_same(in_c.identify(frame.centroids_px, wide), expected)
+    assert [found.status for found in in_c.identify_many([frame.centroids_px], wide)] == [
+        expected.status
+    ]
+
+
 # --- Many frames
 
 

@@ -64,7 +64,8 @@ void starcat_many(const starcat_image *image, const starcat_camera *camera,
     answer->seconds = now_s() - begun_s;
     answer->status = (int32_t)status;
     answer->steps = (int64_t)result->steps;
-    for (int64_t i = 0; (status >= 0) && (i < stop - start); i++) {
+    const int has_stars = (status >= 0) || (status == STARCAT_E_BUDGET);
+    for (int64_t i = 0; has_stars && (i < stop - start); i++) {
       stars[start + i] = result->star[i];
     }
     if (status == STARCAT_IDENTIFIED) {

@@ -110,6 +110,11 @@ class Answers:
     frames: NDArray[np.void]
     star_index: NDArray[np.int32]
 
+    @property
+    def is_whole(self) -> bool:
+        """Whether the library took all frames; a camera or limit may be beyond it."""
+        return all(code in WORDS for code in self.frames["status"].tolist())
+
 
 def is_compiled() -> bool:
     """Return whether the C library is there.

@@ -253,6 +253,8 @@ class Matcher:
         if fast is None or not fast.takes(len(frame)):
             return self._identify(frame, camera, mag)
         found = fast.identify([frame], camera, self._limits, None if mag is None else [mag])
+        if not found.is_whole:
+            return self._identify(frame, camera, mag)
         return MatchResults(found, self.database.star_id)[0]
 
     def identify_many(
@@ -302,6 +304,8 @@ class Matcher:
         workers = threads or os.cpu_count() or 1
         px = [frame for frame, _ in given]
         found = fast.identify(px, camera, self._limits, mags, threads=workers)
+        if not found.is_whole:
+            return [self._identify(frame, camera, mag) for frame, mag in given]
         return MatchResults(found, self.database.star_id)
 
     def track(
@@ -355,6 +359,8 @@ class Matcher:
             None if mag is None else [mag],
             priors=(prior[None], float(np.radians(uncertainty_deg))),
         )
+        if not found.is_whole:
+            return self._identify(frame, camera, mag)
         return MatchResults(found, self.database.star_id)[0]
 
     def _identify(
