@@ -78,5 +78,8 @@ def compile_binding() -> Path:
     with tempfile.TemporaryDirectory() as folder:
         built = Path(ffi.compile(tmpdir=folder, verbose=False))
         compiled = target.with_name(built.name)
-        compiled.write_bytes(built.read_bytes())
+        # By another name first: a process that runs may have the present one mapped.
+        copy = compiled.with_suffix(".partial")
+        copy.write_bytes(built.read_bytes())
+        copy.replace(compiled)
     return compiled
