@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -82,15 +84,21 @@ def test_the_example_of_the_page_is_ten_lines():
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_the_example_runs_from_an_installed_wheel_in_an_empty_folder(tmp_path):
+@pytest.mark.parametrize("with_c", [True, False], ids=["with a compiler", "without"])
+def test_the_example_runs_from_an_installed_wheel_in_an_empty_folder(tmp_path, with_c):
+    if with_c and shutil.which("cc") is None:
+        pytest.skip("no C compiler")
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
     wheel = [*pip, "wheel", "--quiet", "--no-deps", "--wheel-dir", tmp_path / "wheel", ROOT]
-    subprocess.run(wheel, check=True)
+    environment = {**os.environ, "STARCAT_WITHOUT_C": "" if with_c else "1"}
+    subprocess.run(wheel, check=True, env=environment)
     (built,) = (tmp_path / "wheel").glob("*.whl")
+    assert built.name.count("-abi3-") == with_c
     site, empty = tmp_path / "site", tmp_path / "empty"
     subprocess.run([*pip, "install", "--quiet", "--no-deps", "--target", site, built], check=True)
     empty.mkdir()
     program = f"import sys; sys.path.insert(0, {str(site)!r})\n{example()}\nprint(starcat.__file__)"
+    program += "\nfrom starcat.matcher import fast\nprint(fast.is_compiled())"
     done = subprocess.run(
         [sys.executable, "-I", "-c", program],
         cwd=empty,
@@ -101,7 +109,9 @@ def test_the_example_runs_from_an_installed_wheel_in_an_empty_folder(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "<Artifact gaia-12deg-1.0.0: " in done.stdout
     assert "<MatchResult" in done.stdout
-    assert done.stdout.splitlines()[-1].startswith(str(site))
+    *_, place, is_compiled = done.stdout.splitlines()
+    assert place.startswith(str(site))
+    assert is_compiled == str(with_c)
 
 
 def test_a_database_is_opened_looked_at_and_asked(small_artifact):
