@@ -1,0 +1,59 @@
+/* The unit test: every part on images of two made-up skies. Prints each check that fails; the exit
+ * code says whether one did.
+ *
+ * SPDX-License-Identifier: MIT
+ */
+#include "unit.h"
+
+#include <string.h>
+
+unsigned check_count, check_failures;
+unit_sky unit_triangle, unit_pyramid, unit_scratch;
+starcat_workspace unit_work;
+starcat_result unit_result;
+
+static void open_sky(unit_sky *sky) {
+  CHECK_IS(starcat_open(&sky->image, sky->bytes, sky->size, 0), STARCAT_IDENTIFIED);
+  starcat_camera_of(&sky->image, &sky->camera);
+  starcat_default_options(&sky->options);
+}
+
+static void make_sky(unit_sky *sky, uint32_t method, uint32_t index_bytes) {
+  const sky_recipe recipe = {method, index_bytes, 8};
+  sky->bytes = (uint8_t *)sky->words;
+  sky->size = sky_image(&recipe, sky->bytes);
+  open_sky(sky);
+}
+
+void unit_copy(const unit_sky *from) {
+  unit_scratch = *from;
+  unit_scratch.bytes = (uint8_t *)unit_scratch.words;
+  open_sky(&unit_scratch);
+}
+
+starcat_status unit_open_with(size_t at, uint32_t value) {
+  memcpy(unit_scratch.bytes + at, &value, 4);
+  sky_seal(unit_scratch.bytes);
+  return starcat_open(&unit_scratch.image, unit_scratch.bytes, unit_scratch.size, 0);
+}
+
+int main(void) {
+  static const struct {
+    const char *name;
+    void (*run)(void);
+  } tests[] = {{"open", test_open},         {"scrub", test_scrub},       {"damaged", test_damaged},
+               {"errors", test_errors},     {"dropped", test_dropped},   {"identify", test_identify},
+               {"track", test_track},       {"budget", test_budget},     {"attitude", test_attitude},
+               {"camera", test_camera},     {"kernels", test_kernels},   {"rare", test_rare}};
+  make_sky(&unit_triangle, 1, 2);
+  make_sky(&unit_pyramid, 2, 4);
+  for (size_t n = 0; n < sizeof tests / sizeof tests[0]; n++) {
+    const unsigned before = check_failures;
+    tests[n].run();
+    if (check_failures != before) {
+      (void)fprintf(stderr, "test %s: %u failed\n", tests[n].name, check_failures - before);
+    }
+  }
+  (void)printf("%u checks, %u failed\n", check_count, check_failures);
+  return check_failures == 0u ? 0 : 1;
+}
