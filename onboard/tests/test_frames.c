@@ -125,7 +125,7 @@ void test_errors(void) {
   uint64_t state = 3;
   sky_frame truth;
   unit_copy(&unit_triangle);
-  sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.2, 0, &truth);
+  sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.2, SKY_SPOTS, 0, &truth);
   starcat_frame frame = frame_of(&truth);
   check_nulls(&frame, truth.q_body_from_icrs);
   check_options(&frame, truth.q_body_from_icrs);
@@ -147,8 +147,9 @@ void test_errors(void) {
 void test_dropped(void) {
   uint64_t state = 4;
   sky_frame truth;
-  starcat_real x[20], y[20], magnitudes[20];
-  sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.2, 0, &truth);
+  starcat_real x[STARCAT_MAX_CENTROIDS], y[STARCAT_MAX_CENTROIDS];
+  starcat_real magnitudes[STARCAT_MAX_CENTROIDS];
+  sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.2, SKY_SPOTS, 0, &truth);
   const starcat_frame clean = frame_of(&truth), dirty = {truth.count + 6u, x, y, magnitudes};
   const uint32_t n = truth.count;
   memcpy(x, truth.x, sizeof truth.x);
@@ -214,7 +215,7 @@ static void look_around(const unit_sky *sky, int with_magnitudes, uint32_t n_fal
   found[0] = 0;
   found[1] = 0;
   for (uint32_t n = 0; n < 60u; n++) {
-    sky_look(&unit_triangle.image, &sky->camera, &state, 0.2, n_false, &truth);
+    sky_look(&unit_triangle.image, &sky->camera, &state, 0.2, SKY_SPOTS, n_false, &truth);
     starcat_frame frame = frame_of(&truth);
     if (!with_magnitudes) {
       frame.magnitudes = NULL;
@@ -273,7 +274,7 @@ void test_track(void) {
   sky_frame truth;
   for (uint32_t n = 0; n < 40u; n++) {
     starcat_real q[4], wrong[4];
-    sky_look(&unit_pyramid.image, &unit_pyramid.camera, &state, 0.2, 2, &truth);
+    sky_look(&unit_pyramid.image, &unit_pyramid.camera, &state, 0.2, SKY_SPOTS, 2, &truth);
     const starcat_frame frame = frame_of(&truth);
     for (uint32_t k = 0; k < 4u; k++) {
       const double turn = n % 4u == k ? 0.008 : 0.0;
@@ -321,7 +322,7 @@ void test_budget(void) {
   uint64_t state = 31;
   sky_frame truth;
   const unit_sky *skies[2] = {&unit_triangle, &unit_pyramid};
-  sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.2, 2, &truth);
+  sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.2, SKY_SPOTS, 2, &truth);
   for (uint32_t n = 0; n < 8u; n++) {
     unit_copy(skies[n % 2u]);
     check_budgets(&unit_scratch, &truth, (n & 2u) != 0u, (n & 4u) != 0u);

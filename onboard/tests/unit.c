@@ -8,7 +8,7 @@
 #include <string.h>
 
 unsigned check_count, check_failures;
-unit_sky unit_triangle, unit_pyramid, unit_scratch;
+unit_sky unit_triangle, unit_pyramid, unit_crowded, unit_scratch;
 starcat_workspace unit_work;
 starcat_result unit_result;
 
@@ -18,10 +18,9 @@ static void open_sky(unit_sky *sky) {
   starcat_default_options(&sky->options);
 }
 
-static void make_sky(unit_sky *sky, uint32_t method, uint32_t index_bytes) {
-  const sky_recipe recipe = {method, index_bytes, 8};
+static void make_sky(unit_sky *sky, const sky_recipe *recipe) {
   sky->bytes = (uint8_t *)sky->words;
-  sky->size = sky_image(&recipe, sky->bytes);
+  sky->size = sky_image(recipe, sky->bytes);
   open_sky(sky);
 }
 
@@ -45,8 +44,11 @@ int main(void) {
                {"errors", test_errors},     {"dropped", test_dropped},   {"identify", test_identify},
                {"track", test_track},       {"budget", test_budget},     {"attitude", test_attitude},
                {"camera", test_camera},     {"kernels", test_kernels},   {"rare", test_rare}};
-  make_sky(&unit_triangle, 1, 2);
-  make_sky(&unit_pyramid, 2, 4);
+  const sky_recipe triangles = {1, 2, SKY_STARS, 0.42, 8}, pairs = {2, 4, SKY_STARS, 0.698, 8};
+  const sky_recipe crowded = {2, 2, 1500, 0.18, 9};
+  make_sky(&unit_triangle, &triangles);
+  make_sky(&unit_pyramid, &pairs);
+  make_sky(&unit_crowded, &crowded);
   for (size_t n = 0; n < sizeof tests / sizeof tests[0]; n++) {
     const unsigned before = check_failures;
     tests[n].run();

@@ -6,7 +6,7 @@
 #define STARCAT_TESTS_UNIT_H
 
 #include "check.h"
-#include "sky.h"
+#include "random_sky.h"
 
 #ifdef STARCAT_SINGLE
 #define IF_SINGLE(single, dbl) (single)
@@ -24,7 +24,8 @@ typedef struct {
   starcat_options options;
 } unit_sky;
 
-extern unit_sky unit_triangle, unit_pyramid, unit_scratch;
+/* Two images of the same sky, one of a sky of five times the stars, and one to be damaged. */
+extern unit_sky unit_triangle, unit_pyramid, unit_crowded, unit_scratch;
 extern starcat_workspace unit_work;
 extern starcat_result unit_result;
 

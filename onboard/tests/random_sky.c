@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: MIT */
-#include "sky.h"
+#include "random_sky.h"
 
 #include <math.h>
 #include <stdlib.h>
@@ -9,8 +9,6 @@
 #define BLOCK 4096u
 #define WIDTH_PX 512u
 #define FOCAL_LENGTH_PX 703.35 /* 40 degrees across */
-#define LONGEST_TRIANGLE_RAD 0.42
-#define LONGEST_PAIR_RAD 0.698
 #define BANDS 6u
 #define SECTORS 12u
 #define MOST_FEATURES 40000u
@@ -28,7 +26,7 @@ typedef struct {
   uint32_t cell;
 } star;
 
-static star stars[SKY_STARS];
+static star stars[SKY_MOST_STARS];
 static feature features[MOST_FEATURES];
 
 double sky_uniform(uint64_t *state) {
@@ -100,9 +98,9 @@ static int by_value(const void *a, const void *b) {
   return p->value < q->value ? -1 : (p->value > q->value);
 }
 
-static void make_stars(uint64_t seed) {
-  uint64_t state = seed;
-  for (uint32_t n = 0; n < SKY_STARS; n++) {
+static void make_stars(const sky_recipe *recipe) {
+  uint64_t state = recipe->seed;
+  for (uint32_t n = 0; n < recipe->n_stars; n++) {
     double v[3], square = 0.0;
     for (int k = 0; k < 3; k++) {
       v[k] = sky_normal(&state);
@@ -112,18 +110,19 @@ static void make_stars(uint64_t seed) {
       stars[n].u[k] = (int32_t)rint(v[k] / sqrt(square) * SCALE);
     }
     stars[n].id = (int64_t)n + 1;
-    stars[n].mag = (int16_t)(n % 50u == 49u ? -32768 : (int)(1000u + 15u * n));
+    stars[n].mag = (int16_t)(n % 50u == 49u ? -32768 : (int)(1000u + 4500u * n / recipe->n_stars));
     stars[n].cell = cell_of(stars[n].u);
   }
-  qsort(stars, SKY_STARS, sizeof stars[0], by_cell);
+  qsort(stars, recipe->n_stars, sizeof stars[0], by_cell);
 }
 
-static void add_triangle(uint32_t i, uint32_t j, uint32_t k, uint32_t *count) {
+static void add_triangle(const sky_recipe *recipe, uint32_t i, uint32_t j, uint32_t k,
+                         uint32_t *count) {
   const double a = separation(j, k), b = separation(i, k), c = separation(i, j);
   const double s = 0.5 * (a + b + c);
   feature *f = features + *count;
   f->longest = fmax(a, fmax(b, c));
-  if ((f->longest <= LONGEST_TRIANGLE_RAD) && (*count < MOST_FEATURES)) {
+  if ((f->longest <= recipe->longest_rad) && (*count < MOST_FEATURES)) {
     f->stars[0] = i;
     f->stars[1] = j;
     f->stars[2] = k;
@@ -133,18 +132,22 @@ static void add_triangle(uint32_t i, uint32_t j, uint32_t k, uint32_t *count) {
   }
 }
 
-static uint32_t make_features(uint32_t method) {
+static uint32_t make_features(const sky_recipe *recipe) {
+  const uint32_t n_stars = recipe->n_stars;
   uint32_t count = 0;
-  for (uint32_t i = 0; i < SKY_STARS; i++) {
-    for (uint32_t j = i + 1u; j < SKY_STARS; j++) {
+  for (uint32_t i = 0; i < n_stars; i++) {
+    for (uint32_t j = i + 1u; j < n_stars; j++) {
       const double apart = separation(i, j);
-      if ((method == 2u) && (apart <= LONGEST_PAIR_RAD)) {
-        const feature pair = {{i, j, 0}, apart, 0.0, apart};
-        features[count++] = pair;
+      if (apart > recipe->longest_rad) {
+        continue;
       }
-      for (uint32_t k = j + 1u; (method == 1u) && (apart <= LONGEST_TRIANGLE_RAD) && (k < SKY_STARS);
-           k++) {
-        add_triangle(i, j, k, &count);
+      if (recipe->method == 2u) {
+        const feature pair = {{i, j, 0}, apart, 0.0, apart};
+        features[count] = pair;
+        count += count < MOST_FEATURES - 1u;
+      }
+      for (uint32_t k = j + 1u; (recipe->method == 1u) && (k < n_stars); k++) {
+        add_triangle(recipe, i, j, k, &count);
       }
     }
   }
@@ -212,13 +215,13 @@ static void put_header(const sky_recipe *recipe, uint32_t count, uint8_t *bytes)
   memcpy(bytes + 12, &major, 2);
   put32(bytes, 16, 512);
   put32(bytes, 28, recipe->method);
-  put32(bytes, 32, SKY_STARS);
+  put32(bytes, 32, recipe->n_stars);
   put32(bytes, 36, count);
   put32(bytes, 40, count / 4u + 2u);
   put32(bytes, 44, recipe->index_bytes);
   put32(bytes, 48, BANDS);
   put32(bytes, 52, SECTORS);
-  put32(bytes, 56, 60);
+  put32(bytes, 56, recipe->n_stars / 8u);
   put32(bytes, 64, WIDTH_PX);
   put32(bytes, 68, WIDTH_PX);
   put64(bytes, 72, FOCAL_LENGTH_PX);
@@ -229,26 +232,27 @@ static void put_header(const sky_recipe *recipe, uint32_t count, uint8_t *bytes)
   memcpy(bytes + 160, "sky-1.0.0", 9);
 }
 
-static size_t put_stars(uint8_t *bytes) {
-  size_t at = 512, next = enter(bytes, 1, at, SKY_STARS, 12);
+static size_t put_stars(const sky_recipe *recipe, uint8_t *bytes) {
+  const uint32_t n_stars = recipe->n_stars;
+  size_t at = 512, next = enter(bytes, 1, at, n_stars, 12);
   uint32_t cell = 0;
-  for (uint32_t n = 0; n < SKY_STARS; n++) {
+  for (uint32_t n = 0; n < n_stars; n++) {
     memcpy(bytes + at + 12u * n, stars[n].u, 12);
   }
   at = next;
-  next = enter(bytes, 2, at, SKY_STARS, 2);
-  for (uint32_t n = 0; n < SKY_STARS; n++) {
+  next = enter(bytes, 2, at, n_stars, 2);
+  for (uint32_t n = 0; n < n_stars; n++) {
     memcpy(bytes + at + 2u * n, &stars[n].mag, 2);
   }
   at = next;
-  next = enter(bytes, 3, at, SKY_STARS, 8);
-  for (uint32_t n = 0; n < SKY_STARS; n++) {
+  next = enter(bytes, 3, at, n_stars, 8);
+  for (uint32_t n = 0; n < n_stars; n++) {
     memcpy(bytes + at + 8u * n, &stars[n].id, 8);
   }
   at = next;
   next = enter(bytes, 4, at, BANDS * SECTORS + 1u, 4);
-  for (uint32_t n = 0; n <= SKY_STARS; n++) {
-    for (; cell <= (n < SKY_STARS ? stars[n].cell : BANDS * SECTORS); cell++) {
+  for (uint32_t n = 0; n <= n_stars; n++) {
+    for (; cell <= (n < n_stars ? stars[n].cell : BANDS * SECTORS); cell++) {
       put32(bytes, at + 4u * cell, n);
     }
   }
@@ -290,10 +294,10 @@ static size_t put_features(const sky_recipe *recipe, uint32_t count, size_t at, 
 
 size_t sky_image(const sky_recipe *recipe, uint8_t *bytes) {
   memset(bytes, 0, SKY_MOST_BYTES);
-  make_stars(recipe->seed);
-  const uint32_t count = make_features(recipe->method);
+  make_stars(recipe);
+  const uint32_t count = make_features(recipe);
   put_header(recipe, count, bytes);
-  const size_t end = put_features(recipe, count, put_stars(bytes), bytes);
+  const size_t end = put_features(recipe, count, put_stars(recipe, bytes), bytes);
   const uint32_t data = (uint32_t)((end + BLOCK - 1u) / BLOCK * BLOCK);
   put32(bytes, 20, data + BLOCK);
   put32(bytes, 24, data);
@@ -323,14 +327,14 @@ static int project(const starcat_image *image, const starcat_camera *camera, uin
 }
 
 void sky_look(const starcat_image *image, const starcat_camera *camera, uint64_t *state,
-              double noise_px, uint32_t n_false, sky_frame *frame) {
+              double noise_px, uint32_t n_spots, uint32_t n_false, sky_frame *frame) {
   double q[4];
   sky_rotation(state, frame->matrix, q);
   for (int n = 0; n < 4; n++) {
     frame->q_body_from_icrs[n] = (starcat_real)q[n];
   }
   frame->count = 0;
-  for (uint32_t row = 0; (row < image->n_stars) && (frame->count < SKY_SPOTS - n_false); row++) {
+  for (uint32_t row = 0; (row < image->n_stars) && (frame->count < n_spots - n_false); row++) {
     double x = 0.0, y = 0.0;
     if (project(image, camera, row, frame->matrix, &x, &y)) {
       const uint32_t n = frame->count++;
