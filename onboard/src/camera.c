@@ -120,8 +120,8 @@ starcat_status sc_prepare_camera(const starcat_camera *given, sc_camera *camera)
   camera->given = *given;
   camera->half_width = R(0.5) * given->width_px;
   camera->half_height = R(0.5) * given->height_px;
-  camera->distorted = (absolute(given->k1) + absolute(given->k2) + absolute(given->k3) + absolute(given->p1) +
-                       absolute(given->p2)) > R(0.0);
+  camera->distorted = (absolute(given->k1) + absolute(given->k2) + absolute(given->k3) +
+                       absolute(given->p1) + absolute(given->p2)) > R(0.0);
   for (uint32_t n = 0; n < 4u; n++) {
     const real x = (n & 1u) != 0u ? given->width_px : R(0.0);
     const real y = (n & 2u) != 0u ? given->height_px : R(0.0);

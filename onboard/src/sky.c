@@ -4,14 +4,12 @@
  */
 #include "internal.h"
 
-/* A number of 0 to 4 that grows with right ascension, without an angle. */
+/* A number of 0 to 4 that grows with right ascension, without an angle. At x = 0 both formulas give
+ * the same; at a pole it is not a number, which cell() puts into the first cell. */
 static real longitude(real x, real y) {
   const real ax = x < R(0.0) ? -x : x, ay = y < R(0.0) ? -y : y;
-  if (!(ax + ay > R(0.0))) {
-    return R(0.0);
-  }
   const real t = y / (ax + ay);
-  if ((x < R(0.0)) || ((x <= R(0.0)) && (y > R(0.0)))) {
+  if (x < R(0.0)) {
     return R(2.0) - t;
   }
   return y < R(0.0) ? R(4.0) + t : t;

@@ -69,7 +69,7 @@ static uint32_t match(const sc_call *call, real reach_px) {
       const real dy = y - w->y_of[k];
       const real square = dx * dx + dy * dy;
       if ((square <= reach) && sc_compatible(call, i, w->near_row[w->within[k]])) {
-        if ((square < least) || (best < 0)) {
+        if ((best < 0) || (square < least)) {
           least = square;
           best = (int16_t)k;
         }

@@ -53,12 +53,12 @@ static void check_degenerate(void) {
   begin(&unit_triangle, 4, SKY_SPOTS, 0);
   CHECK(sc_try(&call, unit_result.matrix));
   const uint32_t n = unit_work.best.n_matched;
-  CHECK(sc_log_chance(&call, (starcat_real)1.0, n, unit_work.n_within) < (starcat_real)0.0);
+  CHECK(sc_log_chance(&call, (starcat_real)1.0, n) < (starcat_real)0.0);
   CHECK(sc_share(&call, unit_work.best.matrix, (starcat_real)0.0, n) > (starcat_real)0.5);
   for (uint32_t i = 0; i < unit_work.count; i++) {
     unit_work.match[i] = -1;
   }
-  CHECK(sc_log_chance(&call, (starcat_real)1.0, n, unit_work.n_within) >= (starcat_real)0.0);
+  CHECK(sc_log_chance(&call, (starcat_real)1.0, n) >= (starcat_real)0.0);
   CHECK(sc_share(&call, unit_work.best.matrix, (starcat_real)0.0, n) <= (starcat_real)0.0);
 }
 
@@ -72,6 +72,13 @@ static void check_coincident(void) {
   sides[2] = sc_angle_of_chord(sc_chord_square(unit_work.body[0], unit_work.body[1]));
   for (uint32_t k = 0; k < 3u; k++) {
     unit_work.body[1][k] = unit_work.body[0][k];
+  }
+  CHECK_IS(sc_triangle(&call, triple, sides), 0);
+  const uint32_t mirrored[3] = {1, 0, 2};
+  const starcat_real mirrored_sides[3] = {sides[1], sides[0], sides[2]};
+  CHECK_IS(sc_triangle(&call, mirrored, mirrored_sides), 0);
+  for (uint32_t k = 0; k < 3u; k++) { /* all on one great circle */
+    sides[k] = (starcat_real)(0.05 * (k + 1u));
   }
   CHECK_IS(sc_triangle(&call, triple, sides), 0);
   CHECK_IS(unit_work.n_tried, 0);
