@@ -85,7 +85,8 @@ int main(int argc, char **argv) {
                  (double)result.log_chance * 0.4342944819);
     for (uint32_t i = 0; i < count; i++) {
       const int32_t row = result.star[i];
-      (void)printf("centroid %u: %ld\n", (unsigned)i, row < 0 ? (long)row : (long)image.star_ids[row]);
+      const long found = row < 0 ? (long)row : (long)image.star_ids[row];
+      (void)printf("centroid %u: %ld\n", (unsigned)i, found);
     }
   }
   free(bytes);

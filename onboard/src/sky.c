@@ -78,7 +78,8 @@ uint32_t sc_gather(const sc_call *call, const real centre[3], real cos_r, real s
   const starcat_image *image = call->image;
   const real x = centre[0], y = centre[1], z = centre[2];
   const real level = STARCAT_SQRT(x * x + y * y);
-  cap query = {image, centre, cos_r - COSINE_MARGIN, rows, icrs, most, 0, 0, call->work->steps_left};
+  cap query = {image, centre, cos_r - COSINE_MARGIN,  rows, icrs, most,
+               0,     0,      call->work->steps_left};
   const int has_pole = (z >= cos_r) || (-z >= cos_r) || (level <= sin_r);
   const real high = z >= cos_r ? R(1.0) : z * cos_r + level * sin_r;
   const real low = -z >= cos_r ? R(-1.0) : z * cos_r - level * sin_r;

@@ -36,7 +36,7 @@ void sc_project(const sc_call *call, const real m[9], real margin_px) {
   for (uint32_t j = 0; j < w->n_near; j++) {
     real body[3], x, y;
     sc_turn(m, w->near_icrs[j], body);
-    if (sc_pixel(&call->camera, body, &x, &y)) {
+    if (sc_pixel(&call->camera, body, &x, &y) != 0) {
       const real dx = x - x0, dy = y - y0;
       w->x_of[count] = x;
       w->y_of[count] = y;

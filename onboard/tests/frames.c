@@ -4,7 +4,8 @@
  *   frames PREFIX COUNT
  *
  * writes PREFIX-triangle.img, PREFIX-pyramid.img, PREFIX-frames.txt with COUNT frames as replay.c
- * reads them, and PREFIX-frame.txt with the centroids of the first one, a line "x y magnitude" each.
+ * reads them, and PREFIX-frame.txt with the centroids of the first one, each a line "x y
+ * magnitude".
  *
  * SPDX-License-Identifier: MIT
  */

@@ -51,6 +51,11 @@ static void check_known_rotations(void) {
   CHECK_NEAR(q[3], sqrt(0.5), tight);
 }
 
+static starcat_status solve(starcat_real (*body)[3], starcat_real (*icrs)[3], uint32_t count,
+                            starcat_real *q) {
+  return starcat_attitude((const starcat_real(*)[3])body, (const starcat_real(*)[3])icrs, count, q);
+}
+
 void test_attitude(void) {
   starcat_real body[12][3], icrs[12][3], q[4];
   uint64_t state = 41;
@@ -60,8 +65,7 @@ void test_attitude(void) {
     const uint32_t count = 2u + n % 10u;
     sky_rotation(&state, m, truth);
     make_pairs(m, count, &state, n % 2u == 0u ? 0.0 : 1e-3, body, icrs);
-    CHECK_IS(starcat_attitude((const starcat_real(*)[3])body, (const starcat_real(*)[3])icrs, count, q),
-             STARCAT_IDENTIFIED);
+    CHECK_IS(solve(body, icrs, count, q), STARCAT_IDENTIFIED);
     for (uint32_t k = 0; k < 4u; k++) {
       off = fmax(off, fabs((double)q[k] - truth[k]));
     }
@@ -71,27 +75,21 @@ void test_attitude(void) {
     }
   }
   body[1][1] = (starcat_real)NAN;
-  CHECK_IS(starcat_attitude((const starcat_real(*)[3])body, (const starcat_real(*)[3])icrs, 4, q),
-           STARCAT_E_NOT_FINITE);
-  CHECK_IS(starcat_attitude((const starcat_real(*)[3])body, (const starcat_real(*)[3])icrs, 1, q),
-           STARCAT_TOO_FEW_STARS);
-  CHECK_IS(starcat_attitude((const starcat_real(*)[3])body, (const starcat_real(*)[3])icrs, 0, q),
-           STARCAT_TOO_FEW_STARS);
-  CHECK_IS(starcat_attitude(NULL, (const starcat_real(*)[3])icrs, 4, q), STARCAT_E_NULL);
-  CHECK_IS(starcat_attitude((const starcat_real(*)[3])body, NULL, 4, q), STARCAT_E_NULL);
-  CHECK_IS(starcat_attitude((const starcat_real(*)[3])body, (const starcat_real(*)[3])icrs, 4, NULL),
-           STARCAT_E_NULL);
+  CHECK_IS(solve(body, icrs, 4, q), STARCAT_E_NOT_FINITE);
+  CHECK_IS(solve(body, icrs, 1, q), STARCAT_TOO_FEW_STARS);
+  CHECK_IS(solve(body, icrs, 0, q), STARCAT_TOO_FEW_STARS);
+  CHECK_IS(solve(NULL, icrs, 4, q), STARCAT_E_NULL);
+  CHECK_IS(solve(body, NULL, 4, q), STARCAT_E_NULL);
+  CHECK_IS(solve(body, icrs, 4, NULL), STARCAT_E_NULL);
   for (uint32_t k = 0; k < 3u; k++) { /* the same direction twice, in the sky and in the camera */
     body[1][k] = body[0][k];
   }
-  CHECK_IS(starcat_attitude((const starcat_real(*)[3])body, (const starcat_real(*)[3])icrs, 2, q),
-           STARCAT_TOO_FEW_STARS);
+  CHECK_IS(solve(body, icrs, 2, q), STARCAT_TOO_FEW_STARS);
   make_pairs((const double[9]){1, 0, 0, 0, 1, 0, 0, 0, 1}, 2, &state, 0.0, body, icrs);
   for (uint32_t k = 0; k < 3u; k++) {
     icrs[1][k] = icrs[0][k];
   }
-  CHECK_IS(starcat_attitude((const starcat_real(*)[3])body, (const starcat_real(*)[3])icrs, 2, q),
-           STARCAT_TOO_FEW_STARS);
+  CHECK_IS(solve(body, icrs, 2, q), STARCAT_TOO_FEW_STARS);
 }
 
 /* Pixels to directions and back over the whole detector. */
