@@ -21,12 +21,12 @@ extern "C" {
 
 /* Largest number of centroids that a frame may have. */
 #ifndef STARCAT_MAX_CENTROIDS
-#define STARCAT_MAX_CENTROIDS 64
+#define STARCAT_MAX_CENTROIDS 64u
 #endif
 
 /* Largest number of stars in or next to a frame; an image that may exceed it is not opened. */
 #ifndef STARCAT_MAX_STARS
-#define STARCAT_MAX_STARS 192
+#define STARCAT_MAX_STARS 192u
 #endif
 
 /* Single precision by -DSTARCAT_SINGLE, double by default. */

@@ -1,11 +1,16 @@
-/* The five functions of libm that the library uses. Each can be replaced: -DSTARCAT_SQRT=my_sqrt.
+/* The five functions of libm that the library uses. Each can be replaced: -DSTARCAT_SQRT=my_sqrt,
+ * declared in a header of yours: -DSTARCAT_MATH_HEADER='"my_math.h"' instead of <math.h>.
  *
  * SPDX-License-Identifier: MIT
  */
 #ifndef STARCAT_MATH_H
 #define STARCAT_MATH_H
 
+#ifdef STARCAT_MATH_HEADER
+#include STARCAT_MATH_HEADER
+#else
 #include <math.h>
+#endif
 
 #ifdef STARCAT_SINGLE
 #define STARCAT_LIBM(name) name##f

@@ -99,17 +99,16 @@ int sc_pixel(const sc_camera *camera, const real body[3], real *x_px, real *y_px
   return 1;
 }
 
-static int is_between(real x, real low, real high) { return (x >= low) && (x <= high); }
-
 static int is_possible(const starcat_camera *c) {
-  return is_between(c->width_px, R(1.0), LARGEST_PX) &&
-         is_between(c->height_px, R(1.0), LARGEST_PX) &&
-         is_between(c->focal_length_px, R(1e-2), R(1e9)) &&
-         is_between(c->x0_px, -LARGEST_PX, LARGEST_PX) &&
-         is_between(c->y0_px, -LARGEST_PX, LARGEST_PX) && is_between(c->k1, R(-1e9), R(1e9)) &&
-         is_between(c->k2, R(-1e9), R(1e9)) && is_between(c->k3, R(-1e9), R(1e9)) &&
-         is_between(c->p1, R(-1e9), R(1e9)) &&
-         is_between(c->p2, R(-1e9), R(1e9)) && is_between(c->fold_radius, R(0.0), R(1e9));
+  return sc_is_between(c->width_px, R(1.0), LARGEST_PX) &&
+         sc_is_between(c->height_px, R(1.0), LARGEST_PX) &&
+         sc_is_between(c->focal_length_px, R(1e-2), R(1e9)) &&
+         sc_is_between(c->x0_px, -LARGEST_PX, LARGEST_PX) &&
+         sc_is_between(c->y0_px, -LARGEST_PX, LARGEST_PX) &&
+         sc_is_between(c->k1, R(-1e9), R(1e9)) && sc_is_between(c->k2, R(-1e9), R(1e9)) &&
+         sc_is_between(c->k3, R(-1e9), R(1e9)) &&
+         sc_is_between(c->p1, R(-1e9), R(1e9)) &&
+         sc_is_between(c->p2, R(-1e9), R(1e9)) && sc_is_between(c->fold_radius, R(0.0), R(1e9));
 }
 
 starcat_status sc_prepare_camera(const starcat_camera *given, sc_camera *camera) {
@@ -120,8 +119,8 @@ starcat_status sc_prepare_camera(const starcat_camera *given, sc_camera *camera)
   camera->given = *given;
   camera->half_width = R(0.5) * given->width_px;
   camera->half_height = R(0.5) * given->height_px;
-  camera->distorted = (absolute(given->k1) + absolute(given->k2) + absolute(given->k3) + absolute(given->p1) +
-                       absolute(given->p2)) > R(0.0);
+  camera->distorted = (absolute(given->k1) + absolute(given->k2) + absolute(given->k3) +
+                       absolute(given->p1) + absolute(given->p2)) > R(0.0);
   for (uint32_t n = 0; n < 4u; n++) {
     const real x = (n & 1u) != 0u ? given->width_px : R(0.0);
     const real y = (n & 2u) != 0u ? given->height_px : R(0.0);

@@ -146,15 +146,13 @@ static int try_pair(sc_call *call, prior *p, uint32_t a, uint32_t star, uint32_t
 static int try_anchor(sc_call *call, prior *p, uint32_t a, uint32_t b) {
   starcat_workspace *w = call->work;
   real past = R(-1.0);
-  for (uint32_t n = 0; n < STARCAT_MAX_STARS; n++) {
+  int32_t star = 0;
+  while (star >= 0) { /* each one is farther than the one before: no more than there are stars */
     if (!predict(call, p) || !sc_spend(w, w->n_within + 1u)) {
       return 1;
     }
-    const int32_t star = next_star(call, p, a, &past);
-    if (star < 0) {
-      return 0;
-    }
-    if (try_pair(call, p, a, (uint32_t)star, b)) {
+    star = next_star(call, p, a, &past);
+    if ((star >= 0) && try_pair(call, p, a, (uint32_t)star, b)) {
       return 1;
     }
   }

@@ -16,11 +16,11 @@ typedef struct {
   real sum[3];
   real low[3], high[3]; /* squares of chords: first to second, first and second to third */
   real cos_reach, sin_reach;
-} observed;
+} base;
 
 /* Choose the side with the fewest pairs. Returns 0 if a side is longer than any pair. */
 static int choose_side(const sc_call *call, const uint32_t triple[3], const real sides[3],
-                       real error, observed *o) {
+                       real error, base *o) {
   const starcat_image *image = call->image;
   o->start = 0;
   o->stop = UINT32_MAX;
@@ -44,8 +44,8 @@ static int choose_side(const sc_call *call, const uint32_t triple[3], const real
   return o->stop != UINT32_MAX;
 }
 
-static int observe(const sc_call *call, const uint32_t triple[3], const real sides[3],
-                   observed *o) {
+static int choose_base(const sc_call *call, const uint32_t triple[3], const real sides[3],
+                       base *o) {
   const starcat_workspace *w = call->work;
   const real error = SC_SIDE_TOLERANCE * call->tolerance_rad;
   real normal[3];
@@ -76,10 +76,8 @@ static int observe(const sc_call *call, const uint32_t triple[3], const real sid
   return 1;
 }
 
-static int is_between(real x, real low, real high) { return (x >= low) && (x <= high); }
-
 /* Complete a pair by a third star. Returns 1 if the search can end. */
-static int complete(sc_call *call, const observed *o, const real first[3], const real second[3]) {
+static int complete(sc_call *call, const base *o, const real first[3], const real second[3]) {
   const starcat_workspace *w = call->work;
   uint32_t rows[MOST_THIRD];
   real normal[3], third[3], found[MOST_THIRD][3], body[3][3], m[9];
@@ -105,11 +103,11 @@ static int complete(sc_call *call, const observed *o, const real first[3], const
     const real icrs[3][3] = {{first[0], first[1], first[2]},
                              {second[0], second[1], second[2]},
                              {found[n][0], found[n][1], found[n][2]}};
-    if (is_between(sc_chord_square(first, found[n]), o->low[1], o->high[1]) &&
-        is_between(sc_chord_square(second, found[n]), o->low[2], o->high[2]) &&
+    if (sc_is_between(sc_chord_square(first, found[n]), o->low[1], o->high[1]) &&
+        sc_is_between(sc_chord_square(second, found[n]), o->low[2], o->high[2]) &&
         sc_triad(body[0], body[1], icrs[0], icrs[1], m)) {
       sc_refine(m, &body[0][0], &icrs[0][0], NULL, 3, 1);
-      if (sc_try(call, m)) {
+      if (sc_try(call, m) != 0) {
         return 1;
       }
     }
@@ -119,8 +117,8 @@ static int complete(sc_call *call, const observed *o, const real first[3], const
 
 int sc_pyramid(sc_call *call, const uint32_t triple[3], const real sides[3]) {
   const starcat_image *image = call->image;
-  observed o;
-  if (!observe(call, triple, sides, &o)) {
+  base o;
+  if (!choose_base(call, triple, sides, &o)) {
     return 0;
   }
   for (uint32_t pair = o.start; pair < o.stop; pair++) {
@@ -135,7 +133,7 @@ int sc_pyramid(sc_call *call, const uint32_t triple[3], const real sides[3]) {
     }
     sc_star(image, rows[0], first);
     sc_star(image, rows[1], second);
-    if (is_between(sc_chord_square(first, second), o.low[0], o.high[0]) &&
+    if (sc_is_between(sc_chord_square(first, second), o.low[0], o.high[0]) &&
         (complete(call, &o, first, second) || complete(call, &o, second, first))) {
       return 1;
     }

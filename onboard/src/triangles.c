@@ -73,7 +73,7 @@ static int by_brightness(sc_call *call, const search *s) {
     }
     for (uint32_t j = 1; j < k; j++) {
       for (uint32_t i = 0; i < j; i++) {
-        if (take(call, s, i, j, k)) {
+        if (take(call, s, i, j, k) != 0) {
           return 1;
         }
       }
@@ -89,9 +89,9 @@ static int is_closer(const starcat_workspace *w, uint16_t a, uint16_t b) {
 }
 
 /* Restore the order of the heap of pairs below a place. */
-static void sift(starcat_workspace *w, uint32_t at, uint32_t count) {
-  const uint16_t moved = w->heap[at];
-  uint32_t child = 2u * at + 1u;
+static void sift(starcat_workspace *w, uint32_t top, uint32_t count) {
+  const uint16_t moved = w->heap[top];
+  uint32_t at = top, child = 2u * top + 1u;
   while (child < count) {
     if ((child + 1u < count) && is_closer(w, w->heap[child + 1u], w->heap[child])) {
       child++;
@@ -118,7 +118,7 @@ static int with_longest_side(sc_call *call, const search *s, uint16_t pair) {
     if ((r != p) && (r != q) && is_closer(w, (uint16_t)pair_of(r, p), pair) &&
         is_closer(w, (uint16_t)pair_of(r, q), pair)) {
       const uint32_t i = r < p ? r : p, k = r > q ? r : q;
-      if (take(call, s, i, p + q + r - i - k, k)) {
+      if (take(call, s, i, p + q + r - i - k, k) != 0) {
         return 1;
       }
     }
@@ -150,7 +150,7 @@ static int by_longest_side(sc_call *call, const search *s) {
     count--;
     w->heap[0] = w->heap[count];
     sift(w, 0, count);
-    if (with_longest_side(call, s, closest)) {
+    if (with_longest_side(call, s, closest) != 0) {
       return 1;
     }
   }
@@ -164,9 +164,10 @@ void sc_each_triangle(sc_call *call, sc_look_up look_up) {
   if (s.count > STARCAT_MOST_CENTROIDS) {
     s.count = STARCAT_MOST_CENTROIDS;
   }
-  const int rounds = s.count <= SC_FEW_CENTROIDS ? 2 : 1;
-  for (s.poor = 0; s.poor < rounds; s.poor++) {
-    if (w->has_magnitudes != 0u ? by_brightness(call, &s) : by_longest_side(call, &s)) {
+  const uint32_t rounds = s.count <= SC_FEW_CENTROIDS ? 2u : 1u;
+  for (uint32_t n = 0; n < rounds; n++) {
+    s.poor = n > 0u;
+    if ((w->has_magnitudes != 0u ? by_brightness(call, &s) : by_longest_side(call, &s)) != 0) {
       return;
     }
   }
@@ -230,7 +231,7 @@ static void observe(const sc_call *call, const uint32_t triple[3], const real si
 }
 
 /* Try a triangle of stars in one order of its corners. Returns 1 if the search can end. */
-static int try_order(sc_call *call, const observed *o, const real stars[3][3],
+static int try_order(sc_call *call, const observed *o, real stars[3][3],
                      const uint8_t order[3]) {
   const starcat_workspace *w = call->work;
   const uint32_t *t = o->triple;
@@ -276,7 +277,7 @@ static int compare(sc_call *call, const observed *o, uint32_t feature) {
     /* The first, fourth and fifth orders keep the handedness. */
     const int is_even = (k == 0u) || (k == 3u) || (k == 4u);
     if (fits && ((is_even == is_right_handed) == o->is_right_handed)) {
-      if (try_order(call, o, (const real(*)[3])stars, order)) {
+      if (try_order(call, o, stars, order) != 0) {
         return 1;
       }
     }

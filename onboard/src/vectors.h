@@ -12,7 +12,12 @@ typedef starcat_real real;
 
 #define R(number) ((real)(number))
 
-static inline real sc_dot(const real a[3], const real b[3]) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+/* Whether a number is in a closed range; not so where one of the three is not a number. */
+static inline int sc_is_between(real x, real low, real high) { return (x >= low) && (x <= high); }
+
+static inline real sc_dot(const real a[3], const real b[3]) {
+  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
 
 static inline void sc_cross(const real a[3], const real b[3], real c[3]) {
   c[0] = a[1] * b[2] - a[2] * b[1];

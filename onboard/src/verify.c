@@ -36,7 +36,7 @@ void sc_project(const sc_call *call, const real m[9], real margin_px) {
   for (uint32_t j = 0; j < w->n_near; j++) {
     real body[3], x, y;
     sc_turn(m, w->near_icrs[j], body);
-    if (sc_pixel(&call->camera, body, &x, &y)) {
+    if (sc_pixel(&call->camera, body, &x, &y) != 0) {
       const real dx = x - x0, dy = y - y0;
       w->x_of[count] = x;
       w->y_of[count] = y;
@@ -69,7 +69,7 @@ static uint32_t match(const sc_call *call, real reach_px) {
       const real dy = y - w->y_of[k];
       const real square = dx * dx + dy * dy;
       if ((square <= reach) && sc_compatible(call, i, w->near_row[w->within[k]])) {
-        if ((square < least) || (best < 0)) {
+        if ((best < 0) || (square < least)) {
           least = square;
           best = (int16_t)k;
         }

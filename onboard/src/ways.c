@@ -87,7 +87,7 @@ static void count_compatible(const sc_call *call) {
   for (uint32_t i = 0; i < w->count; i++) {
     w->compatible[i] = 0;
     for (uint32_t j = 0; j < w->n_within; j++) {
-      if (sc_compatible(call, i, w->near_row[w->within[j]])) {
+      if (sc_compatible(call, i, w->near_row[w->within[j]]) != 0) {
         w->compatible[i]++;
         w->nearest[j]++; /* not needed any more, so that it can count */
       }

@@ -1,0 +1,130 @@
+/* libFuzzer: everything else that a caller hands over. Camera, options, prior and centroids are
+ * those of a frame of a made-up sky, and each is replaced as the fuzzer says.
+ *
+ * SPDX-License-Identifier: MIT
+ */
+#include <float.h>
+#include <math.h>
+
+#include "fuzz.h"
+
+int LLVMFuzzerInitialize(int *argc, char ***argv);
+int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
+
+static uint64_t words[2][SKY_MOST_BYTES / 8u];
+static starcat_image images[2];
+static starcat_workspace work;
+static starcat_result result;
+
+int LLVMFuzzerInitialize(int *argc, char ***argv) {
+  (void)argc;
+  (void)argv;
+  for (uint32_t n = 0; n < 2u; n++) {
+    const sky_recipe recipe = {n + 1u, n == 0u ? 2u : 4u, 300, 0.4, 8};
+    const size_t size = sky_image(&recipe, (uint8_t *)words[n]);
+    if (starcat_open(&images[n], words[n], size, 0) != STARCAT_IDENTIFIED) {
+      abort();
+    }
+  }
+  return 0;
+}
+
+/* A number as it was, a little off, a plain one, one of the odd ones, or any bits at all. */
+static starcat_real changed(fuzz_bytes *bytes, starcat_real value) {
+  static const double odd[12] = {0.0,     -0.0,    1.0, -1.0,        INFINITY,    -INFINITY,
+                                 1e-300,  1e300,   1e9, DBL_EPSILON, DBL_MIN / 4, 512.0};
+  const uint32_t kind = fuzz_number(bytes, 1);
+  double any;
+  switch (kind % 8u) {
+    case 1:
+      return value * (starcat_real)(1.0 + 1e-6 * ((double)fuzz_number(bytes, 2) - 32768.0));
+    case 2:
+      return (starcat_real)((double)fuzz_number(bytes, 2) / 64.0 - 256.0);
+    case 3:
+      return (starcat_real)odd[fuzz_number(bytes, 1) % 12u];
+    case 4:
+      fuzz_take(bytes, &any, sizeof any);
+      return (starcat_real)any;
+    case 5:
+      return (starcat_real)NAN;
+    default:
+      return value;
+  }
+}
+
+static void change_camera(fuzz_bytes *bytes, starcat_camera *c) {
+  starcat_real *const numbers[11] = {&c->width_px, &c->height_px, &c->focal_length_px, &c->x0_px,
+                                     &c->y0_px,    &c->k1,        &c->k2,              &c->k3,
+                                     &c->p1,       &c->p2,        &c->fold_radius};
+  for (uint32_t n = fuzz_number(bytes, 1) % 32u; n < 11u; n += 1u + fuzz_number(bytes, 1) % 8u) {
+    *numbers[n] = changed(bytes, *numbers[n]);
+  }
+}
+
+static void change_options(fuzz_bytes *bytes, starcat_options *o) {
+  starcat_real *const numbers[4] = {&o->tolerance_px, &o->noise_px, &o->noise_mag, &o->log_chance};
+  for (uint32_t n = fuzz_number(bytes, 1) % 8u; n < 4u; n++) {
+    *numbers[n] = changed(bytes, *numbers[n]);
+  }
+  o->max_steps = fuzz_number(bytes, 2);
+}
+
+/* A column of exactly as many numbers as there are centroids; its first ones those of the frame. */
+static starcat_real *column(fuzz_bytes *bytes, const starcat_real *values, uint32_t known,
+                            uint32_t count, uint32_t some) {
+  starcat_real *made = malloc(((size_t)count + (count == 0u)) * sizeof *made);
+  for (uint32_t i = 0; (made != NULL) && (i < count); i++) {
+    made[i] = values[i % known];
+    if ((i >= known) || (fuzz_number(bytes, 1) % 8u < some)) {
+      made[i] = changed(bytes, made[i]);
+    }
+  }
+  return made;
+}
+
+int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
+  fuzz_bytes bytes = {data, size};
+  const starcat_image *image = &images[fuzz_number(&bytes, 1) % 2u];
+  uint64_t seed = fuzz_number(&bytes, 1);
+  starcat_camera camera;
+  starcat_options options;
+  sky_frame truth;
+  starcat_camera_of(image, &camera);
+  starcat_default_options(&options);
+  sky_look(image, &camera, &seed, 0.2, SKY_SPOTS, fuzz_number(&bytes, 1) % 4u, &truth);
+  change_camera(&bytes, &camera);
+  change_options(&bytes, &options);
+  starcat_real q[4], uncertainty_rad = (starcat_real)0.02;
+  const uint32_t prior = fuzz_number(&bytes, 1);
+  for (uint32_t n = 0; n < 4u; n++) {
+    q[n] = (prior >> n & 1u) != 0u ? changed(&bytes, truth.q_body_from_icrs[n])
+                                   : truth.q_body_from_icrs[n];
+  }
+  if ((prior >> 4 & 1u) != 0u) {
+    uncertainty_rad = changed(&bytes, uncertainty_rad);
+  }
+  const uint32_t change = fuzz_number(&bytes, 1);
+  const uint32_t count = (change & 1u) != 0u ? fuzz_number(&bytes, 1) % 70u : truth.count;
+  starcat_real *x = column(&bytes, truth.x, truth.count, count, change >> 1 & 3u);
+  starcat_real *y = column(&bytes, truth.y, truth.count, count, change >> 3 & 3u);
+  starcat_real *magnitudes = column(&bytes, truth.magnitudes, truth.count, count, change >> 5 & 3u);
+  const starcat_frame frame = {count, x, y, (change & 128u) != 0u ? NULL : magnitudes};
+  fuzz_check(image, &options, &frame,
+             starcat_identify(image, &camera, &options, &frame, &work, &result), &result);
+  fuzz_check(image, &options, &frame,
+             starcat_track(image, &camera, &options, &frame, q, uncertainty_rad, &work, &result),
+             &result);
+  starcat_real(*vectors)[3] = malloc((size_t)(count / 3u + 1u) * sizeof *vectors);
+  if ((vectors != NULL) && (x != NULL) && (y != NULL)) {
+    for (uint32_t n = 0; n < count / 3u; n++) {
+      memcpy(vectors[n], x + 3u * n, sizeof vectors[n]);
+    }
+    (void)starcat_attitude((const starcat_real(*)[3])vectors, (const starcat_real(*)[3])vectors,
+                           count / 3u, q);
+  }
+  free(vectors);
+  free(x);
+  free(y);
+  free(magnitudes);
+  return 0;
+}

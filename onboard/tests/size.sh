@@ -1,0 +1,23 @@
+#!/bin/sh
+# Code of the library for 32-bit ARM, the deepest stack of each call, and the workspace. Called by
+# `make size`; fails above 24 KiB of code or 16 KiB of stack.
+set -eu
+out=$BUILD/size
+mkdir -p "$out"
+rm -f "$out"/*
+for source in src/*.c; do
+  $ARM-gcc $FLAGS -Os -fcallgraph-info=su -c "$source" -o "$out/$(basename "$source" .c).o"
+done
+code=$($ARM-size "$out"/*.o | awk 'NR > 1 { sum += $1 + $2 + $3 } END { print sum }')
+echo "size: code and constants of the library for ARM, -Os: $code bytes (at most 24576)"
+cat >"$out/sizes.c" <<'END'
+#include "starcat.h"
+char workspace[sizeof(starcat_workspace)];
+char result[sizeof(starcat_result)];
+char image[sizeof(starcat_image)];
+END
+$ARM-gcc -std=c99 -fno-common -Iinclude -c "$out/sizes.c" -o "$out/sizes.o"
+$ARM-nm --print-size "$out/sizes.o" |
+  while read -r _ bytes _ name; do echo "size: sizeof(starcat_$name): $((0x$bytes)) bytes"; done
+cat "$out"/*.ci | awk -f tests/stack.awk
+[ "$code" -le 24576 ]

@@ -1,0 +1,61 @@
+/* The unit test: every part on images of two made-up skies. Prints each check that fails; the exit
+ * code says whether one did.
+ *
+ * SPDX-License-Identifier: MIT
+ */
+#include "unit.h"
+
+#include <string.h>
+
+unsigned check_count, check_failures;
+unit_sky unit_triangle, unit_pyramid, unit_crowded, unit_scratch;
+starcat_workspace unit_work;
+starcat_result unit_result;
+
+static void open_sky(unit_sky *sky) {
+  CHECK_IS(starcat_open(&sky->image, sky->bytes, sky->size, 0), STARCAT_IDENTIFIED);
+  starcat_camera_of(&sky->image, &sky->camera);
+  starcat_default_options(&sky->options);
+}
+
+static void make_sky(unit_sky *sky, const sky_recipe *recipe) {
+  sky->bytes = (uint8_t *)sky->words;
+  sky->size = sky_image(recipe, sky->bytes);
+  open_sky(sky);
+}
+
+void unit_copy(const unit_sky *from) {
+  unit_scratch = *from;
+  unit_scratch.bytes = (uint8_t *)unit_scratch.words;
+  open_sky(&unit_scratch);
+}
+
+starcat_status unit_open_with(size_t at, uint32_t value) {
+  memcpy(unit_scratch.bytes + at, &value, 4);
+  sky_seal(unit_scratch.bytes);
+  return starcat_open(&unit_scratch.image, unit_scratch.bytes, unit_scratch.size, 0);
+}
+
+int main(void) {
+  static const struct {
+    const char *name;
+    void (*run)(void);
+  } tests[] = {{"open", test_open},       {"scrub", test_scrub},         {"damaged", test_damaged},
+               {"errors", test_errors},   {"dropped", test_dropped},     {"track", test_track},
+               {"budget", test_budget},   {"identify", test_identify},   {"camera", test_camera},
+               {"kernels", test_kernels}, {"attitude", test_attitude},   {"rare", test_rare}};
+  const sky_recipe triangles = {1, 2, SKY_STARS, 0.42, 8}, pairs = {2, 4, SKY_STARS, 0.698, 8};
+  const sky_recipe crowded = {2, 2, 1500, 0.18, 9};
+  make_sky(&unit_triangle, &triangles);
+  make_sky(&unit_pyramid, &pairs);
+  make_sky(&unit_crowded, &crowded);
+  for (size_t n = 0; n < sizeof tests / sizeof tests[0]; n++) {
+    const unsigned before = check_failures;
+    tests[n].run();
+    if (check_failures != before) {
+      (void)fprintf(stderr, "test %s: %u failed\n", tests[n].name, check_failures - before);
+    }
+  }
+  (void)printf("%u checks, %u failed\n", check_count, check_failures);
+  return check_failures == 0u ? 0 : 1;
+}
