@@ -256,6 +256,7 @@ def slower(
     return spec, stars, content(folder / "dist"), time.monotonic() - began
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "attempts"), [(signal.SIGKILL, 6), (signal.SIGTERM, 4)], ids=["kill", "terminate"]
 )
