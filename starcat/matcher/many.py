@@ -64,31 +64,34 @@ class MatchResults(Sequence[MatchResult]):
             return [self[n] for n in range(*frame.indices(len(self)))]
         frame = range(len(self))[frame]
         answers = self.answers
-        found = answers.frames[frame]
         star = answers.star_index[answers.starts[frame] : answers.starts[frame + 1]]
-        status = WORDS[int(found["status"])]
-        dropped = _dropped(star)
-        index = np.maximum(star, -1)
+        # In the order of `ANSWER`.
+        code, n_matched, _, quaternion, matrix, residual_rad, log_chance, _ = answers.frames[
+            frame
+        ].item()
+        status, index, dropped = WORDS[code], np.maximum(star, -1), _dropped(star)
         if status != "identified":
             none, nan = np.full(len(index), -1, dtype=np.int64), math.nan
-            quaternion = np.full(4, nan)
-            return MatchResult(status, none, index, quaternion, nan, nan, nan, 0, nan, 1.0, dropped)
+            unknown = np.full(4, nan)
+            return MatchResult(status, none, index, unknown, nan, nan, nan, 0, nan, 1.0, dropped)
+        ids = self.star_id[index]
+        ids[index < 0] = -1
         return MatchResult(
             status,
-            np.where(index >= 0, self.star_id[index], -1),
+            ids,
             index,
-            found["q_body_from_icrs"].copy(),
-            *radec_roll_from_matrix(found["matrix"]),
-            int(found["n_matched"]),
-            math.degrees(float(found["residual_rad"])) * 3600.0,
-            math.exp(float(found["log_chance"])),
+            quaternion,
+            *radec_roll_from_matrix(matrix),
+            n_matched,
+            math.degrees(residual_rad) * 3600.0,
+            math.exp(log_chance),
             dropped,
         )
 
 
 def _dropped(star: NDArray[np.int32]) -> tuple[tuple[int, str], ...]:
     """Return row and reason of every centroid that was not used, repeats last."""
-    if not (star < -1).any():
+    if star.min(initial=-1) >= -1:
         return ()
     rows = np.flatnonzero(star < -1)
     reasons = [(int(row), DROPPED[int(star[row])]) for row in rows]
