@@ -26,6 +26,7 @@
 #define SC_SURE_SHARE (R(2.0) / R(3.0))
 #define SC_REACH R(1.5)          /* largest distance of a match, in tolerances */
 #define SC_REFINEMENTS 4u
+#define SC_RIVAL_REACH R(4.0)     /* how near a rival is to a star, in reaches */
 #define SC_SIDE_TOLERANCE R(1.5) /* largest error of a side, in tolerances */
 #define SC_SCALE_DEVIATIONS R(3.0)
 #define SC_SIGMAS_OF_TOLERANCE R(3.0)

@@ -187,6 +187,75 @@ static real judge(const sc_call *call, const real m[9], uint32_t matched, starca
   return share;
 }
 
+/* List the centroids without a star that are near the star of another one. */
+static void find_rivals(const sc_call *call) {
+  starcat_workspace *w = call->work;
+  const real reach_px = SC_RIVAL_REACH * call->reach_px;
+  w->n_rivals = 0;
+  for (uint32_t i = 0; i < w->count; i++) {
+    real least = reach_px * reach_px;
+    uint32_t of = w->count;
+    for (uint32_t k = 0; (k < w->count) && (w->match[i] < 0); k++) {
+      if (w->match[k] >= 0) {
+        const real dx = w->x[i] - w->x_of[w->match[k]], dy = w->y[i] - w->y_of[w->match[k]];
+        const real square = dx * dx + dy * dy;
+        if ((square < least) || ((of == w->count) && (square <= least))) {
+          least = square;
+          of = k;
+        }
+      }
+    }
+    if ((of < w->count) && sc_compatible(call, i, w->near_row[w->within[w->match[of]]])) {
+      w->rival[w->n_rivals] = (uint16_t)i;
+      w->rival_of[w->n_rivals] = (uint16_t)of;
+      w->n_rivals++;
+    }
+  }
+}
+
+/* Give the star of a centroid to its rival, and fit the attitude to that. */
+static void fit_rival(const sc_call *call, uint32_t rival, uint32_t centroid, real m[9]) {
+  const starcat_workspace *w = call->work;
+  real body[STARCAT_MAX_CENTROIDS][3], icrs[STARCAT_MAX_CENTROIDS][3];
+  uint32_t n = 0;
+  for (uint32_t k = 0; k < 9u; k++) {
+    m[k] = w->found.matrix[k];
+  }
+  for (uint32_t i = 0; i < w->count; i++) {
+    const uint32_t owner = i == rival ? centroid : i;
+    if ((i != centroid) && (w->found.star[owner] >= 0)) {
+      sc_star(call->image, (uint32_t)w->found.star[owner], icrs[n]);
+      body[n][0] = w->body[i][0];
+      body[n][1] = w->body[i][1];
+      body[n][2] = w->body[i][2];
+      n++;
+    }
+  }
+  sc_refine(m, &body[0][0], &icrs[0][0], NULL, n, 4);
+}
+
+/* A false spot beside a star far from the others can turn the attitude so that it is the nearest
+ * to the star itself. The star's own spot then has no star, and fits better. Returns the share of
+ * the frame that the best of them explains. */
+static real try_rivals(const sc_call *call, real share) {
+  starcat_workspace *w = call->work;
+  real best_share = share;
+  find_rivals(call);
+  for (uint32_t n = 0; n < w->n_rivals; n++) {
+    const uint32_t rival = w->rival[n], centroid = w->rival_of[n];
+    if ((w->found.star[rival] < 0) && (w->found.star[centroid] >= 0)) {
+      real m[9];
+      fit_rival(call, rival, centroid, m);
+      const real its_share = judge(call, m, fit(call, m, 0), &w->wider);
+      if (w->wider.log_chance < w->found.log_chance) {
+        w->found = w->wider;
+        best_share = its_share;
+      }
+    }
+  }
+  return best_share;
+}
+
 /* Verify an attitude; keep it if it is the best so far. Returns 1 if the search can end: the
  * agreement is certain, or the budget is used up. */
 int sc_try(sc_call *call, const real m[9]) {
@@ -197,10 +266,16 @@ int sc_try(sc_call *call, const real m[9]) {
     attitude[k] = m[k];
   }
   w->n_tried++;
-  const real share = judge(call, attitude, fit(call, attitude, 0), &w->found);
+  real share = judge(call, attitude, fit(call, attitude, 0), &w->found);
+  if (w->found.log_chance < R(0.0)) {
+    share = try_rivals(call, share);
+  }
   if ((w->found.n_matched >= SC_MIN_STARS) && (share < SC_SURE_SHARE)) {
     /* Not due to chance, although much of the frame is unexplained: one or two wrong stars at the
      * edge of a cluster may have spoilt an attitude that is nearly right. */
+    for (uint32_t k = 0; k < 9u; k++) {
+      attitude[k] = w->found.matrix[k];
+    }
     (void)judge(call, attitude, fit(call, attitude, 2), &w->wider);
     if (w->wider.log_chance < w->found.log_chance) {
       found = &w->wider;

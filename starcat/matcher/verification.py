@@ -40,6 +40,10 @@ SURE_SHARE = 2.0 / 3.0
 WIDER = (4.0, 2.0)
 """Reaches of that second refinement, one after the other, in units of the final reach."""
 
+RIVAL_REACH = 4.0
+"""A centroid without a star that is this near to one that another centroid has may have more right
+to it; in units of the final reach."""
+
 REACH = 1.5
 """Largest distance between a centroid and its star, in units of the tolerance.
 
@@ -182,14 +186,51 @@ def agree(matrix: Array, observation: Observation, database: Database) -> Agreem
     """
     fit = _refined(matrix, observation, database)
     found, share = _judged(fit, observation)
+    if found.false_match_probability < 1.0:
+        # A false spot beside a star far from the others can turn the attitude so that it is the
+        # nearest to the star itself. The star's own spot then has no star, and fits better.
+        for rival, centroid in _rivals(fit, observation):
+            other, its_share = _with_rival(found, rival, centroid, observation, database)
+            if other.false_match_probability < found.false_match_probability:
+                found, share = other, its_share
     if share < SURE_SHARE:
         # This agreement is not due to chance, although much of the frame is unexplained. One or
         # two wrong stars at the edge of a cluster may have spoilt an attitude that is nearly
         # right, and a search within wider reaches replaces them.
-        wider, _ = _judged(_refined(fit.matrix, observation, database, WIDER), observation)
+        wider, _ = _judged(_refined(found.matrix, observation, database, WIDER), observation)
         if wider.false_match_probability < found.false_match_probability:
             return wider
     return found
+
+
+def _rivals(fit: _Fit, observation: Observation) -> list[tuple[int, int]]:
+    """Return centroids without a star, each with the one that has the star nearest to it."""
+    loose, matched = np.flatnonzero(fit.star < 0), fit.matched
+    if not len(loose) or not len(matched):
+        return []
+    star = fit.star[matched]
+    x, y = observation.centroids_px[loose].T
+    dx, dy = x[:, None] - fit.predicted_px[star, 0], y[:, None] - fit.predicted_px[star, 1]
+    square = dx * dx + dy * dy
+    nearest = square.argmin(axis=1)
+    reach_px = RIVAL_REACH * REACH * observation.tolerance_px
+    near = square[np.arange(len(loose)), nearest] <= reach_px * reach_px
+    if fit.compatible is not None:
+        near &= fit.compatible[loose, star[nearest]]
+    return list(zip(loose[near].tolist(), matched[nearest[near]].tolist(), strict=True))
+
+
+def _with_rival(
+    found: Agreement, rival: int, centroid: int, observation: Observation, database: Database
+) -> tuple[Agreement, float]:
+    """Return the agreement in which a centroid's star is that of its rival, and its share."""
+    index = found.star_index.copy()
+    if index[rival] >= 0 or index[centroid] < 0:
+        return found, 1.0
+    index[rival], index[centroid] = index[centroid], -1
+    matched = np.flatnonzero(index >= 0)
+    matrix = solve_wahba_svd(observation.body[matched], database.directions[index[matched]])
+    return _judged(_refined(matrix, observation, database), observation)
 
 
 @dataclass(frozen=True)
