@@ -320,6 +320,10 @@ static void check_priors(void) {
   sky_look(&unit_scratch.image, &unit_scratch.camera, &seed, 0.1, SKY_SPOTS, 0, &truth);
   CHECK_IS(track(&unit_scratch, (starcat_real)0.2), STARCAT_IDENTIFIED);
   unit_copy(&unit_crowded);
+  CHECK_IS(track(&unit_scratch, (starcat_real)0.35), STARCAT_E_CAPACITY);
+  unit_scratch.options.max_steps = 10;
+  CHECK_IS(track(&unit_scratch, (starcat_real)0.35), STARCAT_E_BUDGET);
+  starcat_default_options(&unit_scratch.options);
   unit_scratch.options.noise_mag = (starcat_real)0.1;
   for (uint32_t n = 0; n < 10u; n++) {
     sky_look(&unit_scratch.image, &unit_scratch.camera, &seed, 0.1, 30, 0, &truth);
