@@ -144,7 +144,8 @@ starcat_status starcat_identify(const starcat_image *image, const starcat_camera
                                 const starcat_options *options, const starcat_frame *frame,
                                 starcat_workspace *work, starcat_result *result);
 
-/* Identify the stars of a frame near a prior attitude, wrong by at most `uncertainty_rad`. */
+/* Identify the stars of a frame near a prior attitude, wrong by at most `uncertainty_rad`. If more
+ * than STARCAT_MAX_STARS may be seen that is STARCAT_E_CAPACITY: state the prior more narrowly. */
 starcat_status starcat_track(const starcat_image *image, const starcat_camera *camera,
                              const starcat_options *options, const starcat_frame *frame,
                              const starcat_real q_prior[4], starcat_real uncertainty_rad,

@@ -175,6 +175,9 @@ starcat_status starcat_track(const starcat_image *image, const starcat_camera *c
   if (status != STARCAT_IDENTIFIED) {
     return status;
   }
+  if (!predict(&call, &p) && (work->steps_left > 0u)) {
+    return STARCAT_E_CAPACITY; /* so wide a prior, and so many stars */
+  }
   for (uint32_t a = 0; (a < work->count) && (a < MOST_ANCHORS); a++) {
     const uint32_t b = farthest(work, a);
     /* A false spot may be the farthest one; then the next one in order serves. */

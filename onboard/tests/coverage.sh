@@ -18,7 +18,9 @@ for precision in double single; do
     "$here"/tests/random_sky.c "$here"/tests/test_*.c ./*.o --coverage -lm -o unit -fno-profile-arcs \
     -fno-test-coverage
   ./unit
-  lcov --quiet --rc lcov_branch_coverage=1 --capture --directory . --output-file ../$precision.info
+  # Perl warns of lcov itself.
+  lcov --quiet --rc lcov_branch_coverage=1 --capture --directory . \
+    --output-file ../$precision.info 2>lcov.log || { cat lcov.log >&2; exit 1; }
   traces="$traces --add-tracefile $precision.info"
   cd "$out"
 done

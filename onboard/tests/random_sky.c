@@ -185,12 +185,17 @@ static size_t enter(uint8_t *bytes, uint32_t kind, size_t at, uint32_t count, ui
 }
 
 static uint32_t crc_of(const uint8_t *bytes, size_t count) {
+  static uint32_t table[256];
   uint32_t crc = 0xffffffffu;
-  for (size_t n = 0; n < count; n++) {
-    crc ^= bytes[n];
+  for (uint32_t n = 0; (n < 256u) && (table[255] == 0u); n++) {
+    uint32_t entry = n;
     for (int bit = 0; bit < 8; bit++) {
-      crc = (crc >> 1) ^ ((crc & 1u) != 0u ? 0xedb88320u : 0u);
+      entry = (entry >> 1) ^ ((entry & 1u) != 0u ? 0xedb88320u : 0u);
     }
+    table[n] = entry;
+  }
+  for (size_t n = 0; n < count; n++) {
+    crc = (crc >> 8) ^ table[(crc ^ bytes[n]) & 255u];
   }
   return ~crc;
 }

@@ -58,7 +58,9 @@ static starcat_status with_option(starcat_real *option, starcat_real value,
                                   const starcat_frame *frame, const starcat_real q[4]) {
   const starcat_real before = *option;
   *option = value;
+  unit_result.n_matched = 9; /* of the frame before */
   const starcat_status status = identify(&unit_scratch, frame);
+  CHECK_IS(unit_result.n_matched, 0);
   CHECK_IS(track(&unit_scratch, frame, q, PRIOR_RAD), status);
   *option = before;
   return status;
@@ -311,6 +313,7 @@ static void check_budgets(unit_sky *sky, const sky_frame *truth, int is_tracked,
       CHECK((unit_result.steps == enough) || (unit_result.steps == steps));
     } else {
       CHECK((status == STARCAT_NO_MATCH) || (status == STARCAT_E_BUDGET));
+      CHECK_IS(unit_result.n_matched, 0);
       CHECK((status == STARCAT_NO_MATCH) || (unit_result.steps == steps));
       used_up += (uint32_t)(status == STARCAT_E_BUDGET);
     }

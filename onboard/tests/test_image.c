@@ -33,11 +33,13 @@ static starcat_status with_f64(size_t at, double value) {
 
 /* What stands before the sections can be believed is checked without the CRC. */
 static starcat_status start_with(size_t at, uint32_t value) {
-  uint32_t before;
-  memcpy(&before, unit_scratch.bytes + at, 4);
+  uint32_t sound, bad = 1;
+  memcpy(&sound, unit_scratch.bytes + at, 4);
   memcpy(unit_scratch.bytes + at, &value, 4);
   const starcat_status status = open_scratch(0);
-  memcpy(unit_scratch.bytes + at, &before, 4);
+  CHECK_IS(starcat_scrub(unit_scratch.bytes, unit_scratch.size, 0, 0, &bad), status);
+  CHECK_IS(bad, 0); /* the header is in the first block */
+  memcpy(unit_scratch.bytes + at, &sound, 4);
   return status;
 }
 

@@ -292,6 +292,24 @@ static void check_wide(void) {
   }
 }
 
+/* Frames of few and of many spots, and noises that make few, many or no number of stars certain. */
+static void check_noises(void) {
+  static const double noises[4] = {0.05, 0.3, 1.5, 6.0};
+  uint32_t identified[4] = {0};
+  unit_copy(&unit_pyramid);
+  for (uint32_t n = 0; n < 36u; n++) {
+    uint64_t seed = n + 50u;
+    unit_scratch.options.noise_px = (starcat_real)noises[n % 4u];
+    sky_look(&unit_scratch.image, &unit_scratch.camera, &seed, 0.05, 4u + n / 4u, n / 16u, &truth);
+    if (identify(&unit_scratch) == STARCAT_IDENTIFIED) {
+      CHECK_IS(wrong_stars(), 0);
+      identified[n % 4u]++;
+    }
+  }
+  CHECK(identified[0] >= 6u);
+  CHECK(identified[3] < identified[0]);
+}
+
 /* A prior that reaches beyond the fold of the lens, where nothing is seen; and one so wide that
  * brightness has to tell the stars apart. */
 static void check_priors(void) {
@@ -302,6 +320,10 @@ static void check_priors(void) {
   sky_look(&unit_scratch.image, &unit_scratch.camera, &seed, 0.1, SKY_SPOTS, 0, &truth);
   CHECK_IS(track(&unit_scratch, (starcat_real)0.2), STARCAT_IDENTIFIED);
   unit_copy(&unit_crowded);
+  CHECK_IS(track(&unit_scratch, (starcat_real)0.35), STARCAT_E_CAPACITY);
+  unit_scratch.options.max_steps = 10;
+  CHECK_IS(track(&unit_scratch, (starcat_real)0.35), STARCAT_E_BUDGET);
+  starcat_default_options(&unit_scratch.options);
   unit_scratch.options.noise_mag = (starcat_real)0.1;
   for (uint32_t n = 0; n < 10u; n++) {
     sky_look(&unit_scratch.image, &unit_scratch.camera, &seed, 0.1, 30, 0, &truth);
@@ -452,6 +474,7 @@ void test_rare(void) {
   check_crowded();
   check_second_rows();
   check_wide();
+  check_noises();
   check_priors();
   check_caps();
   check_clusters();

@@ -1,0 +1,237 @@
+"""The C library of ``onboard/``: its own tests, with the compilers and tools that are there.
+
+The folder is copied first, so that it is built as it stands for itself, without the rest.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from starcat.geometry.attitude import quaternion_from_matrix
+from starcat.geometry.camera import Camera
+from starcat.onboard.image import Contents, longest_pair_rad, make_image
+from starcat.products.pairs import find_pairs
+from starcat.simulation.simulate import Noise, simulate_frames
+
+ONBOARD = Path(__file__).parents[1] / "onboard"
+README = (ONBOARD / "README.md").read_text(encoding="utf-8")
+LIBM = {"sqrt", "sin", "cos", "atan2", "log"}
+COMPILERS_OWN = {"memcpy", "memmove", "memset", "_GLOBAL_OFFSET_TABLE_", "__stack_chk_fail"}
+"""What compilers call by themselves."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    copy = tmp_path_factory.mktemp("vendored") / "onboard"
+    shutil.copytree(ONBOARD, copy, ignore=shutil.ignore_patterns("build", "python"))
+    return copy
+
+
+def compiler() -> str:
+    """Return a C compiler."""
+    found = shutil.which("gcc") or shutil.which("cc")
+    if found is None or shutil.which("make") is None:
+        pytest.skip("gcc or make is missing")
+    return found
+
+
+def make(folder: Path, *arguments: str, **environment: str) -> str:
+    """Run make in the folder; skip where a tool that the target needs is missing."""
+    compiler()
+    # The targets find their own compilers; what builds the wheel is not theirs.
+    kept = {name: text for name, text in os.environ.items() if name not in ("CC", "CFLAGS")}
+    ran = subprocess.run(
+        ["make", "--no-print-directory", "-s", *arguments],
+        cwd=folder,
+        env=kept | environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ran.returncode == 0, ran.stdout[-3000:] + ran.stderr[-3000:]
+    skipped = [line for line in ran.stdout.splitlines() if "skipped" in line]
+    if skipped:
+        pytest.skip("; ".join(skipped))
+    return ran.stdout
+
+
+def build(folder: Path, name: str, *sources: str, flags: tuple[str, ...] = ()) -> Path:
+    """Compile a program of the folder's tests with the library."""
+    program = folder / name
+    every = [*folder.glob("src/*.c"), *(folder / "tests" / source for source in sources)]
+    command = [compiler(), "-std=c99", "-O2", *flags, f"-I{folder / 'include'}", *every]
+    subprocess.run([*command, "-lm", "-o", program], check=True)
+    return program
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory, random_directions) -> dict[str, Path]:
+    """An image of pairs in both byte orders, and frames of it as the C programs read them."""
+    camera, folder = Camera(1024, 1024, fov_x_deg=40.0), tmp_path_factory.mktemp("images")
+    u, mag = random_directions(300, 4), np.random.default_rng(4).uniform(2.0, 6.0, 300)
+    pairs = find_pairs(u, 0.0, longest_pair_rad(camera))
+    contents = Contents(
+        "sky-1.0.0",
+        2026.0,
+        camera,
+        np.arange(1, 301),
+        u,
+        mag,
+        "pyramid",
+        np.stack([pairs.i, pairs.j], axis=-1),
+    )
+    paths = {order: folder / f"{order}.img" for order in ("little", "big")}
+    for order, path in paths.items():
+        path.write_bytes(make_image(contents, order).data)
+    lines = []
+    for frame in simulate_frames(u, camera, 100, Noise(0.4, 0.1, 3), 5, mag):
+        q = quaternion_from_matrix(frame.matrix)
+        lines.append(f"{len(frame.centroids_px)} " + " ".join(float(x).hex() for x in q))
+        spots = np.column_stack([frame.centroids_px, frame.mag])
+        lines += [" ".join(float(x).hex() for x in spot) for spot in spots]
+    paths["frames"] = folder / "frames.txt"
+    paths["frames"].write_text("\n".join(lines) + "\n")
+    return paths
+
+
+@pytest.mark.parametrize("cc", ["gcc", pytest.param("clang", marks=pytest.mark.slow)])
+def test_the_unit_test_passes_where_the_folder_stands_alone(folder: Path, cc: str) -> None:
+    if shutil.which(cc) is None:
+        pytest.skip(f"{cc} is missing")
+    said = make(folder, "test", f"COMPILERS={cc}", "CFLAGS=-O1", f"BUILD=build-{cc}")
+    assert re.findall(r"(\d+) checks, 0 failed", said)
+    assert said.count(" 0 failed") == 2  # in double and in single precision
+
+
+def test_the_example_prints_the_attitude(folder: Path) -> None:
+    said = make(folder, "all", "example")
+    assert "status 0 after" in said
+    assert re.search(r"^attitude( -?0\.\d{9},?){4}", said, re.MULTILINE)
+
+
+def undefined(folder: Path, *flags: str) -> set[str]:
+    """Return what the library calls and has not, beside what compilers call by themselves."""
+    defined, called = set(), set()
+    options = ["-std=c99", "-Os", "-ffreestanding", *flags, f"-I{folder / 'include'}"]
+    files = sorted((folder / "src").glob("*.c"))
+    # Freestanding, as gcc makes one call to sincos of two where it knows the C library.
+    subprocess.run([compiler(), *options, "-c", *files], cwd=folder, check=True)
+    for file in files:
+        target = folder / f"{file.stem}.o"
+        said = subprocess.run(["nm", target], capture_output=True, text=True, check=True).stdout
+        for line in said.splitlines():
+            kind, name = line.split()[-2:]
+            (called if kind == "U" else defined).add(name)
+    return called - defined - COMPILERS_OWN
+
+
+def test_the_library_calls_nothing_but_five_functions_of_libm(folder: Path) -> None:
+    if shutil.which("nm") is None:
+        pytest.skip("nm is missing")
+    assert undefined(folder) == LIBM
+    assert undefined(folder, "-DSTARCAT_SINGLE") == {f"{name}f" for name in LIBM}
+
+
+def test_the_functions_of_libm_can_be_replaced(folder: Path, tmp_path: Path) -> None:
+    if shutil.which("nm") is None:
+        pytest.skip("nm is missing")
+    names = sorted(LIBM)
+    (tmp_path / "mine.h").write_text(
+        "".join(
+            f"double my_{name}({'double, double' if name == 'atan2' else 'double'});\n"
+            for name in names
+        )
+    )
+    flags = [f"-DSTARCAT_{name.upper()}=my_{name}" for name in names]
+    found = undefined(folder, '-DSTARCAT_MATH_HEADER="mine.h"', f"-I{tmp_path}", *flags)
+    assert found == {f"my_{name}" for name in names}
+
+
+def test_no_flipped_bit_goes_unseen(folder: Path, made: dict[str, Path]) -> None:
+    program = build(folder, "flips", "flips.c", "random_sky.c")
+    ran = subprocess.run([program, made["little"], "10000"], capture_output=True, text=True)
+    assert ran.stdout == "10000 flips, 0 missed\n", ran.stderr
+
+
+def test_an_image_of_the_other_byte_order_is_refused(folder: Path, made: dict[str, Path]) -> None:
+    program = build(folder, "replay", "replay.c")
+    ran = subprocess.run([program, made["big"], made["frames"]], capture_output=True, text=True)
+    assert (ran.returncode, ran.stderr) == (2, "cannot open: -5\n")
+    ran = subprocess.run([program, made["little"], made["frames"]], capture_output=True, text=True)
+    lines = ran.stdout.splitlines()
+    assert len(lines) == 100
+    assert sum(line.startswith("0 ") for line in lines) >= 95
+
+
+def rows(heading: str) -> list[list[str]]:
+    """Return the rows of the first table below a heading of the README."""
+    part = README.split(f"\n## {heading}\n")[1]
+    table = re.search(r"(?:^\|.*\|\n)+", part, re.MULTILINE)
+    assert table is not None
+    return [
+        [cell.strip() for cell in line.strip("|").split("|")] for line in table[0].splitlines()[2:]
+    ]
+
+
+def test_every_status_is_in_the_table_and_reached_by_the_test_that_it_names() -> None:
+    header = (ONBOARD / "include" / "starcat.h").read_text()
+    enum = header[header.index("typedef enum") : header.index("} starcat_status")]
+    sources = {path.name: path.read_text() for path in ONBOARD.glob("tests/test_*.c")}
+    named = set()
+    for code, number, functions, _, tests in rows("What a call comes to"):
+        name = code.strip("`")
+        assert re.search(rf"\b{name} = {number}\b", enum)
+        for file, function in re.findall(r"`([^`]+)` `([^`]+)`", tests):
+            parts = re.split(rf"^(?:static )?void {function}\(", sources[file], flags=re.MULTILINE)
+            assert len(parts) == 2, f"{file} has no {function}"
+            assert name in parts[1].split("\n}\n")[0], f"{function} does not reach {name}"
+        assert tests
+        for called in re.findall(r"`(\w+)`", functions):
+            assert f"starcat_{called}(" in header
+        named.add(name)
+    assert named == set(re.findall(r"STARCAT_\w+(?= = )", enum))
+
+
+def test_every_deviation_from_misra_is_explained() -> None:
+    text = (ONBOARD / "tests" / "cppcheck.txt").read_text()
+    suppressed = re.findall(r"^misra-c2012-(\S+)|^(\w+):", text, re.MULTILINE)
+    explained = [row[0].strip("`") for row in rows("MISRA C:2012")]
+    assert sorted(a or b for a, b in suppressed) == sorted(explained)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("target", ["sanitize", "valgrind", "coverage", "cppcheck", "size"])
+def test_tools_find_nothing(folder: Path, target: str) -> None:
+    said = make(folder, target, f"BUILD=build-{target}")
+    if target == "coverage":
+        assert "(100.00 %)" in said
+    if target == "size":
+        assert len(re.findall(r"stack of starcat_\w+: \d+ bytes", said)) == 5
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_other_processors_give_the_same_answers(folder: Path, made: dict[str, Path]) -> None:
+    """32-bit ARM, and big-endian PowerPC with an image that Python wrote for it."""
+    of_c = make(folder, "cross", "BUILD=build-cross")
+    images = f"{made['little']} {made['big']}"
+    of_python = make(
+        folder, "cross", "BUILD=build-cross-images", IMAGES=images, FRAMES=str(made["frames"])
+    )
+    assert of_c.count("every answer the same") == 8
+    assert of_python.count("100 frames, every answer the same") == 4
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("target", ["fuzz-image", "fuzz-centroids"])
+def test_fuzzing_finds_nothing(folder: Path, target: str) -> None:
+    make(folder, target, "FUZZ_SECONDS=5", f"BUILD=build-{target}")
