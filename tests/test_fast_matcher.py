@@ -100,6 +100,20 @@ def test_a_frame_as_noisy_as_stated_gets_the_same_stars(sky, seed, noise_px, mis
         assert_same(in_c.identify(frame.centroids_px, magnitudes=mag), expected)
 
 
+@needs_c
+@pytest.mark.parametrize("stated", [{}, {"noise_px": 0.7, "noise_mag": 0.3}])
+def test_false_spots_beside_stars_get_the_same_stars(sky, stated):
+    in_c, in_numpy = both(sky, **stated)
+    generator = np.random.default_rng(9)
+    for frame in frames(sky, 40, Noise(0.6, 0.3, noise_mag=0.3), seed=41):
+        angle = generator.uniform(0.0, 2.0 * np.pi, len(frame.mag))
+        beside = 6.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+        px = np.concatenate([frame.centroids_px, frame.centroids_px + beside])
+        mag = np.concatenate([frame.mag, frame.mag + 0.1])
+        expected = in_numpy.identify(px, magnitudes=mag)
+        assert_same(in_c.identify(px, magnitudes=mag), expected)
+
+
 LENSES = [
     Distortion(k1=-0.2),
     Distortion(k1=0.1, k2=-0.3, k3=0.2, p1=2e-3, p2=-1e-3),
