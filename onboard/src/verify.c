@@ -199,7 +199,7 @@ static void find_rivals(const sc_call *call) {
       if (w->match[k] >= 0) {
         const real dx = w->x[i] - w->x_of[w->match[k]], dy = w->y[i] - w->y_of[w->match[k]];
         const real square = dx * dx + dy * dy;
-        if ((square < least) || ((of == w->count) && (square <= least))) {
+        if (square < least) {
           least = square;
           of = k;
         }
@@ -235,25 +235,21 @@ static void fit_rival(const sc_call *call, uint32_t rival, uint32_t centroid, re
 }
 
 /* A false spot beside a star far from the others can turn the attitude so that it is the nearest
- * to the star itself. The star's own spot then has no star, and fits better. Returns the share of
- * the frame that the best of them explains. */
+ * to the star itself. The star's own spot then has no star, and fits better: the first such rival is
+ * taken. Returns the share of the frame that the agreement explains. */
 static real try_rivals(const sc_call *call, real share) {
   starcat_workspace *w = call->work;
-  real best_share = share;
   find_rivals(call);
   for (uint32_t n = 0; n < w->n_rivals; n++) {
-    const uint32_t rival = w->rival[n], centroid = w->rival_of[n];
-    if ((w->found.star[rival] < 0) && (w->found.star[centroid] >= 0)) {
-      real m[9];
-      fit_rival(call, rival, centroid, m);
-      const real its_share = judge(call, m, fit(call, m, 0), &w->wider);
-      if (w->wider.log_chance < w->found.log_chance) {
-        w->found = w->wider;
-        best_share = its_share;
-      }
+    real m[9];
+    fit_rival(call, w->rival[n], w->rival_of[n], m);
+    const real its_share = judge(call, m, fit(call, m, 0), &w->wider);
+    if (w->wider.log_chance < w->found.log_chance) {
+      w->found = w->wider;
+      return its_share;
     }
   }
-  return best_share;
+  return share;
 }
 
 /* Verify an attitude; keep it if it is the best so far. Returns 1 if the search can end: the

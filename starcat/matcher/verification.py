@@ -193,6 +193,7 @@ def agree(matrix: Array, observation: Observation, database: Database) -> Agreem
             other, its_share = _with_rival(found, rival, centroid, observation, database)
             if other.false_match_probability < found.false_match_probability:
                 found, share = other, its_share
+                break
     if share < SURE_SHARE:
         # This agreement is not due to chance, although much of the frame is unexplained. One or
         # two wrong stars at the edge of a cluster may have spoilt an attitude that is nearly
@@ -214,7 +215,7 @@ def _rivals(fit: _Fit, observation: Observation) -> list[tuple[int, int]]:
     square = dx * dx + dy * dy
     nearest = square.argmin(axis=1)
     reach_px = RIVAL_REACH * REACH * observation.tolerance_px
-    near = square[np.arange(len(loose)), nearest] <= reach_px * reach_px
+    near = square[np.arange(len(loose)), nearest] < reach_px * reach_px
     if fit.compatible is not None:
         near &= fit.compatible[loose, star[nearest]]
     return list(zip(loose[near].tolist(), matched[nearest[near]].tolist(), strict=True))
@@ -225,8 +226,6 @@ def _with_rival(
 ) -> tuple[Agreement, float]:
     """Return the agreement in which a centroid's star is that of its rival, and its share."""
     index = found.star_index.copy()
-    if index[rival] >= 0 or index[centroid] < 0:
-        return found, 1.0
     index[rival], index[centroid] = index[centroid], -1
     matched = np.flatnonzero(index >= 0)
     matrix = solve_wahba_svd(observation.body[matched], database.directions[index[matched]])
