@@ -71,8 +71,6 @@ def export(
     """Write tables for other tools, one file a product, or an image for flight software.
 
     Example: starcat export dist/gaia-12deg-1.0.0 --to fits -o fits
-
-    Example: starcat export dist/gaia-12deg-1.0.0 --to onboard -o db.img
     """
     of_images: dict[str, object] = {"method": method, "endian": endian, "max_bytes": max_bytes}
     of_tables: dict[str, object] = {"product": product, "from_peer": from_peer}
