@@ -11,7 +11,6 @@
 int LLVMFuzzerInitialize(int *argc, char ***argv);
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 
-static uint64_t words[2][SKY_MOST_BYTES / 8u];
 static starcat_image images[2];
 static starcat_workspace work;
 static starcat_result result;
@@ -21,8 +20,14 @@ int LLVMFuzzerInitialize(int *argc, char ***argv) {
   (void)argv;
   for (uint32_t n = 0; n < 2u; n++) {
     const sky_recipe recipe = {n + 1u, n == 0u ? 2u : 4u, 300, 0.4, 8};
-    const size_t size = sky_image(&recipe, (uint8_t *)words[n]);
-    if (starcat_open(&images[n], words[n], size, 0) != STARCAT_IDENTIFIED) {
+    static uint64_t words[SKY_MOST_BYTES / 8u];
+    const size_t size = sky_image(&recipe, (uint8_t *)words);
+    void *exact = malloc(size); /* so that reading past the end is found */
+    if (exact == NULL) {
+      abort();
+    }
+    memcpy(exact, words, size);
+    if (starcat_open(&images[n], exact, size, 0) != STARCAT_IDENTIFIED) {
       abort();
     }
   }
