@@ -213,7 +213,7 @@ def test_help_has_a_short_name(starcat: Run) -> None:
 def test_summaries_are_whole(starcat: Run) -> None:
     text = starcat(["--help"]).out.partition("Commands:")[2]
     assert "..." not in text
-    assert "references, counts." in text
+    assert "the five papers." in text
 
 
 def test_the_shell_completes_commands_and_options() -> None:
