@@ -26,6 +26,8 @@ struct starcat_workspace {
   starcat_real x[STARCAT_MAX_CENTROIDS];
   starcat_real y[STARCAT_MAX_CENTROIDS];
   starcat_real magnitude[STARCAT_MAX_CENTROIDS];
+  starcat_real brightness[STARCAT_MAX_CENTROIDS]; /* magnitude, a large one where unknown */
+  starcat_real square[STARCAT_MAX_CENTROIDS];     /* of the distance from the centre */
   starcat_real body[STARCAT_MAX_CENTROIDS][3];
 
   /* Separations of pairs of centroids k > i, at k (k - 1) / 2 + i. */
@@ -59,7 +61,8 @@ struct starcat_workspace {
   /* Stars that each centroid may be by its magnitude; bounds of the ways to assign n of them. */
   uint16_t compatible[STARCAT_MAX_CENTROIDS];
   starcat_real log_ways[STARCAT_MAX_CENTROIDS + 1];
-  starcat_real sums[STARCAT_MAX_CENTROIDS + 1];
+  starcat_real sums[4][STARCAT_MAX_CENTROIDS + 1];
+  starcat_real log_largest[4];
 
   starcat_agreement found;
   starcat_agreement wider;

@@ -49,7 +49,7 @@ static real log_unit_ball(uint32_t n) {
 
 /* Logarithm of the expected number of agreements of n centroids. */
 static real log_expected(const sc_call *call, uint32_t n, real square_px, real log_information) {
-  return call->work->log_ways[n] + LOG_ALL_ATTITUDES + R(3.0) * call->camera.log_focal +
+  return sc_log_ways(call, n) + LOG_ALL_ATTITUDES + R(3.0) * call->camera.log_focal +
          R(0.5) * log_information + log_unit_ball(n) +
          R(0.5) * (real)(2u * n - 3u) * STARCAT_LOG(larger(square_px, LEAST_SQUARE)) -
          (real)n * call->camera.log_area;

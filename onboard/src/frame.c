@@ -29,48 +29,38 @@ static starcat_status check_options(const starcat_options *o) {
   return STARCAT_IDENTIFIED;
 }
 
-/* Whether centroid a of the frame comes before b: the brighter one, those without magnitude
- * last; then the nearer to the centre; then by x and y. Differences decide, the first that is not
- * zero. */
-static int comes_before(const starcat_workspace *w, const real keys_a[4], const real keys_b[4]) {
-  for (uint32_t k = w->has_magnitudes != 0u ? 0u : 1u; k < 4u; k++) {
-    if (keys_a[k] < keys_b[k]) {
-      return 1;
-    }
-    if (keys_a[k] > keys_b[k]) {
-      return 0;
-    }
+/* Whether a centroid comes before one that is in order: the brighter one, those without magnitude
+ * last; then the nearer to the centre; then by x and y. */
+static int comes_before(const starcat_workspace *w, real brightness, real square, real x, real y,
+                        uint32_t other) {
+  if ((w->has_magnitudes != 0u) && (brightness != w->brightness[other])) {
+    return brightness < w->brightness[other];
   }
-  return 0;
-}
-
-static void keys_of(const sc_camera *camera, real magnitude, real x, real y, real keys[4]) {
-  const real dx = x - camera->half_width, dy = y - camera->half_height;
-  keys[0] = is_finite(magnitude) ? magnitude : R(1e30);
-  keys[1] = dx * dx + dy * dy;
-  keys[2] = dx;
-  keys[3] = dy;
+  if (square != w->square[other]) {
+    return square < w->square[other];
+  }
+  return (x != w->x[other]) ? (x < w->x[other]) : (y < w->y[other]);
 }
 
 /* Put a centroid where it belongs among those that are in order. */
 static void insert(const sc_call *call, uint32_t row, real magnitude, real x, real y) {
   starcat_workspace *w = call->work;
+  const real dx = x - call->camera.half_width, dy = y - call->camera.half_height;
+  const real brightness = is_finite(magnitude) ? magnitude : R(1e30), square = dx * dx + dy * dy;
   uint32_t at = w->count;
-  real keys[4], others[4];
-  keys_of(&call->camera, magnitude, x, y, keys);
-  while (at > 0u) {
-    keys_of(&call->camera, w->magnitude[at - 1u], w->x[at - 1u], w->y[at - 1u], others);
-    if (!comes_before(w, keys, others)) {
-      break;
-    }
+  while ((at > 0u) && comes_before(w, brightness, square, x, y, at - 1u)) {
     w->row[at] = w->row[at - 1u];
     w->magnitude[at] = w->magnitude[at - 1u];
+    w->brightness[at] = w->brightness[at - 1u];
+    w->square[at] = w->square[at - 1u];
     w->x[at] = w->x[at - 1u];
     w->y[at] = w->y[at - 1u];
     at--;
   }
   w->row[at] = row;
   w->magnitude[at] = magnitude;
+  w->brightness[at] = brightness;
+  w->square[at] = square;
   w->x[at] = x;
   w->y[at] = y;
   w->count++;

@@ -86,6 +86,7 @@ uint32_t sc_gather(const sc_call *call, const real centre[3], real cos_r, real s
 /* ways.c */
 real sc_log_factorial(uint32_t n);
 void sc_count_ways(const sc_call *call, uint32_t most);
+real sc_log_ways(const sc_call *call, uint32_t n);
 
 /* chance.c */
 real sc_log_chance(const sc_call *call, real square_px, uint32_t n_matched);

@@ -35,47 +35,58 @@ static real exponential(real x) {
   return power;
 }
 
-/* Lower `bounds` to the elementary symmetric polynomials of `count` numbers; in logarithms, up to
- * degree `most`. With `others` above 0 the numbers n stand for (n!)^(1/n), and what Bregman's
- * theorem adds is added. */
-static void lower(const uint16_t *numbers, uint32_t count, uint32_t most, uint32_t others,
-                  real *sums, real *bounds) {
-  const real whole = others > 0u ? sc_log_factorial(others) : R(0.0);
-  uint32_t top = 1;
+/* Compute the elementary symmetric polynomials of `count` numbers up to degree `most`, in units of
+ * the largest one. From the third bound on the numbers n stand for (n!)^(1/n). */
+static void add_up(starcat_workspace *w, uint32_t bound, const uint16_t *numbers, uint32_t count,
+                   uint32_t most) {
+  const int is_tight = bound >= 2u;
+  real *sums = w->sums[bound];
+  uint32_t top = 1, last = 0;
+  real share = R(0.0);
   for (uint32_t i = 0; i < count; i++) {
     top = numbers[i] > top ? numbers[i] : top;
   }
-  const real largest = others > 0u ? exponential(sc_log_factorial(top) / (real)top) : (real)top;
+  const real largest =
+      is_tight ? exponential(sc_log_factorial(top) / (real)top) : (real)top;
+  w->log_largest[bound] = STARCAT_LOG(largest);
   sums[0] = R(1.0);
   for (uint32_t k = 1; k <= most; k++) {
     sums[k] = R(0.0);
   }
   for (uint32_t i = 0; i < count; i++) {
-    const real own = (real)numbers[i];
-    real share = R(1.0);
-    if (numbers[i] == 0u) {
-      continue;
+    const uint32_t own = numbers[i];
+    if (own != last) { /* many are alike */
+      share = (is_tight ? exponential(sc_log_factorial(own) / (real)own) : (real)own) / largest;
+      last = own;
     }
-    if (numbers[i] != top) {
-      share = (others > 0u ? exponential(sc_log_factorial(numbers[i]) / own) : own) / largest;
-    }
-    for (uint32_t k = most; k > 0u; k--) {
+    for (uint32_t k = own > 0u ? most : 0u; k > 0u; k--) {
       sums[k] += share * sums[k - 1u];
     }
   }
-  const real log_largest = STARCAT_LOG(largest);
-  for (uint32_t n = 1; n <= most; n++) {
-    real bound = LEAST;
-    if (sums[n] > R(0.0)) {
-      bound = STARCAT_LOG(sums[n]) + (real)n * log_largest;
-      if (others > 0u) {
-        bound += (real)(others - n) / (real)others * whole - sc_log_factorial(others - n);
+}
+
+/* What Bregman's theorem adds to the logarithm for n of them, with `others` on the other side. */
+static real filled(uint32_t others, uint32_t n) {
+  return (real)(others - n) / (real)others * sc_log_factorial(others) -
+         sc_log_factorial(others - n);
+}
+
+/* Logarithm of the bound of the ways to assign n of the centroids to n stars, after
+ * sc_count_ways. */
+real sc_log_ways(const sc_call *call, uint32_t n) {
+  const starcat_workspace *w = call->work;
+  real least = w->log_ways[n];
+  for (uint32_t bound = 0; (bound < 4u) && (call->mag_reach > R(0.0)); bound++) {
+    real logarithm = LEAST;
+    if (w->sums[bound][n] > R(0.0)) {
+      logarithm = STARCAT_LOG(w->sums[bound][n]) + (real)n * w->log_largest[bound];
+      if (bound >= 2u) {
+        logarithm += filled(bound == 2u ? w->n_within : w->count, n);
       }
     }
-    if (bound < bounds[n]) {
-      bounds[n] = bound;
-    }
+    least = logarithm < least ? logarithm : least;
   }
+  return least;
 }
 
 /* Count the stars that each centroid may be, and the centroids that each star may be. */
@@ -95,8 +106,8 @@ static void count_compatible(const sc_call *call) {
   }
 }
 
-/* Bound the ways to assign n of the centroids to n stars, for every n up to `most`: logarithms in
- * the workspace. */
+/* Prepare sc_log_ways for every n up to `most`: the number of all ways, and where magnitudes are
+ * stated four bounds of those of like magnitude, from the centroids and from the stars. */
 void sc_count_ways(const sc_call *call, uint32_t most) {
   starcat_workspace *w = call->work;
   const uint32_t stars = w->n_within;
@@ -107,9 +118,9 @@ void sc_count_ways(const sc_call *call, uint32_t most) {
   }
   if (call->mag_reach > R(0.0)) {
     count_compatible(call);
-    lower(w->compatible, w->count, most, 0, w->sums, w->log_ways);
-    lower(w->nearest, stars, most, 0, w->sums, w->log_ways);
-    lower(w->compatible, w->count, most, stars, w->sums, w->log_ways);
-    lower(w->nearest, stars, most, w->count, w->sums, w->log_ways);
+    add_up(w, 0, w->compatible, w->count, most);
+    add_up(w, 1, w->nearest, stars, most);
+    add_up(w, 2, w->compatible, w->count, most);
+    add_up(w, 3, w->nearest, stars, most);
   }
 }

@@ -310,6 +310,22 @@ static void check_noises(void) {
   CHECK(identified[3] < identified[0]);
 }
 
+/* Ways to assign centroids that are no star's like: none. With all alike, Bregman's bounds are the
+ * number of all ways. */
+static void check_ways(void) {
+  begin(&unit_triangle, 4, SKY_SPOTS, 0);
+  CHECK(sc_try(&call, unit_result.matrix));
+  call.mag_reach = (starcat_real)100.0;
+  sc_count_ways(&call, 5);
+  const double all = (double)unit_work.log_ways[5];
+  CHECK_NEAR((double)sc_log_ways(&call, 5), all, 1e-4);
+  for (uint32_t i = 0; i < unit_work.count; i++) {
+    unit_work.magnitude[i] = (starcat_real)1000.0;
+  }
+  sc_count_ways(&call, 5);
+  CHECK(sc_log_ways(&call, 5) < (starcat_real)-1e29);
+}
+
 /* A prior that reaches beyond the fold of the lens, where nothing is seen; and one so wide that
  * brightness has to tell the stars apart. */
 static void check_priors(void) {
@@ -475,6 +491,7 @@ void test_rare(void) {
   check_second_rows();
   check_wide();
   check_noises();
+  check_ways();
   check_priors();
   check_caps();
   check_clusters();
