@@ -322,6 +322,15 @@ def test_an_image_is_matched_as_its_artifact(small_artifact, tmp_path):
 
 
 @needs_c
+def test_an_image_has_nothing_for_frames_that_are_too_large(small_artifact, tmp_path):
+    path = tmp_path / "db.img"
+    export_image(small_artifact, "onboard", path)
+    frame = np.random.default_rng(3).random((600, 2)) * 500.0
+    with pytest.raises(ConfigError, match="600 centroids and this camera are beyond the C library"):
+        Matcher.open(path).identify(frame)
+
+
+@needs_c
 def test_an_image_for_another_machine_is_refused(small_artifact, tmp_path):
     path = tmp_path / "db.img"
     export_image(small_artifact, "onboard", path, endian="big")

@@ -41,6 +41,4 @@ typedef struct {
 #define STARCAT_MAX_STARS ...
 const char *starcat_version(void);
 int starcat_open(starcat_image *image, const void *bytes, size_t size, uint32_t flags);
-int starcat_scrub(const void *bytes, size_t size, uint32_t first, uint32_t count, uint32_t *bad_block);
-int starcat_attitude(const double (*body)[3], const double (*icrs)[3], uint32_t count, double q_body_from_icrs[4]);
 void starcat_many(const starcat_image *image, const starcat_camera *camera, const starcat_options *options, const starcat_frames *frames, starcat_answer *answers, int32_t *stars, starcat_workspace *work, starcat_result *result);

@@ -21,15 +21,12 @@ from starcat.onboard.c_source import c_header, c_source
 from starcat.onboard.checking import artifact_problems, capacity_problems, value_problems
 from starcat.onboard.fit import Fitted, fit
 from starcat.onboard.image import Contents, MadeImage, check_method, make_image
-from starcat.onboard.layout import BLOCK_BYTES, BYTE_ORDERS, ByteOrder
+from starcat.onboard.layout import BLOCK_BYTES, BYTE_ORDERS, FEATURES, ByteOrder
 from starcat.onboard.reading import bytes_of_file, read_image
 from starcat.pipeline.recipes import tile_guide_stars
 from starcat.products.boresights import FieldStars
 from starcat.specs.reading import spec_from_dict
 from starcat.storage.atomic import whole_file
-
-PRODUCTS = {"triangle": ("triangles", "ijk"), "pyramid": ("pairs", "ij")}
-"""The product that each method's features are from, and its columns of rows."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +164,7 @@ def contents_of(artifact: Artifact, method: str) -> Contents:
         If the artifact lacks the product of the method.
     """
     _check_product(artifact, method)
-    product, columns = PRODUCTS[method]
+    product, columns = FEATURES[method]
     stars, features = artifact.table("stars"), artifact.table(product)
     manifest = artifact.manifest
     spec = spec_from_dict(manifest["spec"], MANIFEST_NAME)
@@ -241,7 +238,7 @@ def _name(artifact: Artifact) -> str:
 
 
 def _check_product(artifact: Artifact, method: str) -> None:
-    product, _ = PRODUCTS[method]
+    product, _ = FEATURES[method]
     if product not in artifact.products:
         raise ConfigError(
             f"{_name(artifact)} has no product {product!r}, which an image for the method {method} "

@@ -24,6 +24,7 @@ from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
 from starcat.matcher.result import Status
 from starcat.onboard.image import Contents, make_image
+from starcat.onboard.layout import FEATURES
 
 try:
     _onboard: Any = import_module("starcat.matcher._onboard")
@@ -31,9 +32,6 @@ except ImportError:  # the wheel was built without a compiler
     _onboard = None
 
 Array = NDArray[np.float64]
-
-FEATURES = {"triangle": ("triangles", ("i", "j", "k")), "pyramid": ("pairs", ("i", "j"))}
-"""For each method that an image can hold, the product and the columns that it is made of."""
 
 MAX_STEPS = 2_000_000_000
 """Steps for one frame: on the ground the limit is the matcher's patience, not a clock."""

@@ -38,7 +38,10 @@ RADIUS_STEPS = 65534
 RADIUS_RANGE = 2.5
 """The largest circumradius that is told apart, in units of the camera's diagonal."""
 
-METHODS = ("triangle", "pyramid")
+FEATURES = {"triangle": ("triangles", ("i", "j", "k")), "pyramid": ("pairs", ("i", "j"))}
+"""For each method of an image, the product that its features are from, and the columns of rows."""
+
+METHODS = tuple(FEATURES)
 METHOD_NUMBERS = {"triangle": 1, "pyramid": 2}
 STARS_OF_FEATURE = {"triangle": 3, "pyramid": 2}
 
