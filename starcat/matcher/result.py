@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
+from starcat.geometry.camera import Camera
 from starcat.matcher.observation import Observation
+from starcat.matcher.pose import focal_length_error_px
 from starcat.matcher.verification import Agreement
 
 Status = Literal["identified", "no_match", "too_few_stars"]
@@ -53,6 +55,8 @@ class MatchResult:
     residual_arcsec: float
     false_match_probability: float
     dropped: tuple[tuple[int, str], ...] = ()
+    camera: Camera | None = None
+    focal_length_error_px: float | None = None
 
     def __repr__(self) -> str:
         """Return the answer in one line."""
@@ -130,12 +134,13 @@ def identified(
     ids = np.full(count, -1, dtype=np.int64)
     has_star = index >= 0
     ids[has_star] = star_id[index[has_star]]
-    ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(found.matrix)
+    pose, matched = found.pose, np.flatnonzero(found.star_index >= 0)
+    ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(pose.matrix)
     return MatchResult(
         "identified",
         ids,
         index,
-        quaternion_from_matrix(found.matrix),
+        quaternion_from_matrix(pose.matrix),
         ra_deg,
         dec_deg,
         roll_deg,
@@ -143,4 +148,8 @@ def identified(
         float(np.degrees(found.residual_rad) * 3600.0),
         found.false_match_probability,
         observation.dropped,
+        pose.camera,
+        focal_length_error_px(pose, matched, found.residual_rad, observation)
+        if observation.fov_error
+        else None,
     )
