@@ -200,9 +200,9 @@ def attitude_covariance(
         moved[:, axis] += step
         turned = np.cross(body, (camera.directions_from_pixels(moved) - body) / step[:, None])
         total += turned.T @ turned
-    try:
-        inverse = np.linalg.inv(information(body))
-    except np.linalg.LinAlgError:
+    matrix = information(body)
+    if np.linalg.matrix_rank(matrix, hermitian=True) < 3:
         return np.full((3, 3), np.nan)
+    inverse = np.linalg.inv(matrix)
     covariance = (noise_px * ARCSEC) ** 2 * (inverse @ total @ inverse)
     return np.asarray(0.5 * (covariance + covariance.T))
