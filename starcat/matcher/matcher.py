@@ -8,8 +8,10 @@ the readable reference in numpy; where it can, the C library answers, with the s
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Literal, get_args
@@ -27,7 +29,9 @@ from starcat.matcher.many import MatchResults
 from starcat.matcher.methods.table import METHODS, best_method, method_named
 from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder
 from starcat.matcher.observation import WIDEST_FOV_ERROR, Observation, as_frame, observe
+from starcat.matcher.refusal import Refusal
 from starcat.matcher.result import MatchResult, identified, unidentified
+from starcat.matcher.stars import Asked
 from starcat.matcher.verification import Agreement, verify
 from starcat.onboard.layout import FEATURES
 from starcat.onboard.reading import is_image
@@ -258,7 +262,7 @@ class Matcher:
         camera = camera or self.database.camera
         frame, mag = as_frame(centroids_px, magnitudes)
         if fov_error:
-            return self._identify(frame, camera, mag, self._checked_fov_error(fov_error))
+            return self._timed(frame, camera, mag, self._checked_fov_error(fov_error))
         return self._answers([(frame, mag)], camera)[0]
 
     def identify_many(
@@ -361,8 +365,30 @@ class Matcher:
             mags = [mag for _, mag in given if mag is not None] or None
             found = fast.identify(px, camera, self._limits, mags, priors, threads)
             if found.is_whole:
-                return MatchResults(found, self.database.star_id)
-        return [self._identify(frame, camera, mag) for frame, mag in given]
+                asked = [self._asked(frame, mag) for frame, mag in given]
+                explain = None if self.database.image else partial(self._why, priors is not None)
+                return MatchResults(found, asked, camera, explain)
+        return [self._timed(frame, camera, mag) for frame, mag in given]
+
+    def _asked(self, frame: Array, mag: Array | None) -> Asked:
+        return Asked(frame, mag, self.database, self.noise_px)
+
+    def _why(
+        self, is_tracked: bool, frame: Array, camera: Camera, mag: Array | None
+    ) -> Refusal | None:
+        """Return why the C library has no answer: what the search with numpy comes to."""
+        found = self._identify(frame, camera, mag)
+        # The library may have looked near a prior attitude only, where this frame is not.
+        return Refusal("no_candidate") if found.ok and is_tracked else found.refusal
+
+    def _timed(
+        self, frame: Array, camera: Camera, mag: Array | None, fov_error: float = 0.0
+    ) -> MatchResult:
+        """Identify a frame with numpy, and say how long that took and what was asked."""
+        before_s = time.perf_counter()
+        found = self._identify(frame, camera, mag, fov_error)
+        asked = self._asked(frame, mag)
+        return replace(found, time_s=time.perf_counter() - before_s, asked=asked)
 
     def _checked_fov_error(self, fov_error: float) -> float:
         if self.method != "triangle":
@@ -388,7 +414,7 @@ class Matcher:
             return unidentified("too_few_stars", observation)
         found = self._search(observation)
         if found is None:
-            return unidentified("no_match", observation)
+            return unidentified("no_match", observation, Refusal("chance"))
         return identified(found, observation, self.database.star_id)
 
     def _search(self, observation: Observation) -> Agreement | None:
