@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from hostile_frames import hostile_frame
 
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
@@ -106,3 +107,11 @@ def test_limits_that_are_none_are_refused(sky):
     ):
         with pytest.raises(ConfigError, match=text):
             Matcher(sky, **given)
+
+
+def test_frames_that_no_answer_belongs_to_get_none(sky):
+    matcher = Matcher(sky, max_steps=3_000)
+    for number in range(120):
+        kind, px, mag, fov_error = hostile_frame(number, sky)
+        result = matcher.identify(px, magnitudes=mag, fov_error=fov_error)
+        assert not result.ok, (number, kind)
