@@ -7,7 +7,15 @@ from typing import Annotated
 
 import typer
 
-from starcat.commands.shared import Json, MethodName, NoisePx
+from starcat.commands.shared import (
+    Json,
+    MethodName,
+    NoisePx,
+    Orbit,
+    Time,
+    Velocity,
+    observer_of_options,
+)
 
 app = typer.Typer()
 
@@ -81,18 +89,23 @@ def identify(
     picture: Annotated[
         Path | None, typer.Option(help="PNG or SVG of the first frame, its stars named.")
     ] = None,
+    time: Time = None,
+    velocity: Velocity = None,
+    orbit: Orbit = None,
     json: Json = False,
 ) -> None:
     """Identify the stars of frames and find the camera's attitude.
 
     Example: starcat identify dist/gaia-12deg-1.0.0 frame.csv --picture frame.png
     """
-    from starcat.images.identification import draw, identify_frames, measure
+    from starcat.images.identification import draw, identify_frames, measure, skies_of
     from starcat.matcher.matcher import Matcher
     from starcat.specs.camera_file import read_camera
     from starcat.terminal.console import say
     from starcat.terminal.matches import print_matches
+    from starcat.terminal.sky_in_time import print_sky_in_time
 
+    observer = observer_of_options(time, velocity, orbit)
     matcher = Matcher.open(
         artifact,
         method,
@@ -103,12 +116,15 @@ def identify(
     )
     eye = read_camera(camera) if camera else matcher.database.camera
     measured = measure(file, flip=flip)
-    results = identify_frames(matcher, measured, eye)
+    results = identify_frames(matcher, measured, eye, observer)
+    skies = skies_of(measured, results, matcher.database, eye, observer)
     print_matches(measured.frames, results, matcher.database, as_json=json)
+    if not json:
+        print_sky_in_time([frame.name for frame in measured.frames], skies)
     if measured.image is not None and results[0].status != "identified":
         say("An image that was read upside down is never identified: try --flip or --no-flip.")
     if picture:
-        draw(picture, measured, results[0], matcher.database, eye)
+        draw(picture, measured, results[0], matcher.database, eye, skies[0])
 
 
 @app.command()

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
@@ -17,6 +18,10 @@ from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.simulation.simulate import Frame
+
+if TYPE_CHECKING:
+    from starcat.sky.in_time import SkyInTime
+    from starcat.sky.observer import Observer
 
 IMAGE_SUFFIXES = (".fits", ".fit", ".fts", ".gz", ".fz", ".png", ".tif", ".tiff")
 """Files that are read as images; all others hold centroids."""
@@ -71,7 +76,9 @@ def measure(path: Path, *, flip: bool | None = None) -> MeasuredFile:
     return MeasuredFile([MeasuredFrame(path.stem, spots.centroids_px, spots.mag)], image)
 
 
-def identify_frames(matcher: Matcher, measured: MeasuredFile, camera: Camera) -> list[MatchResult]:
+def identify_frames(
+    matcher: Matcher, measured: MeasuredFile, camera: Camera, observer: Observer | None = None
+) -> list[MatchResult]:
     """Identify the frames of a file.
 
     Parameters
@@ -82,6 +89,8 @@ def identify_frames(matcher: Matcher, measured: MeasuredFile, camera: Camera) ->
         The frames.
     camera : Camera
         That took them.
+    observer : Observer, optional
+        When and where they were taken: then the spots of planets are named.
 
     Returns
     -------
@@ -100,9 +109,62 @@ def identify_frames(matcher: Matcher, measured: MeasuredFile, camera: Camera) ->
                 f"the image has {width} x {height} px, the camera {camera.width_px} x "
                 f"{camera.height_px}; describe the camera that took it with --camera"
             )
+    if observer is None:
+        return [
+            matcher.identify(frame.centroids_px, camera, magnitudes=frame.mag)
+            for frame in measured.frames
+        ]
+    from starcat.sky.in_time import identify_in_time
+
     return [
-        matcher.identify(frame.centroids_px, camera, magnitudes=frame.mag)
+        identify_in_time(
+            partial(matcher.identify, camera=camera),
+            matcher.database,
+            frame.centroids_px,
+            camera,
+            observer,
+            magnitudes=frame.mag,
+            tolerance_px=matcher.tolerance_px,
+            max_false_match_probability=matcher.max_false_match_probability,
+        )
         for frame in measured.frames
+    ]
+
+
+def skies_of(
+    measured: MeasuredFile,
+    results: Sequence[MatchResult],
+    database: Database,
+    camera: Camera,
+    observer: Observer | None,
+) -> list[SkyInTime | None]:
+    """Return what the time adds to the answers to the frames of a file.
+
+    Parameters
+    ----------
+    measured : MeasuredFile
+        The frames.
+    results : sequence of MatchResult
+        The answers, in the same order.
+    database : Database
+        The stars that they name.
+    camera : Camera
+        The camera.
+    observer : Observer or None
+        When and where the frames were taken.
+
+    Returns
+    -------
+    list of SkyInTime or None
+        One a frame; None where it is not identified, or the time is not known.
+    """
+    if observer is None:
+        return [None] * len(results)
+    from starcat.sky.in_time import sky_in_time
+
+    return [
+        sky_in_time(result, database, frame.centroids_px, camera, observer)
+        for frame, result in zip(measured.frames, results, strict=True)
     ]
 
 
@@ -146,7 +208,12 @@ def write_simulated(path: Path, frame: Frame, camera: Camera, seed: int) -> None
 
 
 def draw(
-    path: Path, measured: MeasuredFile, result: MatchResult, database: Database, camera: Camera
+    path: Path,
+    measured: MeasuredFile,
+    result: MatchResult,
+    database: Database,
+    camera: Camera,
+    sky: SkyInTime | None = None,
 ) -> None:
     """Draw the first frame of a file with its stars circled and named.
 
@@ -161,7 +228,9 @@ def draw(
     database : Database
         Names of the stars.
     camera : Camera
-        The camera, for its size.
+        The camera.
+    sky : SkyInTime, optional
+        What the time adds: its planets are drawn.
 
     Raises
     ------
