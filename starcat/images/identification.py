@@ -239,35 +239,48 @@ def draw(
     OutputError
         If it cannot be written.
     """
+    from starcat.images.overlay import overlay_from_attitude
     from starcat.images.picture import compass_from_matrix, draw_identified
 
     frame = measured.frames[0]
-    names = [
-        short_name(database.designation[row].decode()) if row >= 0 else None
-        for row in result.star_index
-    ]
-    title, below, compass = f"{frame.name}: {result.status.replace('_', ' ')}", database.name, None
+    title, below = f"{frame.name}: {result.status.replace('_', ' ')}", database.name
+    compass = overlay = None
     if result.status == "identified":
         title = (
             f"{frame.name}: RA {result.boresight_ra_deg:.4f}, "
             f"Dec {result.boresight_dec_deg:+.4f}, roll {result.roll_deg:.3f} deg"
         )
         below = (
-            f"{result.n_matched} of {len(names)} spots are stars of {database.name}, "
+            f"{result.n_matched} of {len(result.star_index)} spots are stars of {database.name}, "
             f"residual {result.residual_arcsec:.1f} arcsec"
         )
-        compass = compass_from_matrix(matrix_from_quaternion(result.q_body_from_icrs))
+        matrix = matrix_from_quaternion(result.q_body_from_icrs)
+        compass = compass_from_matrix(matrix)
+        bodies = () if sky is None else sky.bodies
+        overlay = overlay_from_attitude(matrix, camera, database.epoch_jyear, bodies)
     draw_identified(
         path,
         measured.image,
         (camera.width_px, camera.height_px),
         frame.centroids_px,
-        names,
+        _labels(result, database),
         title,
         mag=frame.mag,
         below=below,
         compass=compass,
+        overlay=overlay,
     )
+
+
+def _labels(result: MatchResult, database: Database) -> list[str | None]:
+    """Return the names that stars are known by; the catalog's own where there is no other."""
+    from starcat.sky.names import common_names
+
+    rows = result.star_index[result.star_index >= 0]
+    own = [name.decode() for name in database.designation[rows].tolist()]
+    known = common_names(own, database.directions[rows], database.mag[rows], database.epoch_jyear)
+    found = iter([name or short_name(other) for name, other in zip(known, own, strict=True)])
+    return [next(found) if row >= 0 else None for row in result.star_index]
 
 
 def short_name(designation: str) -> str:
@@ -288,7 +301,7 @@ def short_name(designation: str) -> str:
     >>> short_name("Gaia DR3 3221269181884277504"), short_name("SAO 308")
     ('Gaia …84277504', 'SAO 308')
     """
-    words = designation.split()
+    words = designation.split() or [""]
     if len(words[-1]) <= 12:
         return designation
     return f"{words[0]} …{words[-1][-8:]}"
