@@ -1,6 +1,7 @@
 """What lies behind the stars of a picture: a grid, the lines of constellations, planets.
 
-A grid of right ascension and declination, in ICRS. All in pixels of the camera, by an attitude. A line that leaves the frame is cut where it is drawn.
+The grid is of right ascension and declination, ICRS. All is in pixels of the camera, by an
+attitude. A line that leaves the frame is cut where it is drawn.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 GRID, LINES, PLANET = "#3d6b86", "#8f86c9", "#ffe08a"
-_STEPS_DEG = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 30.0, 45.0, 90.0)
+_STEPS_DEG = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 30.0, 45.0)
 _POINTS = 181
 _INTERVALS = 5
 """Wanted number of intervals of the grid across the frame."""
@@ -89,10 +90,10 @@ def draw_overlay(plate: Plate, overlay: Overlay) -> Array:
     """
     taken = []
     for name, points in overlay.grid:
-        plate.axes.plot(*points.T, color=GRID, lw=0.6, alpha=0.75, zorder=1.2)
+        plate.axes.plot(*points.T, color=GRID, lw=0.6, alpha=0.75, zorder=0.5)
         taken += _write_at_edge(plate, name, points)
     for points in overlay.figures:
-        plate.axes.plot(*points.T, color=LINES, lw=1.1, alpha=0.75, zorder=1.3)
+        plate.axes.plot(*points.T, color=LINES, lw=1.1, alpha=0.75, zorder=0.6)
     for body in overlay.bodies:
         taken.append(_draw_body(plate, body))
     return np.array(taken).reshape(-1, 4)
@@ -111,7 +112,7 @@ def _grid(matrix: Array, camera: Camera) -> tuple[tuple[str, Array], ...]:
             name = f"{at_deg:+.4g}°"
             lines.append((name, directions_from_radec(ra, np.full(len(ra), at_deg))))
     wide_deg = step_deg / max(np.cos(np.radians(min(abs(float(dec)), 89.0))), 0.02)
-    ra_step = next((s for s in _STEPS_DEG if s >= 0.99 * wide_deg and 360 % s < 1e-9), 45.0)
+    ra_step = next((step for step in _STEPS_DEG if step >= 0.99 * wide_deg), 45.0)
     for number in range(round(360.0 / ra_step)):
         line = np.linspace(max(lowest, -90.0), min(highest, 90.0), _POINTS)
         at_deg = number * ra_step
@@ -125,8 +126,8 @@ def _grid(matrix: Array, camera: Camera) -> tuple[tuple[str, Array], ...]:
 
 def _step(camera: Camera) -> float:
     """Return the step of a grid that has about five intervals across the frame."""
-    wanted = min(camera.fov_x_deg, camera.fov_y_deg) / _INTERVALS
-    return next((step for step in _STEPS_DEG if step >= wanted), _STEPS_DEG[-1])
+    most = 1.25 * min(camera.fov_x_deg, camera.fov_y_deg) / _INTERVALS
+    return max((step for step in _STEPS_DEG if step <= most), default=_STEPS_DEG[0])
 
 
 def _figures(matrix: Array, camera: Camera, epoch_jyear: float) -> tuple[Array, ...]:
