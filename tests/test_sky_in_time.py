@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from datetime import UTC, datetime, timedelta, timezone
 from typing import Any
 
@@ -497,3 +499,45 @@ def test_what_is_printed_is_what_was_found(random_sky, jupiter_frame, capsys):
     assert "two" not in said
     print_sky_in_time(["two"], [None])
     assert capsys.readouterr().out == ""
+
+
+def test_the_command_prints_and_draws_the_sky_at_a_time(starcat, small_artifact, tmp_path):
+    frame, picture = tmp_path / "frame.csv", tmp_path / "frame.png"
+    assert starcat(["simulate", small_artifact, "-o", frame, "--seed", "3"]).code == 0
+    at = ["--time", "2026-11-22T10:00:00", "--orbit", "7000,0,0,0,7.5,0"]
+    run = starcat(["identify", small_artifact, frame, *at, "--picture", picture])
+    assert run.code == 0
+    assert "With aberration, at 2026-11-22T10:00:00Z" in run.out
+    assert "Earth limb deg" in " ".join(run.out.split())
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    plain = starcat(["identify", small_artifact, frame])
+    assert "With aberration" not in plain.out
+    # The answer itself stays what it was: positions of the catalog on their pixels.
+    assert run.out.startswith(plain.out.rstrip()[:400])
+    moving = starcat(
+        ["identify", small_artifact, frame, *at[:2], "--velocity", "0,7.5,0"]
+    )  # fmt: skip
+    assert "With aberration" in moving.out
+
+
+def test_nothing_of_it_needs_the_network_or_astropy():
+    # A fresh interpreter, in which astropy cannot be imported and no socket be opened.
+    program = """
+import sys, socket
+class Nothing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] == "astropy":
+            raise ImportError(name)
+sys.meta_path.insert(0, Nothing())
+def refuse(*args, **options):
+    raise OSError("no network")
+socket.socket.connect = refuse
+import starcat.sky.in_time
+from starcat.sky.bodies import bodies_seen
+from starcat.sky.observer import Observer
+print(len(bodies_seen(Observer.at("2026-11-22T10:00:00")).names))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert (done.returncode, done.stdout) == (0, "9\n"), done.stderr
