@@ -9,6 +9,7 @@ from typing import Any
 
 import astropy.units as u
 import erfa
+import matplotlib.text
 import numpy as np
 import pytest
 from astropy.coordinates import (
@@ -36,6 +37,8 @@ from starcat.geometry.attitude import (
 )
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import radec_from_directions, separation
+from starcat.images.identification import MeasuredFile, draw, identify_frames, skies_of
+from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.sky.bodies import bodies_seen
@@ -541,3 +544,28 @@ print(len(bodies_seen(Observer.at("2026-11-22T10:00:00")).names))
         [sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60
     )
     assert (done.returncode, done.stdout) == (0, "9\n"), done.stderr
+
+
+def test_the_picture_of_a_frame_with_jupiter_names_it_once(
+    random_sky, jupiter_frame, tmp_path, monkeypatch
+):
+    frame, mag, _, _ = jupiter_frame
+    camera, observer = random_sky.camera, Observer.at(JUPITER)
+    measured = MeasuredFile([MeasuredFrame("one", frame, mag)])
+    results = identify_frames(Matcher(random_sky), measured, camera, observer)
+    skies = skies_of(measured, results, random_sky, camera, observer)
+    written = []
+    write = matplotlib.text.Text.__init__
+
+    def listen(self, x=0, y=0, text="", **options):
+        written.append(text)
+        write(self, x, y, text, **options)
+
+    monkeypatch.setattr(matplotlib.text.Text, "__init__", listen)
+    draw(tmp_path / "a.png", measured, results[0], random_sky, camera, skies[0])
+    assert written.count("Jupiter") == 1
+    assert f"identified: {results[0].n_matched + 1}" in written
+    written.clear()
+    draw(tmp_path / "a.png", measured, results[0], random_sky, camera)
+    assert "Jupiter" not in written
+    assert f"identified: {results[0].n_matched}" in written

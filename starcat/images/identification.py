@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from starcat.errors import ConfigError
@@ -263,7 +264,7 @@ def draw(
         measured.image,
         (camera.width_px, camera.height_px),
         frame.centroids_px,
-        _labels(result, database),
+        _labels(result, database, sky),
         title,
         mag=frame.mag,
         below=below,
@@ -272,15 +273,24 @@ def draw(
     )
 
 
-def _labels(result: MatchResult, database: Database) -> list[str | None]:
-    """Return the names that stars are known by; the catalog's own where there is no other."""
+def _labels(result: MatchResult, database: Database, sky: SkyInTime | None) -> list[str | None]:
+    """Return the names that stars are known by; the catalog's own where there is no other.
+
+    The spot of a planet has an empty name: it is identified, and named beside its place.
+    """
     from starcat.sky.names import common_names
 
-    rows = result.star_index[result.star_index >= 0]
-    own = [name.decode() for name in database.designation[rows].tolist()]
-    known = common_names(own, database.directions[rows], database.mag[rows], database.epoch_jyear)
-    found = iter([name or short_name(other) for name, other in zip(known, own, strict=True)])
-    return [next(found) if row >= 0 else None for row in result.star_index]
+    rows = np.flatnonzero(result.star_index >= 0)
+    stars = result.star_index[rows]
+    own = [name.decode() for name in database.designation[stars].tolist()]
+    known = common_names(own, database.directions[stars], database.mag[stars], database.epoch_jyear)
+    labels: list[str | None] = [None] * len(result.star_index)
+    for row, name, other in zip(rows.tolist(), known, own, strict=True):
+        labels[row] = name or short_name(other)
+    for body in () if sky is None else sky.bodies:
+        if body.row is not None:
+            labels[body.row] = ""
+    return labels
 
 
 def short_name(designation: str) -> str:

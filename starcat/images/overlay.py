@@ -88,10 +88,10 @@ def draw_overlay(plate: Plate, overlay: Overlay) -> Array:
     ndarray of float64, shape (K, 4)
         Boxes of the words written, points from the top left: left, top, right, bottom.
     """
-    taken = []
+    taken: list[list[float]] = []
     for name, points in overlay.grid:
         plate.axes.plot(*points.T, color=GRID, lw=0.6, alpha=0.75, zorder=0.5)
-        taken += _write_at_edge(plate, name, points)
+        taken += _write_at_edge(plate, name, points, taken)
     for points in overlay.figures:
         plate.axes.plot(*points.T, color=LINES, lw=1.1, alpha=0.75, zorder=0.6)
     for body in overlay.bodies:
@@ -164,8 +164,10 @@ def _on_detector(points: Array, camera: Camera) -> Array:
     return np.asarray(np.where(near[:, None], points, np.nan)[kept[0] : kept[-1] + 1])
 
 
-def _write_at_edge(plate: Plate, name: str, points: Array) -> list[list[float]]:
-    """Write the name of a line of the grid where it is nearest to the frame's edge."""
+def _write_at_edge(
+    plate: Plate, name: str, points: Array, taken: list[list[float]]
+) -> list[list[float]]:
+    """Write the name of a line of the grid at the edge of the frame, unless another is there."""
     size = np.array(plate.size, dtype=np.float64)
     to_edge = np.minimum(points, size - points).min(axis=1)
     inside = np.flatnonzero(to_edge >= 0.0)
@@ -176,11 +178,17 @@ def _write_at_edge(plate: Plate, name: str, points: Array) -> list[list[float]]:
     width, height = plate.frame
     x = float(np.clip(x, half_width, width - half_width))
     y = float(np.clip(y, half_height, height - half_height))
+    box = [x - half_width, y - half_height, x + half_width, y + half_height]
+    if any(
+        box[0] < right and left < box[2] and box[1] < bottom and top < box[3]
+        for left, top, right, bottom in taken
+    ):
+        return []
     plate.axes.text(
         x / plate.scale, y / plate.scale, name, color="#7fb2cf", size=0.8 * LABEL_PT,
         ha="center", va="center", zorder=2.5, parse_math=False,
     )  # fmt: skip
-    return [[x - half_width, y - half_height, x + half_width, y + half_height]]
+    return [box]
 
 
 def _draw_body(plate: Plate, body: BodyInFrame) -> list[float]:
