@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
 from typing import Any
 
@@ -42,7 +43,12 @@ from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.sky.bodies import bodies_seen
-from starcat.sky.in_time import earth_limb_angle_deg, identify_in_time, sky_in_time
+from starcat.sky.in_time import (
+    earth_limb_angle_deg,
+    identify_in_time,
+    planets_among,
+    sky_in_time,
+)
 from starcat.sky.magnitudes import PHASE_CURVES, apparent_magnitude
 from starcat.sky.observer import Observer, numbers_of
 from starcat.terminal.sky_in_time import print_sky_in_time, sky_as_dict
@@ -464,6 +470,31 @@ def test_a_frame_that_jupiter_spoils_is_asked_again_without_it(random_sky, jupit
     before = len(asked)
     identify_in_time(stubborn, random_sky, frame, camera, at)
     assert len(asked) == before + 1
+
+
+def test_the_earth_and_the_moon_do_not_take_the_spot_of_a_planet(random_sky, jupiter_frame):
+    # From a low orbit the disc of the Earth covers a third of the sky, frame or no frame.
+    _, mag, _, matrix = jupiter_frame
+    camera, last = random_sky.camera, len(mag) - 1
+    place = -7000.0 * matrix[2]  # the Earth is straight ahead
+    orbit = (place, [0.0, 0.0, 0.0])
+    observer = Observer.at(JUPITER, position_km=place, velocity_km_s=orbit[1])
+    frame, rows = apparent_frame(random_sky, matrix, camera, JUPITER, orbit)
+    seen = bodies_seen(observer)
+    jupiter = seen.directions[seen.row("Jupiter")]
+    spot = camera.pixels_from_directions(jupiter[None] @ matrix.T)
+    frame = np.vstack([frame, spot])
+    found = identify_in_time(
+        Matcher(random_sky).identify, random_sky, frame, camera, observer, magnitudes=mag
+    )
+    assert found.dropped == ((last, "jupiter"),)
+    assert (found.star_index[:last] == rows).mean() > 0.9
+    # Of two spots, one on the Moon's disc and one that is Jupiter on it, each has its name.
+    moon = replace(seen, directions=seen.directions.copy())
+    moon.directions[seen.row("Moon")] = jupiter
+    both = np.vstack([spot, spot + np.array([9.0, 0.0])])
+    names = planets_among(both, matrix, camera, moon, magnitudes=np.array([-2.7, -3.0]))
+    assert names == {0: "jupiter", 1: "moon"}
 
 
 def test_faint_bodies_are_not_looked_for(random_sky):

@@ -92,6 +92,8 @@ def test_stars_of_any_catalog_get_their_names_by_place():
     assert common_names([""], u[2:3], np.array([0.0]), 2000.0) == [None]
     # What stands beside it but is much fainter is another star.
     assert common_names([""], u[:1], np.array([5.0]), 2026.0) == [None]
+    # In Ks, Betelgeuse is five magnitudes brighter than in V.
+    assert common_names([""], u[1:2], np.array([-4.4]), 2026.0) == ["Betelgeuse"]
     assert common_names(["HIP 27989"], -u[:1], np.array([9.0]), 2026.0) == ["Betelgeuse"]
 
 

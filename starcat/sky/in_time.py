@@ -37,6 +37,9 @@ Array = NDArray[np.float64]
 FAINTER_MAG = 1.0
 """A body is looked for if it is at most this much fainter than the database's faintest star."""
 
+LARGEST_SPOT_RAD = np.radians(1.0)
+"""A body that is larger, as the Earth is from an orbit, has no spot."""
+
 BRIGHTEST = 3
 """So many of the brightest spots may be planets that a frame was not identified for."""
 
@@ -223,13 +226,17 @@ def planets_among(
     rows: dict[int, str] = {}
     places = camera.pixels_from_directions(seen.directions @ matrix.T)
     own = np.full(len(centroids_px), np.nan) if star_mag is None else star_mag
-    for body in np.argsort(seen.mag, kind="stable"):
-        if seen.mag[body] > faint_limit_mag + FAINTER_MAG or np.isnan(places[body, 0]):
+    sought = (seen.mag <= faint_limit_mag + FAINTER_MAG) & (seen.radius_rad < LARGEST_SPOT_RAD)
+    sought &= np.isfinite(places[:, 0])
+    # Planets come before what shows a disc, on which their spot may lie.
+    has_disc = seen.radius_rad * camera.focal_length_px >= tolerance_px
+    for body in np.lexsort((seen.mag, has_disc)):
+        if not sought[body]:
             continue
         disc_px = float(seen.radius_rad[body]) * camera.focal_length_px
         reach_px = tolerance_px + disc_px + float(seen.error_rad[body]) * camera.focal_length_px
         distance = np.hypot(*(centroids_px - places[body]).T)
-        free = np.isnan(own) | ((own > seen.mag[body]) & (disc_px < tolerance_px))
+        free = np.isnan(own) | ((own > seen.mag[body]) & ~has_disc[body])
         free[list(rows)] = False
         near = np.flatnonzero((distance <= reach_px) & free)
         if len(near):

@@ -27,8 +27,8 @@ Array = NDArray[np.float64]
 REACH_ARCSEC = 20.0
 """Largest separation from the place that the list has for a star."""
 
-REACH_MAG = 2.0
-"""Largest difference of magnitudes, whose bands may differ: V - G of the reddest stars is 1.5."""
+FAINTER_MAG, BRIGHTER_MAG = 2.0, 9.0
+"""How much fainter and brighter than V a catalog may have a star: V - Ks of the reddest is 9."""
 
 _FOLDER = Path(__file__).parent
 _MAS = np.radians(1.0 / 3_600_000.0)
@@ -138,7 +138,7 @@ def common_names(
     directions : ndarray of float64, shape (N, 3)
         ICRS unit vectors.
     mag : ndarray of float64, shape (N,)
-        Magnitudes of any visual band.
+        Magnitudes of any band from B to Ks.
     epoch_jyear : float
         Epoch of the directions.
 
@@ -159,11 +159,9 @@ def common_names(
         label = known.label_of(designation)
         if label is None:
             near = np.flatnonzero(places @ u >= near_cosine)
-            off = places[near] - u
-            within = (np.einsum("ij,ij->i", off, off) <= chord * chord) & (
-                np.abs(known.mag[near] - m) <= REACH_MAG
-            )
-            near = near[within]
+            off, fainter = places[near] - u, m - known.mag[near]
+            within = np.einsum("ij,ij->i", off, off) <= chord * chord
+            near = near[within & (fainter <= FAINTER_MAG) & (fainter >= -BRIGHTER_MAG)]
             if len(near):
                 label = known.labels[near[np.abs(known.mag[near] - m).argmin()]]
         names.append(label)
