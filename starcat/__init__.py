@@ -23,8 +23,9 @@ if TYPE_CHECKING:
     from starcat.face.functions import build, ingest, verify
     from starcat.geometry.camera import Camera
     from starcat.matcher.matcher import Matcher
-    from starcat.sky.in_time import identify_in_time, sky_in_time
+    from starcat.sky.in_time import sky_in_time
     from starcat.sky.observer import Observer
+    from starcat.sky.spots import identify_in_time
     from starcat.specs.reading import preset, read_spec
 
 __all__ = [
@@ -51,7 +52,7 @@ _HOMES = {
     "StarcatError": ("starcat.errors", "StarcatError"),
     "build": ("starcat.face.functions", "build"),
     "connect": ("starcat.face.connection", "connect"),
-    "identify_in_time": ("starcat.sky.in_time", "identify_in_time"),
+    "identify_in_time": ("starcat.sky.spots", "identify_in_time"),
     "ingest": ("starcat.face.functions", "ingest"),
     "open": ("starcat.face.artifact", "open_artifact"),
     "preset": ("starcat.specs.reading", "preset"),

@@ -43,14 +43,10 @@ from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.sky.bodies import bodies_seen
-from starcat.sky.in_time import (
-    earth_limb_angle_deg,
-    identify_in_time,
-    planets_among,
-    sky_in_time,
-)
+from starcat.sky.in_time import earth_limb_angle_deg, sky_in_time
 from starcat.sky.magnitudes import PHASE_CURVES, apparent_magnitude
 from starcat.sky.observer import Observer, numbers_of
+from starcat.sky.spots import identify_in_time, planets_among
 from starcat.terminal.sky_in_time import print_sky_in_time, sky_as_dict
 
 Array = NDArray[np.float64]

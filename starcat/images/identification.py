@@ -115,7 +115,7 @@ def identify_frames(
             matcher.identify(frame.centroids_px, camera, magnitudes=frame.mag)
             for frame in measured.frames
         ]
-    from starcat.sky.in_time import identify_in_time
+    from starcat.sky.spots import identify_in_time
 
     return [
         identify_in_time(

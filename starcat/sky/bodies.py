@@ -7,6 +7,7 @@ ephemeris. Nothing is read and nothing is downloaded.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import erfa
 import numpy as np
@@ -87,6 +88,7 @@ class Bodies:
         return self.names.index(name)
 
 
+@lru_cache(maxsize=4)
 def bodies_seen(observer: Observer) -> Bodies:
     """Return the bodies of the solar system as an observer sees them.
 
@@ -98,7 +100,7 @@ def bodies_seen(observer: Observer) -> Bodies:
     Returns
     -------
     Bodies
-        All of them, above a horizon or not.
+        All of them, above a horizon or not; the same object for the same observer.
     """
     names = ["Sun", "Moon", *_PLANETS, *(["Earth"] if observer.is_placed else [])]
     seen = np.array([_light_time_corrected(name, observer) for name in names])

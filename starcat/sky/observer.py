@@ -37,7 +37,7 @@ FIRST_YEAR, LAST_YEAR = 1900, 2099
 DAY_S = 86_400.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Observer:
     """A time, a place and a velocity.
 
