@@ -121,14 +121,11 @@ def bodies_seen(observer: Observer) -> Bodies:
         _ephemeris_error_rad(name, sun, own)
         for name, sun, own in zip(names, from_sun, seen, strict=True)
     ]
-    return Bodies(
-        tuple(names),
-        u,
-        distance,
-        np.arcsin(np.minimum(radius_au / distance, 1.0)),
-        np.array(mag),
-        error_rad,
-    )
+    radius_rad = np.arcsin(np.minimum(radius_au / distance, 1.0))
+    arrays = (u, distance, radius_rad, np.array(mag), error_rad)
+    for array in arrays:
+        array.setflags(write=False)
+    return Bodies(tuple(names), *arrays)
 
 
 def _light_time_corrected(name: str, observer: Observer) -> Array:
