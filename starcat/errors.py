@@ -187,6 +187,12 @@ class BuildError(StarcatError):
     """A build that ran but has no usable result: no stars left, or a failed self-test."""
 
 
+class NotIdentifiedError(StarcatError):
+    """A frame that was not identified, where only an identified one will do."""
+
+    exit_code = 6
+
+
 class OutputError(StarcatError):
     """A place that cannot be written to, or already holds something else."""
 

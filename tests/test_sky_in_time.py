@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -38,7 +39,8 @@ from starcat.geometry.attitude import (
 )
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import radec_from_directions, separation
-from starcat.images.identification import MeasuredFile, draw, identify_frames, skies_of
+from starcat.images.answering import sky_of_answer
+from starcat.images.identification import MeasuredFile, draw, identify_frames
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
@@ -548,6 +550,11 @@ def test_the_command_prints_and_draws_the_sky_at_a_time(starcat, small_artifact,
         ["identify", small_artifact, frame, *at[:2], "--velocity", "0,7.5,0"]
     )  # fmt: skip
     assert "With aberration" in moving.out
+    [answer] = json.loads(starcat(["identify", small_artifact, frame, *at, "--json"]).out)
+    assert answer["in_time"]["time"] == "2026-11-22T10:00:00Z"
+    assert answer["in_time"]["earth_limb_angle_deg"] is not None
+    [answer] = json.loads(starcat(["identify", small_artifact, frame, "--json"]).out)
+    assert "in_time" not in answer
 
 
 def test_nothing_of_it_needs_the_network_or_astropy():
@@ -580,7 +587,7 @@ def test_the_picture_of_a_frame_with_jupiter_names_it_once(
     camera, observer = random_sky.camera, Observer.at(JUPITER)
     measured = MeasuredFile([MeasuredFrame("one", frame, mag)])
     results = identify_frames(Matcher(random_sky), measured, camera, observer)
-    skies = skies_of(measured, results, random_sky, camera, observer)
+    sky = sky_of_answer(measured.frames[0], results[0], observer)
     written = []
     write = matplotlib.text.Text.__init__
 
@@ -589,7 +596,7 @@ def test_the_picture_of_a_frame_with_jupiter_names_it_once(
         write(self, x, y, text, **options)
 
     monkeypatch.setattr(matplotlib.text.Text, "__init__", listen)
-    draw(tmp_path / "a.png", measured, results[0], random_sky, camera, skies[0])
+    draw(tmp_path / "a.png", measured, results[0], random_sky, camera, sky)
     assert written.count("Jupiter") == 1
     assert f"identified: {results[0].n_matched + 1}" in written
     written.clear()

@@ -8,12 +8,15 @@ from typing import Annotated
 import typer
 
 from starcat.commands.shared import (
+    FailOnNoMatch,
     Json,
+    JsonLines,
     MethodName,
     NoisePx,
     Orbit,
     Time,
     Velocity,
+    WcsFile,
     observer_of_options,
 )
 
@@ -62,7 +65,9 @@ def identify(
     artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
     file: Annotated[
         Path,
-        typer.Argument(help="Centroids (CSV: x_px,y_px[,mag]; JSON) or image (FITS, PNG, TIFF)."),
+        typer.Argument(
+            help="Centroids (CSV: x_px,y_px[,mag]; JSON; - for stdin) or image (FITS, PNG, TIFF)."
+        ),
     ],
     method: MethodName = None,
     camera: Annotated[
@@ -92,18 +97,20 @@ def identify(
     time: Time = None,
     velocity: Velocity = None,
     orbit: Orbit = None,
+    wcs: WcsFile = None,
+    fail_on_no_match: FailOnNoMatch = False,
+    ndjson: JsonLines = False,
     json: Json = False,
 ) -> None:
     """Identify the stars of frames and find the camera's attitude.
 
     Example: starcat identify dist/gaia-12deg-1.0.0 frame.csv --picture frame.png
     """
-    from starcat.images.identification import draw, identify_frames, measure, skies_of
+    from starcat.images.answering import answer_each, measure_input, write_extras
     from starcat.matcher.matcher import Matcher
     from starcat.specs.camera_file import read_camera
     from starcat.terminal.console import say
-    from starcat.terminal.matches import print_matches
-    from starcat.terminal.sky_in_time import print_sky_in_time
+    from starcat.terminal.matches import print_answers
 
     observer = observer_of_options(time, velocity, orbit)
     matcher = Matcher.open(
@@ -115,16 +122,19 @@ def identify(
         noise_mag=noise_mag,
     )
     eye = read_camera(camera) if camera else matcher.database.camera
-    measured = measure(file, flip=flip)
-    results = identify_frames(matcher, measured, eye, observer)
-    skies = skies_of(measured, results, matcher.database, eye, observer)
-    print_matches(measured.frames, results, matcher.database, as_json=json)
-    if not json:
-        print_sky_in_time([frame.name for frame in measured.frames], skies)
-    if measured.image is not None and results[0].status != "identified":
+    measured = measure_input(file, flip=flip, wcs=wcs)
+    answered = answer_each(matcher, measured, eye, observer)
+    told = print_answers(
+        answered, matcher.database, as_json=json, as_lines=ndjson, observer=observer
+    )
+    if measured.image is not None and not told.identified:
         say("An image that was read upside down is never identified: try --flip or --no-flip.")
-    if picture:
-        draw(picture, measured, results[0], matcher.database, eye, skies[0])
+    if told.first is not None:
+        write_extras(
+            file, measured, *told.first, eye, picture=picture, wcs=wcs, flip=flip, observer=observer
+        )
+    if fail_on_no_match:
+        told.expect_all_identified()
 
 
 @app.command()

@@ -132,43 +132,6 @@ def identify_frames(
     ]
 
 
-def skies_of(
-    measured: MeasuredFile,
-    results: Sequence[MatchResult],
-    database: Database,
-    camera: Camera,
-    observer: Observer | None,
-) -> list[SkyInTime | None]:
-    """Return what the time adds to the answers to the frames of a file.
-
-    Parameters
-    ----------
-    measured : MeasuredFile
-        The frames.
-    results : sequence of MatchResult
-        The answers, in the same order.
-    database : Database
-        The stars that they name.
-    camera : Camera
-        The camera.
-    observer : Observer or None
-        When and where the frames were taken.
-
-    Returns
-    -------
-    list of SkyInTime or None
-        One a frame; None where it is not identified, or the time is not known.
-    """
-    if observer is None:
-        return [None] * len(results)
-    from starcat.sky.in_time import sky_in_time
-
-    return [
-        sky_in_time(result, database, frame.centroids_px, camera, observer)
-        for frame, result in zip(measured.frames, results, strict=True)
-    ]
-
-
 def write_simulated(path: Path, frame: Frame, camera: Camera, seed: int) -> None:
     """Write a simulated frame as centroids, or as the image that a camera would take.
 

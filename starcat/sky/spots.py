@@ -57,7 +57,8 @@ def identify_in_time(
     centroids_px : array_like of float64, shape (N, 2)
         Pixels.
     camera : Camera
-        The camera that took the frame.
+        The camera that took the frame; where the answer has found another focal length, that one
+        counts.
     observer : Observer
         When and from where.
     magnitudes : array_like of float64, shape (N,), optional
@@ -82,10 +83,11 @@ def identify_in_time(
     def rows_of(result: MatchResult) -> dict[int, str]:
         if result.status != "identified":
             return {}
-        matrix = _apparent_matrix(result, camera, frame, observer)
+        eye = result.camera or camera
+        matrix = _apparent_matrix(result, eye, frame, observer)
         star_mag = np.where(result.star_index >= 0, database.mag[result.star_index], np.nan)
         return planets_among(
-            frame, matrix, camera, seen, magnitudes=mag, star_mag=star_mag,
+            frame, matrix, eye, seen, magnitudes=mag, star_mag=star_mag,
             tolerance_px=tolerance_px, faint_limit_mag=float(database.mag.max()),
         )  # fmt: skip
 
