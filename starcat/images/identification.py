@@ -18,7 +18,9 @@ from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.simulation.simulate import Frame
 
-IMAGE_SUFFIXES = (".fits", ".fit", ".fts", ".gz", ".fz", ".png", ".tif", ".tiff")
+IMAGE_SUFFIXES = (
+    ".fits", ".fit", ".fts", ".gz", ".fz", ".png", ".tif", ".tiff", ".jpg", ".jpeg",
+)  # fmt: skip
 """Files that are read as images; all others hold centroids."""
 
 CENTROIDS_SUFFIX = ".csv"

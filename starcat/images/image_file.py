@@ -1,4 +1,4 @@
-"""Image files: FITS, PNG and TIFF to and from one array of grey values, row 0 at the top.
+"""Image files: FITS, PNG, TIFF and JPEG to and from one array of grey values, row 0 at the top.
 
 What kind a file is, its first bytes say, not its name. Colour becomes luminance. Stacks and
 cubes are refused, and so is what could only be read with fewer digits than the file has.
@@ -30,9 +30,11 @@ _KINDS = {
     b"MM\0*": "TIFF",
     b"II+\0": "TIFF",
     b"MM\0+": "TIFF",
+    b"\xff\xd8\xff": "JPEG",
 }
 WRITTEN_KINDS = {
     ".fits": "FITS", ".fit": "FITS", ".fts": "FITS", ".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF",
+    ".jpg": "JPEG", ".jpeg": "JPEG",
 }  # fmt: skip
 """What is written under which suffix."""
 _LUMINANCE = np.array([0.299, 0.587, 0.114])
@@ -80,7 +82,7 @@ def read_image(path: Path, *, flip: bool | None = None, hdu: int | None = None) 
             raise ConfigError(f"{path}: damaged gzip file ({error})") from error
     kind = next((kind for start, kind in _KINDS.items() if data.startswith(start)), None)
     if kind is None:
-        raise ConfigError(f"{path}: neither FITS nor PNG nor TIFF; convert it to one of these")
+        raise ConfigError(f"{path}: neither FITS nor PNG, TIFF or JPEG; convert it to one of these")
     try:
         values, upside_down = _read_fits(data, path, hdu) if kind == "FITS" else _read_picture(data)
     except ConfigError as error:
@@ -133,7 +135,7 @@ def _grey_of_picture(data: bytes) -> NDArray[Any]:
     from PIL import Image, UnidentifiedImageError
 
     try:
-        picture = Image.open(io.BytesIO(data), formats=("PNG", "TIFF"))
+        picture = Image.open(io.BytesIO(data), formats=("PNG", "TIFF", "JPEG"))
     except UnidentifiedImageError as error:
         raise ConfigError("damaged, or a variety that Pillow does not know") from error
     with picture:
@@ -155,12 +157,14 @@ def _bits(data: bytes, picture: Any) -> tuple[int, bool]:
     """Return the bits of a value in the file, and whether 16 of them count from white down."""
     if picture.format == "PNG":
         return data[24], False
+    if picture.format == "JPEG":
+        return 8, False
     bits = max(picture.tag_v2.get(258, (1,)))  # BitsPerSample
     # Pillow turns 8-bit values around where white is zero, but not 16-bit ones.
     return bits, picture.tag_v2.get(262) == 0 and picture.mode.startswith("I;16")
 
 
-def write_image(path: Path, image: NDArray[Any]) -> None:
+def write_image(path: Path, image: NDArray[Any], *, quality: int = 95) -> None:
     """Write an image, the same bytes for the same values.
 
     Parameters
@@ -196,7 +200,8 @@ def write_image(path: Path, image: NDArray[Any]) -> None:
 
         if image.dtype not in (np.uint8, np.uint16):
             raise ValueError(f"image of {image.dtype}; {kind} takes uint8 and uint16")
-        Image.fromarray(np.ascontiguousarray(image)).save(buffer, format=kind)
+        options = {"quality": quality} if kind == "JPEG" else {}
+        Image.fromarray(np.ascontiguousarray(image)).save(buffer, format=kind, **options)
     try:
         path.write_bytes(buffer.getvalue())
     except OSError as error:
