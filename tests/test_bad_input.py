@@ -804,7 +804,7 @@ def _(place: Place) -> Call:
 
 @case("frame of a kind that is not written", 2)
 def _(place: Place) -> Call:
-    return ["simulate", place.artifact, "-o", place.folder / "frame.jpg"]
+    return ["simulate", place.artifact, "-o", place.folder / "frame.gif"]
 
 
 @case("frame missing", 2)

@@ -304,7 +304,7 @@ def test_each_command_has_json(name: str) -> None:
 def test_a_frame_of_an_unknown_kind_is_not_written(
     starcat: Run, small_artifact: Path, tmp_path: Path
 ) -> None:
-    for name in ("f.jpg", "f", "f.json", "f.csv.gz"):
+    for name in ("f.gif", "f", "f.json", "f.csv.gz"):
         run = starcat(["simulate", small_artifact, "-o", tmp_path / name])
         assert (run.code, run.out) == (2, "")
         assert "end it with one of .csv (centroids), .fits" in run.err

@@ -22,14 +22,11 @@ from starcat.images.background import (
     repair_hot_pixels,
     subtract_background,
 )
+from starcat.images.detection import detect
+from starcat.images.spot_width import SIGMA_RANGE_PX, is_sharp, sigma_of_stars
 
 Array = NDArray[np.float64]
 
-_SIGMA_RANGE_PX = (0.3, 5.0)
-_SIGMA_SPOTS = 50
-_CLEAR_NOISE = 100.0
-"""Flux in units of one pixel's noise: 100 is a signal over noise of 28 where sigma is 1 px."""
-_WIDEST_RADIUS_PX = 15.0
 _NARROWEST_WINDOW_PX = 1.0  # a narrower window follows the pixel grid (docs/decisions.md)
 _APERTURE_SIGMA, _EDGE_SIGMA = 2.0, 3.0
 _PLATEAU_NOISE, _PLATEAU_DEPTH, _PLATEAU_PIXELS = 6.0, 0.005, 3
@@ -124,10 +121,13 @@ def find_spots(
     levels = subtract_background(image)
     sigma = psf_sigma_px
     if sigma is None:
-        levels = repair_hot_pixels(levels, _SIGMA_RANGE_PX[0])
-        sigma = _measured_sigma(levels, _detect(levels, 1.0, threshold_sigma))
+        levels = repair_hot_pixels(levels, SIGMA_RANGE_PX[0])
+        sigma = _measured_sigma(levels, detect(levels, 1.0, threshold_sigma), saturation)
     levels = repair_hot_pixels(levels, sigma)
-    found = _detect(levels, float(sigma), threshold_sigma)
+    found = detect(levels, float(sigma), threshold_sigma)
+    if psf_sigma_px is None:
+        places = np.stack([found["x"], found["y"]], axis=1)
+        found = found[~is_sharp(levels, places, float(sigma))]
     return _measured(levels, found, float(sigma), saturation, gain_e_per_adu)
 
 
@@ -139,46 +139,10 @@ def _check_positive(**values: float | None) -> None:
             )
 
 
-def _detect(levels: Levels, sigma: float, threshold: float) -> NDArray[Any]:
-    """Return sep's table of what stands out after smoothing with a star's shape.
-
-    Filter "conv" with the threshold in units of the smoothed noise, and no cleaning: sep's
-    matched filter followed by its cleaning loses real stars (docs/decisions.md).
-    """
-    reach = np.arange(-int(np.ceil(2.5 * sigma)), int(np.ceil(2.5 * sigma)) + 1)
-    profile = np.exp(-0.5 * (reach / sigma) ** 2)
-    kernel = np.outer(profile, profile) / profile.sum() ** 2
-    smoothed = threshold * float(np.sqrt((kernel**2).sum()))
-    try:
-        found = load_sep().extract(
-            levels.above, smoothed, err=levels.noise, mask=levels.mask, minarea=1, clean=False,
-            filter_kernel=kernel, filter_type="conv",
-        )  # fmt: skip
-    except Exception as error:  # sep raises nothing more special when a buffer is full
-        raise ConfigError(
-            f"the image has too much in it to tell stars from the sky ({error}); raise the "
-            f"threshold ({threshold:g} sigma) or check that it is a star image"
-        ) from error
-    return np.asarray(found)
-
-
-def _measured_sigma(levels: Levels, found: NDArray[Any]) -> float:
-    """Return sigma of the spots that stand out well, from the radius with half of their light.
-
-    The middle ones by brightness are taken: the brightest may be saturated and so too wide.
-    """
-    order = np.argsort(-found["flux"], kind="stable")
-    clear = int((found["flux"] > _CLEAR_NOISE * levels.noise[found["ypeak"], found["xpeak"]]).sum())
-    first = max(clear - _SIGMA_SPOTS, 0) // 2
-    chosen = found[order[first : first + min(max(clear, 3), _SIGMA_SPOTS)]]
-    if not len(chosen):
-        return 1.0
-    widest = np.full(len(chosen), _WIDEST_RADIUS_PX)
-    radius, _ = load_sep().flux_radius(
-        levels.above, chosen["x"], chosen["y"], widest, 0.5, mask=levels.mask, subpix=5
-    )
-    variance = np.median(radius) ** 2 / (2.0 * np.log(2.0)) - PIXEL_VARIANCE
-    return float(np.clip(np.sqrt(max(variance, 0.0)), *_SIGMA_RANGE_PX))
+def _measured_sigma(levels: Levels, found: NDArray[Any], saturation: float | None) -> float:
+    """Return sigma of the spots whose middle the detector could hold."""
+    sound = found[~_is_saturated(levels, found, saturation)]
+    return sigma_of_stars(levels, np.stack([sound["x"], sound["y"]], axis=1), sound["flux"])
 
 
 def _measured(

@@ -114,7 +114,7 @@ def write_simulated(path: Path, frame: Frame, camera: Camera, seed: int) -> None
     Parameters
     ----------
     path : Path
-        CSV, FITS, PNG or TIFF.
+        CSV, FITS, PNG or TIFF; JPEG with eight bits.
     frame : Frame
         Centroids and magnitudes.
     camera : Camera
@@ -142,9 +142,14 @@ def write_simulated(path: Path, frame: Frame, camera: Camera, seed: int) -> None
         )
 
     from starcat.images.render import Optics, render_image
+    from starcat.images.scene import Scene, in_file_steps
 
+    eight_bits = Scene(bits=8, black_adu=90.0, adu_per_step=4.0)  # of the default optics
     size = camera.width_px, camera.height_px
-    write_image(path, render_image(frame.centroids_px, frame.mag, size, Optics(), seed))
+    image = render_image(frame.centroids_px, frame.mag, size, Optics(), seed)
+    if WRITTEN_KINDS[suffix] == "JPEG":
+        image = in_file_steps(image, eight_bits)
+    write_image(path, image)
 
 
 def draw(

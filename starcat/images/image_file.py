@@ -170,9 +170,11 @@ def write_image(path: Path, image: NDArray[Any], *, quality: int = 95) -> None:
     Parameters
     ----------
     path : Path
-        ``.fits``, ``.png`` or ``.tif``, replaced if it exists.
+        ``.fits``, ``.png``, ``.tif`` or ``.jpg``, replaced if it exists.
     image : ndarray, shape (height, width)
-        Row 0 is the top row. PNG and TIFF take uint8 and uint16, FITS all numbers.
+        Row 0 is the top row. PNG and TIFF take uint8 and uint16, JPEG uint8, FITS all numbers.
+    quality : int, default 95
+        Quality of JPEG, up to 95.
 
     Raises
     ------
@@ -198,8 +200,9 @@ def write_image(path: Path, image: NDArray[Any], *, quality: int = 95) -> None:
     else:
         from PIL import Image
 
-        if image.dtype not in (np.uint8, np.uint16):
-            raise ValueError(f"image of {image.dtype}; {kind} takes uint8 and uint16")
+        taken = ("uint8",) if kind == "JPEG" else ("uint8", "uint16")
+        if image.dtype.name not in taken:
+            raise ValueError(f"image of {image.dtype}; {kind} takes {' and '.join(taken)}")
         options = {"quality": quality} if kind == "JPEG" else {}
         Image.fromarray(np.ascontiguousarray(image)).save(buffer, format=kind, **options)
     try:
