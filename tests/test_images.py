@@ -546,14 +546,14 @@ def test_fits_may_be_compressed(tmp_path):
 
 def test_of_several_fits_images_the_first_plane_is_read(tmp_path, caplog):
     parts = [
-        fits.PrimaryHDU(np.zeros((3, 4, 5))),
+        fits.PrimaryHDU(np.zeros((4, 4, 5))),
         fits.ImageHDU(GREY16[None]),
         fits.ImageHDU(GREY8),
     ]
     fits.HDUList(parts).writeto(tmp_path / "a.fits")
     with caplog.at_level(logging.INFO, "starcat.images.image_file"):
         np.testing.assert_array_equal(read_image(tmp_path / "a.fits"), GREY16)
-    assert "HDU 1 of 3 (HDU 0 3x4x5; HDU 1 1x20x31; HDU 2 20x31)" in caplog.text
+    assert "HDU 1 of 3 (HDU 0 4x4x5; HDU 1 1x20x31; HDU 2 20x31)" in caplog.text
     np.testing.assert_array_equal(read_image(tmp_path / "a.fits", hdu=2), GREY8)
     for hdu in (0, 3, -1):
         with pytest.raises(ConfigError, match="expected an image of two dimensions"):
@@ -633,12 +633,64 @@ def test_files_of_other_programs_are_read_right(tmp_path):
         np.testing.assert_array_equal(read_image(tmp_path / name), GREY16, err_msg=name)
 
 
+COLOUR16 = np.random.default_rng(2).integers(0, 65_536, (20, 31, 3), dtype=np.uint16)
+LUMINANCE = [0.299, 0.587, 0.114]
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("a.png", png(COLOUR16, 2)),
+        ("a.png", png(np.dstack([COLOUR16, GREY16]), 6)),
+        ("a.tif", tiff(COLOUR16, "<", 2, 3)),
+        ("a.tif", tiff(COLOUR16, ">", 2, 3)),
+    ],
+)
+def test_colour_of_16_bits_keeps_them(name, data, tmp_path):
+    (tmp_path / name).write_bytes(data)
+    np.testing.assert_allclose(read_image(tmp_path / name), COLOUR16 @ LUMINANCE, rtol=1e-12)
+
+
+def test_transparency_is_left_out(tmp_path):
+    (tmp_path / "a.png").write_bytes(png(np.dstack([GREY16, GREY16[::-1]]), 4))
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png"), GREY16)
+
+
+def test_colour_of_16_bits_without_the_extra_says_how_to_get_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imagecodecs", None)
+    (tmp_path / "a.png").write_bytes(png(COLOUR16, 2))
+    with pytest.raises(ConfigError, match=r"pip install 'starcat-guide-stars\[images\]'"):
+        read_image(tmp_path / "a.png")
+
+
+def test_three_planes_are_colours_and_one_may_be_chosen(tmp_path):
+    planes = np.moveaxis(COLOUR16, 2, 0)
+    fits.PrimaryHDU(planes).writeto(tmp_path / "a.fits")
+    colours = COLOUR16 @ LUMINANCE
+    np.testing.assert_allclose(read_image(tmp_path / "a.fits"), colours, rtol=1e-7)
+    for number in range(3):
+        found = read_image(tmp_path / "a.fits", plane=number)
+        np.testing.assert_array_equal(found, planes[number])
+    for number in (3, -1):
+        with pytest.raises(ConfigError, match="there is no plane"):
+            read_image(tmp_path / "a.fits", plane=number)
+
+
+def test_jpeg_is_written_and_read(tmp_path):
+    y, x = np.mgrid[:40, :56]
+    smooth = (2 * x + 3 * y).astype(np.uint8)
+    write_image(tmp_path / "a.jpg", smooth)
+    assert (tmp_path / "a.jpg").read_bytes()[:3] == b"\xff\xd8\xff"
+    assert np.abs(read_image(tmp_path / "a.jpg") - smooth).max() <= 4
+    write_image(tmp_path / "b.jpeg", smooth, quality=30)
+    assert (tmp_path / "b.jpeg").stat().st_size < (tmp_path / "a.jpg").stat().st_size
+
+
 @pytest.mark.parametrize(
     ("name", "data", "word"),
     [
-        ("a.png", png(np.dstack([GREY16] * 3), 2), "colour of 16 bits"),
-        ("a.png", png(np.dstack([GREY16] * 2), 4), "colour of 16 bits"),
-        ("a.tif", tiff(np.dstack([GREY16] * 3), "<", 2, 3), "colour of 16 bits"),
+        ("a.png", png(np.dstack([GREY16] * 3), 2)[:900], "cannot be read as PNG"),
+        ("a.tif", tiff(np.dstack([GREY16] * 3), "<", 2, 3)[:900], "TIFF|variety"),
         ("a.png", png(GREY16, 0)[:900], "cannot be read as PNG"),
         ("a.png", b"\x89PNG\r\n\x1a\nxyz", "damaged, or a variety"),
         ("a.tif", tiff(GREY16, "<", 1)[:900], "TIFF|variety"),
@@ -673,14 +725,14 @@ def test_fits_without_its_last_filling_is_whole_enough(tmp_path):
 
 
 def test_what_is_not_one_plane_is_refused(tmp_path):
-    fits.PrimaryHDU(np.zeros((3, 4, 5))).writeto(tmp_path / "cube.fits")
+    fits.PrimaryHDU(np.zeros((4, 4, 5))).writeto(tmp_path / "cube.fits")
     column = fits.Column("a", "E", array=np.zeros(1))
     table = fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns([column])])
     table.writeto(tmp_path / "table.fits")
     pages = [Image.fromarray(GREY8), Image.fromarray(GREY8)]
     pages[0].save(tmp_path / "pages.tif", save_all=True, append_images=pages[1:])
     for name, word in (
-        ("cube.fits", "HDU 0 3x4x5; expected an image of two dimensions"),
+        ("cube.fits", "HDU 0 4x4x5; expected an image of two dimensions"),
         ("table.fits", "HDU 0 no image; HDU 1 no image"),
         ("pages.tif", "holds 2 images; expected one"),
         ("absent.fits", "No such file"),

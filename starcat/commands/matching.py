@@ -7,7 +7,18 @@ from typing import Annotated
 
 import typer
 
-from starcat.commands.shared import Json, MethodName, NoisePx
+from starcat.commands.shared import (
+    Dark,
+    Json,
+    Mask,
+    MethodName,
+    Mosaic,
+    MostSpots,
+    NoisePx,
+    Plane,
+    PsfSigmaPx,
+    Threshold,
+)
 
 app = typer.Typer()
 
@@ -26,7 +37,7 @@ def methods(json: Json = False) -> None:
 @app.command()
 def simulate(
     artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="CSV, FITS, PNG or TIFF.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="CSV, FITS, PNG, TIFF, JPEG.")],
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same frame.")] = 0,
     noise_px: NoisePx = 0.5,
     false_stars: Annotated[int, typer.Option(min=0, help="Spots that are no stars.")] = 0,
@@ -54,7 +65,9 @@ def identify(
     artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
     file: Annotated[
         Path,
-        typer.Argument(help="Centroids (CSV: x_px,y_px[,mag]; JSON) or image (FITS, PNG, TIFF)."),
+        typer.Argument(
+            help="Centroids (CSV: x_px,y_px[,mag]; JSON) or image (FITS, PNG, TIFF, JPEG)."
+        ),
     ],
     method: MethodName = None,
     camera: Annotated[
@@ -76,8 +89,15 @@ def identify(
         float, typer.Option(min=0.0, max=1.0, help="Less certain answers are withheld.")
     ] = 1e-9,
     flip: Annotated[
-        bool | None, typer.Option("--flip/--no-flip", help="First row of the image at the bottom.")
+        bool | None, typer.Option("--flip/--no-flip", help="First row at the bottom; y upwards.")
     ] = None,
+    psf_sigma_px: PsfSigmaPx = None,
+    threshold: Threshold = 5.0,
+    most_spots: MostSpots = 200,
+    plane: Plane = None,
+    bayer: Mosaic = False,
+    dark: Dark = None,
+    mask: Mask = None,
     picture: Annotated[
         Path | None, typer.Option(help="PNG or SVG of the first frame, its stars named.")
     ] = None,
@@ -87,7 +107,14 @@ def identify(
 
     Example: starcat identify dist/gaia-12deg-1.0.0 frame.csv --picture frame.png
     """
-    from starcat.images.identification import draw, identify_frames, measure
+    from starcat.images.identification import (
+        PictureOptions,
+        draw,
+        flipped,
+        identify_frames,
+        measure,
+    )
+    from starcat.matcher.centroids import said_of_columns
     from starcat.matcher.matcher import Matcher
     from starcat.specs.camera_file import read_camera
     from starcat.terminal.console import say
@@ -102,7 +129,10 @@ def identify(
         noise_mag=noise_mag,
     )
     eye = read_camera(camera) if camera else matcher.database.camera
-    measured = measure(file, flip=flip)
+    how = PictureOptions(threshold, psf_sigma_px, most_spots, plane, bayer, dark, mask)
+    measured = flipped(measure(file, flip=flip, options=how), eye, flip)
+    if unknown := said_of_columns(measured.frames):
+        say(unknown)
     results = identify_frames(matcher, measured, eye)
     print_matches(measured.frames, results, matcher.database, as_json=json)
     if measured.image is not None and results[0].status != "identified":

@@ -29,6 +29,24 @@ Scheduler = Annotated[
     str | None,
     typer.Option(metavar="tcp://HOST:PORT", help="A Dask cluster to use instead of this machine."),
 ]
+PsfSigmaPx = Annotated[
+    float | None,
+    typer.Option(min=0.3, max=20, help="Width (sigma) of a star in an image; default: measured."),
+]
+Threshold = Annotated[
+    float, typer.Option(min=1, max=1000, help="Least signal over noise of a spot in an image.")
+]
+MostSpots = Annotated[int, typer.Option(min=4, help="The brightest spots of an image are used.")]
+Plane = Annotated[
+    int | None, typer.Option(min=0, help="Plane of a FITS cube, from 0; default: colours as one.")
+]
+Mosaic = Annotated[
+    bool, typer.Option("--bayer", help="The image is a raw colour mosaic, in any order.")
+]
+Dark = Annotated[Path | None, typer.Option(help="Image with the lid on, to be subtracted.")]
+Mask = Annotated[
+    Path | None, typer.Option(help="Image, not zero where pixels are dead or hot: no spots there.")
+]
 NoisePx = Annotated[float, typer.Option(min=0, max=50, help="Noise of a centroid, each axis.")]
 
 

@@ -2,12 +2,12 @@
 
 Input is one grey image, output are centroids and brightness, brightest first. Background,
 detection, windowed centroids and apertures are those of sep, Source Extractor as a library,
-which the extra ``images`` brings. Trails and blooming are not handled.
+which the extra ``images`` brings. Trails are told and refused; blooming is not handled.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from starcat.images.background import (
 )
 from starcat.images.detection import detect
 from starcat.images.spot_width import SIGMA_RANGE_PX, is_sharp, sigma_of_stars
+from starcat.images.trails import trail_px
 
 Array = NDArray[np.float64]
 
@@ -70,6 +71,22 @@ class Spots:
         """Return the number of spots."""
         return len(self.flux)
 
+    def brightest(self, count: int) -> Spots:
+        """Return the first spots.
+
+        Parameters
+        ----------
+        count : int
+            How many there are to be at most.
+
+        Returns
+        -------
+        Spots
+            The brightest ones, in the same order.
+        """
+        columns = [getattr(self, field.name) for field in fields(self)[:-1]]
+        return Spots(*(column[:count] for column in columns), self.psf_sigma_px)
+
 
 def find_spots(
     image: ArrayLike,
@@ -78,6 +95,7 @@ def find_spots(
     psf_sigma_px: float | None = None,
     saturation: float | None = None,
     gain_e_per_adu: float | None = None,
+    most_spots: int | None = None,
 ) -> Spots:
     """Find the spots of an image and measure them.
 
@@ -96,6 +114,8 @@ def find_spots(
     gain_e_per_adu : float, optional
         Electrons of one grey step, for the photon noise in ``snr``; without it only the noise
         of the background counts.
+    most_spots : int, optional
+        The brightest so many are returned; all by default.
 
     Returns
     -------
@@ -106,7 +126,8 @@ def find_spots(
     ------
     ConfigError
         If sep is not installed; if the image is not 2-D, too small, without a finite value, or
-        has too much in it to tell stars from the sky; if a parameter is not positive.
+        has too much in it to tell stars from the sky; if the stars are trails; if a parameter
+        is not positive.
 
     References
     ----------
@@ -117,18 +138,23 @@ def find_spots(
         psf_sigma_px=psf_sigma_px,
         saturation=saturation,
         gain_e_per_adu=gain_e_per_adu,
+        most_spots=most_spots,
     )
     levels = subtract_background(image)
     sigma = psf_sigma_px
     if sigma is None:
         levels = repair_hot_pixels(levels, SIGMA_RANGE_PX[0])
-        sigma = _measured_sigma(levels, detect(levels, 1.0, threshold_sigma), saturation)
+        first = detect(levels, 1.0, threshold_sigma)
+        first = first[~_is_saturated(levels, first, saturation)]
+        _refuse_trails(first)
+        sigma = sigma_of_stars(levels, np.stack([first["x"], first["y"]], axis=1), first["flux"])
     levels = repair_hot_pixels(levels, sigma)
     found = detect(levels, float(sigma), threshold_sigma)
     if psf_sigma_px is None:
         places = np.stack([found["x"], found["y"]], axis=1)
         found = found[~is_sharp(levels, places, float(sigma))]
-    return _measured(levels, found, float(sigma), saturation, gain_e_per_adu)
+    spots = _measured(levels, found, float(sigma), saturation, gain_e_per_adu)
+    return spots if most_spots is None else spots.brightest(most_spots)
 
 
 def _check_positive(**values: float | None) -> None:
@@ -139,10 +165,14 @@ def _check_positive(**values: float | None) -> None:
             )
 
 
-def _measured_sigma(levels: Levels, found: NDArray[Any], saturation: float | None) -> float:
-    """Return sigma of the spots whose middle the detector could hold."""
-    sound = found[~_is_saturated(levels, found, saturation)]
-    return sigma_of_stars(levels, np.stack([sound["x"], sound["y"]], axis=1), sound["flux"])
+def _refuse_trails(found: NDArray[Any]) -> None:
+    length = trail_px(found)
+    if length is not None:
+        raise ConfigError(
+            f"the stars are trails of {length:.0f} px in one direction, whose ends are not known "
+            "to a pixel; expose shorter or follow the sky, or state the width of a star "
+            "(--psf-sigma-px 1.5) to measure the middles all the same"
+        )
 
 
 def _measured(

@@ -57,8 +57,8 @@ def detect(levels: Levels, sigma: float, threshold: float) -> NDArray[Any]:
     reach = np.arange(-int(np.ceil(2.5 * sigma)), int(np.ceil(2.5 * sigma)) + 1)
     profile = np.exp(-0.5 * (reach / sigma) ** 2)
     profile /= profile.sum()
-    kernel = np.outer(profile, profile)
-    image, noise, least = levels.above, levels.noise, threshold * float(np.sqrt((kernel**2).sum()))
+    kernel: NDArray[np.float64] | None = np.outer(profile, profile)
+    image, noise, least = levels.above, levels.noise, threshold * float((profile**2).sum())
     if levels.is_rough:
         image, noise = _filtered(levels, profile)
         least, kernel = threshold, None

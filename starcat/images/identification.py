@@ -12,7 +12,12 @@ from numpy.typing import NDArray
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import matrix_from_quaternion
 from starcat.geometry.camera import Camera
-from starcat.matcher.centroids import MeasuredFrame, read_frames, write_centroids
+from starcat.matcher.centroids import (
+    MeasuredFrame,
+    read_frames,
+    upside_down,
+    write_centroids,
+)
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
@@ -43,15 +48,48 @@ class MeasuredFile:
     image: NDArray[Any] | None = None
 
 
-def measure(path: Path, *, flip: bool | None = None) -> MeasuredFile:
+@dataclass(frozen=True)
+class PictureOptions:
+    """How a picture is read, and spots are found in it.
+
+    Attributes
+    ----------
+    threshold_sigma, psf_sigma_px, most_spots
+        As those of `find_spots`. The matcher gets the brightest 200 spots: measured, further
+        ones find no further picture, and each costs time.
+    plane : int, optional
+        Plane of a FITS cube, counted from 0.
+    is_mosaic : bool
+        Whether the pixels are behind a mosaic of colour filters.
+    dark : Path, optional
+        Image with the lid on, which is subtracted.
+    mask : Path, optional
+        Image that is not zero where no stars are wanted.
+    """
+
+    threshold_sigma: float = 5.0
+    psf_sigma_px: float | None = None
+    most_spots: int = 200
+    plane: int | None = None
+    is_mosaic: bool = False
+    dark: Path | None = None
+    mask: Path | None = None
+
+
+def measure(
+    path: Path, *, flip: bool | None = None, options: PictureOptions | None = None
+) -> MeasuredFile:
     """Read centroids, or find them in an image.
 
     Parameters
     ----------
     path : Path
-        CSV, JSON, FITS, PNG or TIFF.
+        CSV, JSON, FITS, PNG, TIFF or JPEG.
     flip : bool, optional
-        Whether the first row of an image is its bottom; the file's own word by default.
+        Whether the first row of an image is its bottom; the file's own word by default. For
+        centroids, whose camera is not known here, there is `flipped`.
+    options : PictureOptions, optional
+        How a picture is read and measured.
 
     Returns
     -------
@@ -66,11 +104,76 @@ def measure(path: Path, *, flip: bool | None = None) -> MeasuredFile:
     if path.suffix.lower() not in IMAGE_SUFFIXES:
         return MeasuredFile(read_frames(path))
     from starcat.images.centroiding import find_spots
+
+    how = options or PictureOptions()
+    image = read_picture(path, flip, how)
+    try:
+        spots = find_spots(
+            image,
+            threshold_sigma=how.threshold_sigma,
+            psf_sigma_px=how.psf_sigma_px,
+            most_spots=how.most_spots,
+        )
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}", key=error.key, value=error.value) from error
+    return MeasuredFile([MeasuredFrame(path.stem, spots.centroids_px, spots.mag)], image)
+
+
+def read_picture(path: Path, flip: bool | None, options: PictureOptions) -> NDArray[Any]:
+    """Read an image and repair it as the options say: dark frame, mask, mosaic.
+
+    Parameters
+    ----------
+    path : Path
+        Image file.
+    flip : bool, optional
+        As that of `measure`; dark frame and mask are turned like the image.
+    options : PictureOptions
+        What is to be done.
+
+    Returns
+    -------
+    ndarray, shape (height, width)
+        Grey values; NaN where the mask is not zero.
+
+    Raises
+    ------
+    ConfigError
+        If a file cannot be read or is not of the image's size.
+    """
+    from starcat.images.frame_repair import grey_of_mosaic, without_dark, without_dead_zones
     from starcat.images.image_file import read_image
 
-    image = read_image(path, flip=flip)
-    spots = find_spots(image)
-    return MeasuredFile([MeasuredFrame(path.stem, spots.centroids_px, spots.mag)], image)
+    image: NDArray[Any] = read_image(path, flip=flip, plane=options.plane)
+    if options.dark is not None:
+        image = without_dark(image, read_image(options.dark, flip=flip))
+    if options.is_mosaic:
+        image = grey_of_mosaic(image)
+    if options.mask is not None:
+        image = without_dead_zones(image, read_image(options.mask, flip=flip))
+    return image
+
+
+def flipped(measured: MeasuredFile, camera: Camera, flip: bool | None) -> MeasuredFile:
+    """Turn centroids upside down where that is asked for; images were turned when read.
+
+    Parameters
+    ----------
+    measured : MeasuredFile
+        What a file holds.
+    camera : Camera
+        That took it, for the height.
+    flip : bool, optional
+        Whether y was counted from the bottom.
+
+    Returns
+    -------
+    MeasuredFile
+        With y counted from the top.
+    """
+    if not flip or measured.image is not None:
+        return measured
+    return MeasuredFile([upside_down(frame, camera.height_px) for frame in measured.frames])
 
 
 def identify_frames(matcher: Matcher, measured: MeasuredFile, camera: Camera) -> list[MatchResult]:

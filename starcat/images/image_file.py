@@ -1,7 +1,9 @@
 """Image files: FITS, PNG, TIFF and JPEG to and from one array of grey values, row 0 at the top.
 
-What kind a file is, its first bytes say, not its name. Colour becomes luminance. Stacks and
-cubes are refused, and so is what could only be read with fewer digits than the file has.
+What kind a file is, its first bytes say, not its name. Colour becomes luminance, also that of
+FITS files with three planes. Pillow reads what it keeps all bits of; colour of 16 bits is read
+by imagecodecs, which the extra ``images`` brings. Stacks of other numbers of planes are refused,
+unless one of them is chosen.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.errors import ConfigError, OutputError, reason
+from starcat.version import install_command
 
 Grey = NDArray[np.float32] | NDArray[np.float64]
 
@@ -41,13 +44,15 @@ _LUMINANCE = np.array([0.299, 0.587, 0.114])
 """Weights of red, green and blue: ITU-R BT.601."""
 
 
-def read_image(path: Path, *, flip: bool | None = None, hdu: int | None = None) -> Grey:
+def read_image(
+    path: Path, *, flip: bool | None = None, hdu: int | None = None, plane: int | None = None
+) -> Grey:
     """Read the grey values of an image.
 
     Parameters
     ----------
     path : Path
-        FITS (also gzipped or tile-compressed), PNG or TIFF.
+        FITS (also gzipped or tile-compressed), PNG, TIFF or JPEG.
     flip : bool, optional
         Whether the first row of the file is the bottom of the picture. If not given, it is so
         where a FITS file says ``ROWORDER = 'BOTTOM-UP'``, and nowhere else.
@@ -63,7 +68,8 @@ def read_image(path: Path, *, flip: bool | None = None, hdu: int | None = None) 
     Raises
     ------
     ConfigError
-        If the file is missing, damaged, of another kind, not one plane, or colour of 16 bits.
+        If the file is missing, damaged, of another kind, not one plane, or if
+        colour of 16 bits is to be read without imagecodecs.
 
     Notes
     -----
@@ -84,7 +90,10 @@ def read_image(path: Path, *, flip: bool | None = None, hdu: int | None = None) 
     if kind is None:
         raise ConfigError(f"{path}: neither FITS nor PNG, TIFF or JPEG; convert it to one of these")
     try:
-        values, upside_down = _read_fits(data, path, hdu) if kind == "FITS" else _read_picture(data)
+        if kind == "FITS":
+            values, upside_down = _read_fits(data, path, hdu, plane)
+        else:
+            values, upside_down = _read_picture(data)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
     except Exception as error:  # damaged bytes make either library raise whatever it happens to
@@ -96,7 +105,9 @@ def read_image(path: Path, *, flip: bool | None = None, hdu: int | None = None) 
     return np.ascontiguousarray(values, dtype=np.float64)
 
 
-def _read_fits(data: bytes, path: Path, hdu: int | None) -> tuple[NDArray[Any], bool]:
+def _read_fits(
+    data: bytes, path: Path, hdu: int | None, plane: int | None
+) -> tuple[NDArray[Any], bool]:
     """Return the plane of a FITS file, and whether it says that its first row is the bottom."""
     from astropy.io import fits
     from astropy.utils.exceptions import AstropyWarning
@@ -105,23 +116,43 @@ def _read_fits(data: bytes, path: Path, hdu: int | None) -> tuple[NDArray[Any], 
         warnings.simplefilter("ignore", AstropyWarning)  # about headers, as cameras write them
         with fits.open(io.BytesIO(data), memmap=False) as parts:
             shapes = [part.shape if part.is_image else () for part in parts]
-            planes = [number for number, shape in enumerate(shapes) if _is_plane(shape)]
-            found = "; ".join(
-                f"HDU {number} {'x'.join(map(str, shape)) or 'no image'}"
-                for number, shape in enumerate(shapes)
-            )
-            if not planes or (hdu is not None and hdu not in planes):
-                raise ConfigError(f"{found}; expected an image of two dimensions")
-            chosen = planes[0] if hdu is None else hdu
-            _log.info("%s: HDU %d of %d (%s)", path, chosen, len(parts), found)
+            chosen = _part_of_fits(shapes, hdu, plane)
+            _log.info("%s: HDU %d of %d (%s)", path, chosen, len(parts), _shapes_told(shapes))
             values = np.asarray(parts[chosen].data)
             order = str(parts[chosen].header.get("ROWORDER", "")).strip().upper()
-    return values.reshape(values.shape[-2:]), order == "BOTTOM-UP"
+    planes = values.reshape(-1, *values.shape[-2:])
+    if plane is not None:
+        return planes[plane], order == "BOTTOM-UP"
+    grey = planes[0] if len(planes) == 1 else np.tensordot(_LUMINANCE, planes, axes=1)
+    return grey, order == "BOTTOM-UP"
 
 
-def _is_plane(shape: tuple[int, ...]) -> bool:
-    """Return whether an array is a plane, however many axes of length 1 it has before."""
-    return len(shape) >= 2 and min(shape) > 0 and all(length == 1 for length in shape[:-2])
+def _part_of_fits(shapes: list[tuple[int, ...]], hdu: int | None, plane: int | None) -> int:
+    """Return the HDU to be read: the first of one plane, else the first of three."""
+    counts = [
+        int(np.prod(shape[:-2])) if len(shape) >= 2 and min(shape) > 0 else 0 for shape in shapes
+    ]
+    wanted = [number for number, count in enumerate(counts) if hdu in (None, number) and count]
+    if plane is not None:
+        found = [number for number in wanted if 0 <= plane < counts[number]]
+        if not found:
+            raise ConfigError(f"{_shapes_told(shapes)}; there is no plane {plane} (from 0)")
+        return max(found, key=lambda number: counts[number] > 1)
+    for count in (1, 3):
+        for number in wanted:
+            if counts[number] == count:
+                return number
+    raise ConfigError(
+        f"{_shapes_told(shapes)}; expected an image of two dimensions, or three planes of colour; "
+        "choose one plane of a cube with --plane"
+    )
+
+
+def _shapes_told(shapes: list[tuple[int, ...]]) -> str:
+    return "; ".join(
+        f"HDU {number} {'x'.join(map(str, shape)) or 'no image'}"
+        for number, shape in enumerate(shapes)
+    )
 
 
 def _read_picture(data: bytes) -> tuple[NDArray[Any], bool]:
@@ -144,13 +175,30 @@ def _grey_of_picture(data: bytes) -> NDArray[Any]:
         bits, is_negative = _bits(data, picture)
         is_grey = picture.mode in ("L", "I", "F") or picture.mode.startswith("I;16")
         if bits > 8 and not is_grey:
-            raise ConfigError(
-                f"colour of {bits} bits, of which 8 would be left; convert it to grey or FITS"
-            )
+            return _grey_of_many_bits(data, str(picture.format))
         if is_grey:
             values = np.asarray(picture)
             return 65_535 - values if is_negative else values
         return np.asarray(np.asarray(picture.convert("RGB")) @ _LUMINANCE)
+
+
+def _grey_of_many_bits(data: bytes, kind: str) -> NDArray[Any]:
+    """Return the grey values of a colour image of 16 bits, which Pillow would read as 8."""
+    try:
+        from imagecodecs import png_decode, tiff_decode
+    except ImportError as error:
+        raise ConfigError(
+            f"colour of 16 bits needs the package imagecodecs ({error}); "
+            f"{install_command('images')}"
+        ) from error
+    values = np.asarray((png_decode if kind == "PNG" else tiff_decode)(data))
+    if values.ndim == 3 and values.shape[0] in (3, 4) and values.shape[2] > 4:
+        values = np.moveaxis(values, 0, 2)  # each colour by itself
+    if values.ndim == 3 and values.shape[2] in (1, 2):
+        return values[..., 0]  # beside it is transparency
+    if values.ndim != 3 or values.shape[2] not in (3, 4):
+        raise ConfigError(f"an image of shape {values.shape}; expected grey or three colours")
+    return np.asarray(values[..., :3] @ _LUMINANCE)
 
 
 def _bits(data: bytes, picture: Any) -> tuple[int, bool]:

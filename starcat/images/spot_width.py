@@ -48,7 +48,8 @@ def best_widths(levels: Levels, places: Array) -> tuple[Array, Array]:
     if not len(places):
         return np.empty(0), np.empty(0)
     low, high = SIGMA_RANGE_PX
-    widths = low * _STEP ** np.arange(int(np.ceil(np.log(high / low) / np.log(_STEP))) + 1)
+    steps = int(np.ceil(np.log(high / low) / np.log(_STEP)))
+    widths = np.asarray(low * _STEP ** np.arange(steps + 1), dtype=np.float64)
     corner = np.floor(places + 0.5).astype(np.int64)
     patches, shift = _patches(levels.above, corner), places - corner
     # Scores in windows of different sizes do not compare to a tenth: the second round has one
@@ -137,7 +138,7 @@ def _patches(above: NDArray[np.float32], corner: NDArray[np.int64]) -> Array:
     padded = np.pad(above, _HALF_PX)
     reach = np.arange(2 * _HALF_PX + 1)
     rows = corner[:, 1, None, None] + reach[:, None]
-    return padded[rows, corner[:, 0, None, None] + reach].astype(np.float64)
+    return np.asarray(padded[rows, corner[:, 0, None, None] + reach], dtype=np.float64)
 
 
 def sigma_of_stars(levels: Levels, places: Array, flux: Array) -> float:
