@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter
-from scipy.special import erf
+from scipy.special import erf, ndtri
 
 from starcat.errors import ConfigError
 from starcat.version import install_command
@@ -29,7 +29,11 @@ _BOXES_PX = (64, 32, 16)
 """Boxes of the background, tried one after the other where there are clouds."""
 _SAMPLE_PX, _SAMPLES = 48, 6
 _EXCESS_SIGMA_PX = (1.0, 4.0)
+_CUT_SHARE = (0.2, 0.985)
+"""Share of the pixels at the black point between which the noise is told from the others."""
 _STAR_NOISE = 4.5
+_FLAT_EXCESS = 0.3
+"""Smoothed pixels with so little of the noise of white ones are flat, not noisy."""
 _WHITE_EXCESS, _CLOUD_EXCESS = 1.3, 1.6
 """Noise is white up to the first; the background has structure beyond the second."""
 _HOT_NOISE = 4.0
@@ -54,6 +58,8 @@ class Levels:
     is_rough : bool
         Whether the noise of filtered pixels is larger than that of white noise: coarse digits,
         a clipped background, JPEG, clouds.
+    is_flat : bool
+        Whether there is next to no noise: what compression left of it are steps.
     box_px : int
         Side of the boxes in which the background was found.
     """
@@ -63,6 +69,7 @@ class Levels:
     noise: Grey
     mask: NDArray[np.bool_]
     is_rough: bool = False
+    is_flat: bool = False
     box_px: int = _BOX_PX
 
 
@@ -127,6 +134,10 @@ def _leveled(raw: Grey, mask: NDArray[np.bool_]) -> Levels:
     least = _least_noise(raw[~mask])
     levels = _in_boxes(raw, raw, mask, least, _BOX_PX)
     excess = _excess(levels)
+    if max(excess) < _FLAT_EXCESS:
+        # Compression took the noise away and left steps that are no light.
+        noise = np.maximum(levels.noise, _step(raw[~mask]))
+        return replace(levels, noise=noise, is_flat=True)
     if max(excess) < _WHITE_EXCESS:
         return levels
     # The mode of coarse digits is a digit: that of smoothed ones is near the mean.
@@ -209,10 +220,36 @@ def _sample(levels: Levels) -> NDArray[np.float32]:
 
 def _least_noise(values: Grey) -> np.float32:
     """Return the least noise there can be: a clipped background seems to have none at all."""
-    rounded = bool((values == np.rint(values)).all())
     lowest, highest = float(values.min()), float(values.max())
     digits = 1e-6 * max(abs(lowest), abs(highest))
-    return np.float32(max(rounded * PIXEL_VARIANCE**0.5, 1e-5 * (highest - lowest), digits))
+    steps = float(_step(values)) * PIXEL_VARIANCE**0.5
+    return np.float32(max(steps, 1e-5 * (highest - lowest), digits, _noise_above_black(values)))
+
+
+def _step(values: Grey) -> np.float32:
+    """Return the step of whole numbers, 0 of others; it is found in some of the values."""
+    some = np.unique(values[:: max(values.size // 50_000, 1)])
+    if not (some == np.rint(some)).all():
+        return np.float32(0.0)
+    return np.float32(np.diff(some).min() if len(some) > 1 else 1.0)
+
+
+def _noise_above_black(values: Grey) -> float:
+    """Return the noise of a background of which most lies below the black point; else 0.
+
+    How many values are cut, and how many of the others are above one value, gives the standard
+    deviation of a Gaussian. Where hardly any of the noise is left, the rest may be stars.
+    """
+    black = float(values.min())
+    cut = float((values == black).mean())
+    if not _CUT_SHARE[0] < cut < _CUT_SHARE[1]:
+        return 0.0
+    left = values[values > black]
+    value = np.quantile(left, 0.6, method="lower")
+    beyond = (1.0 - cut) * float((left > value).mean())
+    if not beyond:
+        return 0.0
+    return float((value - black) / (ndtri(1.0 - beyond) - ndtri(cut)))
 
 
 def repair_hot_pixels(levels: Levels, psf_sigma_px: float) -> Levels:

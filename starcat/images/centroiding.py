@@ -147,7 +147,7 @@ def find_spots(
         first = detect(levels, 1.0, threshold_sigma)
         first = first[~_is_saturated(levels, first, saturation)]
         _refuse_trails(first)
-        sigma = sigma_of_stars(levels, np.stack([first["x"], first["y"]], axis=1), first["flux"])
+        sigma = sigma_of_stars(levels, np.stack([first["x"], first["y"]], axis=1), first["peak"])
     levels = repair_hot_pixels(levels, sigma)
     found = detect(levels, float(sigma), threshold_sigma)
     if psf_sigma_px is None:

@@ -179,7 +179,8 @@ def _grey_of_picture(data: bytes) -> NDArray[Any]:
         if is_grey:
             values = np.asarray(picture)
             return 65_535 - values if is_negative else values
-        return np.asarray(np.asarray(picture.convert("RGB")) @ _LUMINANCE)
+        # Whole numbers, from which the step of the digits is seen: grey as colour stays as it is.
+        return np.rint(np.asarray(picture.convert("RGB")) @ _LUMINANCE)
 
 
 def _grey_of_many_bits(data: bytes, kind: str) -> NDArray[Any]:

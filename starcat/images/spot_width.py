@@ -25,6 +25,8 @@ _SHARP_PX = 0.45
 """A spot narrower than this is a hot pixel with its neighbour, if there is another explanation."""
 _CLEAR_SNR, _SHARP_SNR = 15.0, 12.0
 _FEW = 5
+_BRIGHT, _BRIGHT_SHARE = 10, 0.1
+"""In a flat image spots count that have this share of the signal of the tenth brightest."""
 
 
 def best_widths(levels: Levels, places: Array) -> tuple[Array, Array]:
@@ -141,7 +143,7 @@ def _patches(above: NDArray[np.float32], corner: NDArray[np.int64]) -> Array:
     return np.asarray(padded[rows, corner[:, 0, None, None] + reach], dtype=np.float64)
 
 
-def sigma_of_stars(levels: Levels, places: Array, flux: Array) -> float:
+def sigma_of_stars(levels: Levels, places: Array, peak: Array) -> float:
     """Return the width of an image's stars.
 
     Parameters
@@ -150,8 +152,9 @@ def sigma_of_stars(levels: Levels, places: Array, flux: Array) -> float:
         An image above its background.
     places : ndarray of float64, shape (N, 2)
         Middles of spots, without saturated ones, counted from the centre of the first pixel.
-    flux : ndarray of float64, shape (N,)
-        Light of each, roughly: the brightest are looked at.
+    peak : ndarray of float64, shape (N,)
+        Largest value of each: the highest are looked at. Clouds have more light than stars, but
+        it is spread.
 
     Returns
     -------
@@ -160,11 +163,14 @@ def sigma_of_stars(levels: Levels, places: Array, flux: Array) -> float:
         aside; 1 if there is none. It is 0.45 if all are narrower: those cannot be told from
         hot pixels.
     """
-    order = np.argsort(-flux, kind="stable")[: 2 * _MOST_SPOTS]
+    order = np.argsort(-peak, kind="stable")[: 2 * _MOST_SPOTS]
     if not len(order):
         return 1.0
     sigma, snr = best_widths(levels, places[order])
-    clear = snr > _CLEAR_SNR
+    least = _CLEAR_SNR
+    if levels.is_flat:  # its noise is not known, but steps are faint beside stars
+        least = max(least, _BRIGHT_SHARE * float(np.sort(snr)[-_BRIGHT:][0]))
+    clear = snr > least
     if clear.sum() >= _FEW:
         sigma = sigma[clear]
     sound = sigma < 0.99 * SIGMA_RANGE_PX[1]
