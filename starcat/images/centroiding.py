@@ -84,8 +84,8 @@ class Spots:
         Spots
             The brightest ones, in the same order.
         """
-        columns = [getattr(self, field.name) for field in fields(self)[:-1]]
-        return Spots(*(column[:count] for column in columns), self.psf_sigma_px)
+        columns = {field.name: getattr(self, field.name)[:count] for field in fields(self)[:-1]}
+        return Spots(**columns, psf_sigma_px=self.psf_sigma_px)
 
 
 def find_spots(

@@ -37,7 +37,7 @@ def without_dark(image: NDArray[Any], dark: NDArray[Any]) -> NDArray[Any]:
         If the sizes differ.
     """
     _check_size(image, dark, "dark frame")
-    return np.asarray(image, dtype=np.float64) - dark
+    return np.asarray(np.asarray(image, dtype=np.float64) - dark)
 
 
 def without_dead_zones(image: NDArray[Any], mask: NDArray[Any]) -> NDArray[Any]:

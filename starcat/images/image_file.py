@@ -180,7 +180,7 @@ def _grey_of_picture(data: bytes) -> NDArray[Any]:
             values = np.asarray(picture)
             return 65_535 - values if is_negative else values
         # Whole numbers, from which the step of the digits is seen: grey as colour stays as it is.
-        return np.rint(np.asarray(picture.convert("RGB")) @ _LUMINANCE)
+        return np.asarray(np.rint(np.asarray(picture.convert("RGB")) @ _LUMINANCE))
 
 
 def _grey_of_many_bits(data: bytes, kind: str) -> NDArray[Any]:
@@ -196,7 +196,7 @@ def _grey_of_many_bits(data: bytes, kind: str) -> NDArray[Any]:
     if values.ndim == 3 and values.shape[0] in (3, 4) and values.shape[2] > 4:
         values = np.moveaxis(values, 0, 2)  # each colour by itself
     if values.ndim == 3 and values.shape[2] in (1, 2):
-        return values[..., 0]  # beside it is transparency
+        return np.asarray(values[..., 0])  # beside it is transparency
     if values.ndim != 3 or values.shape[2] not in (3, 4):
         raise ConfigError(f"an image of shape {values.shape}; expected grey or three colours")
     return np.asarray(values[..., :3] @ _LUMINANCE)
