@@ -26,6 +26,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from astropy.io import fits
 from genuine_records import PSC
 from hats_stores import write_catalog, write_facts
 
@@ -857,7 +858,7 @@ def _(place: Place) -> Call:
 
 @case("frame of a kind that is not written", 2)
 def _(place: Place) -> Call:
-    return ["simulate", place.artifact, "-o", place.folder / "frame.jpg"]
+    return ["simulate", place.artifact, "-o", place.folder / "frame.gif"]
 
 
 @case("frame missing", 2)
@@ -917,6 +918,48 @@ def _(place: Place) -> Call:
 @case("image that is none", 2)
 def _(place: Place) -> Call:
     return ["identify", place.artifact, place.write("frame.png", b"no picture")]
+
+
+@case("image that shows trails", 2)
+def _(place: Place) -> Call:
+    path, image = place.folder / "frame.fits", np.full((512, 512), 100, dtype=np.uint16)
+    image[::2] += 3
+    for number in range(12):
+        along = np.arange(20)
+        image[40 * number + 20 + along // 2, 30 * number + 30 + along] += np.uint16(
+            2000 + 200 * number
+        )
+    write_image(path, image)
+    return ["identify", place.artifact, path]
+
+
+@case("dark frame of another size", 2)
+def _(place: Place) -> Call:
+    image, dark = place.folder / "frame.fits", place.folder / "dark.fits"
+    write_image(image, np.zeros((512, 512), dtype=np.uint16))
+    write_image(dark, np.zeros((48, 64), dtype=np.uint16))
+    return ["identify", place.artifact, image, "--dark", dark]
+
+
+@case("mask without a hole", 2)
+def _(place: Place) -> Call:
+    image = place.folder / "frame.png"
+    write_image(image, np.ones((512, 512), dtype=np.uint8))
+    return ["identify", place.artifact, image, "--mask", image]
+
+
+@case("cube of more than colours", 2)
+def _(place: Place) -> Call:
+    path = place.folder / "frame.fits"
+    fits.PrimaryHDU(np.zeros((5, 32, 32))).writeto(path)
+    return ["identify", place.artifact, path]
+
+
+@case("plane that is not there", 2)
+def _(place: Place) -> Call:
+    path = place.folder / "frame.fits"
+    fits.PrimaryHDU(np.zeros((5, 32, 32))).writeto(path)
+    return ["identify", place.artifact, path, "--plane", "7"]
 
 
 @case("image of another size than the camera", 2)

@@ -8,16 +8,29 @@ from typing import Annotated
 import typer
 
 from starcat.commands.shared import (
+    Dark,
     FailOnNoMatch,
+    FovError,
     Json,
     JsonLines,
+    Mask,
+    MaxSteps,
     MethodName,
+    MinShare,
+    Mosaic,
+    MostSpots,
     NoisePx,
     Orbit,
+    Plane,
+    PsfSigmaPx,
+    Threshold,
     Time,
+    TimeLimit,
     Velocity,
     WcsFile,
+    limits_of_options,
     observer_of_options,
+    share_of_percent,
 )
 
 app = typer.Typer()
@@ -37,7 +50,7 @@ def methods(json: Json = False) -> None:
 @app.command()
 def simulate(
     artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="CSV, FITS, PNG or TIFF.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="CSV, FITS, PNG, TIFF, JPEG.")],
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same frame.")] = 0,
     noise_px: NoisePx = 0.5,
     false_stars: Annotated[int, typer.Option(min=0, help="Spots that are no stars.")] = 0,
@@ -65,9 +78,7 @@ def identify(
     artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
     file: Annotated[
         Path,
-        typer.Argument(
-            help="Centroids (CSV: x_px,y_px[,mag]; JSON; - for stdin) or image (FITS, PNG, TIFF)."
-        ),
+        typer.Argument(help="Centroids (CSV, JSON, - for stdin) or image (FITS, PNG, TIFF, JPEG)."),
     ],
     method: MethodName = None,
     camera: Annotated[
@@ -88,9 +99,20 @@ def identify(
     max_false_match_probability: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Less certain answers are withheld.")
     ] = 1e-9,
+    fov_error: FovError = None,
+    min_share: MinShare = None,
+    max_steps: MaxSteps = None,
+    time_limit_s: TimeLimit = None,
     flip: Annotated[
-        bool | None, typer.Option("--flip/--no-flip", help="First row of the image at the bottom.")
+        bool | None, typer.Option("--flip/--no-flip", help="First row at the bottom; y upwards.")
     ] = None,
+    psf_sigma_px: PsfSigmaPx = None,
+    threshold: Threshold = 5.0,
+    most_spots: MostSpots = 200,
+    plane: Plane = None,
+    bayer: Mosaic = False,
+    dark: Dark = None,
+    mask: Mask = None,
     picture: Annotated[
         Path | None, typer.Option(help="PNG or SVG of the first frame, its stars named.")
     ] = None,
@@ -107,6 +129,8 @@ def identify(
     Example: starcat identify dist/gaia-12deg-1.0.0 frame.csv --picture frame.png
     """
     from starcat.images.answering import answer_each, measure_input, write_extras
+    from starcat.images.identification import PictureOptions
+    from starcat.matcher.centroids import said_of_columns
     from starcat.matcher.matcher import Matcher
     from starcat.specs.camera_file import read_camera
     from starcat.terminal.console import say
@@ -120,13 +144,18 @@ def identify(
         max_false_match_probability=max_false_match_probability,
         noise_px=noise_px,
         noise_mag=noise_mag,
+        **limits_of_options(min_share, max_steps, time_limit_s),
     )
     eye = read_camera(camera) if camera else matcher.database.camera
-    measured = measure_input(file, flip=flip, wcs=wcs)
-    answered = answer_each(matcher, measured, eye, observer)
+    how = PictureOptions(threshold, psf_sigma_px, most_spots, plane, bayer, dark, mask)
+    measured = measure_input(file, flip=flip, wcs=wcs, options=how)
+    error = share_of_percent(fov_error)
+    answered = answer_each(matcher, measured, eye, observer, flip=flip, fov_error=error)
     told = print_answers(
         answered, matcher.database, as_json=json, as_lines=ndjson, observer=observer
     )
+    if told.first and (unknown := said_of_columns([told.first[0]])):
+        say(unknown)
     if measured.image is not None and not told.identified:
         say("An image that was read upside down is never identified: try --flip or --no-flip.")
     if told.first is not None:

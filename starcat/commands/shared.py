@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypedDict
 
 import typer
 
@@ -41,6 +41,38 @@ Velocity = Annotated[
 Orbit = Annotated[
     str | None,
     typer.Option(metavar="X,Y,Z,VX,VY,VZ", help="Position too, km; instead of --velocity."),
+]
+FovError = Annotated[
+    str | None,
+    typer.Option(metavar="2%", help="Error of the field that is allowed; default: 2% for images."),
+]
+MinShare = Annotated[
+    float | None,
+    typer.Option(min=0, max=1, help="Least share of the frame to be explained; default: a third."),
+]
+MaxSteps = Annotated[
+    int | None, typer.Option(min=1, help="Steps of a search, each some microseconds.")
+]
+TimeLimit = Annotated[
+    float | None, typer.Option("--time-limit", min=0.001, help="Seconds that a frame may take.")
+]
+PsfSigmaPx = Annotated[
+    float | None,
+    typer.Option(min=0.3, max=20, help="Width (sigma) of a star in an image; default: measured."),
+]
+Threshold = Annotated[
+    float, typer.Option(min=1, max=1000, help="Least signal over noise of a spot in an image.")
+]
+MostSpots = Annotated[int, typer.Option(min=4, help="The brightest spots of an image are used.")]
+Plane = Annotated[
+    int | None, typer.Option(min=0, help="Plane of a FITS cube, from 0; default: colours as one.")
+]
+Mosaic = Annotated[
+    bool, typer.Option("--bayer", help="The image is a raw colour mosaic, in any order.")
+]
+Dark = Annotated[Path | None, typer.Option(help="Image with the lid on, to be subtracted.")]
+Mask = Annotated[
+    Path | None, typer.Option(help="Image, not zero where pixels are dead or hot: no spots there.")
 ]
 NoisePx = Annotated[float, typer.Option(min=0, max=50, help="Noise of a centroid, each axis.")]
 
@@ -197,6 +229,78 @@ def inputs_by_source(given: list[str] | None, only: str | None = None) -> Mappin
             raise ConfigError(f"--input {text!r} is not SOURCE=PATH, such as sao=sao.dat.gz")
         inputs.setdefault(data_source(name).name, []).append(Path(path))
     return inputs
+
+
+class SearchLimits(TypedDict, total=False):
+    """The limits of a search, as keywords of `Matcher.open`."""
+
+    min_share: float
+    max_steps: float
+    time_limit_s: float
+
+
+def limits_of_options(
+    min_share: float | None, max_steps: int | None, time_limit_s: float | None
+) -> SearchLimits:
+    """Return the limits of a search that are given.
+
+    Parameters
+    ----------
+    min_share, max_steps, time_limit_s : float, optional
+        As those of `Matcher`.
+
+    Returns
+    -------
+    SearchLimits
+        Without those that are not given.
+    """
+    given: SearchLimits = {}
+    if min_share is not None:
+        given["min_share"] = min_share
+    if max_steps is not None:
+        given["max_steps"] = max_steps
+    if time_limit_s is not None:
+        given["time_limit_s"] = time_limit_s
+    return given
+
+
+def share_of_percent(text: str | None) -> float | None:
+    """Return the number that a share stands for.
+
+    Parameters
+    ----------
+    text : str, optional
+        Such as ``2%`` or ``0.02``.
+
+    Returns
+    -------
+    float or None
+        None where nothing is given.
+
+    Raises
+    ------
+    ConfigError
+        If the text is no number from 0 to a half.
+
+    Examples
+    --------
+    >>> share_of_percent("2%"), share_of_percent("0.1")
+    (0.02, 0.1)
+    """
+    if text is None:
+        return None
+    number, percent, rest = text.strip().partition("%")
+    try:
+        share = float(number) / (100.0 if percent else 1.0)
+        if not rest and 0.0 <= share <= 0.5:
+            return share
+    except ValueError:
+        pass
+    raise ConfigError(
+        f"--fov-error is {text!r}; expected a share from 0 to 50 %, such as 2% or 0.02",
+        key="fov_error",
+        value=text,
+    )
 
 
 def observer_of_options(

@@ -10,9 +10,15 @@ from typing import TYPE_CHECKING, cast
 
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
-from starcat.images.identification import MeasuredFile, draw, identify_frames, measure
+from starcat.images.identification import (
+    MeasuredFile,
+    PictureOptions,
+    draw,
+    identify_frames,
+    measure,
+)
 from starcat.images.wcs_file import expect_room_for_wcs, write_wcs
-from starcat.matcher.centroids import MeasuredFrame, read_stream
+from starcat.matcher.centroids import MeasuredFrame, read_stream, upside_down
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 
@@ -23,7 +29,13 @@ if TYPE_CHECKING:
 STDIN = Path("-")
 
 
-def measure_input(path: Path, *, flip: bool | None = None, wcs: Path | None = None) -> MeasuredFile:
+def measure_input(
+    path: Path,
+    *,
+    flip: bool | None = None,
+    wcs: Path | None = None,
+    options: PictureOptions | None = None,
+) -> MeasuredFile:
     """Read centroids from a file or from stdin, or find them in an image.
 
     Parameters
@@ -34,6 +46,8 @@ def measure_input(path: Path, *, flip: bool | None = None, wcs: Path | None = No
         As for `measure`.
     wcs : Path, optional
         FITS copy of the picture that is to be written.
+    options : PictureOptions, optional
+        As for `measure`.
 
     Returns
     -------
@@ -49,7 +63,7 @@ def measure_input(path: Path, *, flip: bool | None = None, wcs: Path | None = No
         # Its frames are only ever gone through.
         measured = MeasuredFile(cast(Sequence[MeasuredFrame], _frames_of_stdin()))
     else:
-        measured = measure(path, flip=flip)
+        measured = measure(path, flip=flip, options=options)
     if wcs is not None:
         expect_room_for_wcs(wcs, path, is_picture=measured.image is not None)
     return measured
@@ -63,22 +77,33 @@ def _frames_of_stdin() -> Iterator[MeasuredFrame]:
 
 
 def answer_each(
-    matcher: Matcher, measured: MeasuredFile, camera: Camera, observer: Observer | None = None
+    matcher: Matcher,
+    measured: MeasuredFile,
+    camera: Camera,
+    observer: Observer | None = None,
+    *,
+    flip: bool | None = None,
+    fov_error: float | None = None,
 ) -> Iterator[tuple[MeasuredFrame, MatchResult]]:
     """Identify the frames of a file or stream, one when it is asked for.
 
     Parameters
     ----------
-    matcher, measured, camera, observer
+    matcher, measured, camera, observer, fov_error
         As for `identify_frames`.
+    flip : bool, optional
+        Whether y of centroids was counted from the bottom; images were turned when read.
 
     Yields
     ------
     (MeasuredFrame, MatchResult)
         A frame and its answer.
     """
-    for frame in measured.frames:
-        [result] = identify_frames(matcher, replace(measured, frames=[frame]), camera, observer)
+    for given in measured.frames:
+        turned = bool(flip) and measured.image is None
+        frame = upside_down(given, camera.height_px) if turned else given
+        one = replace(measured, frames=[frame])
+        [result] = identify_frames(matcher, one, camera, observer, fov_error)
         yield frame, result
 
 
