@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from starcat.errors import StarcatError
     from starcat.face.artifact import open_artifact as open  # noqa: A004 - as numpy, gzip and PIL have it
     from starcat.face.connection import connect
-    from starcat.face.functions import build, ingest, verify
+    from starcat.face.functions import build, calibrate, ingest, verify
     from starcat.geometry.camera import Camera
     from starcat.matcher.matcher import Matcher
     from starcat.specs.reading import preset, read_spec
@@ -31,6 +31,7 @@ __all__ = [
     "StarcatError",
     "__version__",
     "build",
+    "calibrate",
     "connect",
     "ingest",
     "open",
@@ -44,6 +45,7 @@ _HOMES = {
     "Matcher": ("starcat.matcher.matcher", "Matcher"),
     "StarcatError": ("starcat.errors", "StarcatError"),
     "build": ("starcat.face.functions", "build"),
+    "calibrate": ("starcat.face.functions", "calibrate"),
     "connect": ("starcat.face.connection", "connect"),
     "ingest": ("starcat.face.functions", "ingest"),
     "open": ("starcat.face.artifact", "open_artifact"),

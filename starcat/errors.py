@@ -187,6 +187,10 @@ class BuildError(StarcatError):
     """A build that ran but has no usable result: no stars left, or a failed self-test."""
 
 
+class CalibrationError(StarcatError):
+    """A calibration of frames of which too few could be identified."""
+
+
 class OutputError(StarcatError):
     """A place that cannot be written to, or already holds something else."""
 

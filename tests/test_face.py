@@ -21,6 +21,7 @@ PUBLIC = [
     "StarcatError",
     "__version__",
     "build",
+    "calibrate",
     "connect",
     "ingest",
     "open",

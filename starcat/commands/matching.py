@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from starcat.commands.shared import Json, MethodName, NoisePx
+from starcat.commands.shared import FieldRange, Json, MethodName, NoisePx, field_range, size_in_px
 
 app = typer.Typer()
 
@@ -109,6 +109,53 @@ def identify(
         say("An image that was read upside down is never identified: try --flip or --no-flip.")
     if picture:
         draw(picture, measured, results[0], matcher.database, eye)
+
+
+@app.command()
+def calibrate(
+    artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FRAMES...", help="As 'starcat identify' takes them.")
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Camera file (TOML) to write.")],
+    camera: Annotated[
+        Path | None, typer.Option(help="Camera file to start from; default: the database's camera.")
+    ] = None,
+    size: Annotated[
+        str | None, typer.Option(metavar="WxH", help="Pixels, such as 1280x960, in its place.")
+    ] = None,
+    fov: FieldRange = None,
+    method: MethodName = None,
+    flip: Annotated[
+        bool | None, typer.Option("--flip/--no-flip", help="First row of the image at the bottom.")
+    ] = None,
+    plot: Annotated[Path | None, typer.Option(help="PNG or SVG of the residuals.")] = None,
+    json: Json = False,
+) -> None:
+    """Find focal length, principal point and distortion of a camera from frames of stars.
+
+    Example: starcat calibrate dist/gaia-12deg-1.0.0 frames.json -o camera.toml --plot left.svg
+    """
+    from starcat.calibration.camera_text import write_camera
+    from starcat.calibration.files import calibrate_files
+    from starcat.calibration.residual_plot import checked_kind, draw_residuals
+    from starcat.matcher.matcher import Matcher
+    from starcat.specs.camera_file import read_camera
+    from starcat.terminal.calibrations import print_calibration
+    from starcat.terminal.console import progress_bars
+
+    checked_kind(plot)
+    known = read_camera(camera) if camera else None
+    size_px, fov_deg = size_in_px(size), field_range(fov)
+    with progress_bars() as progress:
+        found = calibrate_files(
+            Matcher.open(artifact, method), files, camera=known, size_px=size_px, fov_deg=fov_deg,
+            flip=flip, progress=progress,
+        )  # fmt: skip
+    write_camera(found, output)
+    if plot:
+        draw_residuals(found, plot)
+    print_calibration(found, output, as_json=json)
 
 
 @app.command()
