@@ -40,8 +40,11 @@ CAREFUL = 2
 LEAST_CURVE = 0.01
 """Curvature of a star beyond the bend in later steps, so that none is infinitely long."""
 
-STILL_RAD = 1e-9
-"""A smaller step ends the search for attitudes: 2e-4 arcsec, whose square is left."""
+STILL_RAD = 1e-6
+"""A smaller step ends the search for attitudes: what is left is a thousandth of it, 2e-4 arcsec."""
+
+EXACT = 1e-8
+"""Share of the sum of squares by which the last step of a fit lowers it at most."""
 
 PASSES = 4
 """Most fits of one camera, until the noise is known."""
@@ -134,6 +137,7 @@ def fit_camera(
     noise_px: float = 1.0,
     *,
     passes: int = PASSES,
+    accuracy: float = EXACT,
 ) -> Fit:
     """Fit a camera to stars.
 
@@ -149,6 +153,8 @@ def fit_camera(
         About the noise of a centroid on each axis, for the first fit.
     passes : int, optional
         Most fits, each with the noise that the one before has found; 1 where it is known.
+    accuracy : float, optional
+        The fit ends where a step lowers the sum of squares by a smaller share.
 
     Returns
     -------
@@ -157,7 +163,7 @@ def fit_camera(
     """
     rows = [PARAMETERS.index(name) for name in free]
     for _ in range(passes):
-        fitted = _one_fit(seen, values, rows, BEND * noise_px)
+        fitted = _one_fit(seen, values, rows, BEND * noise_px, accuracy)
         values, before = fitted, noise_px
         residual_px, matrices = turned_to(seen, values, BEND * noise_px)
         seen = replace(seen, matrices=matrices)
@@ -166,7 +172,7 @@ def fit_camera(
         if abs(noise_px - before) <= 0.01 * before:
             break
     inside = np.abs(residual_px) <= BEND * noise_px
-    reduced = _reduced(seen, values, rows, inside)[inside.ravel()]
+    reduced = reduced_derivatives(seen, values, rows, inside)[inside.ravel()]
     covariance = np.asarray(
         noise_px**2 * np.linalg.pinv(reduced.T @ reduced, hermitian=True), float
     )
@@ -210,17 +216,19 @@ def turned_to(seen: Seen, values: Array, bend_px: float) -> tuple[Array, Array]:
     return seen.centroids_px - project(values, _body(seen, matrices)), matrices
 
 
-def _one_fit(seen: Seen, values: Array, rows: list[int], bend_px: float) -> Array:
+def _one_fit(seen: Seen, values: Array, rows: list[int], bend_px: float, accuracy: float) -> Array:
     """Return all numbers, those of some rows fitted."""
-    known: dict[bytes, tuple[Array, Array]] = {}
+    last: tuple[bytes, Array, Array] = b"", np.empty(0), seen.matrices
 
     def at(x: Array) -> tuple[Array, Array, Array]:
+        nonlocal last
         tried = values.copy()
         tried[rows] = x
-        if x.tobytes() not in known:
-            known.clear()
-            known[x.tobytes()] = turned_to(seen, tried, bend_px)
-        return tried, *known[x.tobytes()]
+        if x.tobytes() != last[0]:
+            # The attitudes with a camera are near those with the camera that was tried before.
+            near = replace(seen, matrices=last[2])
+            last = x.tobytes(), *turned_to(near, tried, bend_px)
+        return tried, last[1], last[2]
 
     def residual(x: Array) -> Array:
         return at(x)[1].ravel()
@@ -228,24 +236,39 @@ def _one_fit(seen: Seen, values: Array, rows: list[int], bend_px: float) -> Arra
     def slope(x: Array) -> Array:
         tried, residual_px, matrices = at(x)
         turned = replace(seen, matrices=matrices)
-        return -_reduced(turned, tried, rows, np.abs(residual_px) <= bend_px)
+        return -reduced_derivatives(turned, tried, rows, np.abs(residual_px) <= bend_px)
 
     start = values[rows]
     low = np.where(np.array(rows) == 0, 1e-3, -np.inf)
     found = least_squares(
         residual, start, slope, (low, np.inf), x_scale="jac", loss="huber", f_scale=bend_px,
-        xtol=1e-8, ftol=1e-8, gtol=1e-8, max_nfev=60,
+        xtol=1e-8, ftol=accuracy, gtol=1e-8, max_nfev=60,
     )  # fmt: skip
     out = values.copy()
     out[rows] = found.x
     return out
 
 
-def _reduced(seen: Seen, values: Array, rows: list[int], inside: NDArray[np.bool_]) -> Array:
-    """Return the derivatives of pixels by some numbers, shape (2 N, len(rows)).
+def reduced_derivatives(
+    seen: Seen, values: Array, rows: list[int], inside: NDArray[np.bool_]
+) -> Array:
+    """Return how pixels change with numbers of the camera when the attitudes follow.
 
-    The attitudes follow the numbers: what they take up of a column is taken out of it. Pixels
-    that are not ``inside`` have no say in the attitudes.
+    Parameters
+    ----------
+    seen : Seen
+        The stars, with the attitudes that fit best.
+    values : ndarray of float64, shape (P,)
+        The camera.
+    rows : list of int
+        The numbers, as rows of ``values``.
+    inside : ndarray of bool, shape (N, 2)
+        Which coordinates have a say in the attitudes.
+
+    Returns
+    -------
+    ndarray of float64, shape (2 N, len(rows))
+        Derivatives; what the attitudes take up of them is taken out.
     """
     body = _body(seen, seen.matrices)
     by_value, by_turn = value_derivatives(values, body)[:, :, rows], turn_derivatives(values, body)

@@ -1,6 +1,6 @@
 """Which terms of a lens the frames support: every model is tried on frames that it has not seen.
 
-The frames are left out in turn. A camera is fitted to the others; of the frames that were left
+The frames are left out in turn. A camera is made of the others; of the frames that were left
 out only the attitudes are fitted, and the residuals of their stars tell how well the camera holds
 where it was not made.
 """
@@ -8,14 +8,14 @@ where it was not made.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.calibration.fit import BEND, Seen, fit_camera, turned_to
-from starcat.calibration.lens import CENTRE, FOCAL, RADIAL, TANGENTIAL, camera_of
+from starcat.calibration.fit import BEND, Fit, Seen, fit_camera, reduced_derivatives, turned_to
+from starcat.calibration.lens import CENTRE, FOCAL, PARAMETERS, RADIAL, TANGENTIAL, camera_of
 from starcat.errors import ConfigError
 
 Array = NDArray[np.float64]
@@ -25,6 +25,9 @@ FOLDS = 5
 
 FAR_PX = 1e6
 """A bend of Huber's loss that nothing is beyond: least squares of all stars."""
+
+NEAR = 1e-5
+"""Accuracy of the fits that are compared."""
 
 MIN_STARS = 4
 """Stars that a frame keeps at least."""
@@ -193,13 +196,9 @@ def _held_out(seen: Seen, values: Array, free: tuple[str, ...], size_px: tuple[i
     """Return the mean square residual of each frame with a camera that was made without it."""
     count = len(seen.matrices)
     group = np.arange(count) % min(FOLDS, count)
+    whole = fit_camera(seen, start_of(values, free, size_px), free, FAR_PX, passes=1, accuracy=NEAR)
     out = np.full(count, np.inf)
-    whole = fit_camera(seen, start_of(values, free, size_px), free, FAR_PX, passes=1)
-    for fold in range(group.max() + 1):
-        kept = whole.seen.of(group != fold)
-        if 2 * len(kept) <= 3 * len(kept.matrices) + len(free):
-            return np.full(count, np.inf)
-        fitted = fit_camera(kept, whole.values, free, FAR_PX, passes=1).values
+    for fold, fitted in enumerate(_without_each(whole, group)):
         try:
             camera_of(fitted, size_px)
         except ConfigError:
@@ -209,3 +208,21 @@ def _held_out(seen: Seen, values: Array, free: tuple[str, ...], size_px: tuple[i
         squares = np.bincount(left.frame, (residual_px**2).sum(axis=1))
         out[group == fold] = squares / (2 * np.bincount(left.frame))
     return out
+
+
+def _without_each(whole: Fit, group: NDArray[np.int64]) -> Iterator[Array]:
+    """Return the cameras of all frames but those of one group, for each group.
+
+    They are one step of Gauss and Newton from the camera of all frames: what is left is of the
+    second order in that step.
+    """
+    rows = [PARAMETERS.index(name) for name in whole.free]
+    everywhere = np.ones_like(whole.residual_px, dtype=bool)
+    slope = reduced_derivatives(whole.seen, whole.values, rows, everywhere)
+    of_row = np.repeat(group[whole.seen.frame], 2)
+    for fold in range(group.max() + 1):
+        kept = of_row != fold
+        step = np.linalg.lstsq(slope[kept], whole.residual_px.ravel()[kept])[0]
+        values = whole.values.copy()
+        values[rows] += step
+        yield values

@@ -109,7 +109,8 @@ def _draw_arrows(axes: Axes, calibration: Calibration) -> None:
     stray = np.hypot(*fit.residual_px.T) > 4.5 * fit.noise_px
     for which, colour in ((~stray, _BLUE), (stray, _RED)):
         # Strays point where they were seen, but no farther than the eye can use.
-        size = np.minimum(1.0, 2.0 * _LONG_ARROW * camera.width_px / np.hypot(dx, dy))[which]
+        longest = 2.0 * _LONG_ARROW * camera.width_px
+        size = np.minimum(1.0, longest / np.maximum(np.hypot(dx, dy), 1e-9))[which]
         axes.quiver(
             x[which], y[which], dx[which] * size, dy[which] * size, color=colour,
             angles="xy", scale_units="xy", scale=1.0, width=0.0022, headwidth=4.0,
