@@ -142,7 +142,7 @@ def _tell(error: Exception, arguments: Sequence[str]) -> int:
     """Say what went wrong on stderr and return the exit code."""
     named = [argument for argument in arguments if not argument.startswith("-")]
     failure = failure_of(error, " ".join(["starcat", *named[:1]]))
-    if "--json" in arguments:
+    if "--json" in arguments or "--ndjson" in arguments:
         sys.stderr.write(failure.as_json())
     elif hasattr(error, "show"):  # a usage error, with the usage above the message
         error.show()

@@ -191,6 +191,12 @@ class CalibrationError(StarcatError):
     """A calibration of frames of which too few could be identified."""
 
 
+class NotIdentifiedError(StarcatError):
+    """A frame that was not identified, where only an identified one will do."""
+
+    exit_code = 6
+
+
 class OutputError(StarcatError):
     """A place that cannot be written to, or already holds something else."""
 

@@ -33,7 +33,7 @@ from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import check_artifact
 from starcat.catalog.readers.delimited import parse_delimited
 from starcat.catalog.source import data_source, read_source
-from starcat.errors import StarcatError
+from starcat.errors import NotIdentifiedError, StarcatError
 from starcat.exchange.formats import format_of
 from starcat.geometry.camera import Camera
 from starcat.images.image_file import write_image
@@ -873,6 +873,28 @@ def _(place: Place) -> Call:
     return ["identify", place.artifact, path]
 
 
+@case("WCS of centroids", 2)
+def _(place: Place) -> Call:
+    return [*place.identify("x_px,y_px\n1,2\n"), "--wcs", place.out / "copy.fits"]
+
+
+@case("WCS into a file of another kind", 2)
+def _(place: Place) -> Call:
+    return [*place.identify("x_px,y_px\n1,2\n"), "--wcs", place.out / "copy.png"]
+
+
+@case("WCS of an image that is not identified", 6)
+def _(place: Place) -> Call:
+    path = place.folder / "frame.fits"
+    write_image(path, np.zeros((512, 512), dtype=np.uint16))
+    return ["identify", place.artifact, path, "--wcs", place.folder / "copy.fits"]
+
+
+@case("frame not identified, with --fail-on-no-match", 6)
+def _(place: Place) -> Call:
+    return [*place.identify("x_px,y_px\n1,2\n"), "--fail-on-no-match"]
+
+
 @case("method unknown", 2)
 def _(place: Place) -> Call:
     return [*place.identify("x_px,y_px\n1,2\n"), "--method", "triangles"]
@@ -1696,7 +1718,11 @@ def check_json(given: Case, call: Call, pattern: str, starcat: Any) -> None:
         return  # 'sql' takes --json for the format that is wanted
     ran = starcat([*call, "--json"])
     error = json.loads(ran.err.splitlines()[-1])["error"]
-    assert (ran.code, error["code"], ran.out) == (given.code, given.code, "")
+    assert (ran.code, error["code"]) == (given.code, given.code)
+    if given.code == NotIdentifiedError.exit_code:  # the answers, which are results, were printed
+        assert isinstance(json.loads(ran.out), list)
+    else:
+        assert ran.out == ""
     assert re.search(pattern, " ".join(error["message"].split()))
     assert error["hint"] is None or error["hint"] in error["message"] or given.code == 2
 

@@ -19,6 +19,7 @@ from starcat.matcher.chance import false_match_probability
 from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.observation import observe
+from starcat.matcher.pose import pose_at
 from starcat.matcher.verification import agree
 from starcat.matcher.ways import compatible_pairs, log_compatible_ways, log_ways
 from starcat.products.pairs import find_pairs
@@ -26,6 +27,11 @@ from starcat.simulation.simulate import Frame, Noise, simulate_frame
 from starcat.simulation.sky import Sky
 
 CAMERA = Camera(1024, 1024, fov_x_deg=30.0)
+
+
+def agreement_of(matrix, seen, database):
+    """Return the agreement of an attitude with the focal length that is given."""
+    return agree(pose_at(matrix, 1.0, seen), seen, database)
 
 
 def rays(centroids_px: list[list[float]]) -> np.ndarray:
@@ -430,7 +436,7 @@ def withheld(
     """Return such frames of which five spots match, with a bound from 1e-9 to another one."""
     found: list[Frame] = []
     for frame in six_of_nine(sky, noise_px, astray_px, 17):
-        right = agree(frame.matrix, observe(frame.centroids_px, sky.camera, 2.0), sky)
+        right = agreement_of(frame.matrix, observe(frame.centroids_px, sky.camera, 2.0), sky)
         if right.n_matched == 5 and 1e-9 < right.false_match_probability <= most:
             found.append(frame)
             if len(found) == count:

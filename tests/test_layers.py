@@ -143,12 +143,16 @@ def test_products_know_neither_catalogs_nor_artifacts(module):
     assert rooms <= {"ground", "geometry", "products"}
 
 
+OPTIONAL = {"starcat.matcher.result": {"astropy"}, "starcat.matcher.sky_objects": {"astropy"}}
+"""What gives objects of a library to those who have it; it is imported when they are asked for."""
+
+
 @pytest.mark.parametrize("module", [name for name in MODULES if room_of(name) == "matcher"])
 def test_the_matcher_needs_little(module):
     names = imports_of(module)
     own = {name for name in of_starcat(names) if room_of(name) == "matcher"}
     assert of_starcat(names) - own <= LIGHT
-    assert outsiders(names) <= {"numpy", "h5py"}
+    assert outsiders(names) <= {"numpy", "h5py", *OPTIONAL.get(module, ())}
 
 
 @pytest.mark.parametrize("module", sorted(LIGHT))
@@ -184,9 +188,7 @@ def test_the_matcher_loads_nothing_heavy():
     assert not loaded & (HEAVY | {"typer", "click", "rich", "requests", "pooch"})
 
 
-def test_the_matcher_runs_where_only_numpy_and_h5py_are_installed():
-    # Everything else that is not of Python itself is made impossible to import.
-    loaded_by(f"""
+ONLY_NUMPY_AND_H5PY = """
 import importlib, sys
 class Nothing:
     def find_spec(self, name, path=None, target=None):
@@ -194,8 +196,33 @@ class Nothing:
         if top not in sys.stdlib_module_names and top not in ("numpy", "h5py", "starcat"):
             raise ImportError(name)
 sys.meta_path.insert(0, Nothing())
-for name in {MATCHER}:
-    importlib.import_module(name)""")
+"""
+"""Everything else that is not of Python itself is made impossible to import."""
+
+
+def test_the_matcher_runs_where_only_numpy_and_h5py_are_installed():
+    loaded_by(f"{ONLY_NUMPY_AND_H5PY}\nfor name in {MATCHER}:\n    importlib.import_module(name)")
+
+
+def test_answers_without_astropy_say_that_it_is_missing():
+    loaded_by(f"""{ONLY_NUMPY_AND_H5PY}
+from starcat.errors import ConfigError
+from starcat.geometry.camera import Camera
+from starcat.matcher import sky_objects
+from starcat.matcher.stars import NO_STARS
+import numpy as np
+calls = [
+    lambda: sky_objects.wcs(Camera(9, 9, 9.0), np.eye(3)),
+    lambda: sky_objects.skycoord(0.0, 0.0),
+    lambda: sky_objects.table(NO_STARS, {{}}),
+]
+for call in calls:
+    try:
+        call()
+    except ConfigError as error:
+        assert "pip install astropy" in str(error)
+    else:
+        raise AssertionError""")
 
 
 def test_the_cli_loads_nothing_heavy_before_it_knows_the_command():

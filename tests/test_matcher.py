@@ -31,6 +31,7 @@ from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.table import METHODS, best_method
 from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder
 from starcat.matcher.observation import Observation, observe
+from starcat.matcher.pose import pose_at
 from starcat.matcher.verification import REACH, agree, agreeing_centroids, verify
 from starcat.simulation.selftest import answers_rightly, self_test
 from starcat.simulation.simulate import Frame, Noise, simulate_frame, simulate_frames
@@ -40,6 +41,11 @@ CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
 
 IN_MEMORY = ("triangle", "pairs", "pyramid")
 """The methods whose products the fixture `sky_of` makes."""
+
+
+def agreement_of(matrix, seen, database):
+    """Return the agreement of an attitude with the focal length that is given."""
+    return agree(pose_at(matrix, 1.0, seen), seen, database)
 
 
 @pytest.fixture(scope="module")
@@ -183,9 +189,9 @@ def test_agreement_from_an_attitude_nearby_is_that_of_all_stars(sky):
     for frame in frames(sky, 10):
         seen, angle = observed(frame), 1.0 / CAMERA.focal_length_px
         tilt = matrix_from_quaternion(np.array([0.5 * angle, 0.0, 0.5 * angle, 1.0]))
-        found = agree(tilt @ frame.matrix, seen, sky)
+        found = agreement_of(tilt @ frame.matrix, seen, sky)
         assert found.star_index.tolist() == frame.star_index[seen.rows].tolist()
-        assert np.abs(found.matrix - frame.matrix).max() < 1e-13
+        assert np.abs(found.pose.matrix - frame.matrix).max() < 1e-13
         assert found.n_matched == len(seen)
         assert found.residual_rad < 1e-14
         assert found.false_match_probability < 1e-50
@@ -194,14 +200,14 @@ def test_agreement_from_an_attitude_nearby_is_that_of_all_stars(sky):
 def test_the_residual_is_that_of_the_attitude_that_is_returned(sky, solve_wahba_quest):
     for frame in frames(sky, 20, Noise(0.5)):
         seen = observed(frame)
-        found = agree(frame.matrix, seen, sky)
+        found = agreement_of(frame.matrix, seen, sky)
         named = found.star_index >= 0
-        miss = seen.body[named] - sky.directions[found.star_index[named]] @ found.matrix.T
+        miss = seen.body[named] - sky.directions[found.star_index[named]] @ found.pose.matrix.T
         expected = np.sqrt((miss**2).sum() / named.sum())
         assert found.residual_rad == pytest.approx(expected, rel=1e-9)
         # And the attitude is the best one for the stars that are named.
         q = solve_wahba_quest(seen.body[named], sky.directions[found.star_index[named]])
-        assert np.abs(matrix_from_quaternion(q) - found.matrix).max() < 1e-9
+        assert np.abs(matrix_from_quaternion(q) - found.pose.matrix).max() < 1e-9
 
 
 def cluster_sky(sky_of, random_directions) -> Database:
@@ -223,8 +229,8 @@ def test_the_stars_outside_of_a_cluster_outweigh_a_wrong_one(sky_of, random_dire
     database = sky_of(np.concatenate([cluster, outside, outside[:1] @ wrong]), boresights=10)
     stars = np.arange(18)
     seen = observe(CAMERA.pixels_from_directions(database.directions[stars]), CAMERA, 2.0)
-    found = agree(wrong, seen, database)
-    assert np.abs(found.matrix - np.eye(3)).max() < 1e-12
+    found = agreement_of(wrong, seen, database)
+    assert np.abs(found.pose.matrix - np.eye(3)).max() < 1e-12
     assert found.star_index.tolist() == stars[seen.rows].tolist()
     assert found.false_match_probability < 1e-30
 
@@ -241,7 +247,7 @@ def test_a_false_spot_beside_a_far_star_does_not_take_it(sky_of, random_directio
     seen = observe(np.vstack([spots, [[912.0, 517.0]]]), CAMERA, 1.5)
     turned = matrix_from_quaternion(np.array([0.0, 0.0, -0.5 * 5.0 / 400.0, 1.0]))
     for start in (matrix, turned):
-        found = agree(start, seen, database)
+        found = agreement_of(start, seen, database)
         star = np.full(len(spots) + 1, -1)
         star[seen.rows] = found.star_index
         assert star.tolist() == [*range(len(spots)), -1]
@@ -257,14 +263,14 @@ def test_the_agreement_of_a_cluster_alone_is_refused(sky_of, random_directions):
     stars = np.flatnonzero(CAMERA.contains(place))
     outside = stars[stars < 1200]
     place[outside] = np.random.default_rng(37).random((len(outside), 2)) * 1024.0
-    found = agree(matrix, observe(place[stars], CAMERA, 2.0), database)
+    found = agreement_of(matrix, observe(place[stars], CAMERA, 2.0), database)
     assert found.n_matched >= 10
     assert found.false_match_probability == 1.0
 
 
 def test_an_attitude_elsewhere_agrees_with_too_few(sky):
     one, other = frames(sky, 2)
-    found = agree(other.matrix, observed(one), sky)
+    found = agreement_of(other.matrix, observed(one), sky)
     assert found.false_match_probability > 1e-3
     assert found.n_matched < 4 or found.residual_rad > 0.0
     assert np.isnan(found.residual_rad) == (found.n_matched < 4)
@@ -272,7 +278,7 @@ def test_an_attitude_elsewhere_agrees_with_too_few(sky):
 
 def test_an_attitude_where_no_star_is(sky):
     empty = replace(sky, directions=sky.directions[:0])
-    found = agree(np.eye(3), observed(frames(sky, 1)[0]), empty)
+    found = agreement_of(np.eye(3), observed(frames(sky, 1)[0]), empty)
     assert (found.n_matched, found.false_match_probability) == (0, 1.0)
 
 
@@ -282,7 +288,7 @@ def test_stars_agree_within_the_reach(sky, offset_px, is_matched):
     frame = frames(sky, 1)[0]
     centroids_px = frame.centroids_px.copy()
     centroids_px[0, 0] += offset_px
-    found = agree(frame.matrix, observe(centroids_px, CAMERA, 2.0), sky)
+    found = agreement_of(frame.matrix, observe(centroids_px, CAMERA, 2.0), sky)
     assert found.n_matched == len(centroids_px) - (not is_matched)
 
 
@@ -290,7 +296,7 @@ def test_two_centroids_do_not_share_a_star_nor_two_stars_a_centroid(sky):
     for frame in frames(sky, 10):
         beside_px = frame.centroids_px[:2] + np.array([0.8, -0.6])
         seen = observe(np.concatenate([beside_px, frame.centroids_px]), CAMERA, 2.0)
-        found = agree(frame.matrix, seen, sky)
+        found = agreement_of(frame.matrix, seen, sky)
         ids = found.star_index[found.star_index >= 0]
         assert len(set(ids.tolist())) == len(ids) == len(frame.star_index)
         # The nearer of two takes the star.
@@ -895,12 +901,12 @@ def test_centroids_take_no_star_of_another_magnitude(sky):
     mag[0], mag[1] = mag[0] + 0.36, np.nan
     seen = observe(frame.centroids_px, CAMERA, 2.0, mag, noise_mag=0.1)
     found = np.empty(len(seen), dtype=np.int64)
-    found[seen.rows] = agree(frame.matrix, seen, sky).star_index
+    found[seen.rows] = agreement_of(frame.matrix, seen, sky).star_index
     assert found[0] == -1
     assert (found[1:] == frame.star_index[1:]).all()
     # Without a stated error the zero point may be any one.
     seen = observe(frame.centroids_px, CAMERA, 2.0, mag + 9.0)
-    found[seen.rows] = agree(frame.matrix, seen, sky).star_index
+    found[seen.rows] = agreement_of(frame.matrix, seen, sky).star_index
     assert (found == frame.star_index).all()
 
 
@@ -918,4 +924,4 @@ def test_a_star_of_another_magnitude_hides_no_star_behind_it(sky):
     for noise_mag, expected in ((0.3, star), (None, len(sky.mag))):
         seen = observe(moved, CAMERA, 2.0, sky.mag[frame.star_index], noise_mag=noise_mag)
         [row] = np.flatnonzero(seen.rows == 0)
-        assert agree(frame.matrix, seen, crowded).star_index[row] == expected
+        assert agreement_of(frame.matrix, seen, crowded).star_index[row] == expected

@@ -7,7 +7,17 @@ from typing import Annotated
 
 import typer
 
-from starcat.commands.shared import FieldRange, Json, MethodName, NoisePx, field_range, size_in_px
+from starcat.commands.shared import (
+    FailOnNoMatch,
+    FieldRange,
+    Json,
+    JsonLines,
+    MethodName,
+    NoisePx,
+    WcsFile,
+    field_range,
+    size_in_px,
+)
 
 app = typer.Typer()
 
@@ -54,7 +64,9 @@ def identify(
     artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
     file: Annotated[
         Path,
-        typer.Argument(help="Centroids (CSV: x_px,y_px[,mag]; JSON) or image (FITS, PNG, TIFF)."),
+        typer.Argument(
+            help="Centroids (CSV: x_px,y_px[,mag]; JSON; - for stdin) or image (FITS, PNG, TIFF)."
+        ),
     ],
     method: MethodName = None,
     camera: Annotated[
@@ -81,17 +93,20 @@ def identify(
     picture: Annotated[
         Path | None, typer.Option(help="PNG or SVG of the first frame, its stars named.")
     ] = None,
+    wcs: WcsFile = None,
+    fail_on_no_match: FailOnNoMatch = False,
+    ndjson: JsonLines = False,
     json: Json = False,
 ) -> None:
     """Identify the stars of frames and find the camera's attitude.
 
     Example: starcat identify dist/gaia-12deg-1.0.0 frame.csv --picture frame.png
     """
-    from starcat.images.identification import draw, identify_frames, measure
+    from starcat.images.answering import answer_each, measure_input, write_extras
     from starcat.matcher.matcher import Matcher
     from starcat.specs.camera_file import read_camera
     from starcat.terminal.console import say
-    from starcat.terminal.matches import print_matches
+    from starcat.terminal.matches import print_answers
 
     matcher = Matcher.open(
         artifact,
@@ -102,13 +117,15 @@ def identify(
         noise_mag=noise_mag,
     )
     eye = read_camera(camera) if camera else matcher.database.camera
-    measured = measure(file, flip=flip)
-    results = identify_frames(matcher, measured, eye)
-    print_matches(measured.frames, results, matcher.database, as_json=json)
-    if measured.image is not None and results[0].status != "identified":
+    measured = measure_input(file, flip=flip, wcs=wcs)
+    answered = answer_each(matcher, measured, eye)
+    told = print_answers(answered, matcher.database, as_json=json, as_lines=ndjson)
+    if measured.image is not None and not told.identified:
         say("An image that was read upside down is never identified: try --flip or --no-flip.")
-    if picture:
-        draw(picture, measured, results[0], matcher.database, eye)
+    if told.first is not None:
+        write_extras(file, measured, *told.first, eye, picture=picture, wcs=wcs, flip=flip)
+    if fail_on_no_match:
+        told.expect_all_identified()
 
 
 @app.command()

@@ -35,6 +35,17 @@ FieldRange = Annotated[
 ]
 NoisePx = Annotated[float, typer.Option(min=0, max=50, help="Noise of a centroid, each axis.")]
 
+JsonLines = Annotated[
+    bool, typer.Option("--ndjson", help="JSON, a line a frame as soon as it is done.")
+]
+FailOnNoMatch = Annotated[
+    bool,
+    typer.Option("--fail-on-no-match", help="End with code 6 unless all frames are identified."),
+]
+WcsFile = Annotated[
+    Path | None, typer.Option(help="FITS copy of the image with the WCS that was found.")
+]
+
 
 def chosen_spec(path: Path | None, name: str | None, changes: list[str] | None = None) -> BuildSpec:
     """Return the spec of a file or of a preset.

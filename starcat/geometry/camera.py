@@ -88,9 +88,11 @@ class Camera:
 
     def _refuse_fold(self) -> None:
         """Raise ConfigError unless all of the detector lies inside the fold."""
+        if self.distortion.is_none:
+            return
         reach_px = float(np.hypot(*(self._corners - self.principal_point_px).T).max())
         fold_px = self.distortion.image_radius * self.focal_length_px
-        if reach_px >= fold_px and not self.distortion.is_none:
+        if reach_px >= fold_px:
             raise ConfigError(
                 f"distortion folds the image back at {fold_px:.6g} px from the principal point, "
                 f"but the detector reaches out to {reach_px:.6g} px; expected a fold beyond that",
@@ -112,6 +114,32 @@ class Camera:
         """Return the largest separation between the directions of pixels."""
         body = self.directions_from_pixels(centroids_px)
         return float(separation(body[:, None], body[None]).max())
+
+    def with_focal_length(self, focal_length_px: float) -> Camera:
+        """Return the same camera with another focal length.
+
+        Parameters
+        ----------
+        focal_length_px : float
+            Pixels.
+
+        Returns
+        -------
+        Camera
+            The coefficients of the distortion are kept.
+
+        Raises
+        ------
+        ConfigError
+            If the distortion then folds the image back on the detector.
+        """
+        return Camera(
+            self.width_px,
+            self.height_px,
+            focal_length_px,
+            principal_point_px=self.principal_point_px,
+            distortion=self.distortion,
+        )
 
     @property
     def in_words(self) -> str:

@@ -11,7 +11,9 @@ import csv
 import json
 import math
 import os
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -155,6 +157,42 @@ def _number(value: Any, name: str, where: str) -> float:
         return float(value)
     except (TypeError, ValueError):
         raise ConfigError(f"{where}: {name} is {value!r}; expected a number") from None
+
+
+def read_stream(lines: Iterable[str], name: str = "stdin") -> Iterator[MeasuredFrame]:
+    """Read the frames of a stream, each as soon as it is there.
+
+    Parameters
+    ----------
+    lines : iterable of str
+        CSV or JSON as `read_frames` takes them, or JSON with a frame on every line.
+    name : str, default "stdin"
+        What the stream is called in messages and in names of frames.
+
+    Yields
+    ------
+    MeasuredFrame
+        In the order of the stream. Where the first line is JSON by itself, a line is read when
+        the frame before it was taken; all else is read to its end first.
+
+    Raises
+    ------
+    ConfigError
+        As `read_frames`.
+    """
+    rest = enumerate(lines, start=1)
+    filled = ((number, line.removeprefix("\ufeff")) for number, line in rest if line.strip())
+    begin, first = next(filled, (1, ""))
+    if not first.lstrip().startswith(("{", "[")):
+        yield _csv_frame(first + "".join(line for _, line in rest), Path(name))
+        return
+    try:
+        json.loads(first)
+    except ValueError:  # JSON over several lines
+        yield from _json_frames(first + "".join(line for _, line in rest), Path(name))
+        return
+    for number, line in chain([(begin, first)], filled):
+        yield from _json_frames(line, Path(f"{name} {number}"))
 
 
 def write_centroids(centroids_px: Array, path: Path, mag: Array | None = None) -> None:

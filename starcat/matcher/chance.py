@@ -42,6 +42,7 @@ def false_match_probability(
     *,
     noise_px: float | None = None,
     compatible: Compatible | None = None,
+    log_scales: float = 0.0,
 ) -> float:
     """Bound the probability that random centroids agree as well with any attitude.
 
@@ -63,6 +64,8 @@ def false_match_probability(
     compatible : ndarray of bool, shape (n_centroids, stars_in_frame), optional
         Which centroids may be which of these stars by their magnitudes, where the error of
         magnitudes was stated. Every matched centroid is compatible with its star.
+    log_scales : float
+        Logarithm of the longest over the shortest focal length, where it was fitted too.
 
     Returns
     -------
@@ -79,6 +82,11 @@ def false_match_probability(
     three angles. The product is the expected number. Its sum over the N - 3 possible values of
     n bounds the probability. M is counted around the field, so the bound is higher in a crowded
     field, and where most of the field is left unexplained.
+
+    Focal length. Where it is fitted, the frames that agree are those of a manifold with a fourth
+    dimension: the volume is ``8 pi^2 f^3 L sqrt(det H)`` times that of a ball in 2n - 4
+    dimensions, L being the logarithm of the range and H having a fourth row for the derivatives
+    by the logarithm of f. The two ends of the range add that of the known focal length once.
 
     Magnitudes. Assignments of centroids to stars that they are not compatible with are never
     agreements, so they are not counted (`log_compatible_ways`). The hypothesis is that the
@@ -107,7 +115,8 @@ def false_match_probability(
     x, y = body[:, 0] / body[:, 2], body[:, 1] / body[:, 2]
     # How places move as the camera turns about its three axes, in units of the focal length.
     turned = np.array([[x * y, -1.0 - x * x, y], [1.0 + y * y, -x * y, -x]])
-    information = determinant(np.einsum("ain,ajn->ij", turned, turned))
+    gram = np.einsum("ain,ajn->ij", turned, turned)
+    information = determinant(gram)
     if not information > 0.0 or (noise_px is not None and n < MIN_STARS):
         return 1.0
     most = n if noise_px is None else min(n_centroids, stars)
@@ -118,16 +127,29 @@ def false_match_probability(
         log_values = math.log(max(1, n_centroids - 3))
     else:
         log_values = -_log_share(n, most, ways, noise_px, camera)
-    expected = _log_expected(ways(n), n, square_px, information, camera) + log_values
-    return math.exp(min(0.0, expected))
+    expected = _log_expected(ways(n), n, square_px, information, camera)
+    if log_scales > 0.0:
+        radial = np.array([x, y])
+        cross = np.einsum("ain,an->i", turned, radial)
+        # The determinant with a fourth row, by Schur's complement.
+        left = float(np.vdot(radial, radial) - cross @ np.linalg.solve(gram, cross))
+        scaled = _log_expected(ways(n), n, square_px, information * left, camera, unknowns=4)
+        expected = float(np.logaddexp(expected, scaled + math.log(log_scales)))
+    return math.exp(min(0.0, expected + log_values))
 
 
 def _log_expected(
-    ways: float, n: int, square_px: float, information: float, camera: Camera
+    ways: float,
+    n: int,
+    square_px: float,
+    information: float,
+    camera: Camera,
+    unknowns: int = 3,
 ) -> float:
     """Return the logarithm of the expected number of agreements of n centroids."""
-    left = 2 * n - 3
-    attitudes = math.log(_ALL_ATTITUDES * camera.focal_length_px**3 * math.sqrt(information))
+    left = 2 * n - unknowns
+    root = camera.focal_length_px**unknowns * math.sqrt(max(information, 1e-300))
+    attitudes = math.log(_ALL_ATTITUDES * root)
     unit_ball = 0.5 * left * math.log(math.pi) - math.lgamma(0.5 * left + 1.0)
     ball = unit_ball + 0.5 * left * math.log(max(square_px, 1e-30))
     frames = n * math.log(camera.width_px * camera.height_px)

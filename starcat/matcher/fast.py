@@ -39,9 +39,13 @@ MAX_STEPS = 2_000_000_000
 CHUNK = 256
 """Frames that one thread takes at a time."""
 
-WORDS: dict[int, Status] = {0: "identified", 1: "no_match", 2: "too_few_stars", -14: "no_match"}
-"""What a frame came to, by the number that the library returns. The last one is a budget that
-was used up."""
+OUT_OF_STEPS = -14
+"""What the library returns where a budget was used up."""
+
+WORDS: dict[int, Status] = {
+    0: "identified", 1: "no_match", 2: "too_few_stars", OUT_OF_STEPS: "no_match",
+}  # fmt: skip
+"""What a frame came to, by the number that the library returns."""
 
 REFUSED = {
     -4: "it is of a version of the format that the library does not read",

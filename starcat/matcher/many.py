@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from starcat.geometry.attitude import radec_roll_from_matrix
-from starcat.matcher.fast import DROPPED, WORDS, Answers
+from starcat.geometry.camera import Camera
+from starcat.matcher.fast import DROPPED, OUT_OF_STEPS, WORDS, Answers
+from starcat.matcher.refusal import Refusal
 from starcat.matcher.result import MatchResult, Status
+from starcat.matcher.stars import Asked
+
+Explain = Callable[[NDArray[np.float64], Camera, "NDArray[np.float64] | None"], "Refusal | None"]
+"""What says why a frame, of a camera and perhaps with magnitudes, gets no answer."""
 
 
 @dataclass(frozen=True)
@@ -23,12 +30,18 @@ class MatchResults(Sequence[MatchResult]):
     ----------
     answers : Answers
         All of them, as arrays.
-    star_id : ndarray of int64, shape (S,)
-        Permanent numbers of the database's stars.
+    asked : sequence of Asked
+        What was asked of each frame.
+    camera : Camera
+        The camera of all of them.
+    explain : callable, optional
+        Searches a frame again and says why it gets no answer, which the library does not.
     """
 
     answers: Answers
-    star_id: NDArray[np.int64]
+    asked: Sequence[Asked]
+    camera: Camera
+    explain: Explain | None = None
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -66,15 +79,21 @@ class MatchResults(Sequence[MatchResult]):
         answers = self.answers
         star = answers.star_index[answers.starts[frame] : answers.starts[frame + 1]]
         # In the order of `ANSWER`.
-        code, n_matched, _, quaternion, matrix, residual_rad, log_chance, _ = answers.frames[
+        code, n_matched, _, quaternion, matrix, residual_rad, log_chance, seconds = answers.frames[
             frame
         ].item()
         status, index, dropped = WORDS[code], np.maximum(star, -1), _dropped(star)
+        asked = self.asked[frame]
         if status != "identified":
             none, nan = np.full(len(index), -1, dtype=np.int64), math.nan
             unknown = np.full(4, nan)
-            return MatchResult(status, none, index, unknown, nan, nan, nan, 0, nan, 1.0, dropped)
-        ids = self.star_id[index]
+            return MatchResult(
+                *(status, none, index, unknown, nan, nan, nan, 0, nan, 1.0, dropped),
+                time_s=seconds,
+                asked=asked,
+                why=self._why(code, asked),
+            )
+        ids = asked.database.star_id[index]
         ids[index < 0] = -1
         return MatchResult(
             status,
@@ -86,7 +105,20 @@ class MatchResults(Sequence[MatchResult]):
             math.degrees(residual_rad) * 3600.0,
             math.exp(log_chance),
             dropped,
+            self.camera,
+            time_s=seconds,
+            asked=asked,
         )
+
+    def _why(self, code: int, asked: Asked) -> Refusal | Callable[[], Refusal | None] | None:
+        """Return why a frame has no answer, or what finds it out."""
+        if code == OUT_OF_STEPS:
+            return Refusal("steps")
+        if WORDS[code] == "too_few_stars":
+            return Refusal("too_few_stars")
+        if self.explain is None:
+            return None
+        return partial(self.explain, asked.centroids_px, self.camera, asked.magnitudes)
 
 
 def _dropped(star: NDArray[np.int32]) -> tuple[tuple[int, str], ...]:

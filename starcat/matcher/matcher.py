@@ -8,8 +8,10 @@ the readable reference in numpy; where it can, the C library answers, with the s
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Literal, get_args
@@ -26,8 +28,10 @@ from starcat.matcher.fast import FastMatcher, Limits, fast_matcher, is_compiled
 from starcat.matcher.many import MatchResults
 from starcat.matcher.methods.table import METHODS, best_method, method_named
 from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder
-from starcat.matcher.observation import Observation, as_frame, observe
+from starcat.matcher.observation import WIDEST_FOV_ERROR, Observation, as_frame, observe
+from starcat.matcher.refusal import Refusal
 from starcat.matcher.result import MatchResult, identified, unidentified
+from starcat.matcher.stars import Asked
 from starcat.matcher.verification import Agreement, verify
 from starcat.onboard.layout import FEATURES
 from starcat.onboard.reading import is_image
@@ -227,6 +231,7 @@ class Matcher:
         camera: Camera | None = None,
         *,
         magnitudes: ArrayLike | None = None,
+        fov_error: float = 0.0,
     ) -> MatchResult:
         """Identify the stars of a frame.
 
@@ -240,6 +245,9 @@ class Matcher:
         magnitudes : array_like of float64, shape (N,), optional
             Magnitudes; they decide what is tried first. With ``noise_mag`` they also decide
             what is accepted, and their zero point has to be that of the database.
+        fov_error : float
+            Largest relative error of the camera's focal length, 0 to 0.5. Above 0 the focal
+            length is found with the attitude, which the method ``triangle`` can.
 
         Returns
         -------
@@ -253,6 +261,8 @@ class Matcher:
         """
         camera = camera or self.database.camera
         frame, mag = as_frame(centroids_px, magnitudes)
+        if fov_error:
+            return self._timed(frame, camera, mag, self._checked_fov_error(fov_error))
         return self._answers([(frame, mag)], camera)[0]
 
     def identify_many(
@@ -355,10 +365,43 @@ class Matcher:
             mags = [mag for _, mag in given if mag is not None] or None
             found = fast.identify(px, camera, self._limits, mags, priors, threads)
             if found.is_whole:
-                return MatchResults(found, self.database.star_id)
-        return [self._identify(frame, camera, mag) for frame, mag in given]
+                asked = [self._asked(frame, mag) for frame, mag in given]
+                explain = None if self.database.image else partial(self._why, priors is not None)
+                return MatchResults(found, asked, camera, explain)
+        return [self._timed(frame, camera, mag) for frame, mag in given]
 
-    def _identify(self, frame: Array, camera: Camera, mag: Array | None) -> MatchResult:
+    def _asked(self, frame: Array, mag: Array | None) -> Asked:
+        return Asked(frame, mag, self.database, self.noise_px)
+
+    def _why(
+        self, is_tracked: bool, frame: Array, camera: Camera, mag: Array | None
+    ) -> Refusal | None:
+        """Return why the C library has no answer: what the search with numpy comes to."""
+        found = self._identify(frame, camera, mag)
+        # The library may have looked near a prior attitude only, where this frame is not.
+        return Refusal("no_candidate") if found.ok and is_tracked else found.refusal
+
+    def _timed(
+        self, frame: Array, camera: Camera, mag: Array | None, fov_error: float = 0.0
+    ) -> MatchResult:
+        """Identify a frame with numpy, and say how long that took and what was asked."""
+        before_s = time.perf_counter()
+        found = self._identify(frame, camera, mag, fov_error)
+        asked = self._asked(frame, mag)
+        return replace(found, time_s=time.perf_counter() - before_s, asked=asked)
+
+    def _checked_fov_error(self, fov_error: float) -> float:
+        if self.method != "triangle":
+            text = f"method {self.method!r} needs the focal length; only 'triangle' can find it"
+            raise ConfigError(text, key="method", value=self.method)
+        if not 0.0 < fov_error <= WIDEST_FOV_ERROR:
+            text = f"fov_error is {fov_error}; expected 0 to {WIDEST_FOV_ERROR:g}"
+            raise ConfigError(text, key="fov_error", value=fov_error)
+        return float(fov_error)
+
+    def _identify(
+        self, frame: Array, camera: Camera, mag: Array | None, fov_error: float = 0.0
+    ) -> MatchResult:
         """Identify a frame with numpy."""
         if self.database.image is not None:
             raise ConfigError(
@@ -366,12 +409,12 @@ class Matcher:
                 "an onboard image holds nothing for numpy; open the artifact that it is of"
             )
         stated = {"noise_px": self.noise_px, "noise_mag": self.noise_mag}
-        observation = observe(frame, camera, self.tolerance_px, mag, **stated)
+        observation = observe(frame, camera, self.tolerance_px, mag, fov_error=fov_error, **stated)
         if len(observation) < MIN_STARS:
             return unidentified("too_few_stars", observation)
         found = self._search(observation)
         if found is None:
-            return unidentified("no_match", observation)
+            return unidentified("no_match", observation, Refusal("chance"))
         return identified(found, observation, self.database.star_id)
 
     def _search(self, observation: Observation) -> Agreement | None:

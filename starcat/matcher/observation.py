@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,6 +12,44 @@ from numpy.typing import ArrayLike, NDArray
 from starcat.geometry.camera import Camera
 
 Array = NDArray[np.float64]
+
+
+WIDEST_FOV_ERROR = 0.5
+"""Largest relative error of a focal length that is found with the attitude."""
+
+
+@dataclass(frozen=True)
+class FocalRange:
+    """Focal lengths that a frame may have, over the one that was given.
+
+    Attributes
+    ----------
+    low, high : float
+        Ends, 0 < low <= 1 <= high.
+    """
+
+    low: float = 1.0
+    high: float = 1.0
+
+    @property
+    def log_width(self) -> float:
+        """Logarithm of the longest over the shortest."""
+        return math.log(self.high / self.low)
+
+    def clip(self, factors: Array | float) -> Array:
+        """Return factors, those outside of the range moved to its nearer end.
+
+        Parameters
+        ----------
+        factors : ndarray of float64, or float
+            Focal lengths over the one that was given.
+
+        Returns
+        -------
+        ndarray of float64
+            Of the same shape.
+        """
+        return np.minimum(np.maximum(factors, self.low), self.high)
 
 
 @dataclass(frozen=True)
@@ -39,6 +78,8 @@ class Observation:
         Standard deviation of a centroid on each axis, where it was stated.
     noise_mag : float or None
         Standard deviation of a magnitude in the band of the database, where it was stated.
+    fov_error : float
+        Largest relative error of the focal length, 0 where it is known.
     """
 
     rows: NDArray[np.int64]
@@ -50,6 +91,7 @@ class Observation:
     dropped: tuple[tuple[int, str], ...] = ()
     noise_px: float | None = None
     noise_mag: float | None = None
+    fov_error: float = 0.0
 
     def __len__(self) -> int:
         """Return the number of usable centroids."""
@@ -59,6 +101,11 @@ class Observation:
     def tolerance_rad(self) -> float:
         """Largest error of a direction, radians."""
         return self.tolerance_px / self.camera.focal_length_px
+
+    @cached_property
+    def focal_range(self) -> FocalRange:
+        """Focal lengths that are allowed, whether the error is a part of the given or the true."""
+        return FocalRange(1.0 - self.fov_error, 1.0 / (1.0 - self.fov_error))
 
     @cached_property
     def separation_rad(self) -> Array:
@@ -77,6 +124,7 @@ def observe(
     *,
     noise_px: float | None = None,
     noise_mag: float | None = None,
+    fov_error: float = 0.0,
 ) -> Observation:
     """Prepare a frame for identification.
 
@@ -91,7 +139,7 @@ def observe(
     magnitudes : array_like of float64, shape (N,), optional
         Magnitudes, larger is fainter; NaN where unknown. The zero point may be any one, unless
         ``noise_mag`` is stated.
-    noise_px, noise_mag : float, optional
+    noise_px, noise_mag, fov_error : float, optional
         As the attributes of `Observation`.
 
     Returns
@@ -114,7 +162,16 @@ def observe(
     known = None if mag is None or not np.isfinite(mag[rows]).any() else mag[rows]
     body = camera.directions_from_pixels(kept)
     return Observation(
-        rows, kept, body, known, camera, tolerance_px, (*dropped, *repeats), noise_px, noise_mag
+        rows,
+        kept,
+        body,
+        known,
+        camera,
+        tolerance_px,
+        (*dropped, *repeats),
+        noise_px,
+        noise_mag,
+        fov_error,
     )
 
 

@@ -2,15 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from html import escape
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
+from starcat.errors import NotIdentifiedError
+from starcat.geometry.attitude import (
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    radec_roll_from_matrix,
+)
+from starcat.geometry.camera import Camera
+from starcat.matcher import sky_objects
 from starcat.matcher.observation import Observation
+from starcat.matcher.pose import focal_length_error_px
+from starcat.matcher.refusal import Refusal
+from starcat.matcher.stars import (
+    NO_STARS,
+    Asked,
+    MatchedStars,
+    attitude_covariance,
+    matched_stars,
+)
 from starcat.matcher.verification import Agreement
+
+if TYPE_CHECKING:
+    from astropy.coordinates import SkyCoord
+    from astropy.table import QTable
+    from astropy.wcs import WCS
 
 Status = Literal["identified", "no_match", "too_few_stars"]
 
@@ -40,6 +65,13 @@ class MatchResult:
     dropped : tuple of (int, str)
         Row and reason of every centroid that was not used: ``not_finite``, ``out_of_frame``
         or ``duplicate``.
+    camera : Camera or None
+        The camera that the answer holds for: the one that was given, with the focal length that
+        was found where it was looked for. None unless identified.
+    focal_length_error_px : float or None
+        Standard error of that focal length; None where it was not looked for.
+    time_s : float
+        Time that the answer took; NaN where nobody measured. It is no part of the answer.
     """
 
     status: Status
@@ -53,27 +85,174 @@ class MatchResult:
     residual_arcsec: float
     false_match_probability: float
     dropped: tuple[tuple[int, str], ...] = ()
+    camera: Camera | None = None
+    focal_length_error_px: float | None = None
+    time_s: float = field(default=math.nan, compare=False)
+    # What follows is what the properties are made of, when they are asked for.
+    asked: Asked | None = field(default=None, repr=False, compare=False)
+    why: Refusal | Callable[[], Refusal | None] | None = field(
+        default=None, repr=False, compare=False
+    )
+
+    @property
+    def ok(self) -> bool:
+        """Whether the frame was identified."""
+        return self.status == "identified"
+
+    @cached_property
+    def refusal(self) -> Refusal | None:
+        """Why there is no answer; None for an answer, and where nothing can tell.
+
+        The C library does not say why: for its answers the frame is searched again with numpy,
+        once, when this is asked for. An onboard image holds nothing to search with.
+        """
+        return self.why() if callable(self.why) else self.why
+
+    @cached_property
+    def stars(self) -> MatchedStars:
+        """The centroids that are stars, one row each; empty unless identified."""
+        if not self.ok:
+            return NO_STARS
+        if self.asked is None or self.camera is None:
+            raise ValueError("this MatchResult does not hold the frame that was asked about")
+        return matched_stars(self.star_index, self._matrix, self.camera, self.asked)
+
+    @cached_property
+    def covariance_arcsec2(self) -> NDArray[np.float64]:
+        """Covariance of the attitude, shape (3, 3); NaN unless identified.
+
+        Of the small rotations about the axes of the camera frame (x right, y down, z along the
+        boresight), square arcseconds. With the stated noise of a centroid where there is one,
+        else with that of the residuals. The camera is taken as exact.
+        """
+        stars = self.stars
+        if self.asked is None or self.camera is None:
+            return np.full((3, 3), np.nan)
+        return attitude_covariance(stars, self.camera, self.asked.noise_px)
+
+    def table(self) -> QTable:
+        """Return the stars as an astropy table.
+
+        Returns
+        -------
+        astropy.table.QTable
+            The columns of `MatchedStars`, with units; attitude and epoch are in its ``meta``.
+            No rows unless identified.
+
+        Raises
+        ------
+        ConfigError
+            If astropy is not installed.
+        """
+        facts: dict[str, Any] = {"status": self.status}
+        if self.asked is not None:
+            database = self.asked.database
+            facts |= {"database": database.name, "epoch_jyear": database.epoch_jyear}
+        if self.ok:
+            facts["q_body_from_icrs"] = self.q_body_from_icrs.tolist()
+            facts["covariance_arcsec2"] = self.covariance_arcsec2.tolist()
+        return sky_objects.table(self.stars, facts)
+
+    @property
+    def skycoord(self) -> SkyCoord:
+        """The boresight, as astropy has it: a ``SkyCoord`` in ICRS.
+
+        `NotIdentifiedError` unless identified, `ConfigError` where astropy is not installed.
+        """
+        self._expect_ok("boresight")
+        return sky_objects.skycoord(self.boresight_ra_deg, self.boresight_dec_deg)
+
+    def wcs(self, *, bottom_up: bool = False) -> WCS:
+        """Return the world coordinates of the picture.
+
+        Parameters
+        ----------
+        bottom_up : bool, default False
+            Whether the first row of the picture's file is its bottom: with the file read as it
+            is, ``y`` then counts from the bottom.
+
+        Returns
+        -------
+        astropy.wcs.WCS
+            ICRS in a gnomonic projection (TAN) about the principal point, with SIP polynomials
+            where the camera has distortion. ``pixel_to_world(x, y)`` is the direction of any
+            pixel; as everywhere in FITS and astropy the *centre* of the first pixel is (0, 0)
+            there: subtract 0.5 from coordinates of starcat, whose origin is that pixel's outer
+            corner.
+
+        Raises
+        ------
+        NotIdentifiedError
+            Unless identified.
+        ConfigError
+            If astropy is not installed.
+        """
+        self._expect_ok("WCS")
+        if self.camera is None:
+            raise ValueError("this MatchResult does not hold the camera that it was found with")
+        return sky_objects.wcs(self.camera, self._matrix, bottom_up)
+
+    @property
+    def _matrix(self) -> NDArray[np.float64]:
+        return matrix_from_quaternion(self.q_body_from_icrs)
+
+    def _expect_ok(self, what: str) -> None:
+        if not self.ok:
+            raise NotIdentifiedError(
+                f"the frame has no {what}: its status is {self.status}; look at 'ok' first, and "
+                "at 'refusal' for what to try"
+            )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what goes to another process: the stars, not the database they are of."""
+        if self.asked is None or self.camera is None:
+            return {**vars(self), "asked": None, "why": None}
+        made = {"stars": self.stars, "covariance_arcsec2": self.covariance_arcsec2}
+        known = vars(self).get("refusal", None if callable(self.why) else self.why)
+        return {**vars(self), **made, "asked": None, "why": known}
 
     def __repr__(self) -> str:
         """Return the answer in one line."""
-        spots = f"{self.n_matched} of {len(self.star_ids)} spots"
-        if self.status != "identified":
-            return f"<MatchResult {self.status}: {len(self.star_ids)} spots>"
+        if not self.ok:
+            # What is not known yet is not searched for, as that may take long.
+            known = vars(self).get("refusal", self.why)
+            because = f", {known.reason}" if isinstance(known, Refusal) else ""
+            because = "" if because == f", {self.status}" else because
+            return f"<MatchResult {self.status}: {len(self.star_ids)} spots{because}>"
         return (
-            f"<MatchResult identified: {spots}, RA {self.boresight_ra_deg:.4f}, "
-            f"Dec {self.boresight_dec_deg:+.4f}, roll {self.roll_deg:.4f} deg, residual "
-            f"{self.residual_arcsec:.1f} arcsec, chance {self.false_match_probability:.1e}>"
+            f"<MatchResult identified: {self.n_matched} of {len(self.star_ids)} spots, "
+            f"RA {self.boresight_ra_deg:.4f}, Dec {self.boresight_dec_deg:+.4f}, "
+            f"roll {self.roll_deg:.4f} deg, residual {self.residual_arcsec:.1f} arcsec, "
+            f"chance {self.false_match_probability:.1e}>"
         )
 
     def _repr_html_(self) -> str:
-        """Return the answer and its stars as a table for a notebook."""
-        head = "<thead><tr><th>spot</th><th>star</th></tr></thead>"
-        named = enumerate(self.star_ids.tolist())
-        rows = "".join(f"<tr><td>{k}</td><td>{star}</td></tr>" for k, star in named if star >= 0)
-        return f"<p>{repr(self)[1:-1]}</p><table>{head}<tbody>{rows}</tbody></table>"
+        """Return the answer and its stars as a table for a notebook, or why there is none."""
+        head = f"<p>{escape(repr(self)[1:-1])}</p>"
+        if not self.ok:
+            why = self.refusal
+            return head + (f"<p>{escape(f'{why.words}. Try: {why.advice}')}</p>" if why else "")
+        stars = self.stars
+        columns = {
+            "spot": stars.spot.tolist(),
+            "star": [escape(name) for name in stars.star],
+            "RA deg": [f"{value:.5f}" for value in stars.ra_deg],
+            "Dec deg": [f"{value:+.5f}" for value in stars.dec_deg],
+            "mag": [f"{value:.2f}" for value in stars.mag],
+            "dx px": [f"{value:+.3f}" for value in stars.dx_px],
+            "dy px": [f"{value:+.3f}" for value in stars.dy_px],
+        }
+        heads = "".join(f"<th>{name}</th>" for name in columns)
+        rows = "".join(
+            f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>"
+            for row in zip(*columns.values(), strict=True)
+        )
+        return f"{head}<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>"
 
 
-def unidentified(status: Status, observation: Observation) -> MatchResult:
+def unidentified(
+    status: Status, observation: Observation, refusal: Refusal | None = None
+) -> MatchResult:
     """Return the answer to a frame that was not identified.
 
     Parameters
@@ -82,12 +261,17 @@ def unidentified(status: Status, observation: Observation) -> MatchResult:
         Why.
     observation : Observation
         The frame.
+    refusal : Refusal, optional
+        The best agreement that was withheld, and why; that there were too few stars is said
+        without it.
 
     Returns
     -------
     MatchResult
         An answer without stars and attitude.
     """
+    if refusal is None and status == "too_few_stars":
+        refusal = Refusal("too_few_stars")
     none = np.full(len(observation) + len(observation.dropped), -1)
     nan = float("nan")
     return MatchResult(
@@ -102,6 +286,7 @@ def unidentified(status: Status, observation: Observation) -> MatchResult:
         nan,
         1.0,
         observation.dropped,
+        why=refusal,
     )
 
 
@@ -130,12 +315,13 @@ def identified(
     ids = np.full(count, -1, dtype=np.int64)
     has_star = index >= 0
     ids[has_star] = star_id[index[has_star]]
-    ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(found.matrix)
+    pose, matched = found.pose, np.flatnonzero(found.star_index >= 0)
+    ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(pose.matrix)
     return MatchResult(
         "identified",
         ids,
         index,
-        quaternion_from_matrix(found.matrix),
+        quaternion_from_matrix(pose.matrix),
         ra_deg,
         dec_deg,
         roll_deg,
@@ -143,4 +329,8 @@ def identified(
         float(np.degrees(found.residual_rad) * 3600.0),
         found.false_match_probability,
         observation.dropped,
+        pose.camera,
+        focal_length_error_px(pose, matched, found.residual_rad, observation)
+        if observation.fov_error
+        else None,
     )

@@ -49,39 +49,53 @@ def share_of_frame(
         that the camera saw no others adds nothing to the attitude. 0 if the matched stars
         determine no attitude at all.
     """
+    with_scale = observation.fov_error > 0.0
     try:
-        covariance = np.asarray(np.linalg.inv(information(matched)), dtype=np.float64)
+        normal = information(matched, with_scale=with_scale)
+        covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     except np.linalg.LinAlgError:
         return 0.0
     of_stars = explained_share(covariance, stars)
     of_centroids = explained_share(covariance, observation.body)
     if of_centroids <= of_stars:
         return of_stars
-    # Three of the 2n components went into the attitude.
-    deviation_rad = residual_rad * math.sqrt(len(matched) / (2 * len(matched) - 3))
+    # Three of the 2n components went into the attitude, a fourth into the scale.
+    deviation_rad = residual_rad * math.sqrt(len(matched) / (2 * len(matched) - len(covariance)))
     corner_rad = deviation_rad * corner_deviation(covariance, observation.camera)
     return of_stars if corner_rad > observation.tolerance_rad else of_centroids
 
 
-def information(directions: Array) -> Array:
+def information(directions: Array, *, with_scale: bool = False) -> Array:
     """Return the information matrix of an attitude that the centroids of stars determine.
 
     Parameters
     ----------
     directions : ndarray of float64, shape (N, 3)
-        Unit vectors of the stars, in any frame.
+        Unit vectors of the stars, in any frame; in the camera frame if the scale is free.
+    with_scale : bool
+        Whether the logarithm of the focal length is a fourth unknown.
 
     Returns
     -------
-    ndarray of float64, shape (3, 3)
-        Inverse of the covariance of the three small angles about the axes of that frame, in
-        units of the variance of a direction along each of the two axes across it.
+    ndarray of float64, shape (3, 3) or (4, 4)
+        Inverse of the covariance of the three small angles about the axes of that frame, and of
+        the scale, in units of the variance of a direction along each of the two axes across it.
 
     References
     ----------
     Shuster and Oh 1981, "Three-axis attitude determination from vector observations".
     """
-    return np.asarray(len(directions) * _UNIT - directions.T @ directions)
+    of_angles = len(directions) * _UNIT - directions.T @ directions
+    if not with_scale:
+        return np.asarray(of_angles)
+    x, y, z = directions.T
+    found = np.empty((4, 4))
+    found[:3, :3] = of_angles
+    # A turn d moves the direction u of a star by d x u; a longer focal length moves that of its
+    # centroid by u_z e_z - u_z^2 u, towards the axis.
+    found[:3, 3] = found[3, :3] = -float(np.vdot(y, z)), float(np.vdot(x, z)), 0.0
+    found[3, 3] = float(np.vdot(z * z, 1.0 - z * z))
+    return found
 
 
 def explained_share(covariance: Array, directions: Array) -> float:
@@ -89,7 +103,7 @@ def explained_share(covariance: Array, directions: Array) -> float:
 
     Parameters
     ----------
-    covariance : ndarray of float64, shape (3, 3)
+    covariance : ndarray of float64, shape (3, 3) or (4, 4)
         Inverse of the `information` of the matched stars.
     directions : ndarray of float64, shape (N, 3)
         Unit vectors of all stars, matched or not, in the same frame.
@@ -103,7 +117,8 @@ def explained_share(covariance: Array, directions: Array) -> float:
     Notes
     -----
     The weight of a star is the variance of its position, given the matched stars. The weights
-    of the matched stars themselves add up to three, the number of angles, wherever they are.
+    of the matched stars themselves add up to three, the number of angles, wherever they are, or
+    to four where the scale is free.
     Outside of them the weight grows with the square of the distance: with ten matched stars
     at 50 px from their middle, a star at 500 px has a weight of ten.
 
@@ -119,7 +134,9 @@ def explained_share(covariance: Array, directions: Array) -> float:
     >>> round(explained_share(covariance, np.concatenate([near, far])), 3)
     0.02
     """
-    return 3.0 / float(np.vdot(covariance, information(directions)))
+    unknowns = len(covariance)
+    weights = np.vdot(covariance, information(directions, with_scale=unknowns == 4))
+    return unknowns / float(weights)
 
 
 def corner_deviation(covariance: Array, camera: Camera) -> float:
@@ -127,7 +144,7 @@ def corner_deviation(covariance: Array, camera: Camera) -> float:
 
     Parameters
     ----------
-    covariance : ndarray of float64, shape (3, 3)
+    covariance : ndarray of float64, shape (3, 3) or (4, 4)
         Inverse of the `information` of the matched stars in the camera frame.
     camera : Camera
         The camera.
@@ -140,9 +157,16 @@ def corner_deviation(covariance: Array, camera: Camera) -> float:
     """
     w, h = float(camera.width_px), float(camera.height_px)
     corners = camera.directions_from_pixels(np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]]))
-    along = np.einsum("ni,ij,nj->n", corners, covariance, corners)
-    # Rounding may make the difference negative where the stars nearly coincide.
-    return math.sqrt(max(0.0, float(np.trace(covariance) - along.min())))
+    if len(covariance) == 3:
+        along = np.einsum("ni,ij,nj->n", corners, covariance, corners)
+        variance = float(np.trace(covariance) - along.min())
+    else:
+        variance = max(
+            float(np.vdot(covariance, information(corner[None], with_scale=True)))
+            for corner in corners
+        )
+    # Rounding may make it negative where the stars nearly coincide.
+    return math.sqrt(max(0.0, variance))
 
 
 def is_scaled(predicted_px: Array, centroids_px: Array, observation: Observation) -> bool:

@@ -17,6 +17,9 @@ Array = NDArray[np.float64]
 MIN_SIDE = 0.02
 """Smallest side of a cell, in units of the sphere's radius: 1.1 degrees."""
 
+SMALLEST_REACH = 0.25 * MIN_SIDE
+"""Cells of the smallest side serve all reaches up to this."""
+
 
 @dataclass(frozen=True)
 class StarCells:

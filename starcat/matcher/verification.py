@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.geometry.attitude import solve_wahba_svd
 from starcat.matcher.chance import MIN_STARS, false_match_probability
 from starcat.matcher.database import Database
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.observation import Observation
+from starcat.matcher.pose import Pose, first_poses, pose_at, refitted, scaled_directions
 from starcat.matcher.spread import is_scaled, share_of_frame
-from starcat.matcher.star_cells import StarCells, star_cells
+from starcat.matcher.star_cells import SMALLEST_REACH, StarCells, star_cells
 from starcat.matcher.ways import Compatible, compatible_pairs
 
 Array = NDArray[np.float64]
@@ -50,6 +50,13 @@ REACH = 1.5
 It is larger than 1 because an attitude that was computed from a few stars has an error too.
 """
 
+ROUGH = (2.0,)
+"""Reach of a first refinement where the focal length is fitted too, in units of the final reach:
+three stars leave more of an error in it than in the attitude."""
+
+FOCAL_MARGIN = 0.02
+"""Margin around a frame whose focal length is fitted, where stars are looked for."""
+
 MAX_REFINEMENTS = 4
 """Largest number of refinements; after the first one the matched stars rarely change."""
 
@@ -63,8 +70,9 @@ class Agreement:
 
     Attributes
     ----------
-    matrix : ndarray of float64, shape (3, 3)
-        Attitude refined on all matched stars, ``body = matrix @ icrs``.
+    pose : Pose
+        Attitude refined on all matched stars, and the camera with the focal length that goes
+        with it.
     star_index : ndarray of int32, shape (N,)
         Row of each centroid's star, -1 where none.
     residual_rad : float
@@ -75,7 +83,7 @@ class Agreement:
         match.
     """
 
-    matrix: Array
+    pose: Pose
     star_index: NDArray[np.int32]
     residual_rad: float
     false_match_probability: float
@@ -114,8 +122,8 @@ def verify(
     best = None
     for first in range(0, len(candidates), AT_ONCE):
         part = candidates[first : first + AT_ONCE]
-        for matrix in _worth_trying(part, observation, database):
-            found = agree(matrix, observation, database)
+        for pose in _worth_trying(part, observation, database):
+            found = agree(pose, observation, database)
             if best is None or found.false_match_probability < best.false_match_probability:
                 best = found
             if best.false_match_probability <= certain:
@@ -125,19 +133,27 @@ def verify(
 
 def _worth_trying(
     candidates: Candidates, observation: Observation, database: Database
-) -> Iterator[Array]:
-    """Return the first attitude, then the others by how many centroids agree."""
-    body, icrs = observation.body, database.directions
-    yield solve_wahba_svd(body[candidates.centroids[0]], icrs[candidates.stars[0]])
-    if len(candidates) > 1:
-        matrices = solve_wahba_svd(body[candidates.centroids[1:]], icrs[candidates.stars[1:]])
-        count = agreeing_centroids(matrices, observation, database)
+) -> Iterator[Pose]:
+    """Return the first pose, then the others by how many centroids agree.
+
+    Where the focal length is not known, there are too many candidates for the first one to be
+    special.
+    """
+    alone = 0
+    if len(candidates) == 1 or not observation.fov_error:
+        matrices, factors = first_poses(candidates[:1], observation, database.directions)
+        yield pose_at(matrices[0], float(factors[0]), observation)
+        alone = 1
+    if len(candidates) > alone:
+        matrices, factors = first_poses(candidates[alone:], observation, database.directions)
+        count = agreeing_centroids(matrices, observation, database, factors)
         order = np.argsort(-count, kind="stable")
-        yield from matrices[order[count[order] >= MIN_STARS]]
+        for row in order[count[order] >= MIN_STARS].tolist():
+            yield pose_at(matrices[row], float(factors[row]), observation)
 
 
 def agreeing_centroids(
-    matrices: Array, observation: Observation, database: Database
+    matrices: Array, observation: Observation, database: Database, factors: Array | None = None
 ) -> NDArray[np.int64]:
     """Count the centroids that attitudes put near a star, on the detector or just off it.
 
@@ -149,6 +165,8 @@ def agreeing_centroids(
         The frame.
     database : Database
         The stars.
+    factors : ndarray of float64, shape (K,), optional
+        Focal lengths over the one that was given, where they are not known.
 
     Returns
     -------
@@ -156,8 +174,14 @@ def agreeing_centroids(
         Centroids within reach of some star.
     """
     reach_rad = REACH * observation.tolerance_rad
-    icrs = observation.body @ matrices
-    near = database.derived(_cells, reach_rad).has_star(icrs.reshape(-1, 3), reach_rad)
+    body = observation.body
+    if observation.fov_error and factors is not None:
+        reach_rad *= ROUGH[0]
+        body = scaled_directions(body, factors)
+    icrs = body @ matrices
+    # Cells for the next power of two serve all reaches below it, as those of many cameras.
+    cells = database.derived(_cells, max(SMALLEST_REACH, 2.0 ** math.ceil(math.log2(reach_rad))))
+    near = cells.has_star(icrs.reshape(-1, 3), reach_rad)
     return np.asarray(near.reshape(len(matrices), -1).sum(axis=1))
 
 
@@ -165,13 +189,13 @@ def _cells(database: Database, reach_rad: float) -> StarCells:
     return star_cells(database.directions, reach_rad)
 
 
-def agree(matrix: Array, observation: Observation, database: Database) -> Agreement:
+def agree(pose: Pose, observation: Observation, database: Database) -> Agreement:
     """Match the centroids of a frame with the stars that an attitude predicts.
 
     Parameters
     ----------
-    matrix : ndarray of float64, shape (3, 3)
-        Attitude to test, ``body = matrix @ icrs``.
+    pose : Pose
+        Attitude to test, and the camera that it is tested with.
     observation : Observation
         The frame.
     database : Database
@@ -184,7 +208,8 @@ def agree(matrix: Array, observation: Observation, database: Database) -> Agreem
         changed. Each star has one centroid at most. The false-match probability is 1 if too
         much of the frame is unexplained (`MIN_SHARE`) or if the frame is scaled.
     """
-    fit = _refined(matrix, observation, database)
+    rough = ROUGH if observation.fov_error else ()
+    fit = _refined(pose, observation, database, rough)
     found, share = _judged(fit, observation)
     if found.false_match_probability < 1.0:
         # A false spot beside a star far from the others can turn the attitude so that it is the
@@ -198,7 +223,7 @@ def agree(matrix: Array, observation: Observation, database: Database) -> Agreem
         # This agreement is not due to chance, although much of the frame is unexplained. One or
         # two wrong stars at the edge of a cluster may have spoilt an attitude that is nearly
         # right, and a search within wider reaches replaces them.
-        wider, _ = _judged(_refined(found.matrix, observation, database, WIDER), observation)
+        wider, _ = _judged(_refined(found.pose, observation, database, WIDER), observation)
         if wider.false_match_probability < found.false_match_probability:
             return wider
     return found
@@ -228,15 +253,15 @@ def _with_rival(
     index = found.star_index.copy()
     index[rival], index[centroid] = index[centroid], -1
     matched = np.flatnonzero(index >= 0)
-    matrix = solve_wahba_svd(observation.body[matched], database.directions[index[matched]])
-    return _judged(_refined(matrix, observation, database), observation)
+    pose = refitted(found.pose, matched, database.directions[index[matched]], observation)
+    return _judged(_refined(pose, observation, database), observation)
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """An attitude, the stars around its field and which of them the centroids are."""
+    """A pose, the stars around its field and which of them the centroids are."""
 
-    matrix: Array
+    pose: Pose
     near: NDArray[np.int64]
     icrs: Array
     compatible: Compatible | None
@@ -247,29 +272,31 @@ class _Fit:
 
 
 def _refined(
-    matrix: Array,
+    pose: Pose,
     observation: Observation,
     database: Database,
     wider: tuple[float, ...] = (),
 ) -> _Fit:
-    """Refine an attitude on all stars that match, first within wider reaches."""
-    camera, body = observation.camera, observation.body
-    near = np.flatnonzero(database.directions @ matrix[2] >= math.cos(camera.radius_rad))
+    """Refine a pose on all stars that match, first within wider reaches."""
+    radius_rad = pose.camera.radius_rad
+    if observation.fov_error:
+        radius_rad *= 1.0 + FOCAL_MARGIN
+    near = np.flatnonzero(database.directions @ pose.matrix[2] >= math.cos(radius_rad))
     u = database.directions[near]
     compatible = None
     if observation.mag is not None and observation.noise_mag is not None:
         compatible = compatible_pairs(observation.mag, database.mag[near], observation.noise_mag)
     before: NDArray[np.int64] = np.empty(0, dtype=np.int64)
     for factor in (*wider, *MAX_REFINEMENTS * (1.0,)):
-        predicted = camera.pixels_from_directions(u @ matrix.T)
+        predicted = pose.camera.pixels_from_directions(u @ pose.matrix.T)
         reach_px = factor * REACH * observation.tolerance_px
         star, square_px = _mutually_nearest(predicted, observation, reach_px, compatible)
         matched = np.flatnonzero(star >= 0)
         if len(matched) < MIN_STARS or (factor == 1.0 and np.array_equal(star, before)):
             break
         before = star
-        matrix = solve_wahba_svd(body[matched], u[star[matched]])
-    return _Fit(matrix, near, u, compatible, predicted, star, matched, square_px)
+        pose = refitted(pose, matched, u[star[matched]], observation)
+    return _Fit(pose, near, u, compatible, predicted, star, matched, square_px)
 
 
 def _judged(fit: _Fit, observation: Observation) -> tuple[Agreement, float]:
@@ -277,13 +304,13 @@ def _judged(fit: _Fit, observation: Observation) -> tuple[Agreement, float]:
 
     The share is 1 where chance explains the agreement, as it is of no use there.
     """
-    camera, matched, star = observation.camera, fit.matched, fit.star[fit.matched]
+    pose, matched, star = fit.pose, fit.matched, fit.star[fit.matched]
     index = np.full(len(observation), -1, dtype=np.int32)
     index[matched] = fit.near[star]
     if len(matched) < MIN_STARS:
-        return Agreement(fit.matrix, index, math.nan, 1.0), 1.0
-    seen = observation.body[matched]
-    difference = seen - fit.icrs[star] @ fit.matrix.T
+        return Agreement(pose, index, math.nan, 1.0), 1.0
+    seen = pose.body[matched]
+    difference = seen - fit.icrs[star] @ pose.matrix.T
     residual_rad = math.sqrt(float(np.vdot(difference, difference)) / len(matched))
     within = _within_reach_of_frame(fit.predicted_px, observation)
     square_px = float(fit.square_px[matched].sum())
@@ -292,20 +319,21 @@ def _judged(fit: _Fit, observation: Observation) -> tuple[Agreement, float]:
         seen,
         len(observation),
         len(within),
-        camera,
+        pose.camera,
         noise_px=observation.noise_px,
         compatible=None if fit.compatible is None else fit.compatible[:, within],
+        log_scales=observation.focal_range.log_width,
     )
     share = 1.0
     if chance < 1.0 and len(matched) < len(within):
-        stars = fit.icrs[within] @ fit.matrix.T
+        stars = fit.icrs[within] @ pose.matrix.T
         share = share_of_frame(seen, stars, residual_rad, observation)
     if share < MIN_SHARE or (
         chance < 1.0
         and is_scaled(fit.predicted_px[star], observation.centroids_px[matched], observation)
     ):
         chance = 1.0
-    return Agreement(fit.matrix, index, residual_rad, chance), share
+    return Agreement(pose, index, residual_rad, chance), share
 
 
 def _within_reach_of_frame(predicted_px: Array, observation: Observation) -> NDArray[np.int64]:

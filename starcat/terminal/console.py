@@ -51,6 +51,18 @@ def print_json(content: Any) -> None:
     sys.stdout.write(json.dumps(content, indent=2, ensure_ascii=False) + "\n")
 
 
+def print_json_line(content: Any) -> None:
+    """Print a value as JSON on a line of its own, and see that it arrives at once.
+
+    Parameters
+    ----------
+    content : object
+        Plain values.
+    """
+    sys.stdout.write(json.dumps(content, ensure_ascii=False) + "\n")
+    sys.stdout.flush()
+
+
 def print_table(
     title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], numbers: Sequence[int] = ()
 ) -> None:

@@ -3,126 +3,151 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from starcat.errors import NotIdentifiedError
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.database import Database
 from starcat.matcher.methods.table import METHODS
 from starcat.matcher.result import MatchResult
 from starcat.simulation.simulate import Frame
-from starcat.terminal.console import print_json, print_table
+from starcat.terminal.answers import answer_content, facts
+from starcat.terminal.console import print_json, print_json_line, print_table
+
+Answered = tuple[MeasuredFrame, MatchResult]
+
+NAMED = 3
+"""Frames that are named where some were not identified."""
 
 
-def print_matches(
-    frames: Sequence[MeasuredFrame],
-    results: Sequence[MatchResult],
-    database: Database,
-    *,
-    as_json: bool,
-) -> None:
+@dataclass(frozen=True)
+class Told:
+    """What was said of the frames of a file.
+
+    Attributes
+    ----------
+    frames, identified : int
+        How many there were, and how many of them were identified.
+    first : (MeasuredFrame, MatchResult) or None
+        The first frame and its answer; None where a stream had no frame.
+    unidentified : tuple of str
+        Names of the first frames that were not, at most `NAMED` of them.
+    """
+
+    frames: int
+    identified: int
+    first: Answered | None
+    unidentified: tuple[str, ...]
+
+    def expect_all_identified(self) -> None:
+        """Raise `NotIdentifiedError` unless every frame was identified."""
+        missing = self.frames - self.identified
+        if missing:
+            more = ", ..." if missing > len(self.unidentified) else ""
+            raise NotIdentifiedError(
+                f"{missing:,} of {self.frames:,} frames not identified "
+                f"({', '.join(self.unidentified)}{more}); 'refusal' of each says why, and what to "
+                "try"
+            )
+
+
+def print_answers(
+    answered: Iterable[Answered], database: Database, *, as_json: bool, as_lines: bool = False
+) -> Told:
     """Print the answers to the frames of a file.
 
     Parameters
     ----------
-    frames : sequence of MeasuredFrame
-        What was asked.
-    results : sequence of MatchResult
-        The answers, in the same order.
+    answered : iterable of (MeasuredFrame, MatchResult)
+        What was asked, and the answers.
     database : Database
-        Names and magnitudes.
+        For its name.
     as_json : bool
-        Whether to print JSON: an object for one frame, a list for several.
+        Whether to print JSON: always a list, with an object a frame.
+    as_lines : bool, default False
+        Whether to print such an object on a line of its own as soon as a frame is done; then
+        no frame is kept, however many there are.
+
+    Returns
+    -------
+    Told
+        How many were identified.
     """
-    if as_json:
-        content = [
-            _as_dict(frame, result, database) for frame, result in zip(frames, results, strict=True)
-        ]
-        print_json(content[0] if len(content) == 1 else content)
-    elif len(frames) == 1:
-        _print_one(frames[0], results[0], database)
-    else:
-        _print_many(frames, results, database)
-
-
-def _as_dict(frame: MeasuredFrame, result: MatchResult, database: Database) -> dict[str, Any]:
-    return {"frame": frame.name, **_facts(result), "stars": _stars(frame, result, database)}
-
-
-def _facts(result: MatchResult) -> dict[str, Any]:
-    facts: dict[str, Any] = {"status": result.status, "n_matched": result.n_matched}
-    if result.status == "identified":
-        facts |= {
-            "boresight_ra_deg": result.boresight_ra_deg,
-            "boresight_dec_deg": result.boresight_dec_deg,
-            "roll_deg": result.roll_deg,
-            "q_body_from_icrs": result.q_body_from_icrs.tolist(),
-            "residual_arcsec": result.residual_arcsec,
-            "false_match_probability": result.false_match_probability,
-        }
-    return facts
-
-
-def _stars(frame: MeasuredFrame, result: MatchResult, database: Database) -> list[dict[str, Any]]:
-    reasons = dict(result.dropped)
-    stars = []
-    for number, row in enumerate(result.star_index):
-        x, y = frame.centroids_px[number]
-        star: dict[str, Any] = {"x_px": float(x), "y_px": float(y), "star": None, "mag": None}
-        if row >= 0:
-            star |= {
-                "star": database.designation[row].decode() or str(database.star_id[row]),
-                "star_id": int(result.star_ids[number]),
-                "mag": float(database.mag[row]),
-            }
-        if number in reasons:
-            star["dropped"] = reasons[number]
-        stars.append(star)
-    return stars
+    kept: list[Answered] = []
+    first: Answered | None = None
+    count = identified = 0
+    missing: list[str] = []
+    for frame, result in answered:
+        first = first or (frame, result)
+        count, identified = count + 1, identified + result.ok
+        if not result.ok and len(missing) < NAMED:
+            missing.append(f"{frame.name}: {result.status}")
+        if as_lines:
+            print_json_line(answer_content(frame, result))
+        else:
+            kept.append((frame, result))
+    if as_json and not as_lines:
+        print_json([answer_content(frame, result) for frame, result in kept])
+    elif len(kept) == 1:
+        _print_one(*kept[0], database)
+    elif kept:
+        _print_many(kept, database)
+    return Told(count, identified, first, tuple(missing))
 
 
 def _print_one(frame: MeasuredFrame, result: MatchResult, database: Database) -> None:
-    rows = [
-        (name, f"{value:.9g}" if isinstance(value, float) else value)
-        for name, value in _facts(result).items()
-    ]
+    rows: list[tuple[str, Any]] = []
+    for name, value in facts(result).items():
+        if name == "covariance_arcsec2":
+            sigma = np.sqrt(result.covariance_arcsec2.diagonal())
+            rows.append(("error about x, y, z arcsec", ", ".join(f"{one:.3g}" for one in sigma)))
+        elif name == "refusal":
+            rows += [("because", value["words"]), ("try", value["advice"])]
+        elif value is not None:
+            rows.append((name, f"{value:.9g}" if isinstance(value, float) else value))
     for reason, count in sorted(Counter(reason for _, reason in result.dropped).items()):
         rows.append((f"dropped, {reason.replace('_', ' ')}", count))
     print_table(f"{len(frame.centroids_px)} centroids, {database.name}", ("", ""), rows)
-    if result.status == "identified":
-        print_table(
-            "Stars",
-            ("x px", "y px", "star", "mag"),
-            [
-                (f"{s['x_px']:.2f}", f"{s['y_px']:.2f}", s["star"] or "-",
-                 "" if s["mag"] is None else f"{s['mag']:.2f}")
-                for s in _stars(frame, result, database)
-            ],
-            numbers=(0, 1, 3),
-        )  # fmt: skip
+    if result.ok:
+        heads = ("x px", "y px", "star", "mag", "RA deg", "Dec deg", "dx px", "dy px")
+        lines = [
+            (f"{s['x_px']:.2f}", f"{s['y_px']:.2f}", s["star"],
+             f"{s['mag']:.2f}", f"{s['ra_deg']:.5f}", f"{s['dec_deg']:+.5f}",
+             f"{s['dx_px']:+.3f}", f"{s['dy_px']:+.3f}")
+            if s["star"] else
+            (f"{_shown(s['x_px'])}", f"{_shown(s['y_px'])}", "-", *5 * ("",))
+            for s in answer_content(frame, result)["stars"]
+        ]  # fmt: skip
+        print_table("Stars", heads, lines, numbers=(0, 1, 3, 4, 5, 6, 7))
 
 
-def _print_many(
-    frames: Sequence[MeasuredFrame], results: Sequence[MatchResult], database: Database
-) -> None:
+def _shown(value: float | None) -> str:
+    return "" if value is None else f"{value:.2f}"
+
+
+def _print_many(answered: Sequence[Answered], database: Database) -> None:
     rows = []
-    for frame, result in zip(frames, results, strict=True):
+    for frame, result in answered:
         angles = (result.boresight_ra_deg, result.boresight_dec_deg, result.roll_deg)
-        known = result.status == "identified"
+        why = result.refusal
         rows.append(
             (
                 frame.name,
-                result.status,
+                result.status if why is None or why.reason == result.status else why.reason,
                 f"{result.n_matched}/{len(frame.centroids_px)}",
-                *(f"{angle:.5f}" if known else "" for angle in angles),
-                f"{result.residual_arcsec:.2f}" if known else "",
-                f"{result.false_match_probability:.1e}" if known else "",
+                *(f"{angle:.5f}" if result.ok else "" for angle in angles),
+                f"{result.residual_arcsec:.2f}" if result.ok else "",
+                f"{result.false_match_probability:.1e}" if result.ok else "",
             )
         )
     heads = ("frame", "status", "stars", "RA deg", "Dec deg", "roll deg", "rms arcsec", "chance")
-    print_table(f"{len(frames)} frames, {database.name}", heads, rows, numbers=(2, 3, 4, 5, 6, 7))
+    print_table(f"{len(answered)} frames, {database.name}", heads, rows, numbers=(2, 3, 4, 5, 6, 7))
 
 
 def print_simulated(frame: Frame, output: Path, *, as_json: bool) -> None:

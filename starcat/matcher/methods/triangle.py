@@ -18,6 +18,7 @@ from starcat.geometry.kvector import KVector
 from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder, select_triangles
+from starcat.matcher.methods.triangle_shape import are_similar, similar_triangles
 from starcat.matcher.observation import Observation
 
 Array = NDArray[np.float64]
@@ -81,6 +82,25 @@ def _look_up(
     apart = observation.separation_rad
     sides = np.stack([apart[j, k], apart[i, k], apart[i, j]], axis=-1)
     tolerance_rad = SIDE_TOLERANCE * observation.tolerance_rad
+    if observation.fov_error:
+        found = similar_triangles(sides, tolerance_rad, observation, database)
+    else:
+        found = _same_triangles(sides, tolerance_rad, product)
+    observed = np.repeat(np.arange(len(triangles)), [len(rows) for rows in found])
+    rows = np.concatenate(found)
+    if len(rows) > MANY and not observation.fov_error:
+        close = _has_a_side(rows, sides[observed], tolerance_rad, database, product)
+        rows, observed = rows[close], observed[close]
+    stars = np.stack([product["i"][rows], product["j"][rows], product["k"][rows]], axis=-1)
+    return _in_order(
+        triangles[observed], stars, sides[observed], tolerance_rad, observation, database
+    )
+
+
+def _same_triangles(
+    sides: Array, tolerance_rad: float, product: ProductArrays
+) -> list[NDArray[np.intp]]:
+    """Return the rows of the triangles with the area and circumradius of observed ones."""
     by_area = KVector(
         product["area_rad2"],
         product["kvector_counts"],
@@ -93,15 +113,7 @@ def _look_up(
         near = by_area.range(area - area_error, area + area_error)
         fits = np.abs(radii[near] - radius) <= radius_error
         found.append(fits.nonzero()[0] + near.start)
-    observed = np.repeat(np.arange(len(triangles)), [len(rows) for rows in found])
-    rows = np.concatenate(found)
-    if len(rows) > MANY:
-        close = _has_a_side(rows, sides[observed], tolerance_rad, database, product)
-        rows, observed = rows[close], observed[close]
-    stars = np.stack([product["i"][rows], product["j"][rows], product["k"][rows]], axis=-1)
-    return _in_order(
-        triangles[observed], stars, sides[observed], tolerance_rad, observation, database
-    )
+    return found
 
 
 def _has_a_side(
@@ -157,9 +169,15 @@ def _in_order(
     u = database.directions[stars]
     chord = u[:, [1, 0, 0]] - u[:, [2, 2, 1]]
     apart = 2.0 * np.arcsin(0.5 * np.sqrt(np.einsum("ijk,ijk->ij", chord, chord)))
-    fits = np.abs(apart[:, :, None] - sides[:, None, :]) <= tolerance_rad
-    first, second, third = _ORDERS.T
-    row, order = np.nonzero(fits[:, first, 0] & fits[:, second, 1] & fits[:, third, 2])
+    if observation.fov_error:
+        observed = np.moveaxis(sides[:, None], -1, 0)
+        ordered = np.moveaxis(apart[:, _ORDERS], -1, 0)
+        fits = are_similar(list(observed), ordered, tolerance_rad, observation)
+    else:
+        side = np.abs(apart[:, :, None] - sides[:, None, :]) <= tolerance_rad
+        first, second, third = _ORDERS.T
+        fits = side[:, first, 0] & side[:, second, 1] & side[:, third, 2]
+    row, order = np.nonzero(fits)
     centroids, stars = centroids[row], stars[row[:, None], _ORDERS[order]]
     # The determinant of the product is the product of the two triangles' handedness.
     turned = database.directions[stars] @ np.swapaxes(observation.body[centroids], 1, 2)

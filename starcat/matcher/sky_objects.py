@@ -1,0 +1,195 @@
+"""Answers as astropy has them: a table, a place in the sky, the world coordinates of a picture.
+
+astropy is imported when one of them is asked for; a program that only matches needs none.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import fields
+from functools import lru_cache
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.errors import ConfigError
+from starcat.geometry.attitude import radec_roll_from_matrix
+from starcat.geometry.camera import Camera
+from starcat.geometry.sphere import tangent_axes
+from starcat.matcher.stars import MatchedStars
+
+if TYPE_CHECKING:
+    from astropy.coordinates import SkyCoord
+    from astropy.table import QTable
+    from astropy.wcs import WCS
+
+Array = NDArray[np.float64]
+
+SIP_ORDERS = range(2, 10)
+"""Orders of the polynomials of SIP: 9 is the highest that the convention has."""
+
+SIP_ERROR_PX = 0.005
+"""The first order that is as good as this, at every place that is looked at, is taken."""
+
+FIRST_CENTRE_PX = 0.5
+"""Where the centre of the first pixel is, which FITS calls 1."""
+
+_UNITS = {"px": "pix", "arcsec": "arcsec", "deg": "deg", "mag": "mag"}
+
+_log = logging.getLogger(__name__)
+
+
+def table(stars: MatchedStars, facts: Mapping[str, Any]) -> QTable:
+    """Return stars as a table of astropy.
+
+    Parameters
+    ----------
+    stars : MatchedStars
+        The stars.
+    facts : mapping
+        What goes into the table's ``meta``.
+
+    Returns
+    -------
+    astropy.table.QTable
+        A column a field, with the unit that its name ends with.
+
+    Raises
+    ------
+    ConfigError
+        If astropy is not installed.
+    """
+    made = _astropy("table").QTable(meta=dict(facts))
+    for field in fields(stars):
+        unit = _UNITS.get(field.name.rpartition("_")[2])
+        column = getattr(stars, field.name)
+        if field.name == "star":
+            column = np.array(column, dtype=np.str_)
+        made[field.name] = column if unit is None else _astropy("units").Quantity(column, unit)
+    return made
+
+
+def skycoord(ra_deg: float, dec_deg: float) -> SkyCoord:
+    """Return a direction as astropy has it.
+
+    Parameters
+    ----------
+    ra_deg, dec_deg : float
+        ICRS, degrees.
+
+    Returns
+    -------
+    astropy.coordinates.SkyCoord
+        In ICRS.
+
+    Raises
+    ------
+    ConfigError
+        If astropy is not installed.
+    """
+    return _astropy("coordinates").SkyCoord(ra_deg, dec_deg, unit="deg", frame="icrs")
+
+
+def wcs(camera: Camera, matrix: Array, bottom_up: bool = False) -> WCS:
+    """Return the world coordinates of a picture.
+
+    Parameters
+    ----------
+    camera : Camera
+        That took it.
+    matrix : ndarray of float64, shape (3, 3)
+        Attitude, ``body = matrix @ icrs``.
+    bottom_up : bool, default False
+        Whether the first row of the picture's file is its bottom.
+
+    Returns
+    -------
+    astropy.wcs.WCS
+        TAN, or TAN with SIP where the camera has distortion.
+
+    Raises
+    ------
+    ConfigError
+        If astropy is not installed.
+
+    Notes
+    -----
+    The reference pixel is the principal point, where the projection touches the sky. Pixel
+    (0, 0) of the camera is the outer corner of the first pixel, whose centre is (1, 1) in FITS:
+    0.5 is added. With rows that count from the bottom, y becomes the height minus y.
+    """
+    package = _astropy("wcs")
+    ra_deg, dec_deg, _ = radec_roll_from_matrix(matrix)
+    axes = np.array(tangent_axes(ra_deg, dec_deg))
+    x_px, y_px = camera.principal_point_px
+    centre = [x_px, camera.height_px - y_px if bottom_up else y_px]
+    sip = None if camera.distortion.is_none else _sip(camera, bottom_up)
+    made = package.WCS(naxis=2)
+    ending = "" if sip is None else "-SIP"
+    made.wcs.ctype = [f"RA---TAN{ending}", f"DEC--TAN{ending}"]
+    made.wcs.cunit = ["deg", "deg"]
+    made.wcs.crval = [ra_deg, dec_deg]
+    made.wcs.crpix = np.array(centre) + FIRST_CENTRE_PX
+    step = np.array([1.0, -1.0 if bottom_up else 1.0]) / camera.focal_length_px
+    made.wcs.cd = np.degrees(axes @ matrix[:2].T * step)
+    made.wcs.lonpole = 180.0
+    made.wcs.radesys = "ICRS"
+    if sip is not None:
+        made.sip = package.Sip(*sip, made.wcs.crpix)
+    made.pixel_shape = (camera.width_px, camera.height_px)
+    made.wcs.set()
+    return made
+
+
+@lru_cache(maxsize=16)
+def _sip(camera: Camera, bottom_up: bool) -> tuple[Array, Array, Array, Array]:
+    """Return the polynomials that take the distortion away, and those that put it back."""
+    # The ends of an interval want more places than its middle.
+    along = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 41))
+    x, y = np.meshgrid(along * camera.width_px, along * camera.height_px)
+    px = np.column_stack([x.ravel(), y.ravel()])
+    body = camera.directions_from_pixels(px)
+    seen = px - camera.principal_point_px
+    plain = camera.focal_length_px * body[:, :2] / body[:, 2:]
+    if bottom_up:
+        seen[:, 1] *= -1.0
+        plain[:, 1] *= -1.0
+    return (*_polynomials(seen, plain - seen), *_polynomials(plain, seen - plain))
+
+
+def _polynomials(places: Array, shifts: Array) -> tuple[Array, Array]:
+    """Return the polynomials of SIP, of the lowest order that will do, for shifts in x and y."""
+    scale = float(np.abs(places).max())
+    u, v = (places / scale).T
+    for order in SIP_ORDERS:
+        powers = [(p, q) for p in range(order + 1) for q in range(order + 1 - p) if p + q > 1]
+        terms = np.stack([u**p * v**q for p, q in powers], axis=-1)
+        found, *_ = np.linalg.lstsq(terms, shifts)
+        error_px = float(np.abs(terms @ found - shifts).max())
+        if error_px <= SIP_ERROR_PX:
+            break
+    else:
+        _log.warning(
+            "the distortion of this camera is beyond polynomials of order %d: the WCS is off by "
+            "up to %.2g px",
+            order,
+            error_px,
+        )
+    made = np.zeros((2, order + 1, order + 1))
+    for (p, q), (in_x, in_y) in zip(powers, found, strict=True):
+        made[:, p, q] = np.array([in_x, in_y]) / scale ** (p + q)
+    return made[0], made[1]
+
+
+def _astropy(module: str) -> Any:
+    """Return a module of astropy."""
+    try:
+        return import_module(f"astropy.{module}")
+    except ImportError as error:
+        text = (
+            f"astropy is not installed ({error}), which this is an object of; pip install astropy"
+        )
+        raise ConfigError(text) from error

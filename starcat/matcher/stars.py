@@ -1,0 +1,208 @@
+"""The stars of an answer: where each is, where it was seen, and what that says of the attitude."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.geometry.camera import Camera
+from starcat.geometry.sphere import radec_from_directions, separation
+from starcat.matcher.database import Database
+from starcat.matcher.spread import information
+
+Array = NDArray[np.float64]
+
+ARCSEC = math.degrees(1.0) * 3600.0
+"""Arcseconds in a radian."""
+
+STEP_PX = 0.01
+"""Step of the differences that say how a direction moves with its pixel."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a matcher was asked of one frame.
+
+    Attributes
+    ----------
+    centroids_px : ndarray of float64, shape (N, 2)
+        Pixels, as they were given.
+    magnitudes : ndarray of float64, shape (N,), or None
+        As they were given.
+    database : Database
+        The stars.
+    noise_px : float or None
+        Standard deviation of a centroid on each axis, where it was stated.
+    """
+
+    centroids_px: Array
+    magnitudes: Array | None
+    database: Database
+    noise_px: float | None = None
+
+
+@dataclass(frozen=True)
+class MatchedStars:
+    """The stars of a frame, one row each, in the order of the centroids.
+
+    Attributes
+    ----------
+    spot : ndarray of int64, shape (n,)
+        Row of the centroid in the frame as it was given.
+    star_id : ndarray of int64, shape (n,)
+        Permanent star numbers.
+    star_index : ndarray of int32, shape (n,)
+        Rows of the database.
+    star : tuple of str
+        Designations; the number where the database has none.
+    ra_deg, dec_deg : ndarray of float64, shape (n,)
+        ICRS, at the epoch of the database.
+    mag : ndarray of float64, shape (n,)
+        Magnitudes of the database.
+    x_px, y_px : ndarray of float64, shape (n,)
+        The centroids.
+    dx_px, dy_px : ndarray of float64, shape (n,)
+        Centroid minus the place where attitude and camera put the star.
+    separation_arcsec : ndarray of float64, shape (n,)
+        Angle between the centroid's direction and the star's.
+    observed_mag, difference_mag : ndarray of float64, shape (n,)
+        Magnitude of the centroid as it was given, and this minus the database's; NaN where none
+        was given. The zero point is the caller's.
+    """
+
+    spot: NDArray[np.int64]
+    star_id: NDArray[np.int64]
+    star_index: NDArray[np.int32]
+    star: tuple[str, ...]
+    ra_deg: Array
+    dec_deg: Array
+    mag: Array
+    x_px: Array
+    y_px: Array
+    dx_px: Array
+    dy_px: Array
+    separation_arcsec: Array
+    observed_mag: Array
+    difference_mag: Array
+
+    def __len__(self) -> int:
+        """Return the number of stars."""
+        return len(self.spot)
+
+    def __repr__(self) -> str:
+        """Return the number of stars and the first ones in one line."""
+        names = ", ".join(self.star[:3]) + (", ..." if len(self) > 3 else "")
+        return f"<MatchedStars: {len(self)}{': ' if self.star else ''}{names}>"
+
+
+def _no_stars() -> MatchedStars:
+    none = np.empty(0)
+    rows = np.empty(0, dtype=np.int64)
+    return MatchedStars(rows, rows, rows.astype(np.int32), (), *(10 * (none,)))
+
+
+NO_STARS = _no_stars()
+"""The stars of a frame that was not identified."""
+
+
+def matched_stars(
+    star_index: NDArray[np.int32], matrix: Array, camera: Camera, asked: Asked
+) -> MatchedStars:
+    """Return the stars that centroids were found to be.
+
+    Parameters
+    ----------
+    star_index : ndarray of int32, shape (N,)
+        Row of the database for each centroid, -1 where none.
+    matrix : ndarray of float64, shape (3, 3)
+        Attitude, ``body = matrix @ icrs``.
+    camera : Camera
+        The camera that the attitude holds for.
+    asked : Asked
+        Centroids and database.
+
+    Returns
+    -------
+    MatchedStars
+        A row for each centroid with a star.
+    """
+    spot = np.flatnonzero(star_index >= 0)
+    row, database = star_index[spot], asked.database
+    seen_px = asked.centroids_px[spot]
+    u = database.directions[row]
+    offset = seen_px - camera.pixels_from_directions(u @ matrix.T)
+    seen = camera.directions_from_pixels(seen_px) @ matrix
+    ra_deg, dec_deg = radec_from_directions(u)
+    mag = np.asarray(database.mag[row], dtype=np.float64)
+    given = np.full(len(spot), np.nan) if asked.magnitudes is None else asked.magnitudes[spot]
+    ids = database.star_id[row]
+    names = zip(database.designation[row].tolist(), ids.tolist(), strict=True)
+    return MatchedStars(
+        spot=spot,
+        star_id=ids,
+        star_index=row,
+        star=tuple(name.decode() or str(number) for name, number in names),
+        ra_deg=ra_deg,
+        dec_deg=dec_deg,
+        mag=mag,
+        x_px=seen_px[:, 0],
+        y_px=seen_px[:, 1],
+        dx_px=offset[:, 0],
+        dy_px=offset[:, 1],
+        separation_arcsec=separation(seen, u) * ARCSEC,
+        observed_mag=given,
+        difference_mag=given - mag,
+    )
+
+
+def attitude_covariance(
+    stars: MatchedStars, camera: Camera, noise_px: float | None = None
+) -> Array:
+    """Return the covariance of an attitude that the centroids of stars determine.
+
+    Parameters
+    ----------
+    stars : MatchedStars
+        The stars of the answer, at least 2.
+    camera : Camera
+        The camera that the attitude holds for.
+    noise_px : float, optional
+        Standard deviation of a centroid on each axis; that of the residuals by default, of whose
+        2n numbers three went into the attitude.
+
+    Returns
+    -------
+    ndarray of float64, shape (3, 3)
+        Of the small rotations about the axes of the camera (x right, y down, z along the
+        boresight), square arcseconds; NaN where the stars determine no attitude.
+
+    Notes
+    -----
+    The attitude is that of Wahba's problem with equal weights, whose error is
+    ``A^-1 sum(b x db)``: A is the `information` of the directions b, and the errors db of these
+    are those of the pixels by the derivative of the camera. With a camera of a narrow field
+    this is the inverse of A times the variance of a direction. An error that all stars share,
+    as of the focal length or the distortion, is not in it.
+    """
+    px = np.column_stack([stars.x_px, stars.y_px])
+    if noise_px is None:
+        square = float(stars.dx_px @ stars.dx_px + stars.dy_px @ stars.dy_px)
+        noise_px = math.sqrt(square / max(1, 2 * len(stars) - 3))
+    body = camera.directions_from_pixels(px)
+    total = np.zeros((3, 3))
+    for axis in (0, 1):
+        # Steps lead inwards, so that they end inside the fold of the distortion.
+        step = np.where(px[:, axis] > camera.principal_point_px[axis], -STEP_PX, STEP_PX)
+        moved = px.copy()
+        moved[:, axis] += step
+        turned = np.cross(body, (camera.directions_from_pixels(moved) - body) / step[:, None])
+        total += turned.T @ turned
+    matrix = information(body)
+    if np.linalg.matrix_rank(matrix, hermitian=True) < 3:
+        return np.full((3, 3), np.nan)
+    inverse = np.linalg.inv(matrix)
+    covariance = (noise_px * ARCSEC) ** 2 * (inverse @ total @ inverse)
+    return np.asarray(0.5 * (covariance + covariance.T))

@@ -1,0 +1,387 @@
+"""What an answer tells: its stars, how sure the attitude is, where every pixel is, or why not."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from dataclasses import fields, replace
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.wcs import WCS
+
+from starcat.errors import NotIdentifiedError
+from starcat.geometry.attitude import (
+    matrix_from_quaternion,
+    matrix_from_radec_roll,
+    quaternion_from_matrix,
+)
+from starcat.geometry.camera import Camera
+from starcat.geometry.distortion import Distortion
+from starcat.geometry.sphere import directions_from_radec
+from starcat.matcher import fast, sky_objects
+from starcat.matcher.database import Database
+from starcat.matcher.matcher import Matcher
+from starcat.matcher.refusal import ADVICE, WORDS, Refusal
+from starcat.matcher.result import MatchResult
+from starcat.matcher.stars import MatchedStars, attitude_covariance
+from starcat.simulation.simulate import Frame, Noise, simulate_frames
+
+needs_c = pytest.mark.skipif(
+    not fast.is_compiled(), reason="starcat was installed without a C compiler"
+)
+
+ARCSEC = 3600.0 * math.degrees(1.0)
+
+LENSES = {
+    "barrel": Camera(1280, 960, fov_x_deg=20.0, distortion=Distortion(k1=-0.2)),
+    "pincushion": Camera(1024, 768, fov_x_deg=11.42, distortion=Distortion(k1=0.6, k2=-2.0)),
+    "all terms, off the middle": Camera(
+        1280,
+        960,
+        fov_x_deg=20.0,
+        principal_point_px=(610.0, 510.5),
+        distortion=Distortion(k1=-0.2, k2=0.05, k3=0.3, p1=1e-3, p2=-2e-3),
+    ),
+    "wide": Camera(
+        1280,
+        960,
+        fov_x_deg=50.0,
+        principal_point_px=(600.0, 500.0),
+        distortion=Distortion(k1=-0.2, k2=0.05),
+    ),
+}
+
+PINHOLES = {
+    "narrow": Camera(1024, 1024, fov_x_deg=1.0),
+    "usual": Camera(1024, 768, fov_x_deg=11.42),
+    "wide, off the middle": Camera(1280, 960, fov_x_deg=90.0, principal_point_px=(600.0, 500.0)),
+}
+
+ATTITUDES = [(123.4, -34.5, 71.0), (0.0, 0.0, 0.0), (10.0, 89.99, 200.0), (0.0, -90.0, 33.0)]
+
+
+@pytest.fixture(scope="module")
+def sky(sky_of, random_directions) -> Database:
+    return sky_of(random_directions(1200, 1))
+
+
+def a_frame(sky: Database, camera: Camera, noise: Noise | None = None, seed: int = 5) -> Frame:
+    frames = simulate_frames(sky.directions, camera, 1, noise or Noise(), seed, sky.mag)
+    return next(iter(frames))
+
+
+def answer(sky: Database, **stated: object) -> tuple[Frame, MatchResult]:
+    frame = a_frame(sky, sky.camera, Noise(0.4, 0.1, 3, noise_mag=0.2))
+    matcher = Matcher(sky, **stated)  # type: ignore[arg-type]
+    return frame, matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+
+
+def found_by_hand(camera: Camera, matrix: np.ndarray) -> MatchResult:
+    none = np.empty(0)
+    return MatchResult(
+        *("identified", none.astype(np.int64), none.astype(np.int32)),
+        *(quaternion_from_matrix(matrix), 0.0, 0.0, 0.0, 0, 0.0, 0.0),
+        camera=camera,
+    )
+
+
+# --- World coordinates
+
+
+def worst_px(camera: Camera, matrix: np.ndarray, *, bottom_up: bool = False) -> float:
+    """Largest difference between camera and WCS, from pixels to the sky and from there back."""
+    made = found_by_hand(camera, matrix).wcs(bottom_up=bottom_up)
+    x, y = np.meshgrid(
+        np.linspace(0.0, camera.width_px, 47), np.linspace(0.0, camera.height_px, 39)
+    )
+    px = np.column_stack([x.ravel(), y.ravel()])
+    in_file = px[:, 0] - 0.5, (camera.height_px - px[:, 1] if bottom_up else px[:, 1]) - 0.5
+    place = made.pixel_to_world(*in_file)
+    directions = directions_from_radec(place.icrs.ra.deg, place.icrs.dec.deg)
+    there = np.abs(camera.pixels_from_directions(directions @ matrix.T) - px).max()
+    true = camera.directions_from_pixels(px) @ matrix
+    sky_place = SkyCoord(*true.T, representation_type="cartesian").represent_as("unitspherical")
+    back = made.world_to_pixel(SkyCoord(sky_place, frame="icrs"))
+    return max(float(there), float(np.abs(np.subtract(back, in_file)).max()))
+
+
+@pytest.mark.parametrize("bottom_up", [False, True], ids=["top down", "bottom up"])
+@pytest.mark.parametrize("attitude", ATTITUDES, ids=str)
+@pytest.mark.parametrize("camera", PINHOLES.values(), ids=PINHOLES)
+def test_the_wcs_of_a_pinhole_is_the_camera(camera, attitude, bottom_up):
+    assert worst_px(camera, matrix_from_radec_roll(*attitude), bottom_up=bottom_up) < 1e-6
+
+
+@pytest.mark.parametrize("bottom_up", [False, True], ids=["top down", "bottom up"])
+@pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
+def test_the_wcs_of_a_lens_is_the_camera_to_a_hundredth_of_a_pixel(camera, bottom_up):
+    matrix = matrix_from_radec_roll(*ATTITUDES[0])
+    assert worst_px(camera, matrix, bottom_up=bottom_up) < 0.01
+
+
+def test_the_polynomials_that_put_the_distortion_back_are_as_good():
+    # astropy inverts the others; programs that take AP and BP as they are want these.
+    camera = LENSES["all terms, off the middle"]
+    made = found_by_hand(camera, np.eye(3)).wcs()
+    px = np.random.default_rng(1).random((500, 2)) * [1280.0, 960.0]
+    plain = made.pix2foc(px + 0.5, 1)
+    seen = made.sip.foc2pix(plain - made.wcs.crpix, 1)
+    assert np.abs(seen - (px + 0.5)).max() < 0.01
+
+
+def test_a_lens_beyond_the_polynomials_is_said(caplog):
+    wide = Camera(1280, 960, fov_x_deg=90.0, distortion=Distortion(k1=-0.1, k2=0.01))
+    sky_objects.wcs(wide, np.eye(3))
+    assert "beyond polynomials of order 9" in caplog.text
+
+
+def test_the_wcs_outlives_its_header():
+    camera = LENSES["all terms, off the middle"]
+    made = found_by_hand(camera, matrix_from_radec_roll(*ATTITUDES[0])).wcs()
+    again = WCS(made.to_header(relax=True))
+    x, y = np.random.default_rng(1).random((2, 100)) * 900.0
+    assert made.pixel_to_world(x, y).separation(again.pixel_to_world(x, y)).arcsec.max() < 1e-6
+
+
+@pytest.mark.parametrize("attitude", ATTITUDES[:2], ids=str)
+def test_boresight_and_roll_are_those_of_a_wcs_made_by_hand(sky, attitude):
+    # The definition of roll: 0 is north up and east left in a picture whose rows go down, and
+    # a positive roll moves north from up towards the left.
+    ra_deg, dec_deg, roll_deg = attitude
+    camera, scale = sky.camera, math.degrees(1.0 / sky.camera.focal_length_px)
+    hand = WCS(naxis=2)
+    hand.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+    hand.wcs.crval = [ra_deg, dec_deg]
+    hand.wcs.crpix = [512.5, 512.5]
+    c, s = math.cos(math.radians(roll_deg)), math.sin(math.radians(roll_deg))
+    hand.wcs.cd = scale * np.array([[-c, s], [-s, -c]])
+    place = SkyCoord(*sky.directions.T, representation_type="cartesian", frame="icrs")
+    near = place.separation(SkyCoord(ra_deg, dec_deg, unit="deg")) < 15.0 * u.deg
+    x, y = hand.world_to_pixel(SkyCoord(place[near].spherical.lon, place[near].spherical.lat))
+    px = np.column_stack([x, y]) + 0.5
+    px = px[camera.contains(px)]
+    found = Matcher(sky).identify(px)
+    assert found.ok
+    assert found.n_matched == len(px)
+    assert found.skycoord.separation(SkyCoord(ra_deg, dec_deg, unit="deg")).arcsec < 1e-4
+    assert (found.roll_deg - roll_deg + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-7)
+    x, y = np.random.default_rng(2).random((2, 50)) * 1024.0
+    difference = found.wcs().pixel_to_world(x, y).separation(hand.pixel_to_world(x, y))
+    assert difference.arcsec.max() < 1e-4
+
+
+def test_a_pixel_is_a_place_in_the_sky_with_any_of_many_frames(sky):
+    frames = list(simulate_frames(sky.directions, sky.camera, 4, Noise(0.0), 3, sky.mag))
+    answers = Matcher(sky).identify_many([frame.centroids_px for frame in frames])
+    for frame, found in zip(frames, answers, strict=True):
+        place = found.wcs().pixel_to_world(*(frame.centroids_px.T - 0.5))
+        stars = found.table()
+        expected = SkyCoord(stars["ra_deg"], stars["dec_deg"])
+        assert place[stars["spot"]].separation(expected).arcsec.max() < 1e-3
+
+
+# --- The stars
+
+
+@pytest.mark.parametrize("engine", ["numpy", pytest.param("c", marks=needs_c)])
+def test_the_stars_are_those_of_the_truth(sky, engine):
+    frame, found = answer(sky, engine=engine)
+    stars = found.stars
+    assert len(stars) == found.n_matched > 10
+    assert stars.spot.tolist() == np.flatnonzero(found.star_index >= 0).tolist()
+    for row in range(len(stars)):
+        spot, star = stars.spot[row], stars.star_index[row]
+        assert (stars.star_id[row], stars.star[row]) == (sky.star_id[star], "star")
+        assert (stars.x_px[row], stars.y_px[row]) == tuple(frame.centroids_px[spot])
+        # One star after the other, by the definition of each number.
+        direction = sky.directions[star]
+        body = matrix_from_quaternion(found.q_body_from_icrs) @ direction
+        place = 512.0 + sky.camera.focal_length_px * body[:2] / body[2]
+        assert stars.dx_px[row] == pytest.approx(frame.centroids_px[spot, 0] - place[0], abs=1e-9)
+        assert stars.dy_px[row] == pytest.approx(frame.centroids_px[spot, 1] - place[1], abs=1e-9)
+        seen = sky.camera.directions_from_pixels(frame.centroids_px[spot][None])[0]
+        angle = math.asin(float(np.linalg.norm(np.cross(seen, body)))) * ARCSEC
+        assert stars.separation_arcsec[row] == pytest.approx(angle, abs=1e-6)
+        same = directions_from_radec(stars.ra_deg[row], stars.dec_deg[row])
+        assert np.abs(same - direction).max() < 1e-15 * 10
+        assert stars.difference_mag[row] == frame.mag[spot] - sky.mag[star]
+    rms = math.sqrt(float(np.mean(stars.separation_arcsec**2)))
+    assert found.residual_arcsec == pytest.approx(rms, rel=1e-6)
+
+
+@needs_c
+def test_both_matchers_tell_the_same(sky):
+    in_c, in_numpy = (answer(sky, engine=engine)[1] for engine in ("c", "numpy"))
+    for field in fields(MatchedStars):
+        one, other = getattr(in_c.stars, field.name), getattr(in_numpy.stars, field.name)
+        if field.name == "star":
+            assert one == other
+        else:
+            np.testing.assert_allclose(one, other, atol=1e-6)
+    np.testing.assert_allclose(in_c.covariance_arcsec2, in_numpy.covariance_arcsec2, rtol=1e-6)
+    assert in_c.camera == in_numpy.camera == sky.camera
+    assert in_c.time_s > 0.0
+    assert in_numpy.time_s > 0.0
+
+
+def test_the_table_has_units_and_says_what_it_is_of(sky):
+    frame, found = answer(sky)
+    stars = found.table()
+    assert len(stars) == found.n_matched
+    assert stars["ra_deg"].unit == u.deg
+    assert stars["dx_px"].unit == u.pix
+    assert stars["separation_arcsec"].unit == u.arcsec
+    assert stars["mag"].unit == stars["difference_mag"].unit == u.mag
+    assert stars["star_id"].dtype == np.int64
+    assert stars.meta["epoch_jyear"] == 2026.0
+    assert stars.meta["q_body_from_icrs"] == found.q_body_from_icrs.tolist()
+    without = Matcher(sky).identify(frame.centroids_px).table()
+    assert np.isnan(without["difference_mag"]).all()
+
+
+def test_a_frame_without_an_answer_has_no_stars_and_no_place(sky):
+    found = Matcher(sky).identify([[1.0, 2.0]])
+    assert (found.ok, found.status) == (False, "too_few_stars")
+    assert len(found.stars) == len(found.table()) == 0
+    assert np.isnan(found.covariance_arcsec2).all()
+    for ask in (found.wcs, lambda: found.skycoord):
+        with pytest.raises(NotIdentifiedError, match=r"status is too_few_stars; look at 'ok'"):
+            ask()
+
+
+def test_an_answer_goes_to_another_process_without_its_database(sky):
+    _, found = answer(sky)
+    data = pickle.dumps(found)
+    assert len(data) < 20_000
+    again = pickle.loads(data)
+    assert again.stars.ra_deg.tolist() == found.stars.ra_deg.tolist()
+    assert again.covariance_arcsec2.tolist() == found.covariance_arcsec2.tolist()
+    assert again.wcs().wcs.crval.tolist() == found.wcs().wcs.crval.tolist()
+    assert len(again.table()) == found.n_matched
+
+
+# --- The covariance
+
+
+def deviations(
+    sky: Database, camera: Camera, noise_px: float, *, is_stated: bool, seed: int = 8
+) -> tuple[np.ndarray, int]:
+    """Squared errors of attitudes in units of their covariance, and the stars of a frame."""
+    frame = a_frame(sky, camera, Noise(0.0))
+    generator = np.random.default_rng(seed)
+    stated = {"noise_px": noise_px} if is_stated else {"tolerance_px": 4.0 * noise_px}
+    matcher, squares, stars = Matcher(sky, **stated), [], []
+    for _ in range(200):
+        px = frame.centroids_px + generator.normal(0.0, noise_px, frame.centroids_px.shape)
+        found = matcher.identify(px, camera)
+        assert found.ok
+        turn = matrix_from_quaternion(found.q_body_from_icrs) @ frame.matrix.T
+        skew = 0.5 * (turn - turn.T)
+        angles = np.array([skew[2, 1], skew[0, 2], skew[1, 0]]) * ARCSEC
+        squares.append(angles @ np.linalg.solve(found.covariance_arcsec2, angles))
+        stars.append(found.n_matched)
+    return np.array(squares), int(np.median(stars))
+
+
+CAMERAS = {
+    "20 deg": Camera(1024, 1024, fov_x_deg=20.0),
+    "70 deg": Camera(1024, 1024, fov_x_deg=70.0, principal_point_px=(400.0, 560.0)),
+    "lens": Camera(1024, 1024, fov_x_deg=30.0, distortion=Distortion(k1=-0.5)),
+}
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+def test_errors_are_as_the_covariance_of_a_stated_noise_says(sky, camera):
+    squares, _ = deviations(sky, camera, 0.3, is_stated=True)
+    # The mean of 200 chi-squares of 3 degrees has a standard deviation of sqrt(6 / 200) = 0.17.
+    assert abs(squares.mean() - 3.0) < 3.0 * 0.17
+    # 5 % of them lie above 7.81.
+    assert 2 <= (squares > 7.81).sum() <= 20
+
+
+def test_errors_are_as_the_covariance_of_the_residuals_says(sky):
+    squares, count = deviations(sky, CAMERAS["20 deg"], 0.3, is_stated=False)
+    freedom = 2 * count - 3
+    expected = 3.0 * freedom / (freedom - 2)  # of three times an F
+    assert abs(squares.mean() - expected) < 0.2 * expected
+
+
+def test_a_narrow_field_has_the_covariance_of_shuster(sky):
+    camera = Camera(1024, 1024, fov_x_deg=20.0)
+    _, found = answer(sky, noise_px=0.4)
+    body = camera.directions_from_pixels(np.column_stack([found.stars.x_px, found.stars.y_px]))
+    sigma = 0.4 / camera.focal_length_px * ARCSEC
+    simple = sigma**2 * np.linalg.inv(len(body) * np.eye(3) - body.T @ body)
+    np.testing.assert_allclose(found.covariance_arcsec2.diagonal(), simple.diagonal(), rtol=0.06)
+    assert found.covariance_arcsec2[2, 2] > 20.0 * found.covariance_arcsec2[0, 0]
+
+
+def test_stars_at_one_place_determine_no_attitude(sky):
+    _, found = answer(sky)
+    same = {field.name: getattr(found.stars, field.name)[:1] for field in fields(MatchedStars)}
+    assert np.isnan(attitude_covariance(MatchedStars(**same), sky.camera)).all()
+
+
+# --- Why not
+
+
+def test_every_reason_has_words_and_advice():
+    assert WORDS.keys() == ADVICE.keys()
+    for reason in WORDS:
+        for told in (Refusal(reason), Refusal(reason, 5, 3e-4, 0.25)):
+            assert len(told.advice) > 20
+            assert "\n" not in repr(told)
+            assert len(repr(told)) < 200
+    assert "5 spots, chance 3.0e-04, 25% of the frame" in Refusal("chance", 5, 3e-4, 0.25).words
+
+
+@pytest.mark.parametrize("engine", ["numpy", pytest.param("c", marks=needs_c)])
+def test_too_few_spots_are_the_reason(sky, engine):
+    found = Matcher(sky, engine=engine).identify([[1.0, 2.0], [30.0, 40.0], [np.nan, 1.0]])
+    assert found.refusal == Refusal("too_few_stars")
+    assert repr(found) == "<MatchResult too_few_stars: 3 spots>"
+    assert "fewer than 4 spots" in found._repr_html_()
+
+
+@needs_c
+def test_the_library_s_no_is_explained_when_somebody_asks(sky, monkeypatch):
+    searched = []
+    search = Matcher._identify
+    monkeypatch.setattr(
+        Matcher, "_identify", lambda self, *frame: searched.append(1) or search(self, *frame)
+    )
+    px = np.random.default_rng(3).random((8, 2)) * 1024.0
+    found = Matcher(sky, engine="c").identify(px)
+    assert (found.status, found.why is None) == ("no_match", False)
+    assert repr(found) == "<MatchResult no_match: 8 spots>"
+    assert not searched
+    why = found.refusal
+    assert why == Matcher(sky, engine="numpy").identify(px).refusal
+    assert why is found.refusal is not None
+    assert len(searched) == 2  # this matcher's, once, and that of numpy
+    assert repr(found) == f"<MatchResult no_match: 8 spots, {why.reason}>"
+    assert why.advice.split(",")[0] in found._repr_html_()
+
+
+@needs_c
+def test_an_attitude_that_is_not_near_the_prior_is_the_reason(sky):
+    frame = a_frame(sky, sky.camera)
+    away = matrix_from_radec_roll(0.0, 90.0, 0.0) @ frame.matrix
+    found = Matcher(sky, engine="c").track(frame.centroids_px, quaternion_from_matrix(away), 0.1)
+    assert found.status == "no_match"
+    assert found.refusal is not None
+    assert found.refusal.reason == "no_candidate"
+
+
+def test_an_answer_is_shown_in_a_line_and_in_a_notebook(sky):
+    named = replace(sky, designation=np.full(len(sky.mag), b"<b>"))
+    _, found = answer(named)
+    assert found.refusal is None
+    assert "\n" not in repr(found)
+    shown = found._repr_html_()
+    assert shown.count("<tr>") == found.n_matched + 1
+    assert "&lt;b&gt;" in shown
+    assert "<b>" not in shown

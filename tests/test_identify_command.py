@@ -1,0 +1,157 @@
+"""``starcat identify`` in a pipeline: streams, exit codes, and copies with world coordinates."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord
+from astropy.io import fits as fits_file
+from astropy.wcs import WCS
+
+Run = Callable[[list[Any]], Any]
+
+
+@pytest.fixture
+def frame(starcat: Run, small_artifact: Path, tmp_path: Path) -> Path:
+    path = tmp_path / "frame.csv"
+    assert starcat(["simulate", small_artifact, "-o", path, "--seed", "7"]).code == 0
+    return path
+
+
+def test_answers_come_line_by_line_from_a_stream(
+    starcat: Run,
+    frame: Path,
+    small_artifact: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    rows = [line.split(",") for line in frame.read_text().splitlines()[1:]]
+    pixels = [[float(x), float(y)] for x, y, _ in rows]
+    asked = [{"name": "a", "centroids_px": pixels}, {"centroids_px": pixels[:2]}]
+    before: list[str] = []
+
+    def lines() -> Iterator[str]:
+        for content in asked:
+            before.append(capsys.readouterr().out)
+            yield json.dumps(content) + "\n"
+
+    monkeypatch.setattr("sys.stdin", lines())
+    run = starcat(["identify", small_artifact, "-", "--ndjson"])
+    # The first answer was there before the second frame was asked for.
+    assert [text.count("\n") for text in before] == [0, 1]
+    first, second = json.loads(before[1]), json.loads(run.out)
+    assert (first["frame"], first["status"]) == ("a", "identified")
+    assert (second["frame"], second["status"]) == ("stdin 2", "too_few_stars")
+    assert second["refusal"]["reason"] == "too_few_stars"
+
+
+@pytest.mark.parametrize("form", ["csv", "json", "one line of json"])
+def test_centroids_come_from_stdin(
+    starcat: Run, frame: Path, small_artifact: Path, monkeypatch: pytest.MonkeyPatch, form: str
+) -> None:
+    text = frame.read_text()
+    if form != "csv":
+        rows = [[float(value) for value in line.split(",")] for line in text.splitlines()[1:]]
+        content = {
+            "centroids_px": [[x, y] for x, y, _ in rows],
+            "mag": [mag for *_, mag in rows],
+        }
+        text = json.dumps({"frames": [content]}, indent=None if "line" in form else 1)
+    monkeypatch.setattr("sys.stdin", StringIO(text))
+    [found] = json.loads(starcat(["identify", small_artifact, "-", "--json"]).out)
+    [expected] = json.loads(starcat(["identify", small_artifact, frame, "--json"]).out)
+    assert found["stars"] == expected["stars"]
+    assert found["frame"].startswith("stdin")
+
+
+def test_a_script_sees_that_a_frame_was_not_identified(
+    starcat: Run, frame: Path, small_artifact: Path, tmp_path: Path
+) -> None:
+    few = tmp_path / "few.csv"
+    few.write_text("x_px,y_px\n1,2\n")
+    assert starcat(["identify", small_artifact, few]).code == 0
+    assert starcat(["identify", small_artifact, frame, "--fail-on-no-match"]).code == 0
+    for form in ("--json", "--ndjson"):
+        run = starcat(["identify", small_artifact, few, "--fail-on-no-match", form])
+        assert run.code == 6
+        assert "too_few_stars" in run.out
+        error = json.loads(run.err)["error"]
+        assert error["message"].startswith("1 of 1 frames not identified (few: too_few_stars)")
+
+
+def test_the_reason_and_what_to_try_are_printed(
+    starcat: Run, small_artifact: Path, tmp_path: Path
+) -> None:
+    few = tmp_path / "few.csv"
+    few.write_text("x_px,y_px\n1,2\n")
+    run = starcat(["identify", small_artifact, few])
+    assert re.search(r"because +fewer than 4 spots", run.out)
+    assert re.search(r"try +find more spots", run.out)
+    assert all(len(line) <= 100 for line in run.out.splitlines())
+
+
+def worst_arcsec(header: fits_file.Header, answer: dict[str, Any]) -> float:
+    """How far the WCS puts spots from their stars, against what the answer says of that."""
+    stars = [star for star in answer["stars"] if star["star"]]
+    assert len(stars) > 10
+    x, y, ra, dec, said = (
+        np.array([star[name] for star in stars])
+        for name in ("x_px", "y_px", "ra_deg", "dec_deg", "separation_arcsec")
+    )
+    y = header["NAXIS2"] - y if header["ROWORDER"] == "BOTTOM-UP" else y
+    place = WCS(header).pixel_to_world(x - 0.5, y - 0.5)
+    return float(np.abs(place.separation(SkyCoord(ra, dec, unit="deg")).arcsec - said).max())
+
+
+@pytest.mark.parametrize("bottom_up", [False, True], ids=["top down", "bottom up"])
+def test_the_wcs_goes_into_a_copy_of_a_fits_file(
+    starcat: Run, small_artifact: Path, tmp_path: Path, *, bottom_up: bool
+) -> None:
+    image, copy = tmp_path / "frame.fits", tmp_path / "copy.fits"
+    assert starcat(["simulate", small_artifact, "-o", image, "--seed", "7"]).code == 0
+    with fits_file.open(image, mode="update") as parts:
+        parts[0].header["OBJECT"] = "a field"
+        parts[0].header["CRVAL1"] = 12.0
+        parts[0].header["CROTA2"] = 77.0
+        if bottom_up:
+            parts[0].data = parts[0].data[::-1]
+            parts[0].header["ROWORDER"] = "BOTTOM-UP"
+    run = starcat(["identify", small_artifact, image, "--json", "--wcs", copy])
+    assert run.code == 0
+    [answer] = json.loads(run.out)
+    with fits_file.open(copy) as parts, fits_file.open(image) as before:
+        header = parts[0].header
+        assert np.array_equal(parts[0].data, before[0].data)
+        assert header["BITPIX"] == before[0].header["BITPIX"]
+        assert header["OBJECT"] == "a field"
+        assert "CROTA2" not in header
+        assert "MJDREF" not in header
+        assert worst_arcsec(header, answer) < 1e-3
+
+
+def test_the_wcs_of_a_png_goes_into_a_new_fits_file(
+    starcat: Run, small_artifact: Path, tmp_path: Path
+) -> None:
+    image, copy = tmp_path / "frame.png", tmp_path / "copy.fits"
+    camera = tmp_path / "camera.toml"
+    camera.write_text(
+        "width_px = 512\nheight_px = 512\nfov_x_deg = 40.0\n[distortion]\nk1 = 0.01\n"
+    )
+    assert starcat(["simulate", small_artifact, "-o", image, "--seed", "7"]).code == 0
+    call = ["identify", small_artifact, image, "--json", "--wcs", copy, "--camera", camera]
+    [answer] = json.loads(starcat(call).out)
+    with fits_file.open(copy) as parts:
+        assert parts[0].header["ROWORDER"] == "TOP-DOWN"
+        assert parts[0].header["CTYPE1"] == "RA---TAN-SIP"
+        # A hundredth of a pixel.
+        assert worst_arcsec(parts[0].header, answer) < 2.8
+    first = copy.read_bytes()
+    assert starcat(call).code == 0
+    assert copy.read_bytes() == first

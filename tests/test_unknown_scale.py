@@ -1,0 +1,137 @@
+"""Frames whose focal length is known to some per cent: it is found with the attitude."""
+
+import math
+
+import numpy as np
+import pytest
+
+from starcat.errors import ConfigError
+from starcat.geometry.attitude import matrix_from_quaternion, random_attitudes
+from starcat.geometry.camera import Camera
+from starcat.geometry.distortion import Distortion
+from starcat.matcher.chance import false_match_probability
+from starcat.matcher.matcher import Matcher
+from starcat.matcher.methods.triangle_shape import scale_free
+from starcat.matcher.observation import observe
+from starcat.matcher.pose import focal_length_error_px, pose_at, refitted
+from starcat.simulation.simulate import Noise, simulate_frames
+
+CAMERA = Camera(1024, 1024, fov_x_deg=12.0)
+
+
+@pytest.fixture(scope="module")
+def sky(sky_of, random_directions):
+    return sky_of(random_directions(1200, 1))
+
+
+def told(factor, camera=CAMERA):
+    """Return the camera as somebody describes it who is wrong by a factor."""
+    return camera.with_focal_length(factor * camera.focal_length_px)
+
+
+def errors_px(result, frame, database):
+    """Return by how much an answer misplaces the stars of its frame."""
+    seen = frame.star_index >= 0
+    stars = database.directions[frame.star_index[seen]]
+    matrix = matrix_from_quaternion(result.q_body_from_icrs)
+    found = result.camera.pixels_from_directions(stars @ matrix.T)
+    return np.hypot(*(found - frame.centroids_px[seen]).T)
+
+
+@pytest.mark.parametrize(("fov_error", "least"), [(0.02, 58), (0.1, 57)])
+@pytest.mark.parametrize("engine", ["auto", "numpy"])
+def test_a_focal_length_off_by_some_per_cent_is_found(sky, fov_error, least, engine):
+    matcher, generator = Matcher(sky, engine=engine), np.random.default_rng(7)
+    noise, pulls = Noise(0.5, 0.1, 3), []
+    for frame in simulate_frames(sky.directions, sky.camera, 60, noise, 3):
+        wrong = told(1.0 + generator.uniform(-fov_error, fov_error), sky.camera)
+        result = matcher.identify(frame.centroids_px, wrong, fov_error=fov_error)
+        if result.status == "identified":
+            assert errors_px(result, frame, sky).max() < 4.0
+            error_px = result.camera.focal_length_px - sky.camera.focal_length_px
+            pulls.append(error_px / result.focal_length_error_px)
+    assert len(pulls) >= least
+    assert np.abs(pulls).max() < 4.0
+    assert 0.5 < np.std(pulls) < 1.4
+
+
+def test_a_focal_length_beyond_what_is_allowed_gives_no_answer(sky):
+    matcher = Matcher(sky)
+    for n, frame in enumerate(simulate_frames(sky.directions, sky.camera, 12, Noise(0.3), 5)):
+        wrong = told(1.06 if n % 2 else 0.94, sky.camera)
+        assert matcher.identify(frame.centroids_px, wrong, fov_error=0.02).status == "no_match"
+
+
+def test_the_fit_finds_attitude_and_focal_length_exactly():
+    generator = np.random.default_rng(1)
+    lens = Camera(1024, 768, fov_x_deg=40.0, distortion=Distortion(k1=-0.1, k2=0.02))
+    for camera, [matrix] in ((lens, random_attitudes(1, generator)), (CAMERA, [np.eye(3)])):
+        px = generator.uniform(20.0, 740.0, (9, 2))
+        stars = camera.directions_from_pixels(px) @ matrix
+        seen = observe(px, told(0.97, camera), 2.0, fov_error=0.05)
+        pose, rows = pose_at(matrix, 1.0, seen), np.arange(9)
+        for _ in range(6):
+            pose = refitted(pose, rows, stars[seen.rows], seen)
+        assert pose.camera.focal_length_px == pytest.approx(camera.focal_length_px, rel=1e-9)
+        assert np.abs(pose.matrix - matrix).max() < 1e-9
+
+
+@pytest.mark.parametrize("n", [4, 6, 20])
+def test_three_standard_errors_of_the_focal_length_hold_the_truth(n):
+    generator, beyond = np.random.default_rng(n), 0
+    for _ in range(400):
+        px = generator.uniform(0.0, 1024.0, (n, 2))
+        stars = CAMERA.directions_from_pixels(px)
+        seen = observe(px + generator.normal(scale=0.5, size=(n, 2)), CAMERA, 2.0, fov_error=0.05)
+        pose, rows = pose_at(np.eye(3), 1.0, seen), np.arange(len(seen))
+        for _ in range(2):
+            pose = refitted(pose, rows, stars[seen.rows], seen)
+        left = pose.body - stars[seen.rows] @ pose.matrix.T
+        residual_rad = math.sqrt(np.vdot(left, left) / len(left))
+        error_px = focal_length_error_px(pose, rows, residual_rad, seen)
+        beyond += abs(pose.camera.focal_length_px - CAMERA.focal_length_px) > 3.0 * error_px
+    assert beyond <= 8  # 0.27 % of 400 is one
+
+
+def test_the_bound_counts_the_scale_as_a_fourth_unknown():
+    # The volume of agreeing frames, with derivatives by small steps instead of formulas.
+    generator, n, square_px, width = np.random.default_rng(2), 6, 4.0, 0.04
+    px = generator.uniform(0.0, 1024.0, (n, 2))
+    body = CAMERA.directions_from_pixels(px)
+
+    def places(turn, longer):
+        q = np.append(0.5 * np.asarray(turn), 1.0)
+        matrix = matrix_from_quaternion(q / np.linalg.norm(q))
+        return told(math.exp(longer)).pixels_from_directions(body @ matrix.T).ravel()
+
+    step = 1e-6
+    slopes = [(places(e[:3], e[3]) - places(-e[:3], -e[3])) / (2 * step) for e in step * np.eye(4)]
+    gram = np.array(slopes) @ np.array(slopes).T
+
+    def expected(unknowns, range_):
+        left = 2 * n - unknowns
+        ball = math.pi ** (left / 2) / math.gamma(left / 2 + 1) * square_px ** (left / 2)
+        volume = 8.0 * math.pi**2 * math.sqrt(np.linalg.det(gram[:unknowns, :unknowns])) * range_
+        ways = math.comb(9, n) * math.perm(20, n)
+        return (9 - 3) * ways * volume * ball / (1024.0 * 1024.0) ** n
+
+    found = false_match_probability(square_px, body, 9, 20, CAMERA, log_scales=width)
+    assert found == pytest.approx(expected(3, 1.0) + expected(4, width), rel=1e-6)
+    known = false_match_probability(square_px, body, 9, 20, CAMERA)
+    assert known == pytest.approx(expected(3, 1.0), rel=1e-6)
+
+
+def test_the_shape_of_a_triangle_does_not_depend_on_its_size():
+    for size in (1e-3, 0.1):
+        shape, error, area, _ = scale_free(3.0 * size, 4.0 * size, 5.0 * size, 0.01 * size)
+        assert shape == pytest.approx(6.0 / 2.5**2)
+        assert area == pytest.approx(6.0 * size**2)
+        a, b, c = (side * size * (1.0 + 0.002) for side in (3.0, 4.0, 5.0))
+        assert abs(scale_free(a, b, c - 0.01 * size, 0.0)[0] - shape) <= error
+
+
+def test_what_cannot_be_found_is_refused(sky):
+    with pytest.raises(ConfigError, match=r"fov_error is 0.7; expected 0 to 0.5"):
+        Matcher(sky).identify([(1.0, 1.0)], fov_error=0.7)
+    with pytest.raises(ConfigError, match=r"'pairs' needs the focal length; only 'triangle'"):
+        Matcher(sky, "pairs").identify([(1.0, 1.0)], fov_error=0.02)
