@@ -214,5 +214,5 @@ def _too_few(
 
 
 def _why(frame: MeasuredFrame, result: MatchResult) -> str:
-    words = {"too_few_stars": "too few stars", "no_match": "no stars of the database agree"}
-    return f"{words[result.status]}: {len(frame.centroids_px)} centroids"
+    words = result.refusal.words if result.refusal else result.status.replace("_", " ")
+    return f"{len(frame.centroids_px)} centroids: {words}"

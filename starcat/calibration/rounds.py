@@ -8,9 +8,10 @@ a smaller tolerance and farther out, and so on until the stars no longer change.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +37,14 @@ NARROW_PX = 0.5
 """Smallest tolerance, however good the centroids are."""
 
 STEP = 1.015
-"""Ratio of neighbouring focal lengths of the first step. Within `WIDE_PX` and `SHARES[0]` of a
-detector of 1,000 px the matcher bears an error of half of that and more."""
+"""Ratio of neighbouring focal lengths of the first step, for a method that has to be told the
+focal length. Within `WIDE_PX` it bears an error of half of that and more."""
+
+FOV_ERROR = 0.1
+"""Error of the focal length that the method ``triangle`` finds by itself."""
+
+FOUND_PX = 4.0
+"""Tolerance of the first step where the focal length is found with the attitude."""
 
 SHARES = (1.0, 0.7, 0.5)
 """Middle parts of the frame that the first step tries: a lens distorts least in the middle."""
@@ -88,6 +95,12 @@ class Identified:
     def found(self) -> list[int]:
         """Numbers of the frames that were identified."""
         return [k for k, result in enumerate(self.results) if result.status == "identified"]
+
+    @property
+    def focal_length_px(self) -> float:
+        """The focal length that the first frame that was identified has found."""
+        found = self.results[self.found[0]].camera
+        return (found or self.camera).focal_length_px
 
     @property
     def stars(self) -> list[bytes]:
@@ -146,24 +159,29 @@ def first_answer(
         Part of the frame that was identified.
         None in place of both where no frame was identified.
     """
-    wide = replace(matcher, tolerance_px=WIDE_PX, noise_px=None)
+    size_px = camera.width_px, camera.height_px
+    finds_scale = matcher.method == "triangle" and matcher.database.image is None
+    error, step = (FOV_ERROR, (1.0 + FOV_ERROR) ** 2) if finds_scale else (0.0, STEP)
+    tolerance_px = FOUND_PX if finds_scale else WIDE_PX
+    wide = replace(matcher, tolerance_px=tolerance_px, noise_px=None)
     usable = [frame for frame in frames if len(frame.centroids_px) >= MIN_STARS]
     usual = np.median([len(frame.centroids_px) for frame in usable]) if usable else 0
     usable.sort(key=lambda frame: abs(len(frame.centroids_px) - usual))
+    values = values_of(camera)
     for first in range(0, len(usable), AT_ONCE):
-        for share in SHARES:
-            for tried in _focal_lengths(*focal_px):
-                values = values_of(camera)
-                values[0] = tried
-                try:
-                    about = camera_of(values, (camera.width_px, camera.height_px))
-                except ConfigError:  # its distortion folds back at this focal length
-                    continue
-                for frame in usable[first : first + AT_ONCE]:
-                    asked = identify_part(wide, [frame], about, share, few=FEW)
-                    if asked.found:
-                        fit = fit_camera(asked.seen([frame], matcher), values, FOCAL, WIDE_PX / 3.0)
-                        return camera_of(fit.values, (camera.width_px, camera.height_px)), share
+        for share, focal in product(SHARES, _focal_lengths(*focal_px, step)):
+            values[0] = focal
+            try:
+                about = camera_of(values, size_px)
+            except ConfigError:  # its distortion folds back at this focal length
+                continue
+            for frame in usable[first : first + AT_ONCE]:
+                asked = identify_part(wide, [frame], about, share, few=FEW, fov_error=error)
+                if asked.found:
+                    seen, noise_px = asked.seen([frame], matcher), tolerance_px / NOISE_DEVIATIONS
+                    values[0] = asked.focal_length_px
+                    fit = fit_camera(seen, values, FOCAL, noise_px)
+                    return camera_of(fit.values, size_px), share
     return None
 
 
@@ -174,6 +192,7 @@ def identify_part(
     share: float = 1.0,
     *,
     few: int | None = None,
+    fov_error: float = 0.0,
 ) -> Identified:
     """Identify the middle of frames.
 
@@ -189,6 +208,8 @@ def identify_part(
         Part of width and height to identify.
     few : int, optional
         Only so many centroids; all by default.
+    fov_error : float, default 0
+        As `Matcher.identify` takes it.
 
     Returns
     -------
@@ -204,7 +225,7 @@ def identify_part(
             away = np.hypot(*(px[rows] - 0.5 * np.array([middle.width_px, middle.height_px])).T)
             rows = np.sort(rows[np.argsort(away if frame.mag is None else frame.mag[rows])[:few]])
         mag = None if frame.mag is None else frame.mag[rows]
-        result = matcher.identify(px[rows], middle, magnitudes=mag)
+        result = matcher.identify(px[rows], middle, magnitudes=mag, fov_error=fov_error)
         results.append(_of_all(result, rows, len(px)))
     return Identified(tuple(results), camera, matcher.tolerance_px)
 
@@ -272,12 +293,13 @@ def _supported(seen: Seen, values: Array, size_px: tuple[int, int], tolerance_px
     return fit
 
 
-def _focal_lengths(shortest: float, longest: float) -> Iterator[float]:
-    """Return focal lengths that are at most `STEP` apart, from the middle outwards."""
-    steps = math.ceil(math.log(longest / shortest) / math.log(STEP))
-    grid = np.geomspace(shortest, longest, steps + 1)
-    middle = math.log(shortest * longest) / 2.0
-    yield from grid[np.argsort(np.abs(np.log(grid) - middle), kind="stable")].tolist()
+def _focal_lengths(shortest: float, longest: float, step: float) -> list[float]:
+    """Return the middles of the parts of a range that a step covers, the middle one first."""
+    parts = max(1, math.ceil(math.log(longest / shortest) / math.log(step)))
+    edges = np.geomspace(shortest, longest, parts + 1)
+    grid = np.sqrt(edges[:-1] * edges[1:])
+    away = np.abs(np.log(grid) - 0.5 * math.log(shortest * longest))
+    return list(grid[np.argsort(away, kind="stable")].tolist())
 
 
 def _of_all(result: MatchResult, rows: NDArray[np.int64], count: int) -> MatchResult:
