@@ -173,9 +173,7 @@ def fit_camera(
             break
     inside = np.abs(residual_px) <= BEND * noise_px
     reduced = reduced_derivatives(seen, values, rows, inside)[inside.ravel()]
-    covariance = np.asarray(
-        noise_px**2 * np.linalg.pinv(reduced.T @ reduced, hermitian=True), float
-    )
+    covariance = noise_px**2 * _inverse_of_square(reduced)
     return Fit(tuple(free), values, covariance, noise_px, residual_px, seen)
 
 
@@ -278,6 +276,15 @@ def reduced_derivatives(
     mixed = np.add.reduceat(across @ by_value, first)
     follows = np.linalg.pinv(normal, hermitian=True) @ mixed
     return np.asarray((by_value - by_turn @ follows[seen.frame]).reshape(-1, len(rows)))
+
+
+def _inverse_of_square(slope: Array) -> Array:
+    """Return the inverse of ``slope.T @ slope``, whose columns have very different sizes."""
+    size = np.linalg.norm(slope, axis=0)
+    size[size == 0.0] = 1.0
+    _, single, rows = np.linalg.svd(slope / size, full_matrices=False)
+    half = rows.T / np.maximum(single, 1e-12) / size[:, None]
+    return np.asarray(half @ half.T)
 
 
 def _body(seen: Seen, matrices: Array) -> Array:

@@ -32,7 +32,7 @@ NEAR = 1e-5
 MIN_STARS = 4
 """Stars that a frame keeps at least."""
 
-SURE = 2.0
+SURE = 1.5
 """A model loses to a better one if the difference is larger than this many standard errors."""
 
 MODELS = tuple(
@@ -60,9 +60,9 @@ class Trial:
         Root mean square residual on each axis over the frames that were left out; inf for a model
         that cannot be fitted or whose image folds back on the detector.
     worse_px2 : float
-        Mean over the frames of their mean square residual less that of the best model.
+        Mean square residual on each axis less that of the best model.
     worse_error_px2 : float
-        Standard error of that difference.
+        Standard error of that difference, from how it scatters between frames.
     is_chosen : bool
         Whether this is the model that the rule chooses.
     """
@@ -102,23 +102,31 @@ def choose_model(
     -------
     list of Trial
         One a model. The one with the fewest terms is chosen that is not worse than the best one
-        by more than `SURE` standard errors; of those with as many terms, the better one.
+        by more than `SURE` standard errors; of those with as many terms, one without tangential
+        terms, and then the better one.
     """
     kept = _without_strays(seen, values, noise_px)
     squares = np.array([_held_out(kept, values, free, size_px) for free in models])
-    mean = squares.mean(axis=1)
-    best = squares[int(mean.argmin())]
+    numbers, frames = 2 * len(kept), squares.shape[1]
+    mean = squares.sum(axis=1) / numbers
     with np.errstate(invalid="ignore"):
-        worse = squares - best
-        spread = worse.std(axis=1, ddof=1) / math.sqrt(squares.shape[1])
-    tied = [k for k in range(len(models)) if worse[k].mean() <= SURE * spread[k]]
-    best_model = min(tied, key=lambda k: (len(models[k]), mean[k]), default=0)
+        difference = squares - squares[int(mean.argmin())]
+        worse = difference.sum(axis=1) / numbers
+        error = difference.std(axis=1, ddof=1) * math.sqrt(frames) / numbers
+    tied = [k for k in range(len(models)) if worse[k] <= SURE * error[k]]
+    simplest = min(tied, key=lambda k: (*_complexity(models[k]), mean[k]), default=0)
     return [
-        Trial(
-            free, math.sqrt(mean[k]), float(worse[k].mean()), float(spread[k]), k == best_model
-        )
+        Trial(free, math.sqrt(mean[k]), float(worse[k]), float(error[k]), k == simplest)
         for k, free in enumerate(models)
-    ]  # fmt: skip
+    ]
+
+
+def _complexity(free: tuple[str, ...]) -> tuple[int, bool]:
+    """Return the number of terms, and whether there are tangential ones.
+
+    In a narrow field these are nearly the same as a principal point, which every camera has.
+    """
+    return len(free), TANGENTIAL[0] in free
 
 
 def chosen(trials: Sequence[Trial]) -> tuple[str, ...]:
@@ -193,7 +201,7 @@ def _without_strays(seen: Seen, values: Array, noise_px: float) -> Seen:
 
 
 def _held_out(seen: Seen, values: Array, free: tuple[str, ...], size_px: tuple[int, int]) -> Array:
-    """Return the mean square residual of each frame with a camera that was made without it."""
+    """Return the sum of squares of each frame with a camera that was made without it."""
     count = len(seen.matrices)
     group = np.arange(count) % min(FOLDS, count)
     whole = fit_camera(seen, start_of(values, free, size_px), free, FAR_PX, passes=1, accuracy=NEAR)
@@ -205,8 +213,7 @@ def _held_out(seen: Seen, values: Array, free: tuple[str, ...], size_px: tuple[i
             return np.full(count, np.inf)
         left = whole.seen.of(group == fold)
         residual_px, _ = turned_to(left, fitted, FAR_PX)
-        squares = np.bincount(left.frame, (residual_px**2).sum(axis=1))
-        out[group == fold] = squares / (2 * np.bincount(left.frame))
+        out[group == fold] = np.bincount(left.frame, (residual_px**2).sum(axis=1))
     return out
 
 
@@ -219,10 +226,12 @@ def _without_each(whole: Fit, group: NDArray[np.int64]) -> Iterator[Array]:
     rows = [PARAMETERS.index(name) for name in whole.free]
     everywhere = np.ones_like(whole.residual_px, dtype=bool)
     slope = reduced_derivatives(whole.seen, whole.values, rows, everywhere)
+    size = np.linalg.norm(slope, axis=0)
+    size[size == 0.0] = 1.0
     of_row = np.repeat(group[whole.seen.frame], 2)
     for fold in range(group.max() + 1):
         kept = of_row != fold
-        step = np.linalg.lstsq(slope[kept], whole.residual_px.ravel()[kept])[0]
+        step = np.linalg.lstsq(slope[kept] / size, whole.residual_px.ravel()[kept])[0]
         values = whole.values.copy()
-        values[rows] += step
+        values[rows] += step / size
         yield values
