@@ -13,6 +13,7 @@ from astropy.coordinates import SkyCoord
 from astropy.wcs import WCS
 
 from starcat.errors import NotIdentifiedError
+from starcat.exchange.onboard import export_image
 from starcat.geometry.attitude import (
     matrix_from_quaternion,
     matrix_from_radec_roll,
@@ -374,6 +375,21 @@ def test_an_attitude_that_is_not_near_the_prior_is_the_reason(sky):
     assert found.status == "no_match"
     assert found.refusal is not None
     assert found.refusal.reason == "no_candidate"
+
+
+@needs_c
+def test_an_onboard_image_tells_the_same_but_why_not(small_artifact, tmp_path):
+    export_image(small_artifact, "onboard", tmp_path / "db.img")
+    ground, flight = Matcher.open(small_artifact), Matcher.open(tmp_path / "db.img")
+    frame = a_frame(ground.database, ground.database.camera)
+    one, other = (matcher.identify(frame.centroids_px) for matcher in (ground, flight))
+    assert one.stars.star_id.tolist() == other.stars.star_id.tolist()
+    assert other.stars.star == tuple(map(str, other.stars.star_id))
+    # The directions of an image are rounded, to some milliarcseconds.
+    assert np.abs(one.stars.dx_px - other.stars.dx_px).max() < 1e-3
+    px = np.random.default_rng(3).random((5, 2)) * 512.0
+    assert (flight.identify(px).status, flight.identify(px).refusal) == ("no_match", None)
+    assert "no_match" in flight.identify(px)._repr_html_()
 
 
 def test_an_answer_is_shown_in_a_line_and_in_a_notebook(sky):

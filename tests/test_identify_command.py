@@ -52,6 +52,17 @@ def test_answers_come_line_by_line_from_a_stream(
     assert second["refusal"]["reason"] == "too_few_stars"
 
 
+def test_a_broken_line_of_a_stream_ends_it_after_the_answers_before_it(
+    starcat: Run, small_artifact: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = '{"centroids_px": [[1, 2]]}\n\n{"centroids_px": [[1'
+    monkeypatch.setattr("sys.stdin", StringIO(text))
+    run = starcat(["identify", small_artifact, "-", "--ndjson"])
+    assert run.code == 2
+    assert json.loads(run.out)["frame"] == "stdin 1"
+    assert json.loads(run.err)["error"]["message"].startswith("stdin 3: not JSON")
+
+
 @pytest.mark.parametrize("form", ["csv", "json", "one line of json"])
 def test_centroids_come_from_stdin(
     starcat: Run, frame: Path, small_artifact: Path, monkeypatch: pytest.MonkeyPatch, form: str
@@ -97,7 +108,9 @@ def test_the_reason_and_what_to_try_are_printed(
     assert all(len(line) <= 100 for line in run.out.splitlines())
 
 
-def worst_arcsec(header: fits_file.Header, answer: dict[str, Any]) -> float:
+def worst_arcsec(
+    header: fits_file.Header, answer: dict[str, Any], *, bottom_up: bool = False
+) -> float:
     """How far the WCS puts spots from their stars, against what the answer says of that."""
     stars = [star for star in answer["stars"] if star["star"]]
     assert len(stars) > 10
@@ -105,14 +118,14 @@ def worst_arcsec(header: fits_file.Header, answer: dict[str, Any]) -> float:
         np.array([star[name] for star in stars])
         for name in ("x_px", "y_px", "ra_deg", "dec_deg", "separation_arcsec")
     )
-    y = header["NAXIS2"] - y if header["ROWORDER"] == "BOTTOM-UP" else y
+    y = header["NAXIS2"] - y if bottom_up else y
     place = WCS(header).pixel_to_world(x - 0.5, y - 0.5)
     return float(np.abs(place.separation(SkyCoord(ra, dec, unit="deg")).arcsec - said).max())
 
 
-@pytest.mark.parametrize("bottom_up", [False, True], ids=["top down", "bottom up"])
+@pytest.mark.parametrize("said_by", [None, "the file", "--flip"], ids=str)
 def test_the_wcs_goes_into_a_copy_of_a_fits_file(
-    starcat: Run, small_artifact: Path, tmp_path: Path, *, bottom_up: bool
+    starcat: Run, small_artifact: Path, tmp_path: Path, said_by: str | None
 ) -> None:
     image, copy = tmp_path / "frame.fits", tmp_path / "copy.fits"
     assert starcat(["simulate", small_artifact, "-o", image, "--seed", "7"]).code == 0
@@ -120,10 +133,13 @@ def test_the_wcs_goes_into_a_copy_of_a_fits_file(
         parts[0].header["OBJECT"] = "a field"
         parts[0].header["CRVAL1"] = 12.0
         parts[0].header["CROTA2"] = 77.0
-        if bottom_up:
+        if said_by:
             parts[0].data = parts[0].data[::-1]
+            del parts[0].header["ROWORDER"]
+        if said_by == "the file":
             parts[0].header["ROWORDER"] = "BOTTOM-UP"
-    run = starcat(["identify", small_artifact, image, "--json", "--wcs", copy])
+    more = ["--flip"] if said_by == "--flip" else []
+    run = starcat(["identify", small_artifact, image, "--json", "--wcs", copy, *more])
     assert run.code == 0
     [answer] = json.loads(run.out)
     with fits_file.open(copy) as parts, fits_file.open(image) as before:
@@ -133,7 +149,24 @@ def test_the_wcs_goes_into_a_copy_of_a_fits_file(
         assert header["OBJECT"] == "a field"
         assert "CROTA2" not in header
         assert "MJDREF" not in header
-        assert worst_arcsec(header, answer) < 1e-3
+        assert worst_arcsec(header, answer, bottom_up=bool(said_by)) < 1e-3
+
+
+def test_all_parts_of_a_compressed_fits_file_are_in_the_copy(
+    starcat: Run, small_artifact: Path, tmp_path: Path
+) -> None:
+    image, packed, copy = (tmp_path / name for name in ("frame.fits", "frame.fits.fz", "copy.fits"))
+    assert starcat(["simulate", small_artifact, "-o", image, "--seed", "7"]).code == 0
+    values = fits_file.getdata(image)
+    table = fits_file.BinTableHDU.from_columns([fits_file.Column("A", "J", array=[1, 2])])
+    parts = [fits_file.PrimaryHDU(), fits_file.CompImageHDU(values), table]
+    fits_file.HDUList(parts).writeto(packed)
+    run = starcat(["identify", small_artifact, packed, "--json", "--wcs", copy])
+    [answer] = json.loads(run.out)
+    with fits_file.open(copy) as copied:
+        assert [type(part) for part in copied] == [type(part) for part in parts]
+        assert np.array_equal(copied[1].data, values)
+        assert worst_arcsec(copied[1].header, answer) < 1e-3
 
 
 def test_the_wcs_of_a_png_goes_into_a_new_fits_file(

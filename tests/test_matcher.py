@@ -32,7 +32,7 @@ from starcat.matcher.methods.table import METHODS, best_method
 from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder
 from starcat.matcher.observation import Observation, observe
 from starcat.matcher.pose import pose_at
-from starcat.matcher.verification import REACH, agree, agreeing_centroids, verify
+from starcat.matcher.verification import REACH, BestOf, agree, agreeing_centroids, verify
 from starcat.simulation.selftest import answers_rightly, self_test
 from starcat.simulation.simulate import Frame, Noise, simulate_frame, simulate_frames
 from starcat.simulation.sky import Sky
@@ -41,6 +41,13 @@ CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
 
 IN_MEMORY = ("triangle", "pairs", "pyramid")
 """The methods whose products the fixture `sky_of` makes."""
+
+
+def verified(candidates, seen, database):
+    """Return the best agreement of a batch of candidates."""
+    best = BestOf(1e-9)
+    verify(candidates, seen, database, best)
+    return best.found
 
 
 def agreement_of(matrix, seen, database):
@@ -321,9 +328,7 @@ def test_verification_finds_the_true_one_among_false_ones(sky):
         true = truth_as_candidate(frame, seen)
         stars = generator.integers(len(sky.directions), size=(300, 3))
         stars[generator.integers(300)] = true.stars[0]
-        found = verify(
-            Candidates(np.broadcast_to(true.centroids, (300, 3)), stars), seen, sky, 1e-9
-        )
+        found = verified(Candidates(np.broadcast_to(true.centroids, (300, 3)), stars), seen, sky)
         assert found is not None
         assert found.false_match_probability < 1e-9
         assert found.star_index.tolist() == frame.star_index[seen.rows].tolist()
@@ -335,13 +340,13 @@ def test_verification_of_false_ones_is_never_certain(sky):
         seen = observed(frame)
         stars = generator.integers(len(sky.directions), size=(300, 3))
         centroids = np.broadcast_to(np.arange(3), (300, 3))
-        found = verify(Candidates(centroids, stars), seen, sky, 1e-9)
+        found = verified(Candidates(centroids, stars), seen, sky)
         assert found is None or found.false_match_probability > 1e-6
 
 
 def test_verification_of_nothing(sky):
     none = np.empty((0, 3), dtype=np.intp)
-    assert verify(Candidates(none, none), observed(frames(sky, 1)[0]), sky, 1e-9) is None
+    assert verified(Candidates(none, none), observed(frames(sky, 1)[0]), sky) is None
 
 
 # --- Methods

@@ -107,7 +107,9 @@ def _copy_fits(data: bytes, result: MatchResult, flip: bool | None, buffer: io.B
 
     # Values stay as they are stored, whatever the scale of the file.
     with fits.open(io.BytesIO(data), memmap=False, do_not_scale_image_data=True) as parts:
-        part = next(part for part in parts if part.is_image and len(part.shape) >= 2)
+        part = next(
+            part for part in parts if part.is_image and len(part.shape) >= 2 and min(part.shape) > 0
+        )
         order = str(part.header.get("ROWORDER", "")).strip().upper()
         bottom_up = order == "BOTTOM-UP" if flip is None else flip
         for key in [key for key in part.header if _OF_A_WCS.fullmatch(key)]:

@@ -7,6 +7,7 @@ the readable reference in numpy; where it can, the C library answers, with the s
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Sequence
@@ -22,17 +23,18 @@ from numpy.typing import ArrayLike, NDArray
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import checked_number
+from starcat.matcher.budget import Budget, BudgetSpentError
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database, open_database, open_image, products_in
 from starcat.matcher.fast import FastMatcher, Limits, fast_matcher, is_compiled
 from starcat.matcher.many import MatchResults
 from starcat.matcher.methods.table import METHODS, best_method, method_named
 from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder
-from starcat.matcher.observation import WIDEST_FOV_ERROR, Observation, as_frame, observe
+from starcat.matcher.observation import MIN_SHARE, WIDEST_FOV_ERROR, Observation, as_frame, observe
 from starcat.matcher.refusal import Refusal
 from starcat.matcher.result import MatchResult, identified, unidentified
 from starcat.matcher.stars import Asked
-from starcat.matcher.verification import Agreement, verify
+from starcat.matcher.verification import Agreement, BestOf, verify
 from starcat.onboard.layout import FEATURES
 from starcat.onboard.reading import is_image
 
@@ -94,6 +96,14 @@ class Matcher:
         and ``pyramid`` with the default selection: with triangles twenty times as fast from
         Python, and a hundred times in itself. Both name the same stars. ``auto`` is ``c`` where
         it can serve.
+    min_share : float
+        Smallest share of the frame, by weight, that the attitude of an answer explains; a third.
+    max_steps : float
+        Steps that a frame may take (`starcat.matcher.budget`), then the best answer so far is
+        given, or none. The same steps give the same answer. Infinite by default.
+    time_limit_s : float
+        Seconds that a frame may take. Infinite by default. Where this, ``min_share`` or
+        ``max_steps`` is given, ``auto`` is ``numpy``.
     """
 
     database: Database
@@ -106,6 +116,9 @@ class Matcher:
     noise_px: float | None = None
     noise_mag: float | None = None
     engine: Engine = "auto"
+    min_share: float = MIN_SHARE
+    max_steps: float = math.inf
+    time_limit_s: float = math.inf
 
     def __post_init__(self) -> None:
         """Check what was stated, and find the tolerance where it was not given."""
@@ -113,6 +126,13 @@ class Matcher:
             if getattr(self, name) is not None:
                 checked_number(name, getattr(self, name), 0.0)
         of_noise = None if self.noise_px is None else NOISE_DEVIATIONS * self.noise_px
+        if not 0.0 <= self.min_share <= 1.0:
+            text = f"min_share is {self.min_share!r}; expected 0 to 1"
+            raise ConfigError(text, key="min_share", value=self.min_share)
+        for name in ("max_steps", "time_limit_s"):
+            if not getattr(self, name) > 0.0:
+                text = f"{name} is {getattr(self, name)!r}; expected a number above 0"
+                raise ConfigError(text, key=name, value=getattr(self, name))
         if self.tolerance_px is None:
             object.__setattr__(self, "tolerance_px", of_noise or TOLERANCE_PX)
         elif of_noise not in (None, self.tolerance_px):
@@ -141,12 +161,13 @@ class Matcher:
         if self.method not in FEATURES:
             return f"method {self.method!r} is not in C; choose one of {', '.join(FEATURES)}"
         if not self._is_default:
-            return "it has no other selection and number of batches than the default ones"
+            return "it has no other selection, share of the frame and limits than the default ones"
         return f"{self.database.name} has too many stars or features for an onboard image"
 
     @property
     def _is_default(self) -> bool:
-        return self.selection == DEFAULT and self.max_batches == MAX_BATCHES
+        own = self.selection, self.max_batches, self.min_share, self.max_steps, self.time_limit_s
+        return own == (DEFAULT, MAX_BATCHES, MIN_SHARE, math.inf, math.inf)
 
     @property
     def _fast(self) -> FastMatcher | None:
@@ -179,6 +200,9 @@ class Matcher:
         noise_px: float | None = None,
         noise_mag: float | None = None,
         engine: Engine = "auto",
+        min_share: float = MIN_SHARE,
+        max_steps: float = math.inf,
+        time_limit_s: float = math.inf,
     ) -> Matcher:
         """Open the database of an artifact, or an onboard image.
 
@@ -190,7 +214,8 @@ class Matcher:
         method : str, default "triangle"
             A key of `METHODS`; None for the best one that the artifact's products allow. An
             image has one method, which is used whatever is asked for.
-        tolerance_px, max_false_match_probability, selection, noise_px, noise_mag, engine
+        tolerance_px, max_false_match_probability, selection, noise_px, noise_mag, engine, \
+        min_share, max_steps, time_limit_s
             As the attributes.
 
         Returns
@@ -223,6 +248,9 @@ class Matcher:
             noise_px=noise_px,
             noise_mag=noise_mag,
             engine=engine,
+            min_share=min_share,
+            max_steps=max_steps,
+            time_limit_s=time_limit_s,
         )
 
     def identify(
@@ -408,29 +436,47 @@ class Matcher:
                 f"a frame of {len(frame)} centroids and this camera are beyond the C library, and "
                 "an onboard image holds nothing for numpy; open the artifact that it is of"
             )
-        stated = {"noise_px": self.noise_px, "noise_mag": self.noise_mag}
-        observation = observe(frame, camera, self.tolerance_px, mag, fov_error=fov_error, **stated)
+        observation = observe(
+            frame,
+            camera,
+            self.tolerance_px,
+            mag,
+            noise_px=self.noise_px,
+            noise_mag=self.noise_mag,
+            fov_error=fov_error,
+            min_share=self.min_share,
+            budget=Budget(self.max_steps, self.time_limit_s),
+        )
         if len(observation) < MIN_STARS:
             return unidentified("too_few_stars", observation)
-        found = self._search(observation)
+        found, reason = self._search(observation)
         if found is None:
-            return unidentified("no_match", observation, Refusal("chance"))
+            return unidentified("no_match", observation, Refusal(reason or "no_candidate"))
+        if found.false_match_probability > self.max_false_match_probability:
+            return unidentified("no_match", observation, _refusal(found, reason))
         return identified(found, observation, self.database.star_id)
 
-    def _search(self, observation: Observation) -> Agreement | None:
-        """Return the first agreement that is certain, or the best of those that are accepted."""
+    def _search(
+        self, observation: Observation
+    ) -> tuple[Agreement | None, Literal["time", "steps"] | None]:
+        """Return the first agreement that is certain, or the best one, and what ended the search.
+
+        The best one is that which chance explains least, among those that are withheld too.
+        """
         limit = self.max_false_match_probability
         certain = limit if limit <= CERTAIN else max(CERTAIN, 0.01 * limit)
-        best: Agreement | None = None
+        best = BestOf(certain)
         proposals = METHODS[self.method].propose(observation, self.database, self.selection)
-        for candidates in islice(proposals, self.max_batches):
-            found = verify(candidates, observation, self.database, certain)
-            if best is None or (
-                found is not None and found.false_match_probability < best.false_match_probability
-            ):
-                best = found
-            if best is not None and best.false_match_probability <= certain:
-                break
-        if best is None or best.false_match_probability > self.max_false_match_probability:
-            return None
-        return best
+        try:
+            for candidates in islice(proposals, self.max_batches):
+                verify(candidates, observation, self.database, best)
+                if best.is_certain:
+                    break
+        except BudgetSpentError as spent:
+            return best.found, spent.limit
+        return best.found, None
+
+
+def _refusal(found: Agreement, limit: Literal["time", "steps"] | None) -> Refusal:
+    """Return why the best agreement is no answer."""
+    return Refusal(limit or found.withheld or "chance", found.n_matched, found.chance, found.share)

@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from starcat.geometry.camera import Camera
+from starcat.matcher.budget import Budget
 
 Array = NDArray[np.float64]
 
+
+MIN_SHARE = 1.0 / 3.0
+"""Smallest share of a frame that the attitude of an answer explains.
+
+The share is that of the centroids or that of the stars, whichever is larger. Every one of them
+is weighted by the uncertainty that the matched stars leave in its position (`explained_share`).
+Without weights, the many stars of one cluster would accept an attitude that is right in the
+cluster and wrong in the rest of the frame.
+"""
 
 WIDEST_FOV_ERROR = 0.5
 """Largest relative error of a focal length that is found with the attitude."""
@@ -80,6 +90,10 @@ class Observation:
         Standard deviation of a magnitude in the band of the database, where it was stated.
     fov_error : float
         Largest relative error of the focal length, 0 where it is known.
+    min_share : float
+        Smallest share of the frame that the attitude of an answer explains.
+    budget : Budget
+        What the search may take.
     """
 
     rows: NDArray[np.int64]
@@ -92,6 +106,8 @@ class Observation:
     noise_px: float | None = None
     noise_mag: float | None = None
     fov_error: float = 0.0
+    min_share: float = MIN_SHARE
+    budget: Budget = field(default_factory=Budget, compare=False, repr=False)
 
     def __len__(self) -> int:
         """Return the number of usable centroids."""
@@ -125,6 +141,8 @@ def observe(
     noise_px: float | None = None,
     noise_mag: float | None = None,
     fov_error: float = 0.0,
+    min_share: float = MIN_SHARE,
+    budget: Budget | None = None,
 ) -> Observation:
     """Prepare a frame for identification.
 
@@ -139,7 +157,7 @@ def observe(
     magnitudes : array_like of float64, shape (N,), optional
         Magnitudes, larger is fainter; NaN where unknown. The zero point may be any one, unless
         ``noise_mag`` is stated.
-    noise_px, noise_mag, fov_error : float, optional
+    noise_px, noise_mag, fov_error, min_share, budget
         As the attributes of `Observation`.
 
     Returns
@@ -172,6 +190,8 @@ def observe(
         noise_px,
         noise_mag,
         fov_error,
+        min_share,
+        budget or Budget(),
     )
 
 

@@ -10,10 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.matcher.budget import AGREEMENT
 from starcat.matcher.chance import MIN_STARS, false_match_probability
 from starcat.matcher.database import Database
 from starcat.matcher.methods.candidates import Candidates
@@ -25,20 +27,20 @@ from starcat.matcher.ways import Compatible, compatible_pairs
 
 Array = NDArray[np.float64]
 
-MIN_SHARE = 1.0 / 3.0
-"""Smallest share of a frame that the attitude of an answer explains.
-
-The share is that of the centroids or that of the stars, whichever is larger. Every one of them
-is weighted by the uncertainty that the matched stars leave in its position (`explained_share`).
-Without weights, the many stars of one cluster would accept an attitude that is right in the
-cluster and wrong in the rest of the frame.
-"""
+Withheld = Literal["share_of_frame", "scale"] | None
 
 SURE_SHARE = 2.0 / 3.0
 """An attitude that explains a smaller share is refined again, with the reaches of `WIDER`."""
 
 WIDER = (4.0, 2.0)
 """Reaches of that second refinement, one after the other, in units of the final reach."""
+
+NARROWER = (0.5, 0.25, 0.125)
+"""Smaller reaches that are tried where an agreement is not certain, in units of the final reach."""
+
+OVER_CHANCE = 2.0
+"""Centroids within a smaller reach, over the number that its area would have by chance, from which
+it is tried."""
 
 RIVAL_REACH = 4.0
 """A centroid without a star that is this near to one that another centroid has may have more right
@@ -78,15 +80,44 @@ class Agreement:
     residual_rad : float
         Root mean square separation of the matched centroids from their stars; NaN where fewer
         than `MIN_STARS` match.
-    false_match_probability : float
+    chance : float
         Bound on the probability that chance agrees as well; 1 where fewer than `MIN_STARS`
         match.
+    share : float
+        Share of the frame that it explains; 1 where chance explains it, as it is of no use there.
+    withheld : {"share_of_frame", "scale"}, optional
+        Why it is no answer, however unlikely chance is.
     """
 
     pose: Pose
     star_index: NDArray[np.int32]
     residual_rad: float
-    false_match_probability: float
+    chance: float
+    share: float = 1.0
+    withheld: Withheld = None
+
+    @property
+    def false_match_probability(self) -> float:
+        """Bound on the probability that it is due to chance; 1 where it is withheld."""
+        return 1.0 if self.withheld else self.chance
+
+    def is_better_than(self, other: Agreement | None) -> bool:
+        """Return whether chance explains it less, be it only among those that are withheld.
+
+        Parameters
+        ----------
+        other : Agreement, optional
+            Another one.
+
+        Returns
+        -------
+        bool
+            True where there is no other one.
+        """
+        if other is None:
+            return True
+        own = self.false_match_probability, self.chance
+        return own < (other.false_match_probability, other.chance)
 
     @property
     def n_matched(self) -> int:
@@ -94,41 +125,56 @@ class Agreement:
         return int((self.star_index >= 0).sum())
 
 
+@dataclass
+class BestOf:
+    """The best of the agreements that a search has come to.
+
+    Attributes
+    ----------
+    certain : float
+        A false-match probability as low as this ends the search.
+    found : Agreement or None
+        The agreement that chance explains least.
+    """
+
+    certain: float
+    found: Agreement | None = None
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether the search is over."""
+        return self.found is not None and self.found.false_match_probability <= self.certain
+
+
 def verify(
-    candidates: Candidates,
-    observation: Observation,
-    database: Database,
-    certain: float,
-) -> Agreement | None:
-    """Return the agreement of a batch of candidates that chance explains least.
+    candidates: Candidates, observation: Observation, database: Database, best: BestOf
+) -> None:
+    """Work out the agreements of a batch of candidates until one is certain.
 
     Parameters
     ----------
     candidates : Candidates
-        A batch.
+        A batch. After the first one, those with more agreeing centroids are tried first.
     observation : Observation
         The frame.
     database : Database
         The stars.
-    certain : float
-        The first agreement with a false-match probability this low ends the search.
+    best : BestOf
+        Keeps the best agreement, also where the budget of the observation ends the search.
 
-    Returns
-    -------
-    Agreement or None
-        None if there is no candidate. After the first one, those with more agreeing centroids
-        are tried first.
+    Raises
+    ------
+    BudgetSpentError
+        If the search may take no further step.
     """
-    best = None
     for first in range(0, len(candidates), AT_ONCE):
         part = candidates[first : first + AT_ONCE]
         for pose in _worth_trying(part, observation, database):
-            found = agree(pose, observation, database)
-            if best is None or found.false_match_probability < best.false_match_probability:
-                best = found
-            if best.false_match_probability <= certain:
-                return best
-    return best
+            found = agree(pose, observation, database, best.certain)
+            if found.is_better_than(best.found):
+                best.found = found
+            if best.is_certain:
+                return
 
 
 def _worth_trying(
@@ -139,6 +185,7 @@ def _worth_trying(
     Where the focal length is not known, there are too many candidates for the first one to be
     special.
     """
+    observation.budget.spend(len(candidates))
     alone = 0
     if len(candidates) == 1 or not observation.fov_error:
         matrices, factors = first_poses(candidates[:1], observation, database.directions)
@@ -189,7 +236,9 @@ def _cells(database: Database, reach_rad: float) -> StarCells:
     return star_cells(database.directions, reach_rad)
 
 
-def agree(pose: Pose, observation: Observation, database: Database) -> Agreement:
+def agree(
+    pose: Pose, observation: Observation, database: Database, certain: float = 1.0
+) -> Agreement:
     """Match the centroids of a frame with the stars that an attitude predicts.
 
     Parameters
@@ -200,32 +249,60 @@ def agree(pose: Pose, observation: Observation, database: Database) -> Agreement
         The frame.
     database : Database
         The stars.
+    certain : float
+        With a false-match probability as low as this no smaller reach is tried; with 1, none is.
 
     Returns
     -------
     Agreement
         The agreement after the attitude was refined on all matched stars until these no longer
         changed. Each star has one centroid at most. The false-match probability is 1 if too
-        much of the frame is unexplained (`MIN_SHARE`) or if the frame is scaled.
+        much of the frame is unexplained (``min_share``) or if the frame is scaled.
     """
+    observation.budget.spend(AGREEMENT)
     rough = ROUGH if observation.fov_error else ()
     fit = _refined(pose, observation, database, rough)
-    found, share = _judged(fit, observation)
+    found = _judged(fit, observation)
     if found.false_match_probability < 1.0:
         # A false spot beside a star far from the others can turn the attitude so that it is the
         # nearest to the star itself. The star's own spot then has no star, and fits better.
         for rival, centroid in _rivals(fit, observation):
-            other, its_share = _with_rival(found, rival, centroid, observation, database)
+            other = _with_rival(found, rival, centroid, observation, database)
             if other.false_match_probability < found.false_match_probability:
-                found, share = other, its_share
+                found = other
                 break
-    if share < SURE_SHARE:
+    if found.false_match_probability > certain:
+        found = _within_less(found, fit, observation, database)
+    if found.share < SURE_SHARE:
         # This agreement is not due to chance, although much of the frame is unexplained. One or
         # two wrong stars at the edge of a cluster may have spoilt an attitude that is nearly
         # right, and a search within wider reaches replaces them.
-        wider, _ = _judged(_refined(found.pose, observation, database, WIDER), observation)
+        wider = _judged(_refined(found.pose, observation, database, WIDER), observation)
         if wider.false_match_probability < found.false_match_probability:
             return wider
+    return found
+
+
+def _within_less(
+    found: Agreement, fit: _Fit, observation: Observation, database: Database
+) -> Agreement:
+    """Return the best agreement within smaller reaches.
+
+    They are tried where more centroids are near their stars than chance would bring there. The
+    tolerance is the largest error that is allowed. Where centroids are better than that, the
+    true stars of a crowded frame are outnumbered by those that chance puts within its reach. The
+    bound holds for every number of matched stars, so that it may be taken at the best one.
+    """
+    square_px, count = fit.square_px[fit.matched], len(fit.matched)
+    for k, factor in enumerate(NARROWER):
+        near = int(np.sum(square_px <= (factor * REACH * observation.tolerance_px) ** 2))
+        if near < MIN_STARS or near < OVER_CHANCE * factor * factor * count:
+            continue
+        observation.budget.spend(AGREEMENT)
+        narrow = _refined(found.pose, observation, database, NARROWER[:k], factor)
+        other = _judged(narrow, observation)
+        if other.is_better_than(found):
+            found = other
     return found
 
 
@@ -248,8 +325,8 @@ def _rivals(fit: _Fit, observation: Observation) -> list[tuple[int, int]]:
 
 def _with_rival(
     found: Agreement, rival: int, centroid: int, observation: Observation, database: Database
-) -> tuple[Agreement, float]:
-    """Return the agreement in which a centroid's star is that of its rival, and its share."""
+) -> Agreement:
+    """Return the agreement in which a centroid's star is that of its rival."""
     index = found.star_index.copy()
     index[rival], index[centroid] = index[centroid], -1
     matched = np.flatnonzero(index >= 0)
@@ -276,8 +353,9 @@ def _refined(
     observation: Observation,
     database: Database,
     wider: tuple[float, ...] = (),
+    last: float = 1.0,
 ) -> _Fit:
-    """Refine a pose on all stars that match, first within wider reaches."""
+    """Refine a pose on all stars that match, first within other reaches than the last one."""
     radius_rad = pose.camera.radius_rad
     if observation.fov_error:
         radius_rad *= 1.0 + FOCAL_MARGIN
@@ -287,28 +365,25 @@ def _refined(
     if observation.mag is not None and observation.noise_mag is not None:
         compatible = compatible_pairs(observation.mag, database.mag[near], observation.noise_mag)
     before: NDArray[np.int64] = np.empty(0, dtype=np.int64)
-    for factor in (*wider, *MAX_REFINEMENTS * (1.0,)):
+    for step, factor in enumerate((*wider, *MAX_REFINEMENTS * (last,))):
         predicted = pose.camera.pixels_from_directions(u @ pose.matrix.T)
         reach_px = factor * REACH * observation.tolerance_px
         star, square_px = _mutually_nearest(predicted, observation, reach_px, compatible)
         matched = np.flatnonzero(star >= 0)
-        if len(matched) < MIN_STARS or (factor == 1.0 and np.array_equal(star, before)):
+        if len(matched) < MIN_STARS or (step >= len(wider) and np.array_equal(star, before)):
             break
         before = star
         pose = refitted(pose, matched, u[star[matched]], observation)
     return _Fit(pose, near, u, compatible, predicted, star, matched, square_px)
 
 
-def _judged(fit: _Fit, observation: Observation) -> tuple[Agreement, float]:
-    """Return the agreement of a fit and the share of the frame that it explains.
-
-    The share is 1 where chance explains the agreement, as it is of no use there.
-    """
+def _judged(fit: _Fit, observation: Observation) -> Agreement:
+    """Return the agreement of a fit, and whether it is withheld."""
     pose, matched, star = fit.pose, fit.matched, fit.star[fit.matched]
     index = np.full(len(observation), -1, dtype=np.int32)
     index[matched] = fit.near[star]
     if len(matched) < MIN_STARS:
-        return Agreement(pose, index, math.nan, 1.0), 1.0
+        return Agreement(pose, index, math.nan, 1.0)
     seen = pose.body[matched]
     difference = seen - fit.icrs[star] @ pose.matrix.T
     residual_rad = math.sqrt(float(np.vdot(difference, difference)) / len(matched))
@@ -328,12 +403,14 @@ def _judged(fit: _Fit, observation: Observation) -> tuple[Agreement, float]:
     if chance < 1.0 and len(matched) < len(within):
         stars = fit.icrs[within] @ pose.matrix.T
         share = share_of_frame(seen, stars, residual_rad, observation)
-    if share < MIN_SHARE or (
-        chance < 1.0
-        and is_scaled(fit.predicted_px[star], observation.centroids_px[matched], observation)
+    withheld: Withheld = None
+    if share < observation.min_share:
+        withheld = "share_of_frame"
+    elif chance < 1.0 and is_scaled(
+        fit.predicted_px[star], observation.centroids_px[matched], observation
     ):
-        chance = 1.0
-    return Agreement(pose, index, residual_rad, chance), share
+        withheld = "scale"
+    return Agreement(pose, index, residual_rad, chance, share, withheld)
 
 
 def _within_reach_of_frame(predicted_px: Array, observation: Observation) -> NDArray[np.int64]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.geometry.sphere import separation
+from starcat.matcher.budget import LOOKUP
 from starcat.matcher.database import Database
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.consensus import consistent_candidates, neighbour_candidates
@@ -133,6 +134,7 @@ def rank_stars(
     at_once = max(1, _AT_ONCE // max(1, len(sets)))
     for start in range(0, len(a), at_once):
         pairs = slice(start, start + at_once)
+        observation.budget.spend(LOOKUP * len(a[pairs]))
         _add(total, sets, apart, a[pairs], b[pairs], cap_rad)
     used = near.sum(axis=0) + near.sum(axis=1)
     with np.errstate(invalid="ignore"):

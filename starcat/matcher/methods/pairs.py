@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from starcat.geometry.kvector import KVector
 from starcat.geometry.sphere import separation
+from starcat.matcher.budget import LOOKUP
 from starcat.matcher.database import Database
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.triangle_order import TriangleOrder, select_triangles
@@ -48,6 +49,7 @@ def candidates(
     Zhang, Jiang et al. 2006, the improved triangle algorithm, a baseline of S2 and S4.
     """
     for triangle in select_triangles(observation, selection):
+        observation.budget.spend(LOOKUP)
         stars = triangles_of_stars(triangle, observation, database)
         if len(stars):
             yield Candidates(np.broadcast_to(triangle, stars.shape), stars)

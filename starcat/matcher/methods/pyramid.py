@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.geometry.sphere import separation
+from starcat.matcher.budget import LOOKUP
 from starcat.matcher.database import Database
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.pairs import directed_pairs, side_tolerance_rad, triangles_of_stars
@@ -49,6 +50,7 @@ def candidates(
     Navigation 51, 171.
     """
     for triangle in select_triangles(observation, selection):
+        observation.budget.spend(LOOKUP)
         stars = triangles_of_stars(triangle, observation, database)
         if not len(stars):
             continue

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.geometry.patterns import cyclic_shifts, ring_of, sector_of
+from starcat.matcher.budget import LOOKUP
 from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.consensus import consistent_candidates
@@ -71,6 +72,7 @@ def candidates(
     done = 0
     for first, most in ROUNDS:
         for reference in order[done:first]:
+            observation.budget.spend(LOOKUP)
             stars, _ = rank_stars(observation, database, int(reference), most=names.shape[1])
             names[reference, : len(stars)] = stars
         done = first

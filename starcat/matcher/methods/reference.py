@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.matcher.budget import LOOKUP
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.observation import Observation
 
@@ -126,6 +127,7 @@ def by_reference(
     found: list[Candidates] = []
     for propose in proposals:
         for reference in references(observation):
+            observation.budget.spend(LOOKUP)
             found.append(propose(int(reference)))
             if len(found[-1]):
                 yield found[-1][:1]

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.geometry.kvector import KVector
+from starcat.matcher.budget import LOOKUP
 from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder, select_triangles
@@ -65,6 +66,7 @@ def candidates(
     done = step = 0
     while done < len(triangles):
         size = BATCHES[min(step, len(BATCHES) - 1)]
+        observation.budget.spend(LOOKUP * size)
         found = _look_up(triangles[done : done + size], observation, database, product)
         if len(found):
             yield found
