@@ -78,7 +78,8 @@ class Calibration:
     axes : Fit
         The supported terms with aspect and skew free too, which no camera file has.
     trials : tuple of Trial
-        The comparison of models on frames that they have not seen.
+        The comparison of models on frames that they have not seen; empty for so few stars that
+        there is nothing to compare, where only the focal length is fitted.
     frames : tuple of CalibratedFrame
         One a frame, in the order that they were given in.
     """
@@ -151,11 +152,20 @@ def calibrate_frames(
     identified, fit = settled(matcher, frames, *begun, progress)
     if fit is None or len(identified.found) < MIN_FRAMES:
         raise CalibrationError(_too_few(frames, identified, focal_px))
-    size_px = camera.width_px, camera.height_px
-    seen = identified.seen(frames, matcher)
     progress("models", 0, None)
-    trials = choose_model(seen, fit.values, size_px, fit.noise_px)
-    terms = chosen(trials) if is_enough(seen) else fit.free
+    return _finished(matcher, frames, identified, fit)
+
+
+def _finished(
+    matcher: Matcher, frames: Sequence[MeasuredFrame], identified: Identified, fit: Fit
+) -> Calibration:
+    """Return the calibration that compares all models, once the stars are known."""
+    size_px = identified.camera.width_px, identified.camera.height_px
+    seen = identified.seen(frames, matcher)
+    trials, terms = [], fit.free
+    if is_enough(seen):
+        trials = choose_model(seen, fit.values, size_px, fit.noise_px)
+        terms = chosen(trials)
     fit = fit_camera(seen, start_of(fit.values, terms, size_px), terms, fit.noise_px)
     found = camera_of(fit.values, size_px)
     # The camera of the last round may have had other terms: its stars are asked for once more.

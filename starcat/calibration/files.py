@@ -163,14 +163,19 @@ def starting_camera(
             )
         focal = known.focal_length_px
         return known, (focal / (1.0 + USUAL_ERROR), focal * (1.0 + USUAL_ERROR))
-    low, high = fov_deg
-    if not 0.0 < low <= high < 180.0:
-        raise ConfigError(
-            f"the range of fields is {low:g} to {high:g} deg; expected the smaller one first, "
-            "above 0 and below 180"
-        )
-    half_px, half_deg = 0.5 * wanted[0], 0.5 * np.array([high, low])
-    shortest, longest = (half_px / np.tan(np.radians(half_deg))).tolist()
+    shortest, longest = _focal_range(wanted[0], *fov_deg)
     if wanted != (known.width_px, known.height_px):
         known = Camera(*wanted, float(np.sqrt(shortest * longest)))
     return known, (shortest, longest)
+
+
+def _focal_range(width_px: int, low_deg: float, high_deg: float) -> tuple[float, float]:
+    """Return the focal lengths of a range of fields, the shortest first."""
+    if not 0.0 < low_deg <= high_deg < 180.0:
+        raise ConfigError(
+            f"the range of fields is {low_deg:g} to {high_deg:g} deg; expected the smaller one "
+            "first, above 0 and below 180"
+        )
+    half_rad = np.radians(0.5 * np.array([high_deg, low_deg]))
+    shortest, longest = (0.5 * width_px / np.tan(half_rad)).tolist()
+    return shortest, longest
