@@ -42,6 +42,7 @@ from starcat.onboard.blocks import check_blocks
 from starcat.onboard.image import Contents, make_image
 from starcat.onboard.reading import read_image
 from starcat.releases.publishing import publish_artifact
+from starcat.sky.observer import Observer
 from starcat.store.pixels import Pixel
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "errors.md"
@@ -624,6 +625,58 @@ def _(place: Place) -> Call:
 def _(place: Place) -> Call:
     frame = place.write("frame.csv", "x_px,y_px\n1,2\n")
     return ["identify", place.artifact, frame, "--tolerance-px", "2", "--noise-px", "0.5"]
+
+
+def identify_at(place: Place, *options: str) -> Call:
+    return [*place.identify("x_px,y_px\n1,2\n"), *options]
+
+
+@case("time that is none", 2)
+def _(place: Place) -> Call:
+    return identify_at(place, "--time", "22 November")
+
+
+@case("time beyond the ephemeris", 2)
+def _(place: Place) -> Call:
+    return identify_at(place, "--time", "2150-01-01T00:00:00")
+
+
+@case("velocity without a time", 2)
+def _(place: Place) -> Call:
+    return identify_at(place, "--velocity", "0,7.5,0")
+
+
+@case("velocity of two numbers", 2)
+def _(place: Place) -> Call:
+    return identify_at(place, "--time", "2026-11-22T10:00:00", "--velocity", "1,2")
+
+
+@case("velocity beside an orbit", 2)
+def _(place: Place) -> Call:
+    both = ("--velocity", "0,7.5,0", "--orbit", "7000,0,0,0,7.5,0")
+    return identify_at(place, "--time", "2026-11-22T10:00:00", *both)
+
+
+@case("velocity above that of light", 2)
+def _(place: Place) -> Call:
+    return identify_at(place, "--time", "2026-11-22T10:00:00", "--velocity", "299900,0,0")
+
+
+@case("position that is no three numbers", 2)
+def _(place: Place) -> Call:
+    return lambda: Observer.at("2026-11-22T10:00:00", position_km=[7000.0])
+
+
+@case("barycentre without a position", 2)
+def _(place: Place) -> Call:
+    return lambda: Observer.at(
+        "2026-11-22T10:00:00", velocity_km_s=[0.0, 30.0, 0.0], origin="barycentre"
+    )
+
+
+@case("origin unknown", 2)
+def _(place: Place) -> Call:
+    return lambda: Observer.at("2026-11-22T10:00:00", origin="moon")  # type: ignore[arg-type]
 
 
 @case("noise of centroids that is none", 2)

@@ -14,8 +14,12 @@ from starcat.commands.shared import (
     JsonLines,
     MethodName,
     NoisePx,
+    Orbit,
+    Time,
+    Velocity,
     WcsFile,
     field_range,
+    observer_of_options,
     size_in_px,
 )
 
@@ -93,6 +97,9 @@ def identify(
     picture: Annotated[
         Path | None, typer.Option(help="PNG or SVG of the first frame, its stars named.")
     ] = None,
+    time: Time = None,
+    velocity: Velocity = None,
+    orbit: Orbit = None,
     wcs: WcsFile = None,
     fail_on_no_match: FailOnNoMatch = False,
     ndjson: JsonLines = False,
@@ -108,6 +115,7 @@ def identify(
     from starcat.terminal.console import say
     from starcat.terminal.matches import print_answers
 
+    observer = observer_of_options(time, velocity, orbit)
     matcher = Matcher.open(
         artifact,
         method,
@@ -118,12 +126,16 @@ def identify(
     )
     eye = read_camera(camera) if camera else matcher.database.camera
     measured = measure_input(file, flip=flip, wcs=wcs)
-    answered = answer_each(matcher, measured, eye)
-    told = print_answers(answered, matcher.database, as_json=json, as_lines=ndjson)
+    answered = answer_each(matcher, measured, eye, observer)
+    told = print_answers(
+        answered, matcher.database, as_json=json, as_lines=ndjson, observer=observer
+    )
     if measured.image is not None and not told.identified:
         say("An image that was read upside down is never identified: try --flip or --no-flip.")
     if told.first is not None:
-        write_extras(file, measured, *told.first, eye, picture=picture, wcs=wcs, flip=flip)
+        write_extras(
+            file, measured, *told.first, eye, picture=picture, wcs=wcs, flip=flip, observer=observer
+        )
     if fail_on_no_match:
         told.expect_all_identified()
 

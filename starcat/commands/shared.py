@@ -12,6 +12,7 @@ import typer
 from starcat.errors import ConfigError
 
 if TYPE_CHECKING:
+    from starcat.sky.observer import Observer
     from starcat.specs.build_spec import BuildSpec, CameraSpec
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
@@ -32,6 +33,18 @@ Scheduler = Annotated[
 FieldRange = Annotated[
     str | None,
     typer.Option(metavar="LOW:HIGH", help="Fields across the width that are possible, degrees."),
+]
+Time = Annotated[
+    str | None,
+    typer.Option(metavar="UTC", help="When, such as 2026-11-22T10:00:00: aberration, planets."),
+]
+Velocity = Annotated[
+    str | None,
+    typer.Option(metavar="VX,VY,VZ", help="Relative to the Earth, km/s, GCRS; with --time."),
+]
+Orbit = Annotated[
+    str | None,
+    typer.Option(metavar="X,Y,Z,VX,VY,VZ", help="Position too, km; instead of --velocity."),
 ]
 NoisePx = Annotated[float, typer.Option(min=0, max=50, help="Noise of a centroid, each axis.")]
 
@@ -243,3 +256,43 @@ def inputs_by_source(given: list[str] | None, only: str | None = None) -> Mappin
             raise ConfigError(f"--input {text!r} is not SOURCE=PATH, such as sao=sao.dat.gz")
         inputs.setdefault(data_source(name).name, []).append(Path(path))
     return inputs
+
+
+def observer_of_options(
+    time: str | None, velocity: str | None, orbit: str | None
+) -> Observer | None:
+    """Return the observer that a command line tells of.
+
+    Parameters
+    ----------
+    time : str, optional
+        UTC.
+    velocity : str, optional
+        ``VX,VY,VZ``: relative to the Earth, km/s.
+    orbit : str, optional
+        ``X,Y,Z,VX,VY,VZ``: position and velocity relative to the Earth, km and km/s, instead.
+
+    Returns
+    -------
+    Observer or None
+        None without a time.
+
+    Raises
+    ------
+    ConfigError
+        If a text is of another form, or they do not go together.
+    """
+    if time is None:
+        if velocity is not None or orbit is not None:
+            word = "--velocity" if velocity is not None else "--orbit"
+            raise ConfigError(f"{word} is given without --time, the time that it is of")
+        return None
+    from starcat.sky.observer import Observer, numbers_of
+
+    if orbit is not None:
+        if velocity is not None:
+            raise ConfigError("give either --velocity or --orbit, which holds the velocity too")
+        state = numbers_of("--orbit", orbit, 6)
+        return Observer.at(time, position_km=state[:3], velocity_km_s=state[3:])
+    speed = None if velocity is None else numbers_of("--velocity", velocity, 3)
+    return Observer.at(time, velocity_km_s=speed)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from starcat.errors import ConfigError
@@ -17,6 +19,10 @@ from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.simulation.simulate import Frame
+
+if TYPE_CHECKING:
+    from starcat.sky.in_time import SkyInTime
+    from starcat.sky.observer import Observer
 
 IMAGE_SUFFIXES = (".fits", ".fit", ".fts", ".gz", ".fz", ".png", ".tif", ".tiff")
 """Files that are read as images; all others hold centroids."""
@@ -71,7 +77,9 @@ def measure(path: Path, *, flip: bool | None = None) -> MeasuredFile:
     return MeasuredFile([MeasuredFrame(path.stem, spots.centroids_px, spots.mag)], image)
 
 
-def identify_frames(matcher: Matcher, measured: MeasuredFile, camera: Camera) -> list[MatchResult]:
+def identify_frames(
+    matcher: Matcher, measured: MeasuredFile, camera: Camera, observer: Observer | None = None
+) -> list[MatchResult]:
     """Identify the frames of a file.
 
     Parameters
@@ -82,6 +90,8 @@ def identify_frames(matcher: Matcher, measured: MeasuredFile, camera: Camera) ->
         The frames.
     camera : Camera
         That took them.
+    observer : Observer, optional
+        When and where they were taken: then the spots of planets are named.
 
     Returns
     -------
@@ -100,8 +110,24 @@ def identify_frames(matcher: Matcher, measured: MeasuredFile, camera: Camera) ->
                 f"the image has {width} x {height} px, the camera {camera.width_px} x "
                 f"{camera.height_px}; describe the camera that took it with --camera"
             )
+    if observer is None:
+        return [
+            matcher.identify(frame.centroids_px, camera, magnitudes=frame.mag)
+            for frame in measured.frames
+        ]
+    from starcat.sky.spots import identify_in_time
+
     return [
-        matcher.identify(frame.centroids_px, camera, magnitudes=frame.mag)
+        identify_in_time(
+            partial(matcher.identify, camera=camera),
+            matcher.database,
+            frame.centroids_px,
+            camera,
+            observer,
+            magnitudes=frame.mag,
+            tolerance_px=matcher.tolerance_px,
+            max_false_match_probability=matcher.max_false_match_probability,
+        )
         for frame in measured.frames
     ]
 
@@ -146,7 +172,12 @@ def write_simulated(path: Path, frame: Frame, camera: Camera, seed: int) -> None
 
 
 def draw(
-    path: Path, measured: MeasuredFile, result: MatchResult, database: Database, camera: Camera
+    path: Path,
+    measured: MeasuredFile,
+    result: MatchResult,
+    database: Database,
+    camera: Camera,
+    sky: SkyInTime | None = None,
 ) -> None:
     """Draw the first frame of a file with its stars circled and named.
 
@@ -161,7 +192,9 @@ def draw(
     database : Database
         Names of the stars.
     camera : Camera
-        The camera, for its size.
+        The camera.
+    sky : SkyInTime, optional
+        What the time adds: its planets are drawn.
 
     Raises
     ------
@@ -170,35 +203,57 @@ def draw(
     OutputError
         If it cannot be written.
     """
+    from starcat.images.overlay import overlay_from_attitude
     from starcat.images.picture import compass_from_matrix, draw_identified
 
     frame = measured.frames[0]
-    names = [
-        short_name(database.designation[row].decode()) if row >= 0 else None
-        for row in result.star_index
-    ]
-    title, below, compass = f"{frame.name}: {result.status.replace('_', ' ')}", database.name, None
+    title, below = f"{frame.name}: {result.status.replace('_', ' ')}", database.name
+    compass = overlay = None
     if result.status == "identified":
         title = (
             f"{frame.name}: RA {result.boresight_ra_deg:.4f}, "
             f"Dec {result.boresight_dec_deg:+.4f}, roll {result.roll_deg:.3f} deg"
         )
         below = (
-            f"{result.n_matched} of {len(names)} spots are stars of {database.name}, "
+            f"{result.n_matched} of {len(result.star_index)} spots are stars of {database.name}, "
             f"residual {result.residual_arcsec:.1f} arcsec"
         )
-        compass = compass_from_matrix(matrix_from_quaternion(result.q_body_from_icrs))
+        matrix = matrix_from_quaternion(result.q_body_from_icrs)
+        compass = compass_from_matrix(matrix)
+        bodies = () if sky is None else sky.bodies
+        overlay = overlay_from_attitude(matrix, camera, database.epoch_jyear, bodies)
     draw_identified(
         path,
         measured.image,
         (camera.width_px, camera.height_px),
         frame.centroids_px,
-        names,
+        _labels(result, database, sky),
         title,
         mag=frame.mag,
         below=below,
         compass=compass,
+        overlay=overlay,
     )
+
+
+def _labels(result: MatchResult, database: Database, sky: SkyInTime | None) -> list[str | None]:
+    """Return the names that stars are known by; the catalog's own where there is no other.
+
+    The spot of a planet has an empty name: it is identified, and named beside its place.
+    """
+    from starcat.sky.names import common_names
+
+    rows = np.flatnonzero(result.star_index >= 0)
+    stars = result.star_index[rows]
+    own = [name.decode() for name in database.designation[stars].tolist()]
+    known = common_names(own, database.directions[stars], database.mag[stars], database.epoch_jyear)
+    labels: list[str | None] = [None] * len(result.star_index)
+    for row, name, other in zip(rows.tolist(), known, own, strict=True):
+        labels[row] = name or short_name(other)
+    for body in () if sky is None else sky.bodies:
+        if body.row is not None:
+            labels[body.row] = ""
+    return labels
 
 
 def short_name(designation: str) -> str:
@@ -219,7 +274,7 @@ def short_name(designation: str) -> str:
     >>> short_name("Gaia DR3 3221269181884277504"), short_name("SAO 308")
     ('Gaia …84277504', 'SAO 308')
     """
-    words = designation.split()
+    words = designation.split() or [""]
     if len(words[-1]) <= 12:
         return designation
     return f"{words[0]} …{words[-1][-8:]}"
