@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from starcat.errors import StarcatError
     from starcat.face.artifact import open_artifact as open  # noqa: A004 - as numpy, gzip and PIL have it
     from starcat.face.connection import connect
-    from starcat.face.functions import build, ingest, verify
+    from starcat.face.functions import build, calibrate, ingest, verify
     from starcat.geometry.camera import Camera
     from starcat.matcher.matcher import Matcher
     from starcat.sky.in_time import sky_in_time
@@ -35,6 +35,7 @@ __all__ = [
     "StarcatError",
     "__version__",
     "build",
+    "calibrate",
     "connect",
     "identify_in_time",
     "ingest",
@@ -51,6 +52,7 @@ _HOMES = {
     "Observer": ("starcat.sky.observer", "Observer"),
     "StarcatError": ("starcat.errors", "StarcatError"),
     "build": ("starcat.face.functions", "build"),
+    "calibrate": ("starcat.face.functions", "calibrate"),
     "connect": ("starcat.face.connection", "connect"),
     "identify_in_time": ("starcat.sky.spots", "identify_in_time"),
     "ingest": ("starcat.face.functions", "ingest"),

@@ -991,6 +991,59 @@ def _(place: Place) -> Call:
     return [*place.identify("x_px,y_px\n1,2\n"), "--fail-on-no-match"]
 
 
+@case("calibration of frames that are not identified", 1)
+def _(place: Place) -> Call:
+    frame = place.write("frame.csv", "x_px,y_px\n100,2\n3,400\n")
+    return ["calibrate", place.artifact, frame, "-o", place.out]
+
+
+@case("calibration of images of two cameras", 2)
+def _(place: Place) -> Call:
+    paths = [place.folder / "1.fits", place.folder / "2.fits"]
+    for path, side in zip(paths, (48, 64), strict=True):
+        write_image(path, np.zeros((side, 64), dtype=np.uint16))
+    return ["calibrate", place.artifact, *paths, "-o", place.out]
+
+
+@case("calibration of a camera of unknown field", 2)
+def _(place: Place) -> Call:
+    frame = place.write("frame.csv", "x_px,y_px\n1,2\n")
+    return ["calibrate", place.artifact, frame, "--size", "1280x960", "-o", place.out]
+
+
+@case("calibration of a camera of another size than the images", 2)
+def _(place: Place) -> Call:
+    path = place.folder / "1.fits"
+    write_image(path, np.zeros((48, 64), dtype=np.uint16))
+    return ["calibrate", place.artifact, path, "--size", "1280x960", "-o", place.out]
+
+
+@case("range of fields that is none", 2)
+def _(place: Place) -> Call:
+    frame = place.write("frame.csv", "x_px,y_px\n1,2\n")
+    return ["calibrate", place.artifact, frame, "--fov", "5-20", "-o", place.out]
+
+
+@case("range of fields that is swapped", 2)
+def _(place: Place) -> Call:
+    frame = place.write("frame.csv", "x_px,y_px\n1,2\n")
+    return ["calibrate", place.artifact, frame, "--fov", "20:5", "-o", place.out]
+
+
+@case("camera and size of a calibration", 2)
+def _(place: Place) -> Call:
+    frame = place.write("frame.csv", "x_px,y_px\n1,2\n")
+    camera = place.write("camera.toml", "width_px = 9\nheight_px = 9\nfocal_length_px = 9.0\n")
+    known = ["--camera", camera, "--size", "1280x960"]
+    return ["calibrate", place.artifact, frame, *known, "-o", place.out]
+
+
+@case("plot of residuals of a kind that is not drawn", 2)
+def _(place: Place) -> Call:
+    frame = place.write("frame.csv", "x_px,y_px\n1,2\n")
+    return ["calibrate", place.artifact, frame, "--plot", "left.pdf", "-o", place.out]
+
+
 @case("method unknown", 2)
 def _(place: Place) -> Call:
     return [*place.identify("x_px,y_px\n1,2\n"), "--method", "triangles"]

@@ -22,6 +22,7 @@ PUBLIC = [
     "StarcatError",
     "__version__",
     "build",
+    "calibrate",
     "connect",
     "identify_in_time",
     "ingest",

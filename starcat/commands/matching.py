@@ -10,6 +10,7 @@ import typer
 from starcat.commands.shared import (
     Dark,
     FailOnNoMatch,
+    FieldRange,
     FovError,
     Json,
     JsonLines,
@@ -28,9 +29,11 @@ from starcat.commands.shared import (
     TimeLimit,
     Velocity,
     WcsFile,
+    field_range,
     limits_of_options,
     observer_of_options,
     share_of_percent,
+    size_in_px,
 )
 
 app = typer.Typer()
@@ -164,6 +167,53 @@ def identify(
         )
     if fail_on_no_match:
         told.expect_all_identified()
+
+
+@app.command()
+def calibrate(
+    artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FRAMES...", help="As 'starcat identify' takes them.")
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Camera file (TOML) to write.")],
+    camera: Annotated[
+        Path | None, typer.Option(help="Camera file to start from; default: the database's camera.")
+    ] = None,
+    size: Annotated[
+        str | None, typer.Option(metavar="WxH", help="Pixels, such as 1280x960, in its place.")
+    ] = None,
+    fov: FieldRange = None,
+    method: MethodName = None,
+    flip: Annotated[
+        bool | None, typer.Option("--flip/--no-flip", help="First row of the image at the bottom.")
+    ] = None,
+    plot: Annotated[Path | None, typer.Option(help="PNG or SVG of the residuals.")] = None,
+    json: Json = False,
+) -> None:
+    """Find focal length, principal point and distortion of a camera from frames of stars.
+
+    Example: starcat calibrate dist/gaia-12deg-1.0.0 frames.json -o camera.toml --plot left.svg
+    """
+    from starcat.calibration.camera_text import write_camera
+    from starcat.calibration.files import calibrate_files
+    from starcat.calibration.residual_plot import checked_kind, draw_residuals
+    from starcat.matcher.matcher import Matcher
+    from starcat.specs.camera_file import read_camera
+    from starcat.terminal.calibrations import print_calibration
+    from starcat.terminal.console import progress_bars
+
+    checked_kind(plot)
+    known = read_camera(camera) if camera else None
+    size_px, fov_deg = size_in_px(size), field_range(fov)
+    with progress_bars() as progress:
+        found = calibrate_files(
+            Matcher.open(artifact, method), files, camera=known, size_px=size_px, fov_deg=fov_deg,
+            flip=flip, progress=progress,
+        )  # fmt: skip
+    write_camera(found, output)
+    if plot:
+        draw_residuals(found, plot)
+    print_calibration(found, output, as_json=json)
 
 
 @app.command()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypedDict
+from typing import TYPE_CHECKING, Annotated, TypedDict, overload
 
 import typer
 
@@ -29,6 +29,10 @@ Workers = Annotated[
 Scheduler = Annotated[
     str | None,
     typer.Option(metavar="tcp://HOST:PORT", help="A Dask cluster to use instead of this machine."),
+]
+FieldRange = Annotated[
+    str | None,
+    typer.Option(metavar="LOW:HIGH", help="Fields across the width that are possible, degrees."),
 ]
 Time = Annotated[
     str | None,
@@ -180,12 +184,10 @@ def camera_of_options(
     from starcat.specs.build_spec import CameraSpec
     from starcat.specs.reading import what_is_wrong
 
-    found = re.fullmatch(r"([0-9]{1,6})\s*[xX]\s*([0-9]{1,6})", size.strip())
-    if found is None:
-        raise ConfigError(f"--size {size!r} is not WIDTHxHEIGHT in pixels, such as 1280x960")
+    width_px, height_px = size_in_px(size)
     content = {
-        "width_px": int(found[1]),
-        "height_px": int(found[2]),
+        "width_px": width_px,
+        "height_px": height_px,
         "focal_length_mm": focal_mm,
         "pixel_um": pixel_um,
         "fov_x_deg": fov_x_deg,
@@ -196,6 +198,63 @@ def camera_of_options(
         )
     except ValidationError as error:
         raise what_is_wrong(error, "camera") from error
+
+
+@overload
+def size_in_px(text: str) -> tuple[int, int]: ...
+@overload
+def size_in_px(text: str | None) -> tuple[int, int] | None: ...
+def size_in_px(text: str | None) -> tuple[int, int] | None:
+    """Return the width and height of a ``--size``.
+
+    Parameters
+    ----------
+    text : str, optional
+        ``1280x960``.
+
+    Returns
+    -------
+    tuple of int, or None
+        Pixels; None for no text.
+
+    Raises
+    ------
+    ConfigError
+        If the text is of another form.
+    """
+    if text is None:
+        return None
+    found = re.fullmatch(r"([0-9]{1,6})\s*[xX]\s*([0-9]{1,6})", text.strip())
+    if found is None:
+        raise ConfigError(f"--size {text!r} is not WIDTHxHEIGHT in pixels, such as 1280x960")
+    return int(found[1]), int(found[2])
+
+
+def field_range(text: str | None) -> tuple[float, float] | None:
+    """Return the smallest and the largest field of a ``--fov``.
+
+    Parameters
+    ----------
+    text : str, optional
+        ``5:20``, or ``12`` for both.
+
+    Returns
+    -------
+    tuple of float, or None
+        Degrees; None for no text.
+
+    Raises
+    ------
+    ConfigError
+        If the text is of another form.
+    """
+    if text is None:
+        return None
+    low, separator, high = text.partition(":")
+    try:
+        return float(low), float(high if separator else low)
+    except ValueError:
+        raise ConfigError(f"--fov {text!r} is not LOW:HIGH in degrees, such as 5:20") from None
 
 
 def inputs_by_source(given: list[str] | None, only: str | None = None) -> Mapping[str, list[Path]]:
