@@ -2,8 +2,9 @@
 
 Three methods share this stage. Triangles of the brightest stars are first where magnitudes are
 known, as in S3; otherwise the most compact ones are, which in a crowded frame are taken from all
-over it. The order of S4, by the radius of the inscribed circle, can be chosen. Triangles with a short side or a narrow angle are left out,
-because the two centroids of a double star, or three centroids in a line, identify little.
+over it. The order of S4, by the radius of the inscribed circle, can be chosen. Triangles with a
+short side or a narrow angle are left out, because the two centroids of a double star, or three
+centroids in a line, identify little.
 """
 
 from __future__ import annotations
