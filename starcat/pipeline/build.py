@@ -31,7 +31,7 @@ from starcat.pipeline.facts import (
     FilterCoverage,
     Results,
     build_facts,
-    filter_coverage,
+    filter_coverages,
     source_facts,
 )
 from starcat.pipeline.guide_stars import select_stars
@@ -198,7 +198,7 @@ def _make(partial: Path, plan: _Plan, clock: Stopwatch, progress: Progress) -> B
     clock.lap("self-test")
     progress("report", 0, None)
     sources = [*source_facts(catalog, selected, amplitudes, joined), *matched.sources]
-    filters = tuple(filter_coverage(step, spec) for step in selected.steps)
+    filters = filter_coverages(selected.steps, fields, spec)
     results = Results(spec, sources, products, facts, fields, filters, rates)
     report = report_build(partial, results)
     clock.lap("report")
