@@ -62,9 +62,11 @@ class Zones:
         north = math.sin(min(0.5 * math.pi, declination + radius_rad)) + _ROUNDING
         first, last = np.searchsorted(self.height, [south, north])
         rows = self.order[first:last]
-        # Not a product of matrices: for that, threads are woken that take longer than the product.
-        x, y, z = self.directions[rows].T
-        inside = x * axis[0] + y * axis[1] + z * axis[2] >= math.cos(radius_rad)
+        # A product of matrices would wake threads, which takes longer than the product; and the
+        # chord keeps its digits where the cosine of a small angle does not.
+        offset = self.directions[rows] - axis
+        chord = 2.0 * math.sin(0.5 * radius_rad)
+        inside = np.einsum("ij,ij->i", offset, offset) <= chord * chord
         return np.sort(rows[inside])
 
 

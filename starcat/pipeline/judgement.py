@@ -50,7 +50,7 @@ def check_rates(rates: Sequence[Rates], spec: BuildSpec, gap: TilingGap) -> None
             f"{spec.name}: the database identifies {clean.identified} of {clean.identifiable} "
             f"simulated fields with at least 4 stars ({clean.frames} in all), which is "
             f"{most:.1%} at the most; self_test.min_identified asks for {wanted:.1%}. "
-            + " ".join(causes(clean, spec, gap))
+            + ". ".join(causes(clean, spec, gap))
         )
     wrong = sum(rate.wrong for rate in rates)
     if wrong:
@@ -83,8 +83,11 @@ def causes(rates: Rates, spec: BuildSpec, gap: TilingGap) -> list[str]:
 def _causes(rates: Rates, spec: BuildSpec, gap: TilingGap) -> Iterator[str]:
     middle = float(np.median(rates.missed)) if rates.missed else 0.0
     if middle < FEW_STARS:
+        have = f"The missed frames have {middle:g} stars (median)"
+        if not rates.identifiable:
+            have = "No simulated field has 4 stars"
         yield (
-            f"The missed frames have {middle:g} stars (median), too few: a fainter "
+            f"{have}, too few: a fainter "
             "selection.faint_limit_mag or a wider camera gives more stars a field"
         )
     if gap.has_holes:

@@ -102,7 +102,7 @@ def find_triangles(fields: FieldStars, directions: Array, brightest: int) -> Tri
 def _features(
     stars: NDArray[np.int64], directions: Array
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Return area, circumradius and inradius of triangles, so many at a time as need little room."""
+    """Return area, circumradius and inradius of triangles, some at a time to save memory."""
     found = np.empty((3, len(stars)), dtype=np.float32)
     for first in range(0, len(stars), AT_ONCE):
         part = slice(first, first + AT_ONCE)
