@@ -237,13 +237,11 @@ def print_refused(built: Built, *, as_json: bool) -> None:
     built : Built
         What the error carries.
     as_json : bool
-        Whether the rates are wanted as JSON; nothing else is then printed on stdout.
+        Whether JSON is wanted: tables are then left out, as what failed has no result.
     """
     for warning in built.warnings:
         say(f"warning: {warning}")
-    if as_json:
-        print_rates(built.rates, as_json=True)
-    else:
+    if not as_json:
         _print_contents(built)
 
 
