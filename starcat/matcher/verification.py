@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.geometry.zones import Zones, zones_of
 from starcat.matcher.budget import AGREEMENT
 from starcat.matcher.chance import MIN_STARS, false_match_probability
 from starcat.matcher.database import Database
@@ -236,6 +237,10 @@ def _cells(database: Database, reach_rad: float) -> StarCells:
     return star_cells(database.directions, reach_rad)
 
 
+def _zones(database: Database) -> Zones:
+    return zones_of(database.directions)
+
+
 def agree(
     pose: Pose, observation: Observation, database: Database, certain: float = 1.0
 ) -> Agreement:
@@ -359,7 +364,7 @@ def _refined(
     radius_rad = pose.camera.radius_rad
     if observation.fov_error:
         radius_rad *= 1.0 + FOCAL_MARGIN
-    near = np.flatnonzero(database.directions @ pose.matrix[2] >= math.cos(radius_rad))
+    near = database.derived(_zones).near(pose.matrix[2], radius_rad)
     u = database.directions[near]
     compatible = None
     if observation.mag is not None and observation.noise_mag is not None:
