@@ -26,11 +26,11 @@ class Zones:
     Attributes
     ----------
     directions : ndarray of float64, shape (N, 3)
-        Unit vectors in the order in which they were given.
+        Unit vectors, southernmost first, so that a zone is read from one place.
     order : ndarray of int64, shape (N,)
-        Rows of them, southernmost first.
+        Rows that they had when they were given.
     height : ndarray of float64, shape (N,)
-        Their third components in that order.
+        Their third components.
     """
 
     directions: Array
@@ -61,13 +61,12 @@ class Zones:
         south = math.sin(max(-0.5 * math.pi, declination - radius_rad)) - _ROUNDING
         north = math.sin(min(0.5 * math.pi, declination + radius_rad)) + _ROUNDING
         first, last = np.searchsorted(self.height, [south, north])
-        rows = self.order[first:last]
         # A product of matrices would wake threads, which takes longer than the product; and the
         # chord keeps its digits where the cosine of a small angle does not.
-        offset = self.directions[rows] - axis
+        offset = self.directions[first:last] - axis
         chord = 2.0 * math.sin(0.5 * radius_rad)
         inside = np.einsum("ij,ij->i", offset, offset) <= chord * chord
-        return np.sort(rows[inside])
+        return np.sort(self.order[first:last][inside])
 
 
 def zones_of(directions: Array) -> Zones:
@@ -84,4 +83,5 @@ def zones_of(directions: Array) -> Zones:
         Ready to be asked.
     """
     order = np.argsort(directions[:, 2], kind="stable")
-    return Zones(directions, order, np.ascontiguousarray(directions[order, 2]))
+    ordered = directions[order]
+    return Zones(ordered, order, np.ascontiguousarray(ordered[:, 2]))
