@@ -14,6 +14,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.geometry.sphere import separation
 from starcat.matcher.budget import LOOKUP
 from starcat.matcher.database import Database
 from starcat.matcher.methods.candidates import Candidates
@@ -48,7 +49,7 @@ def bases(observation: Observation, database: Database) -> Iterator[Candidates]:
     Yields
     ------
     Candidates
-        Three stars each, which at least one further centroid agrees with; a batch a pair.
+        Three stars each, which at least one further centroid is near a star with; a batch a pair.
 
     Notes
     -----
@@ -85,12 +86,15 @@ def _on_base(
     reach_rad = REACH * observation.tolerance_rad
     near = cells_for(database, reach_rad).has_star(icrs.reshape(-1, 3), reach_rad)
     near = near.reshape(len(rows), len(others))
-    chosen = np.flatnonzero(near.sum(axis=1) >= LEAST_OTHERS)
-    # The farthest of those that agree fixes the attitude best.
-    far = np.where(near[chosen], observation.separation_rad[one, others], -1.0).argmax(axis=1)
-    third = (icrs[chosen, far] @ database.directions.T).argmax(axis=1)
-    ends = np.broadcast_to([one, other], (len(chosen), 2))
-    return Candidates(np.column_stack([ends, others[far]]), np.column_stack([stars[chosen], third]))
+    row, third = np.nonzero(near & (near.sum(axis=1) >= LEAST_OTHERS)[:, None])
+    star = (icrs[row, third] @ database.directions.T).argmax(axis=1)
+    ends = np.broadcast_to([one, other], (len(row), 2))
+    found = Candidates(np.column_stack([ends, others[third]]), np.column_stack([stars[row], star]))
+    u = database.directions[found.stars]
+    error = (
+        separation(u[:, :2], u[:, 2:]) - observation.separation_rad[found.centroids[:, 2:], ends]
+    )
+    return found[np.all(np.abs(error) <= side_tolerance_rad(observation), axis=1)]
 
 
 def _axes(one: Array, other: Array) -> Array:
