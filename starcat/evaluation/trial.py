@@ -28,6 +28,7 @@ from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.triangle_order import TriangleOrder
+from starcat.matcher.observation import MIN_SHARE
 from starcat.matcher.verification import REACH
 from starcat.progress import Progress, no_progress
 from starcat.simulation.simulate import Noise, simulate_frame
@@ -97,6 +98,8 @@ class Trial:
         Order in which the matcher takes triangles.
     guide_stars_only : bool
         Whether nothing but guide stars shines.
+    min_share : float
+        Smallest share of the frame that an answer explains, as the matcher is told.
     seed : int
         Seed of all that is random. Each frame has its own, so that their number changes none.
     """
@@ -113,6 +116,7 @@ class Trial:
     answer: str = "matcher"
     selection: TriangleOrder = field(default_factory=TriangleOrder)
     guide_stars_only: bool = False
+    min_share: float = MIN_SHARE
     seed: int = 1
 
     @property
@@ -274,6 +278,7 @@ def _opened(artifact: Path, trial: Trial) -> tuple[Matcher, Sky]:
         tolerance_px=trial.tolerance_px,
         max_false_match_probability=trial.max_false_match_probability,
         selection=trial.selection,
+        min_share=trial.min_share,
         engine="numpy",  # so that records are the same where there is no compiler
     )
     # Stars that noise may lift over the limit belong to the sky.

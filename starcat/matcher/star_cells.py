@@ -6,11 +6,14 @@ candidate explains. They are made when a database first needs them.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+
+from starcat.matcher.database import Database
 
 Array = NDArray[np.float64]
 
@@ -83,6 +86,29 @@ class StarCells:
         found = np.zeros(len(directions), dtype=bool)
         found[query[near]] = True
         return found
+
+
+def cells_for(database: Database, reach_rad: float) -> StarCells:
+    """Return the cells of a database's stars for a reach, which are made once.
+
+    Parameters
+    ----------
+    database : Database
+        The stars, at least one.
+    reach_rad : float
+        Largest reach that will be asked for, radians.
+
+    Returns
+    -------
+    StarCells
+        Cells for the next power of two: they serve all reaches below it, as those of many cameras.
+    """
+    margin_rad = max(SMALLEST_REACH, 2.0 ** math.ceil(math.log2(reach_rad)))
+    return database.derived(_of_database, margin_rad)
+
+
+def _of_database(database: Database, reach_rad: float) -> StarCells:
+    return star_cells(database.directions, reach_rad)
 
 
 def star_cells(directions: Array, reach_rad: float) -> StarCells:

@@ -23,7 +23,7 @@ from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.observation import Observation
 from starcat.matcher.pose import Pose, first_poses, pose_at, refitted, scaled_directions
 from starcat.matcher.spread import is_scaled, share_of_frame
-from starcat.matcher.star_cells import SMALLEST_REACH, StarCells, star_cells
+from starcat.matcher.star_cells import cells_for
 from starcat.matcher.ways import Compatible, compatible_pairs
 
 Array = NDArray[np.float64]
@@ -230,14 +230,8 @@ def agreeing_centroids(
         reach_rad *= ROUGH[0]
         body = scaled_directions(body, factors)
     icrs = body @ matrices
-    # Cells for the next power of two serve all reaches below it, as those of many cameras.
-    cells = database.derived(_cells, max(SMALLEST_REACH, 2.0 ** math.ceil(math.log2(reach_rad))))
-    near = cells.has_star(icrs.reshape(-1, 3), reach_rad)
+    near = cells_for(database, reach_rad).has_star(icrs.reshape(-1, 3), reach_rad)
     return np.asarray(near.reshape(len(matrices), -1).sum(axis=1))
-
-
-def _cells(database: Database, reach_rad: float) -> StarCells:
-    return star_cells(database.directions, reach_rad)
 
 
 def _near(axis: Array, radius_rad: float, database: Database) -> NDArray[np.int64]:

@@ -63,6 +63,9 @@ class Noise:
         Standard deviation of a magnitude, before the limit decides what is seen.
     limit_mag : float
         Fainter ones are not seen.
+    is_limit_true : bool
+        Whether the true magnitude decides what is seen, not the measured one: then the noise of
+        magnitudes neither hides a star nor lifts a fainter one over the limit.
     """
 
     noise_px: float = 0.0
@@ -71,6 +74,7 @@ class Noise:
     false_share: float = 0.0
     noise_mag: float = 0.0
     limit_mag: float = float("inf")
+    is_limit_true: bool = False
 
 
 def simulate_frames(
@@ -138,10 +142,10 @@ def simulate_frame(
     inside = camera.contains(centroids)
     centroids, star = centroids[inside], near[inside]
     seen = generator.random(len(star)) >= noise.drop_probability
-    mag = sky.mag[star]
+    true_mag = mag = sky.mag[star]
     if noise.noise_mag > 0.0:
         mag = mag + generator.normal(scale=noise.noise_mag, size=len(mag))
-    seen &= mag <= noise.limit_mag
+    seen &= (true_mag if noise.is_limit_true else mag) <= noise.limit_mag
     centroids, star, mag = centroids[seen], star[seen], mag[seen]
     centroids = centroids + generator.normal(scale=noise.noise_px, size=centroids.shape)
     count = noise.false_stars + round(len(star) * noise.false_share / (1.0 - noise.false_share))

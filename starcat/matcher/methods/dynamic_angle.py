@@ -18,6 +18,7 @@ from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.pairs import side_tolerance_rad
 from starcat.matcher.methods.reference import Surroundings, by_reference, rows_between, surroundings
+from starcat.matcher.methods.small_fields import bases
 from starcat.matcher.methods.triangle_order import TriangleOrder
 from starcat.matcher.observation import Observation
 
@@ -86,6 +87,7 @@ def candidates(
         return lambda reference: _ranked(observation, database, reference, tolerance, steps)[0]
 
     yield from by_reference(observation, propose((1,)), propose(PASSED_OVER))
+    yield from bases(observation, database)
 
 
 def rank_stars(

@@ -19,7 +19,7 @@ from starcat.matcher.budget import LOOKUP
 from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder, select_triangles
-from starcat.matcher.methods.triangle_shape import are_similar, similar_triangles
+from starcat.matcher.methods.triangle_shape import are_similar, sides_by_length, similar_triangles
 from starcat.matcher.observation import Observation
 
 Array = NDArray[np.float64]
@@ -30,7 +30,11 @@ BATCHES = (2, 8, 32)
 """Sizes of the first batches of observed triangles; all later batches have the last size."""
 
 MANY = 200
-"""With more triangles of stars than this, one side is compared before all three are."""
+"""With more triangles of stars than this, their sides are compared by length before they are put
+into the order of the observed ones."""
+
+ROUNDING_RAD = 1e-7
+"""More than the sides of all triangles lose where they are kept as 32 bits, radians."""
 
 SIDE_TOLERANCE = 1.5
 """Largest error of a side, in units of the largest error of a centroid."""
@@ -91,8 +95,7 @@ def _look_up(
     observed = np.repeat(np.arange(len(triangles)), [len(rows) for rows in found])
     rows = np.concatenate(found)
     if len(rows) > MANY and not observation.fov_error:
-        close = _has_a_side(rows, sides[observed], tolerance_rad, database, product)
-        rows, observed = rows[close], observed[close]
+        rows, observed = _with_sides(rows, observed, sides, tolerance_rad, database)
     stars = np.stack([product["i"][rows], product["j"][rows], product["k"][rows]], axis=-1)
     return _in_order(
         triangles[observed], stars, sides[observed], tolerance_rad, observation, database
@@ -118,18 +121,23 @@ def _same_triangles(
     return found
 
 
-def _has_a_side(
+def _with_sides(
     rows: NDArray[np.intp],
+    observed: NDArray[np.intp],
     sides: Array,
     tolerance_rad: float,
     database: Database,
-    product: ProductArrays,
-) -> NDArray[np.bool_]:
-    """Return where the first two stars are as far apart as one of the observed sides is long."""
-    chord = database.directions[product["i"][rows]] - database.directions[product["j"][rows]]
-    apart = 2.0 * np.arcsin(0.5 * np.sqrt(np.einsum("ij,ij->i", chord, chord)))
-    near = np.abs(sides - apart[:, None]) <= tolerance_rad
-    return np.asarray(near[:, 0] | near[:, 1] | near[:, 2])
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the triangles of stars whose sides, by length, are as long as those observed.
+
+    Where they are not by length, they are not in any other order.
+    """
+    known, seen = database.derived(sides_by_length), np.sort(sides, axis=1).T
+    for length in (2, 1, 0):
+        error = np.abs(known[length, rows] - seen[length, observed])
+        close = np.flatnonzero(error <= tolerance_rad + ROUNDING_RAD)
+        rows, observed = rows[close], observed[close]
+    return rows, observed
 
 
 def features(

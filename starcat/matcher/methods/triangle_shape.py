@@ -25,6 +25,9 @@ CURVATURE = 2.0 / 3.0
 ``theta = atan(r / f)`` shrinks by ``sin(theta) cos(theta)`` of a relative change of f."""
 
 
+AT_ONCE = 2**16
+"""Triangles whose sides are worked out together."""
+
 ANY_ORDER = 1.1
 """Tolerance of sides in order of their length, in units of that of the true order: the scale that
 fits best differs a little between the two."""
@@ -52,6 +55,29 @@ class Shapes:
     rows: Rows
 
 
+def sides_by_length(database: Database) -> NDArray[np.float32]:
+    """Return the sides of all triangles of stars.
+
+    Parameters
+    ----------
+    database : Database
+        With the product ``triangles``.
+
+    Returns
+    -------
+    ndarray of float32, shape (3, M)
+        Radians, the shortest first, in the order of the product.
+    """
+    product = database.products["triangles"]
+    found = np.empty((3, len(product["i"])), dtype=np.float32)
+    for start in range(0, found.shape[1], AT_ONCE):
+        part = slice(start, start + AT_ONCE)
+        u, v, w = (database.directions[product[name][part]] for name in "ijk")
+        chords = np.stack([np.linalg.norm(x - y, axis=1) for x, y in ((u, v), (v, w), (w, u))])
+        found[:, part] = 2.0 * np.arcsin(0.5 * np.sort(chords, axis=0))
+    return found
+
+
 def shapes(database: Database) -> Shapes:
     """Return the triangles of a database in order of their shape.
 
@@ -69,10 +95,8 @@ def shapes(database: Database) -> Shapes:
     radius = product["circumradius_rad"].astype(np.float64)
     shape = product["area_rad2"] / (radius * radius)
     order = np.argsort(shape, kind="stable")
-    i, j, k = (database.directions[product[name][order]] for name in "ijk")
-    chords = np.stack([np.linalg.norm(u - v, axis=1) for u, v in ((i, j), (j, k), (k, i))])
-    sides = 2.0 * np.arcsin(0.5 * np.sort(chords, axis=0))
-    return Shapes(shape[order], product["area_rad2"][order], sides.astype(np.float32), order)
+    sides = database.derived(sides_by_length)[:, order]
+    return Shapes(shape[order], product["area_rad2"][order], sides, order)
 
 
 def similar_triangles(
