@@ -8,11 +8,16 @@ the same: ``body = matrix @ icrs``.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+
+Quaternion = tuple[float, float, float, float]
+
+Turn = tuple[float, float, float]
 
 
 def matrix_from_quaternion(q: Array) -> Array:
@@ -71,6 +76,70 @@ def quaternion_from_matrix(matrix: Array) -> Array:
         q[3] = m[j][k] - m[k][j]
     length = math.copysign(math.hypot(*q), q[3])
     return np.array([part / length for part in q])
+
+
+def turn_between(q_from: Sequence[float], q_to: Sequence[float]) -> Turn:
+    """Return the rotation of the camera that leads from one attitude to another.
+
+    Parameters
+    ----------
+    q_from, q_to : sequence of four float
+        Attitudes, unit.
+
+    Returns
+    -------
+    tuple of three float
+        Radians about the axes of the camera frame (x right, y down, z along the boresight): axis
+        times angle, at most pi long.
+
+    Examples
+    --------
+    >>> turn_between((0.0, 0.0, 0.0, 1.0), (0.0, 0.0, math.sin(0.1), math.cos(0.1)))
+    (0.0, 0.0, 0.2)
+    """
+    x, y, z, w = _quaternion_product((-q_from[0], -q_from[1], -q_from[2], q_from[3]), q_to)
+    sine = math.copysign(math.hypot(x, y, z), w)
+    # The vector part tells small angles, where the cosine would lose their digits.
+    scale = 2.0 * math.atan2(abs(sine), abs(w)) / sine if sine else 0.0
+    return x * scale, y * scale, z * scale
+
+
+def turned(q: Sequence[float], turn: Turn) -> Quaternion:
+    """Return the attitude that a rotation of the camera leads to.
+
+    Parameters
+    ----------
+    q : sequence of four float
+        Attitude, unit.
+    turn : tuple of three float
+        As `turn_between` has it.
+
+    Returns
+    -------
+    tuple of four float
+        Attitude, unit.
+
+    Examples
+    --------
+    >>> there = turned((0.5, 0.5, 0.5, 0.5), (0.1, -0.2, 0.3))
+    >>> [round(part, 9) for part in turn_between((0.5, 0.5, 0.5, 0.5), there)]
+    [0.1, -0.2, 0.3]
+    """
+    half = 0.5 * math.hypot(*turn)
+    scale = 0.5 * math.sin(half) / half if half else 0.5
+    x, y, z = turn
+    return _quaternion_product(q, (x * scale, y * scale, z * scale, math.cos(half)))
+
+
+def _quaternion_product(one: Sequence[float], other: Sequence[float]) -> Quaternion:
+    """Return the attitude of the second rotation after the first one."""
+    (a, b, c, d), (x, y, z, w) = one, other
+    return (
+        d * x + a * w + b * z - c * y,
+        d * y - a * z + b * w + c * x,
+        d * z + a * y - b * x + c * w,
+        d * w - a * x - b * y - c * z,
+    )
 
 
 def matrix_from_radec_roll(ra_deg: float, dec_deg: float, roll_deg: float) -> Array:

@@ -237,7 +237,11 @@ def _cells(database: Database, reach_rad: float) -> StarCells:
 
 
 def agree(
-    pose: Pose, observation: Observation, database: Database, certain: float = 0.0
+    pose: Pose,
+    observation: Observation,
+    database: Database,
+    certain: float = 0.0,
+    first: tuple[float, ...] = (),
 ) -> Agreement:
     """Match the centroids of a frame with the stars that an attitude predicts.
 
@@ -251,6 +255,9 @@ def agree(
         The stars.
     certain : float
         With a false-match probability as low as this no smaller reach is tried.
+    first : tuple of float
+        Reaches of first refinements, one after the other, in units of the final reach, where
+        the attitude is only roughly known.
 
     Returns
     -------
@@ -260,7 +267,7 @@ def agree(
         much of the frame is unexplained (``min_share``) or if the frame is scaled.
     """
     observation.budget.spend(AGREEMENT)
-    rough = ROUGH if observation.fov_error else ()
+    rough = ROUGH if observation.fov_error and not first else first
     fit = _refined(pose, observation, database, rough)
     found = _judged(fit, observation)
     if found.false_match_probability < 1.0:

@@ -117,7 +117,7 @@ def drive_starcat(
     def solve(given: Any) -> Any:
         px, mag, prior = given
         if track:
-            return matcher.track(px, prior, PRIOR_DEG, magnitudes=mag)
+            return matcher.identify(px, magnitudes=mag, prior=prior, prior_error_deg=PRIOR_DEG)
         return matcher.identify(px, magnitudes=mag)
 
     def prepare(px: np.ndarray, mag: np.ndarray, prior: np.ndarray) -> Any:
