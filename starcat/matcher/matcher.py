@@ -11,7 +11,7 @@ import math
 import os
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -389,8 +389,9 @@ class Matcher:
         """Identify a frame with numpy, and say how long that took and what was asked."""
         before_s = time.perf_counter()
         found = self._identify(frame, camera, mag, fov_error, prior)
-        asked = self._asked(frame, mag)
-        return replace(found, time_s=time.perf_counter() - before_s, asked=asked)
+        # A frozen dataclass refuses assignments; nobody else has this one yet.
+        vars(found).update(time_s=time.perf_counter() - before_s, asked=self._asked(frame, mag))
+        return found
 
     def _checked_fov_error(self, fov_error: float) -> float:
         if self.method != "triangle":

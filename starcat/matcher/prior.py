@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from starcat.geometry.attitude import matrix_from_quaternion, turn_between
 from starcat.geometry.camera import Camera
+from starcat.matcher.around import stars_around
 from starcat.matcher.database import Database
 from starcat.matcher.methods import nearby
 from starcat.matcher.methods.candidates import Candidates
@@ -116,6 +117,9 @@ def search_near(
     """
     matrix = matrix_from_quaternion(prior.q_body_from_icrs)
     camera, tolerance_rad = observation.camera, observation.tolerance_rad
+    # A tracked camera is near its last place, where the stars are at hand.
+    sky = stars_around(database)
+    sky.keep(matrix[2], camera.radius_rad)
     error_px = prior.error_rad * camera.focal_length_px
     if error_px <= CLOSE * observation.tolerance_px and not observation.fov_error:
         wide = 1.0 + error_px / (REACH * observation.tolerance_px)
@@ -126,8 +130,7 @@ def search_near(
     reach_rad = prior.error_rad + REACH * tolerance_rad
     # A wrong focal length moves directions along their distance from the axis.
     reach_rad += observation.fov_error / (1.0 - observation.fov_error) * camera.radius_rad
-    cosine = math.cos(min(math.pi, camera.radius_rad + reach_rad))
-    near = np.flatnonzero(database.directions @ matrix[2] >= cosine)
+    near, _ = sky.near(matrix[2], min(math.pi, camera.radius_rad + reach_rad))
     predicted = observation.body @ matrix
     if observation.fov_error or len(near) > nearby.MOST_STARS:
         found = whole_sky

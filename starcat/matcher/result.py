@@ -326,12 +326,12 @@ def identified(
         An answer whose quaternion and angles are the same attitude.
     """
     count = len(observation) + len(observation.dropped)
-    index = np.full(count, -1, dtype=np.int32)
+    index, ids = np.empty(count, dtype=np.int32), np.empty(count, dtype=np.int64)
+    index.fill(-1)
     index[observation.rows] = found.star_index
-    ids = np.full(count, -1, dtype=np.int64)
-    has_star = index >= 0
-    ids[has_star] = star_id[index[has_star]]
-    pose, matched = found.pose, np.flatnonzero(found.star_index >= 0)
+    np.take(star_id, index, out=ids, mode="wrap")
+    ids[index < 0] = -1
+    pose = found.pose
     ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(pose.matrix)
     return MatchResult(
         "identified",
@@ -342,15 +342,18 @@ def identified(
         dec_deg,
         roll_deg,
         found.n_matched,
-        float(np.degrees(found.residual_rad) * 3600.0),
+        math.degrees(found.residual_rad) * 3600.0,
         found.false_match_probability,
         observation.dropped,
         pose.camera,
-        focal_length_error_px(pose, matched, found.residual_rad, observation)
-        if observation.fov_error
-        else None,
+        _focal_length_error_px(found, observation) if observation.fov_error else None,
         origin,
     )
+
+
+def _focal_length_error_px(found: Agreement, observation: Observation) -> float:
+    matched = np.flatnonzero(found.star_index >= 0)
+    return focal_length_error_px(found.pose, matched, found.residual_rad, observation)
 
 
 def withheld(answer: MatchResult, refusal: Refusal) -> MatchResult:
