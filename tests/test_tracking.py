@@ -11,10 +11,10 @@ import pytest
 from slew import JUMP_RAD, slew
 
 from starcat.geometry.attitude import (
+    after_turn,
     matrix_from_quaternion,
     quaternion_from_matrix,
     turn_between,
-    turned,
 )
 from starcat.geometry.camera import Camera
 from starcat.matcher import fast
@@ -51,7 +51,7 @@ def wrong_by(frame: Frame, angle_deg: float, seed: int) -> np.ndarray:
     x, y, z = np.random.default_rng(seed).normal(size=3)
     scale = math.radians(angle_deg) / math.hypot(x, y, z)
     q = quaternion_from_matrix(frame.matrix).tolist()
-    return np.array(turned(q, (x * scale, y * scale, z * scale)))
+    return np.array(after_turn(q, (x * scale, y * scale, z * scale)))
 
 
 def is_right(answer: MatchResult, frame: Frame) -> bool:
@@ -283,7 +283,7 @@ def test_a_narrow_field_is_tracked(sky_of, random_directions):
     all_stars = Sky(u, narrow.mag, np.arange(len(u), dtype=np.int32))
     origins = []
     for _ in range(40):
-        q = turned(q, (0.002, 0.001, 0.01))
+        q = after_turn(q, (0.002, 0.001, 0.01))
         matrix = matrix_from_quaternion(np.array(q))
         frame = simulate_frame(all_stars, camera, matrix, HARD, generator)
         found = tracker.identify(frame.centroids_px)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 from numpy.typing import ArrayLike
 
-from starcat.geometry.attitude import Quaternion, Turn, turn_between, turned
+from starcat.geometry.attitude import Quaternion, Turn, after_turn, turn_between
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.prior import WIDEST_PRIOR_DEG, turn_of_noise_rad
@@ -171,13 +171,13 @@ class Tracker:
         # What is not a constant velocity grows with the square of the time.
         error_rad = min(widest_rad, floor_rad + MARGIN * motion.change_rad * steps * steps)
         x, y, z = motion.turn
-        return turned(motion.q_body_from_icrs, (x * steps, y * steps, z * steps)), error_rad
+        return after_turn(motion.q_body_from_icrs, (x * steps, y * steps, z * steps)), error_rad
 
     def _learnt(self, before: _Motion, q: Quaternion, now: float, camera: Camera) -> _Motion:
         """Return what an answer near the prediction says of the motion."""
         step = now - before.time
         x, y, z = (part * step / before.step for part in before.turn)
-        x, y, z = turn_between(turned(before.q_body_from_icrs, (x, y, z)), q)
+        x, y, z = turn_between(after_turn(before.q_body_from_icrs, (x, y, z)), q)
         # The noise of centroids turns a narrow field about its axis by much more than across.
         noise_rad = turn_of_noise_rad(camera, self.matcher.tolerance_px)
         about_axis = max(abs(z) * math.tan(camera.radius_rad), abs(z) - noise_rad)

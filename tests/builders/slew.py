@@ -6,7 +6,7 @@ from collections.abc import Container, Iterator
 
 import numpy as np
 
-from starcat.geometry.attitude import matrix_from_quaternion, turned
+from starcat.geometry.attitude import after_turn, matrix_from_quaternion
 from starcat.matcher.database import Database
 from starcat.simulation.simulate import Frame, Noise, simulate_frame
 from starcat.simulation.sky import Sky
@@ -41,8 +41,8 @@ def slew(
         axis = axis + 0.01 * generator.normal(size=3)
         axis /= np.linalg.norm(axis)
         x, y, z = (np.radians(rate_deg) * axis).tolist()
-        q = turned(q, (x, y, z))
+        q = after_turn(q, (x, y, z))
         if number in jumps:
-            q = turned(q, (JUMP_RAD, 0.0, 0.0))
+            q = after_turn(q, (JUMP_RAD, 0.0, 0.0))
         matrix = matrix_from_quaternion(np.array(q))
         yield simulate_frame(sky, database.camera, matrix, noise, generator)
