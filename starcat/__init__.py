@@ -23,12 +23,14 @@ if TYPE_CHECKING:
     from starcat.face.functions import build, ingest, verify
     from starcat.geometry.camera import Camera
     from starcat.matcher.matcher import Matcher
+    from starcat.matcher.tracking import Tracker
     from starcat.specs.reading import preset, read_spec
 
 __all__ = [
     "Camera",
     "Matcher",
     "StarcatError",
+    "Tracker",
     "__version__",
     "build",
     "connect",
@@ -43,6 +45,7 @@ _HOMES = {
     "Camera": ("starcat.geometry.camera", "Camera"),
     "Matcher": ("starcat.matcher.matcher", "Matcher"),
     "StarcatError": ("starcat.errors", "StarcatError"),
+    "Tracker": ("starcat.matcher.tracking", "Tracker"),
     "build": ("starcat.face.functions", "build"),
     "connect": ("starcat.face.connection", "connect"),
     "ingest": ("starcat.face.functions", "ingest"),

@@ -7,7 +7,18 @@ from typing import Annotated
 
 import typer
 
-from starcat.commands.shared import FailOnNoMatch, Json, JsonLines, MethodName, NoisePx, WcsFile
+from starcat.commands.shared import (
+    FailOnNoMatch,
+    Json,
+    JsonLines,
+    MethodName,
+    NoisePx,
+    PriorAttitude,
+    PriorErrorDeg,
+    Track,
+    WcsFile,
+    chosen_prior,
+)
 
 app = typer.Typer()
 
@@ -84,6 +95,9 @@ def identify(
         Path | None, typer.Option(help="PNG or SVG of the first frame, its stars named.")
     ] = None,
     wcs: WcsFile = None,
+    prior_q: PriorAttitude = None,
+    prior_error_deg: PriorErrorDeg = None,
+    track: Track = False,
     fail_on_no_match: FailOnNoMatch = False,
     ndjson: JsonLines = False,
     json: Json = False,
@@ -94,10 +108,12 @@ def identify(
     """
     from starcat.images.answering import answer_each, measure_input, write_extras
     from starcat.matcher.matcher import Matcher
+    from starcat.matcher.tracking import Tracker
     from starcat.specs.camera_file import read_camera
     from starcat.terminal.console import say
     from starcat.terminal.matches import print_answers
 
+    prior = chosen_prior(prior_q, prior_error_deg, track=track)
     matcher = Matcher.open(
         artifact,
         method,
@@ -108,7 +124,7 @@ def identify(
     )
     eye = read_camera(camera) if camera else matcher.database.camera
     measured = measure_input(file, flip=flip, wcs=wcs)
-    answered = answer_each(matcher, measured, eye)
+    answered = answer_each(Tracker(matcher) if track else matcher, measured, eye, prior)
     told = print_answers(answered, matcher.database, as_json=json, as_lines=ndjson)
     if measured.image is not None and not told.identified:
         say("An image that was read upside down is never identified: try --flip or --no-flip.")

@@ -10,11 +10,18 @@ from typing import cast
 
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
-from starcat.images.identification import MeasuredFile, draw, identify_frames, measure
+from starcat.images.identification import (
+    MeasuredFile,
+    PriorOption,
+    draw,
+    identify_frames,
+    measure,
+)
 from starcat.images.wcs_file import expect_room_for_wcs, write_wcs
 from starcat.matcher.centroids import MeasuredFrame, read_stream
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
+from starcat.matcher.tracking import Tracker
 
 STDIN = Path("-")
 
@@ -59,13 +66,16 @@ def _frames_of_stdin() -> Iterator[MeasuredFrame]:
 
 
 def answer_each(
-    matcher: Matcher, measured: MeasuredFile, camera: Camera
+    matcher: Matcher | Tracker,
+    measured: MeasuredFile,
+    camera: Camera,
+    prior: PriorOption | None = None,
 ) -> Iterator[tuple[MeasuredFrame, MatchResult]]:
     """Identify the frames of a file or stream, one when it is asked for.
 
     Parameters
     ----------
-    matcher, measured, camera
+    matcher, measured, camera, prior
         As for `identify_frames`.
 
     Yields
@@ -74,7 +84,7 @@ def answer_each(
         A frame and its answer.
     """
     for frame in measured.frames:
-        [result] = identify_frames(matcher, replace(measured, frames=[frame]), camera)
+        [result] = identify_frames(matcher, replace(measured, frames=[frame]), camera, prior)
         yield frame, result
 
 

@@ -16,10 +16,14 @@ from starcat.matcher.centroids import MeasuredFrame, read_frames, write_centroid
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
+from starcat.matcher.tracking import Tracker
 from starcat.simulation.simulate import Frame
 
 IMAGE_SUFFIXES = (".fits", ".fit", ".fts", ".gz", ".fz", ".png", ".tif", ".tiff")
 """Files that are read as images; all others hold centroids."""
+
+PriorOption = tuple[list[float], float]
+"""An attitude as a quaternion, and its largest error in degrees."""
 
 CENTROIDS_SUFFIX = ".csv"
 """Suffix of the file that a simulated frame's centroids are written to."""
@@ -71,17 +75,24 @@ def measure(path: Path, *, flip: bool | None = None) -> MeasuredFile:
     return MeasuredFile([MeasuredFrame(path.stem, spots.centroids_px, spots.mag)], image)
 
 
-def identify_frames(matcher: Matcher, measured: MeasuredFile, camera: Camera) -> list[MatchResult]:
+def identify_frames(
+    matcher: Matcher | Tracker,
+    measured: MeasuredFile,
+    camera: Camera,
+    prior: PriorOption | None = None,
+) -> list[MatchResult]:
     """Identify the frames of a file.
 
     Parameters
     ----------
-    matcher : Matcher
-        The matcher, with a database open.
+    matcher : Matcher or Tracker
+        The matcher, with a database open, or what follows the frames with it.
     measured : MeasuredFile
         The frames.
     camera : Camera
         That took them.
+    prior : (list of float, float), optional
+        Attitude of all frames, ``q_body_from_icrs``, and its largest error in degrees.
 
     Returns
     -------
@@ -100,8 +111,11 @@ def identify_frames(matcher: Matcher, measured: MeasuredFile, camera: Camera) ->
                 f"the image has {width} x {height} px, the camera {camera.width_px} x "
                 f"{camera.height_px}; describe the camera that took it with --camera"
             )
+    q, error_deg = prior or (None, None)
     return [
-        matcher.identify(frame.centroids_px, camera, magnitudes=frame.mag)
+        matcher.identify(
+            frame.centroids_px, camera, magnitudes=frame.mag, prior=q, prior_error_deg=error_deg
+        )
         for frame in measured.frames
     ]
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from starcat.errors import ConfigError
 from starcat.geometry.attitude import matrix_from_quaternion, turn_between
 from starcat.geometry.camera import Camera
 from starcat.matcher.around import stars_around
@@ -68,21 +69,26 @@ def prior_of(quaternion: ArrayLike | None, error_deg: float | None) -> Prior | N
 
     Raises
     ------
-    ValueError
+    ConfigError
         If one of the two is missing, the first is no quaternion, or the second out of range.
     """
     if quaternion is None and error_deg is None:
         return None
     if quaternion is None or error_deg is None:
         missing = "prior" if quaternion is None else "prior_error_deg"
-        raise ValueError(f"{missing} is missing; give prior and prior_error_deg, or neither")
+        raise ConfigError(
+            f"{missing} is missing; give prior and prior_error_deg, or neither", key=missing
+        )
     q = np.asarray(quaternion, dtype=np.float64)
     square = float(q @ q) if q.shape == (4,) else math.nan
     if not 0.0 < square < math.inf:
-        raise ValueError(f"prior is {q}; expected a quaternion, four finite numbers, not all 0")
+        text = f"prior is {q.tolist()}; expected a quaternion, four finite numbers, not all 0"
+        raise ConfigError(text, key="prior", value=quaternion)
     if not 0.0 < error_deg <= WIDEST_PRIOR_DEG:
-        raise ValueError(
-            f"prior_error_deg is {error_deg}; expected above 0, at most {WIDEST_PRIOR_DEG:g}"
+        raise ConfigError(
+            f"prior_error_deg is {error_deg}; expected above 0, at most {WIDEST_PRIOR_DEG:g}",
+            key="prior_error_deg",
+            value=error_deg,
         )
     return Prior(q / math.sqrt(square), math.radians(error_deg))
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 
 from numpy.typing import ArrayLike
 
+from starcat.errors import ConfigError
 from starcat.geometry.attitude import Quaternion, Turn, after_turn, turn_between
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
@@ -51,8 +52,6 @@ class Tracker:
     ----------
     matcher : Matcher
         Of any method and engine.
-    camera : Camera, optional
-        The camera of all frames; the database's own by default.
     max_turn_deg : float
         Largest error of a prediction that is tried, and the largest turn from the first frame to
         the second; above 0, at most 20. A frame beyond it is found in the whole sky.
@@ -65,7 +64,6 @@ class Tracker:
     """
 
     matcher: Matcher
-    camera: Camera | None = None
     max_turn_deg: float = 5.0
     _motion: _Motion | None = field(default=None, init=False, repr=False)
     _time: float = field(default=-math.inf, init=False, repr=False)
@@ -73,9 +71,11 @@ class Tracker:
     def __post_init__(self) -> None:
         """Check the largest turn."""
         if not 0.0 < self.max_turn_deg <= WIDEST_PRIOR_DEG:
-            raise ValueError(
+            raise ConfigError(
                 f"max_turn_deg is {self.max_turn_deg}; expected above 0, at most "
-                f"{WIDEST_PRIOR_DEG:g}"
+                f"{WIDEST_PRIOR_DEG:g}",
+                key="max_turn_deg",
+                value=self.max_turn_deg,
             )
 
     def reset(self) -> None:
@@ -85,16 +85,22 @@ class Tracker:
     def identify(
         self,
         centroids_px: ArrayLike,
+        camera: Camera | None = None,
         *,
         magnitudes: ArrayLike | None = None,
+        prior: ArrayLike | None = None,
+        prior_error_deg: float | None = None,
         time_s: float | None = None,
     ) -> MatchResult:
         """Identify the stars of the next frame.
 
         Parameters
         ----------
-        centroids_px, magnitudes
+        centroids_px, camera, magnitudes
             As for `Matcher.identify`.
+        prior, prior_error_deg
+            As for `Matcher.identify`; they take the place of the prediction, as what a gyroscope
+            says does.
         time_s : float, optional
             Time of the frame, later than that of the one before; frames without a time are
             one after the other at equal intervals. Give it for every frame, or for none.
@@ -107,26 +113,29 @@ class Tracker:
 
         Raises
         ------
-        ValueError
+        ConfigError, ValueError
             As `Matcher.identify`, or if the time is no later than the one before.
         """
         now = self._next_time(time_s)
-        camera = self.camera or self.matcher.database.camera
-        expected, error_rad = self._predicted(now, camera)
-        if expected is not None:
+        camera = camera or self.matcher.database.camera
+        expected, error_deg = prior, prior_error_deg
+        if expected is None and error_deg is None:
+            expected, error_deg = self._predicted(now, camera)
+        found = None
+        if expected is not None or error_deg is not None:
             found = self.matcher.identify(
                 centroids_px,
                 camera,
                 magnitudes=magnitudes,
                 prior=expected,
-                prior_error_deg=math.degrees(error_rad),
+                prior_error_deg=error_deg,
             )
-        if expected is None or found.status == "no_match":
+        if found is None or found.status == "no_match":
             found = self.matcher.identify(centroids_px, camera, magnitudes=magnitudes)
         self._time = now
         if found.ok:
             x, y, z, w = found.q_body_from_icrs.tolist()
-            is_new = expected is None or found.origin == "lost_in_space"
+            is_new = found.origin == "lost_in_space"
             # Beyond the prediction the motion is another one: the next attitude is expected to be
             # the same, within the largest turn.
             self._motion = (
@@ -155,23 +164,28 @@ class Tracker:
         if time_s is None:
             return 0.0 if math.isinf(self._time) else self._time + 1.0
         if not self._time < time_s < math.inf:
-            raise ValueError(
+            raise ConfigError(
                 f"time_s is {time_s}; expected a number above {self._time}, the time of the frame "
-                "before"
+                "before",
+                key="time_s",
+                value=time_s,
             )
         return float(time_s)
 
-    def _predicted(self, now: float, camera: Camera) -> tuple[Quaternion | None, float]:
+    def _predicted(
+        self, now: float, camera: Camera
+    ) -> tuple[Quaternion, float] | tuple[None, None]:
         """Return the attitude that is expected, and its largest error; None where none is."""
-        motion, widest_rad = self._motion, math.radians(self.max_turn_deg)
+        motion = self._motion
         steps = math.inf if motion is None else (now - motion.time) / motion.step
         if motion is None or steps > MOST_STEPS:
-            return None, widest_rad
+            return None, None
         floor_rad = FLOOR * self.matcher.tolerance_px / camera.focal_length_px
         # What is not a constant velocity grows with the square of the time.
-        error_rad = min(widest_rad, floor_rad + MARGIN * motion.change_rad * steps * steps)
+        error_deg = math.degrees(floor_rad + MARGIN * motion.change_rad * steps * steps)
         x, y, z = motion.turn
-        return after_turn(motion.q_body_from_icrs, (x * steps, y * steps, z * steps)), error_rad
+        expected = after_turn(motion.q_body_from_icrs, (x * steps, y * steps, z * steps))
+        return expected, min(self.max_turn_deg, error_deg)
 
     def _learnt(self, before: _Motion, q: Quaternion, now: float, camera: Camera) -> _Motion:
         """Return what an answer near the prediction says of the motion."""
