@@ -11,10 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.geometry.zones import zones_of
 from starcat.matcher.database import Database
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
+
+MANY_STARS = 15_000
+"""So many stars are searched by zones; a product of all is faster for fewer."""
 
 MARGIN = 0.5
 """How far a boresight may move before another part is needed, over the radius around it."""
@@ -46,6 +50,7 @@ class StarsAround:
 
     def __init__(self, database: Database) -> None:
         self._directions = database.directions
+        self._zones = zones_of(database.directions) if len(database.mag) >= MANY_STARS else None
         self._part: _Part | None = None
 
     def near(self, boresight: Array, radius_rad: float) -> tuple[Rows, Array]:
@@ -65,12 +70,17 @@ class StarsAround:
         directions : ndarray of float64, shape (M, 3)
             Of the same stars.
         """
-        part, cosine = self._part, math.cos(radius_rad)
+        part = self._part
         if part is not None and part.radius_rad >= radius_rad and _is_in(part, boresight):
-            inside = (part.directions @ boresight >= cosine).nonzero()[0]
+            inside = (part.directions @ boresight >= math.cos(radius_rad)).nonzero()[0]
             return part.rows[inside], part.directions[inside]
-        rows = (self._directions @ boresight >= cosine).nonzero()[0]
+        rows = self._rows(boresight, radius_rad)
         return rows, self._directions[rows]
+
+    def _rows(self, boresight: Array, radius_rad: float) -> Rows:
+        if self._zones is not None:
+            return self._zones.near(boresight, radius_rad)
+        return (self._directions @ boresight >= math.cos(radius_rad)).nonzero()[0]
 
     def keep(self, boresight: Array, radius_rad: float) -> None:
         """Keep the stars around a boresight at hand, unless those around a near one are.
@@ -87,7 +97,7 @@ class StarsAround:
             margin_rad = MARGIN * radius_rad
             # Rounding of the products must not lose a star at the edge.
             widest_rad = min(math.pi, 1.001 * (radius_rad + margin_rad))
-            rows = (self._directions @ boresight >= math.cos(widest_rad)).nonzero()[0]
+            rows = self._rows(boresight, widest_rad)
             x, y, z = boresight.tolist()
             self._part = _Part(
                 (x, y, z), math.cos(margin_rad), radius_rad, rows, self._directions[rows]

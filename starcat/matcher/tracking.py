@@ -88,6 +88,7 @@ class Tracker:
         camera: Camera | None = None,
         *,
         magnitudes: ArrayLike | None = None,
+        fov_error: float = 0.0,
         prior: ArrayLike | None = None,
         prior_error_deg: float | None = None,
         time_s: float | None = None,
@@ -96,7 +97,7 @@ class Tracker:
 
         Parameters
         ----------
-        centroids_px, camera, magnitudes
+        centroids_px, camera, magnitudes, fov_error
             As for `Matcher.identify`.
         prior, prior_error_deg
             As for `Matcher.identify`; they take the place of the prediction, as what a gyroscope
@@ -127,11 +128,14 @@ class Tracker:
                 centroids_px,
                 camera,
                 magnitudes=magnitudes,
+                fov_error=fov_error,
                 prior=expected,
                 prior_error_deg=error_deg,
             )
         if found is None or found.status == "no_match":
-            found = self.matcher.identify(centroids_px, camera, magnitudes=magnitudes)
+            found = self.matcher.identify(
+                centroids_px, camera, magnitudes=magnitudes, fov_error=fov_error
+            )
         self._time = now
         if found.ok:
             x, y, z, w = found.q_body_from_icrs.tolist()

@@ -241,7 +241,7 @@ def agree(
     pose: Pose,
     observation: Observation,
     database: Database,
-    certain: float = 0.0,
+    certain: float = 1.0,
     first: tuple[float, ...] = (),
 ) -> Agreement:
     """Match the centroids of a frame with the stars that an attitude predicts.
@@ -255,7 +255,7 @@ def agree(
     database : Database
         The stars.
     certain : float
-        With a false-match probability as low as this no smaller reach is tried.
+        With a false-match probability as low as this no smaller reach is tried; with 1, none is.
     first : tuple of float
         Reaches of first refinements, one after the other, in units of the final reach, where
         the attitude is only roughly known.
