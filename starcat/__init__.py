@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from starcat.face.functions import build, calibrate, ingest, verify
     from starcat.geometry.camera import Camera
     from starcat.matcher.matcher import Matcher
+    from starcat.matcher.tracking import Tracker
     from starcat.sky.in_time import sky_in_time
     from starcat.sky.observer import Observer
     from starcat.sky.spots import identify_in_time
@@ -33,6 +34,7 @@ __all__ = [
     "Matcher",
     "Observer",
     "StarcatError",
+    "Tracker",
     "__version__",
     "build",
     "calibrate",
@@ -51,6 +53,7 @@ _HOMES = {
     "Matcher": ("starcat.matcher.matcher", "Matcher"),
     "Observer": ("starcat.sky.observer", "Observer"),
     "StarcatError": ("starcat.errors", "StarcatError"),
+    "Tracker": ("starcat.matcher.tracking", "Tracker"),
     "build": ("starcat.face.functions", "build"),
     "calibrate": ("starcat.face.functions", "calibrate"),
     "connect": ("starcat.face.connection", "connect"),

@@ -371,10 +371,12 @@ def test_the_library_s_no_is_explained_when_somebody_asks(sky, monkeypatch):
 def test_an_attitude_that_is_not_near_the_prior_is_the_reason(sky):
     frame = a_frame(sky, sky.camera)
     away = matrix_from_radec_roll(0.0, 90.0, 0.0) @ frame.matrix
-    found = Matcher(sky, engine="c").track(frame.centroids_px, quaternion_from_matrix(away), 0.1)
+    found = Matcher(sky, engine="c").identify(
+        frame.centroids_px, prior=quaternion_from_matrix(away), prior_error_deg=0.1
+    )
     assert found.status == "no_match"
     assert found.refusal is not None
-    assert found.refusal.reason == "no_candidate"
+    assert found.refusal.reason == "prior"
 
 
 @needs_c

@@ -632,6 +632,36 @@ def identify_at(place: Place, *options: str) -> Call:
     return [*place.identify("x_px,y_px\n1,2\n"), *options]
 
 
+@case("prior attitude without its error", 2)
+def _(place: Place) -> Call:
+    return identify_at(place, "--prior-q", "0,0,0,1")
+
+
+@case("prior attitude of three numbers", 2)
+def _(place: Place) -> Call:
+    return identify_at(place, "--prior-q", "0,0,1", "--prior-error-deg", "1")
+
+
+@case("prior attitude that is none", 2)
+def _(place: Place) -> Call:
+    return identify_at(place, "--prior-q", "0,0,0,0", "--prior-error-deg", "1")
+
+
+@case("error of a prior attitude out of range", 2)
+def _(place: Place) -> Call:
+    return identify_at(place, "--prior-q", "0,0,0,1", "--prior-error-deg", "30")
+
+
+@case("prior attitude of a sequence", 2)
+def _(place: Place) -> Call:
+    return identify_at(place, "--prior-q", "0,0,0,1", "--prior-error-deg", "1", "--track")
+
+
+@case("sequence with a time", 2)
+def _(place: Place) -> Call:
+    return identify_at(place, "--track", "--time", "2026-11-22T10:00:00")
+
+
 @case("time that is none", 2)
 def _(place: Place) -> Call:
     return identify_at(place, "--time", "22 November")

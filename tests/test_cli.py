@@ -367,7 +367,8 @@ def test_a_simulated_frame_is_identified(starcat: Run, frame: Path, small_artifa
 def test_identify_as_json(starcat: Run, frame: Path, small_artifact: Path) -> None:
     [answer] = json.loads(starcat(["identify", small_artifact, frame, "--json"]).out)
     assert list(answer) == [
-        "frame", "status", "n_matched", "boresight_ra_deg", "boresight_dec_deg", "roll_deg",
+        "frame", "status", "origin", "n_matched",
+        "boresight_ra_deg", "boresight_dec_deg", "roll_deg",
         "q_body_from_icrs", "covariance_arcsec2", "residual_arcsec", "false_match_probability",
         "focal_length_px", "focal_length_error_px", "time_s", "stars",
     ]  # fmt: skip

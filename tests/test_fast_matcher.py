@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from starcat.errors import ConfigError, ProductError
 from starcat.exchange.onboard import export_image
-from starcat.geometry.attitude import matrix_from_quaternion, quaternion_from_matrix
+from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.matcher import fast
@@ -207,7 +207,8 @@ def test_many_frames_are_answered_without_c(sky, monkeypatch):
     some = frames(sky, 3)
     found = matcher.identify_many([frame.centroids_px for frame in some])
     assert [answer.status for answer in found] == ["identified"] * 3
-    tracked = matcher.track(some[0].centroids_px, quaternion_from_matrix(some[0].matrix), 0.5)
+    prior = quaternion_from_matrix(some[0].matrix)
+    tracked = matcher.identify(some[0].centroids_px, prior=prior, prior_error_deg=0.5)
     assert tracked.star_ids.tolist() == found[0].star_ids.tolist()
 
 
@@ -215,57 +216,6 @@ def test_many_frames_need_as_many_magnitudes(sky):
     (frame,) = frames(sky, 1)
     with pytest.raises(ValueError, match="magnitudes of 1 frames; expected 2"):
         Matcher(sky).identify_many([frame.centroids_px] * 2, magnitudes=[frame.mag])
-
-
-# --- Tracking
-
-
-def turned(frame: Frame, angle_deg: float, seed: int) -> np.ndarray:
-    """Return an attitude that is wrong by an angle about a random axis."""
-    axis = np.random.default_rng(seed).normal(size=3)
-    half = np.radians(angle_deg) / 2.0
-    axis *= np.sin(half) / np.linalg.norm(axis)
-    error = matrix_from_quaternion(np.append(axis, np.cos(half)))
-    return quaternion_from_matrix(error @ frame.matrix)
-
-
-@needs_c
-@pytest.mark.parametrize("error_deg", [0.0, 0.1, 0.5, 2.0])
-def test_a_tracked_frame_gets_the_stars_that_it_gets_lost_in_space(sky, error_deg):
-    matcher = Matcher(sky, engine="c")
-    same = 0
-    for number, frame in enumerate(frames(sky, 40, HARD, seed=31)):
-        lost = matcher.identify(frame.centroids_px)
-        prior = turned(frame, 0.999 * error_deg, number)
-        found = matcher.track(frame.centroids_px, prior, error_deg or 0.01)
-        if lost.status == found.status == "identified":
-            assert found.star_ids.tolist() == lost.star_ids.tolist()
-            same += 1
-    assert same >= 36
-
-
-@needs_c
-def test_a_wrong_prior_gives_no_answer(sky):
-    matcher = Matcher(sky, engine="c")
-    for number, frame in enumerate(frames(sky, 20)):
-        found = matcher.track(frame.centroids_px, turned(frame, 30.0, number), 2.0)
-        assert found.status == "no_match"
-
-
-@pytest.mark.parametrize(
-    ("prior", "uncertainty_deg", "words"),
-    [
-        ([0.0, 0.0, 0.0, 0.0], 1.0, "not all 0"),
-        ([0.0, 0.0, np.nan, 1.0], 1.0, "expected four numbers"),
-        ([0.0, 0.0, 1.0], 1.0, "expected four numbers"),
-        ([0.0, 0.0, 0.0, 1.0], 0.0, "above 0, at most 20"),
-        ([0.0, 0.0, 0.0, 1.0], 21.0, "above 0, at most 20"),
-        ([0.0, 0.0, 0.0, 1.0], np.nan, "above 0, at most 20"),
-    ],
-)
-def test_a_prior_that_is_none_is_refused(sky, prior, uncertainty_deg, words):
-    with pytest.raises(ValueError, match=words):
-        Matcher(sky).track(np.zeros((5, 2)), prior, uncertainty_deg)
 
 
 # --- Engines

@@ -30,7 +30,7 @@ SINGLE_MODULES = {
     "entry": ["", "cli", "__main__"],  # "" is starcat itself
 }
 
-GEOMETRY = ("attitude", "camera", "distortion", "kvector", "patterns", "sphere")
+GEOMETRY = ("attitude", "camera", "distortion", "kvector", "patterns", "sphere", "zones")
 ONBOARD = ("blocks", "grid", "image", "layout", "reading", "structure")
 LIGHT = {
     "starcat.errors",

@@ -23,12 +23,16 @@ from starcat.commands.shared import (
     NoisePx,
     Orbit,
     Plane,
+    PriorAttitude,
+    PriorErrorDeg,
     PsfSigmaPx,
     Threshold,
     Time,
     TimeLimit,
+    Track,
     Velocity,
     WcsFile,
+    chosen_prior,
     field_range,
     limits_of_options,
     observer_of_options,
@@ -123,6 +127,9 @@ def identify(
     velocity: Velocity = None,
     orbit: Orbit = None,
     wcs: WcsFile = None,
+    prior_q: PriorAttitude = None,
+    prior_error_deg: PriorErrorDeg = None,
+    track: Track = False,
     fail_on_no_match: FailOnNoMatch = False,
     ndjson: JsonLines = False,
     json: Json = False,
@@ -135,10 +142,12 @@ def identify(
     from starcat.images.identification import PictureOptions
     from starcat.matcher.centroids import said_of_columns
     from starcat.matcher.matcher import Matcher
+    from starcat.matcher.tracking import Tracker
     from starcat.specs.camera_file import read_camera
     from starcat.terminal.console import say
     from starcat.terminal.matches import print_answers
 
+    prior = chosen_prior(prior_q, prior_error_deg, track=track)
     observer = observer_of_options(time, velocity, orbit)
     matcher = Matcher.open(
         artifact,
@@ -153,7 +162,8 @@ def identify(
     how = PictureOptions(threshold, psf_sigma_px, most_spots, plane, bayer, dark, mask)
     measured = measure_input(file, flip=flip, wcs=wcs, options=how)
     error = share_of_percent(fov_error)
-    answered = answer_each(matcher, measured, eye, observer, flip=flip, fov_error=error)
+    near = Tracker(matcher) if track else prior
+    answered = answer_each(matcher, measured, eye, observer, flip=flip, fov_error=error, near=near)
     told = print_answers(
         answered, matcher.database, as_json=json, as_lines=ndjson, observer=observer
     )

@@ -8,11 +8,16 @@ the same: ``body = matrix @ icrs``.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+
+Quaternion = tuple[float, float, float, float]
+
+Turn = tuple[float, float, float]
 
 
 def matrix_from_quaternion(q: Array) -> Array:
@@ -28,7 +33,9 @@ def matrix_from_quaternion(q: Array) -> Array:
     ndarray of float64, shape (3, 3)
         ``body = matrix @ icrs``.
     """
-    x, y, z, w = q / np.sqrt(q @ q)
+    x, y, z, w = q.tolist()
+    length = math.hypot(x, y, z, w)
+    x, y, z, w = x / length, y / length, z / length, w / length
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)],
@@ -71,6 +78,70 @@ def quaternion_from_matrix(matrix: Array) -> Array:
         q[3] = m[j][k] - m[k][j]
     length = math.copysign(math.hypot(*q), q[3])
     return np.array([part / length for part in q])
+
+
+def turn_between(q_from: Sequence[float], q_to: Sequence[float]) -> Turn:
+    """Return the rotation of the camera that leads from one attitude to another.
+
+    Parameters
+    ----------
+    q_from, q_to : sequence of four float
+        Attitudes, unit.
+
+    Returns
+    -------
+    tuple of three float
+        Radians about the axes of the camera frame (x right, y down, z along the boresight): axis
+        times angle, at most pi long.
+
+    Examples
+    --------
+    >>> turn_between((0.0, 0.0, 0.0, 1.0), (0.0, 0.0, math.sin(0.1), math.cos(0.1)))
+    (0.0, 0.0, 0.2)
+    """
+    x, y, z, w = _quaternion_product((-q_from[0], -q_from[1], -q_from[2], q_from[3]), q_to)
+    sine = math.copysign(math.hypot(x, y, z), w)
+    # The vector part tells small angles, where the cosine would lose their digits.
+    scale = 2.0 * math.atan2(abs(sine), abs(w)) / sine if sine else 0.0
+    return x * scale, y * scale, z * scale
+
+
+def after_turn(q: Sequence[float], turn: Turn) -> Quaternion:
+    """Return the attitude that a rotation of the camera leads to.
+
+    Parameters
+    ----------
+    q : sequence of four float
+        Attitude, unit.
+    turn : tuple of three float
+        As `turn_between` has it.
+
+    Returns
+    -------
+    tuple of four float
+        Attitude, unit.
+
+    Examples
+    --------
+    >>> there = after_turn((0.5, 0.5, 0.5, 0.5), (0.1, -0.2, 0.3))
+    >>> [round(part, 9) for part in turn_between((0.5, 0.5, 0.5, 0.5), there)]
+    [0.1, -0.2, 0.3]
+    """
+    half = 0.5 * math.hypot(*turn)
+    scale = 0.5 * math.sin(half) / half if half else 0.5
+    x, y, z = turn
+    return _quaternion_product(q, (x * scale, y * scale, z * scale, math.cos(half)))
+
+
+def _quaternion_product(one: Sequence[float], other: Sequence[float]) -> Quaternion:
+    """Return the attitude of the second rotation after the first one."""
+    (a, b, c, d), (x, y, z, w) = one, other
+    return (
+        d * x + a * w + b * z - c * y,
+        d * y - a * z + b * w + c * x,
+        d * z + a * y - b * x + c * w,
+        d * w - a * x - b * y - c * z,
+    )
 
 
 def matrix_from_radec_roll(ra_deg: float, dec_deg: float, roll_deg: float) -> Array:
@@ -164,6 +235,83 @@ def solve_wahba_svd(body: Array, icrs: Array, weights: Array | None = None) -> A
     return np.asarray(u @ vt)
 
 
+NEAR_RAD = 0.05
+"""Largest turn that `solve_wahba_near` makes in one step; a larger one is left to the SVD."""
+
+CONVERGED_RAD = 1e-6
+"""Turn after which there is no further one: the error that is left is of the order of its square.
+"""
+
+
+def solve_wahba_near(body: Array, icrs: Array, matrix: Array) -> Array:
+    """Return the rotation that best turns reference directions into observed ones.
+
+    Parameters
+    ----------
+    body, icrs : ndarray of float64, shape (N, 3)
+        Observed directions in the camera frame and their stars' ICRS directions, N >= 2.
+    matrix : ndarray of float64, shape (3, 3)
+        A rotation near that one.
+
+    Returns
+    -------
+    ndarray of float64, shape (3, 3)
+        As `solve_wahba_svd`, to rounding.
+
+    Notes
+    -----
+    Steps of Newton's method on Wahba's loss, in plain numbers. With ``B = sum(body predicted^T)``
+    the gradient by a small turn of the predicted directions is the vector of its antisymmetric
+    part, and ``tr(B) I - (B + B^T) / 2`` the second derivative. Where a turn is not small, the
+    SVD answers.
+
+    Examples
+    --------
+    >>> icrs = np.array([[0.1, 0.0, 0.995], [0.0, 0.1, 0.995], [-0.1, -0.1, 0.99]])
+    >>> turned = matrix_from_quaternion(np.array([0.001, 0.002, -0.003, 1.0]))
+    >>> found = solve_wahba_near(icrs @ turned.T, icrs, np.eye(3))
+    >>> bool(np.abs(found - turned).max() < 1e-12)
+    True
+    """
+    (a, b, c), (d, e, f), (g, h, i) = (body.T @ icrs @ matrix.T).tolist()
+    whole = (0.0, 0.0, 0.0, 1.0)
+    for _ in range(4):
+        # The symmetric matrix of the second derivative: p, q, r; s, t; u above its diagonal.
+        p, q, r = e + i, -0.5 * (b + d), -0.5 * (c + g)
+        s, t, u = a + i, -0.5 * (f + h), a + e
+        k, m, n = s * u - t * t, r * t - q * u, q * t - r * s
+        size = p * k + q * m + r * n
+        if not size > 0.0:
+            break
+        v, w = p * u - r * r, q * r - p * t
+        tx, ty, tz = h - f, c - g, d - b
+        x, y, z = (
+            0.5 * (k * tx + m * ty + n * tz) / size,
+            0.5 * (m * tx + v * ty + w * tz) / size,
+            0.5 * (n * tx + w * ty + (p * s - q * q) * tz) / size,
+        )
+        half = math.hypot(x, y, z)
+        if not half < 0.5 * NEAR_RAD:
+            break
+        whole = _quaternion_product(whole, (-x, -y, -z, 1.0))
+        if half < 0.5 * CONVERGED_RAD:
+            return np.asarray(matrix_from_quaternion(np.array(whole)) @ matrix)
+        # B is of the observed directions by those that are predicted after the turn, which is
+        # v + scale ((x, y, z) x (v + (x, y, z) x v)) for a direction v.
+        scale = 2.0 / (1.0 + x * x + y * y + z * z)
+        a, b, c = _turned_by(x, y, z, scale, a, b, c)
+        d, e, f = _turned_by(x, y, z, scale, d, e, f)
+        g, h, i = _turned_by(x, y, z, scale, g, h, i)
+    return solve_wahba_svd(body, icrs)
+
+
+def _turned_by(
+    x: float, y: float, z: float, scale: float, a: float, b: float, c: float
+) -> tuple[float, float, float]:
+    d, e, f = a + y * c - z * b, b + z * a - x * c, c + x * b - y * a
+    return a + scale * (y * f - z * e), b + scale * (z * d - x * f), c + scale * (x * e - y * d)
+
+
 def determinant(matrix: Array) -> float:
     """Return the determinant of one 3 x 3 matrix.
 
@@ -184,6 +332,38 @@ def determinant(matrix: Array) -> float:
     """
     (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
     return float(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
+
+
+def inverse(matrix: Array) -> Array:
+    """Return the inverse of one symmetric 3 x 3 matrix.
+
+    Parameters
+    ----------
+    matrix : ndarray of float64, shape (3, 3)
+        Symmetric.
+
+    Returns
+    -------
+    ndarray of float64, shape (3, 3)
+        In plain numbers, as `determinant`.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the determinant is 0.
+
+    Examples
+    --------
+    >>> inverse(np.diag([1.0, 2.0, 4.0])).diagonal().tolist()
+    [1.0, 0.5, 0.25]
+    """
+    (a, b, c), (_, d, e), (_, _, f) = matrix.tolist()
+    p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
+    size = a * p + b * q + c * r
+    if size == 0.0:
+        raise np.linalg.LinAlgError("the matrix has no inverse")
+    s, t, u = a * f - c * c, b * c - a * e, a * d - b * b
+    return np.asarray(np.array([[p, q, r], [q, s, t], [r, t, u]]) / size)
 
 
 def random_attitudes(count: int, generator: np.random.Generator) -> Array:

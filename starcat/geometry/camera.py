@@ -110,6 +110,20 @@ class Camera:
         middle = (0.5 * self.width_px, 0.5 * self.height_px)
         return self.distortion.is_none and self.principal_point_px == middle
 
+    @cached_property
+    def middle_px(self) -> Array:
+        """Middle of the detector, shape (2,)."""
+        return np.array([0.5 * self.width_px, 0.5 * self.height_px])
+
+    @cached_property
+    def _axis_px(self) -> Array:
+        return np.array(self.principal_point_px)
+
+    @cached_property
+    def corner_directions(self) -> Array:
+        """Directions of the four corners in the camera frame, shape (4, 3)."""
+        return self.directions_from_pixels(self._corners)
+
     def _widest_rad(self, centroids_px: Array) -> float:
         """Return the largest separation between the directions of pixels."""
         body = self.directions_from_pixels(centroids_px)
@@ -191,22 +205,14 @@ class Camera:
             Pixels (x right, y down); NaN where a direction lies behind the camera, or so far
             off the axis that the distortion folds its image back.
         """
-        z = body[:, 2]
-        z = np.where(z > 0.0, z, np.nan)
-        pixels = np.empty((len(body), 2))
-        x, y = pixels[:, 0], pixels[:, 1]
+        z = np.where(body[:, 2:] > 0.0, body[:, 2:], np.nan)
         if self.distortion.is_none:
-            scale = self.focal_length_px / z
-            np.multiply(body[:, 0], scale, out=x)
-            np.multiply(body[:, 1], scale, out=y)
+            pixels = body[:, :2] * (self.focal_length_px / z)
         else:
-            np.divide(body[:, :2], z[:, None], out=pixels)
-            image = self.distortion.distorted(pixels.view(np.complex128)[:, 0])
-            np.multiply(image.real, self.focal_length_px, out=x)
-            np.multiply(image.imag, self.focal_length_px, out=y)
-        x += self.principal_point_px[0]
-        y += self.principal_point_px[1]
-        return pixels
+            image = self.distortion.distorted((body[:, :2] / z).view(np.complex128)[:, 0])
+            pixels = image.view(np.float64).reshape(-1, 2) * self.focal_length_px
+        pixels += self._axis_px
+        return np.asarray(pixels)
 
     def directions_from_pixels(self, centroids_px: Array) -> Array:
         """Return the directions that centroids point at.
@@ -222,10 +228,8 @@ class Camera:
             Unit vectors in the camera frame; NaN where no direction inside the fold has that
             image, which happens off the detector only.
         """
-        x_px, y_px = self.principal_point_px
         body = np.empty((len(centroids_px), 3))
-        np.subtract(centroids_px[:, 0], x_px, out=body[:, 0])
-        np.subtract(centroids_px[:, 1], y_px, out=body[:, 1])
+        np.subtract(centroids_px, self._axis_px, out=body[:, :2])
         body[:, 2] = self.focal_length_px
         if not self.distortion.is_none:
             image = (body[:, :2] / self.focal_length_px).view(np.complex128)[:, 0]
@@ -247,8 +251,8 @@ class Camera:
         ndarray of bool, shape (N,)
             Closed at the left and top edge, open at the right and bottom.
         """
-        x, y = centroids_px[:, 0], centroids_px[:, 1]
-        return np.asarray((x >= 0) & (x < self.width_px) & (y >= 0) & (y < self.height_px))
+        inside = (centroids_px >= 0.0) & (centroids_px < 2.0 * self.middle_px)
+        return np.asarray(inside[:, 0] & inside[:, 1])
 
 
 def _size(name: str, value: object) -> int:

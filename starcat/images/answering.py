@@ -12,6 +12,7 @@ from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.images.identification import (
     MeasuredFile,
+    Near,
     PictureOptions,
     draw,
     identify_frames,
@@ -84,12 +85,13 @@ def answer_each(
     *,
     flip: bool | None = None,
     fov_error: float | None = None,
+    near: Near | None = None,
 ) -> Iterator[tuple[MeasuredFrame, MatchResult]]:
     """Identify the frames of a file or stream, one when it is asked for.
 
     Parameters
     ----------
-    matcher, measured, camera, observer, fov_error
+    matcher, measured, camera, observer, fov_error, near
         As for `identify_frames`.
     flip : bool, optional
         Whether y of centroids was counted from the bottom; images were turned when read.
@@ -103,7 +105,7 @@ def answer_each(
         turned = bool(flip) and measured.image is None
         frame = upside_down(given, camera.height_px) if turned else given
         one = replace(measured, frames=[frame])
-        [result] = identify_frames(matcher, one, camera, observer, fov_error)
+        [result] = identify_frames(matcher, one, camera, observer, fov_error, near)
         yield frame, result
 
 

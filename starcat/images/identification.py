@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,6 +22,7 @@ from starcat.matcher.centroids import (
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import SCALE_FREE, Matcher
 from starcat.matcher.result import MatchResult
+from starcat.matcher.tracking import Tracker
 from starcat.simulation.simulate import Frame
 
 if TYPE_CHECKING:
@@ -36,6 +37,9 @@ IMAGE_SUFFIXES = (
 FOV_ERROR_OF_IMAGES = 0.02
 """Error of the focal length that is allowed for an image where none is stated: who describes a
 camera by its data sheet is seldom farther off."""
+
+Near = Tracker | tuple[list[float], float]
+"""What says where frames are expected: a tracker, or an attitude and its largest error, degrees."""
 
 CENTROIDS_SUFFIX = ".csv"
 """Suffix of the file that a simulated frame's centroids are written to."""
@@ -169,6 +173,7 @@ def identify_frames(
     camera: Camera,
     observer: Observer | None = None,
     fov_error: float | None = None,
+    near: Near | None = None,
 ) -> list[MatchResult]:
     """Identify the frames of a file.
 
@@ -185,6 +190,8 @@ def identify_frames(
     fov_error : float, optional
         Largest relative error of the camera's focal length. By default 2 % for an image, where
         the matcher can find it, and 0 for centroids.
+    near : Tracker or (list of float, float), optional
+        What says where the frames are expected, with the same matcher.
 
     Returns
     -------
@@ -194,7 +201,7 @@ def identify_frames(
     Raises
     ------
     ConfigError
-        If the image is not of the camera's size.
+        If the image is not of the camera's size, or a tracker is to tell planets.
     """
     if measured.image is not None:
         height, width = measured.image.shape
@@ -206,9 +213,11 @@ def identify_frames(
     if fov_error is None:
         can = matcher.method in SCALE_FREE and matcher.database.image is None
         fov_error = FOV_ERROR_OF_IMAGES if measured.image is not None and can else 0.0
-    identify = partial(matcher.identify, camera=camera, fov_error=fov_error)
+    identify = partial(_asked(matcher, near), camera=camera, fov_error=fov_error)
     if observer is None:
         return [identify(frame.centroids_px, magnitudes=frame.mag) for frame in measured.frames]
+    if isinstance(near, Tracker):
+        raise ConfigError("--track does not tell planets from stars; leave out --time, or --track")
     from starcat.sky.spots import identify_in_time
 
     return [
@@ -224,6 +233,15 @@ def identify_frames(
         )
         for frame in measured.frames
     ]
+
+
+def _asked(matcher: Matcher, near: Near | None) -> Callable[..., MatchResult]:
+    """Return what identifies frames where they are expected."""
+    if near is None:
+        return matcher.identify
+    if isinstance(near, Tracker):
+        return near.identify
+    return partial(matcher.identify, prior=near[0], prior_error_deg=near[1])
 
 
 def write_simulated(path: Path, frame: Frame, camera: Camera, seed: int) -> None:

@@ -112,10 +112,8 @@ def false_match_probability(
     True
     """
     n, stars = len(body), max(len(body), stars_in_frame)
-    x, y = body[:, 0] / body[:, 2], body[:, 1] / body[:, 2]
-    # How places move as the camera turns about its three axes, in units of the focal length.
-    turned = np.array([[x * y, -1.0 - x * x, y], [1.0 + y * y, -x * y, -x]])
-    gram = np.einsum("ain,ajn->ij", turned, turned)
+    sums = _sums(body)
+    gram = _gram(sums)
     information = determinant(gram)
     if not information > 0.0 or (noise_px is not None and n < MIN_STARS):
         return 1.0
@@ -129,13 +127,44 @@ def false_match_probability(
         log_values = -_log_share(n, most, ways, noise_px, camera)
     expected = _log_expected(ways(n), n, square_px, information, camera)
     if log_scales > 0.0:
-        radial = np.array([x, y])
-        cross = np.einsum("ain,an->i", turned, radial)
         # The determinant with a fourth row, by Schur's complement.
-        left = float(np.vdot(radial, radial) - cross @ np.linalg.solve(gram, cross))
+        along, cross = _by_scale(sums)
+        left = along - float(cross @ np.linalg.solve(gram, cross))
         scaled = _log_expected(ways(n), n, square_px, information * left, camera, unknowns=4)
         expected = float(np.logaddexp(expected, scaled + math.log(log_scales)))
     return math.exp(min(0.0, expected + log_values))
+
+
+def _sums(body: Array) -> list[list[float]]:
+    """Return the sums of the products of 1, x, y, x x, x y and y y, over places (x, y).
+
+    They hold all that the derivatives of the places are made of.
+    """
+    powers = np.empty((6, len(body)))
+    powers[0] = 1.0
+    np.divide(body[:, :2].T, body[:, 2], out=powers[1:3])
+    np.multiply(powers[1:3], powers[1], out=powers[3:5])
+    np.multiply(powers[2], powers[2], out=powers[5])
+    found: list[list[float]] = (powers @ powers.T).tolist()
+    return found
+
+
+def _gram(sums: list[list[float]]) -> Array:
+    """Return the sums of products of the derivatives by the three angles.
+
+    In units of the focal length these are, of a place, (xy, 1 + yy), (-1 - xx, -xy) and (y, -x).
+    """
+    (n, x, y, *_), (_, xx, xy, *_), (_, _, yy, *_), (*_, x4, x3y, x2y2), (*_, xy3), (*_, y4) = sums
+    first = x2y2 + n + 2.0 * yy + y4
+    second = n + 2.0 * xx + x4 + x2y2
+    mixed = -2.0 * xy - x3y - xy3
+    return np.array([[first, mixed, -x], [mixed, second, -y], [-x, -y, xx + yy]])
+
+
+def _by_scale(sums: list[list[float]]) -> tuple[float, Array]:
+    """Return the sums of products of the derivative by the scale, (x, y), with all derivatives."""
+    (_, x, y, *_), (_, xx, _, x3, x2y, xy2), (_, _, yy, _, _, y3), *_ = sums
+    return xx + yy, np.array([y + x2y + y3, -x - x3 - xy2, 0.0])
 
 
 def _log_expected(

@@ -15,7 +15,7 @@ from starcat.geometry.attitude import radec_roll_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.matcher.fast import DROPPED, OUT_OF_STEPS, WORDS, Answers
 from starcat.matcher.refusal import Refusal
-from starcat.matcher.result import MatchResult, Status
+from starcat.matcher.result import MatchResult, Origin, Status
 from starcat.matcher.stars import Asked
 
 Explain = Callable[[NDArray[np.float64], Camera, "NDArray[np.float64] | None"], "Refusal | None"]
@@ -36,12 +36,15 @@ class MatchResults(Sequence[MatchResult]):
         The camera of all of them.
     explain : callable, optional
         Searches a frame again and says why it gets no answer, which the library does not.
+    origin : {"lost_in_space", "tracking"}
+        Where the library looked for the stars.
     """
 
     answers: Answers
     asked: Sequence[Asked]
     camera: Camera
     explain: Explain | None = None
+    origin: Origin = "lost_in_space"
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -89,6 +92,7 @@ class MatchResults(Sequence[MatchResult]):
             unknown = np.full(4, nan)
             return MatchResult(
                 *(status, none, index, unknown, nan, nan, nan, 0, nan, 1.0, dropped),
+                origin=self.origin,
                 time_s=seconds,
                 asked=asked,
                 why=self._why(code, asked),
@@ -106,6 +110,7 @@ class MatchResults(Sequence[MatchResult]):
             math.exp(log_chance),
             dropped,
             self.camera,
+            origin=self.origin,
             time_s=seconds,
             asked=asked,
         )

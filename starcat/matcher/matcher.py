@@ -11,7 +11,7 @@ import math
 import os
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -31,8 +31,9 @@ from starcat.matcher.many import MatchResults
 from starcat.matcher.methods.table import METHODS, best_method, method_named
 from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder
 from starcat.matcher.observation import MIN_SHARE, WIDEST_FOV_ERROR, Observation, as_frame, observe
+from starcat.matcher.prior import Prior, expected_near, prior_of, search_near
 from starcat.matcher.refusal import Refusal
-from starcat.matcher.result import MatchResult, identified, unidentified
+from starcat.matcher.result import MatchResult, Origin, identified, unidentified
 from starcat.matcher.stars import Asked
 from starcat.matcher.verification import Agreement, BestOf, verify
 from starcat.onboard.layout import FEATURES
@@ -60,9 +61,6 @@ Engine = Literal["auto", "c", "numpy"]
 
 SCALE_FREE = ("triangle",)
 """Methods that find the focal length with the attitude."""
-
-WIDEST_PRIOR_DEG = 20.0
-"""Largest error of the prior attitude of a tracked frame."""
 
 MAX_BATCHES = 200
 """Batches of candidates that are tried before giving up."""
@@ -263,6 +261,8 @@ class Matcher:
         *,
         magnitudes: ArrayLike | None = None,
         fov_error: float = 0.0,
+        prior: ArrayLike | None = None,
+        prior_error_deg: float | None = None,
     ) -> MatchResult:
         """Identify the stars of a frame.
 
@@ -279,22 +279,30 @@ class Matcher:
         fov_error : float
             Largest relative error of the camera's focal length, 0 to 0.5. Above 0 the focal
             length is found with the attitude, which the method ``triangle`` can.
+        prior : array_like of float64, shape (4,), optional
+            Attitude that is expected, as ``q_body_from_icrs``. Only the stars near it are then
+            compared, which no method and no product is needed for; the verification is the same.
+        prior_error_deg : float, optional
+            Largest error of the prior, as an angle of rotation; above 0, at most 20.
 
         Returns
         -------
         MatchResult
-            ``no_match`` and ``too_few_stars`` are answers too.
+            ``no_match`` and ``too_few_stars`` are answers too. With a prior it is ``no_match``
+            where no attitude as near as that explains the frame.
 
         Raises
         ------
         ValueError
-            If the centroids are not pairs of numbers, or the magnitudes are not one each.
+            If the centroids are not pairs of numbers, the magnitudes are not one each, the
+            prior is no quaternion or its error is missing or out of range.
         """
         camera = camera or self.database.camera
         frame, mag = as_frame(centroids_px, magnitudes)
+        near = prior_of(prior, prior_error_deg)
         if fov_error:
-            return self._timed(frame, camera, mag, self._checked_fov_error(fov_error))
-        return self._answers([(frame, mag)], camera)[0]
+            return self._timed(frame, camera, mag, self._checked_fov_error(fov_error), near)
+        return self._answers([(frame, mag)], camera, near)[0]
 
     def identify_many(
         self,
@@ -338,55 +346,11 @@ class Matcher:
         ]
         return self._answers(given, camera, threads=threads or os.cpu_count() or 1)
 
-    def track(
-        self,
-        centroids_px: ArrayLike,
-        q_body_from_icrs: ArrayLike,
-        uncertainty_deg: float,
-        camera: Camera | None = None,
-        *,
-        magnitudes: ArrayLike | None = None,
-    ) -> MatchResult:
-        """Identify the stars of a frame near a prior attitude.
-
-        Parameters
-        ----------
-        centroids_px, camera, magnitudes
-            As for `identify`.
-        q_body_from_icrs : array_like of float64, shape (4,)
-            Prior attitude, scalar last.
-        uncertainty_deg : float
-            Largest error of the prior, as an angle of rotation; above 0, at most 20.
-
-        Returns
-        -------
-        MatchResult
-            ``no_match`` where no attitude as near as that explains the frame. The verification is
-            the same as without a prior. Without the C library the whole sky is searched.
-
-        Raises
-        ------
-        ValueError
-            As `identify`, or if the prior is no quaternion or its error out of range.
-        """
-        camera = camera or self.database.camera
-        frame, mag = as_frame(centroids_px, magnitudes)
-        prior = np.asarray(q_body_from_icrs, dtype=np.float64)
-        if prior.shape != (4,) or not np.isfinite(prior).all() or not prior.any():
-            raise ValueError(f"q_body_from_icrs is {prior}; expected four numbers, not all 0")
-        if not 0.0 < uncertainty_deg <= WIDEST_PRIOR_DEG:
-            raise ValueError(
-                f"uncertainty_deg is {uncertainty_deg}; expected above 0, at most "
-                f"{WIDEST_PRIOR_DEG:g}"
-            )
-        priors = prior[None], float(np.radians(uncertainty_deg))
-        return self._answers([(frame, mag)], camera, priors)[0]
-
     def _answers(
         self,
         given: Sequence[tuple[Array, Array | None]],
         camera: Camera,
-        priors: tuple[Array, float] | None = None,
+        prior: Prior | None = None,
         threads: int = 1,
     ) -> Sequence[MatchResult]:
         """Identify frames in C, or all of them with numpy where the library does not take one."""
@@ -394,32 +358,43 @@ class Matcher:
         if fast is not None and all(fast.takes(len(frame)) for frame, _ in given):
             px = [frame for frame, _ in given]
             mags = [mag for _, mag in given if mag is not None] or None
+            priors = None if prior is None else (prior.q_body_from_icrs[None], prior.error_rad)
             found = fast.identify(px, camera, self._limits, mags, priors, threads)
             if found.is_whole:
                 asked = [self._asked(frame, mag) for frame, mag in given]
-                explain = None if self.database.image else partial(self._why, priors is not None)
-                return MatchResults(found, asked, camera, explain)
-        return [self._timed(frame, camera, mag) for frame, mag in given]
+                explain = None if self.database.image else partial(self._why, prior)
+                if prior is None:
+                    return MatchResults(found, asked, camera, explain)
+                [answer] = MatchResults(found, asked, camera, explain, "tracking")
+                return [expected_near(prior, answer, camera, self.tolerance_px)]
+        return [self._timed(frame, camera, mag, prior=prior) for frame, mag in given]
 
     def _asked(self, frame: Array, mag: Array | None) -> Asked:
         return Asked(frame, mag, self.database, self.noise_px)
 
     def _why(
-        self, is_tracked: bool, frame: Array, camera: Camera, mag: Array | None
+        self, prior: Prior | None, frame: Array, camera: Camera, mag: Array | None
     ) -> Refusal | None:
         """Return why the C library has no answer: what the search with numpy comes to."""
-        found = self._identify(frame, camera, mag)
-        # The library may have looked near a prior attitude only, where this frame is not.
-        return Refusal("no_candidate") if found.ok and is_tracked else found.refusal
+        # What is unlikely enough for one of the two searches near a prior may not be found by
+        # the other.
+        found = self._identify(frame, camera, mag, 0.0, prior)
+        return Refusal("prior") if found.ok and prior is not None else found.refusal
 
     def _timed(
-        self, frame: Array, camera: Camera, mag: Array | None, fov_error: float = 0.0
+        self,
+        frame: Array,
+        camera: Camera,
+        mag: Array | None,
+        fov_error: float = 0.0,
+        prior: Prior | None = None,
     ) -> MatchResult:
         """Identify a frame with numpy, and say how long that took and what was asked."""
         before_s = time.perf_counter()
-        found = self._identify(frame, camera, mag, fov_error)
-        asked = self._asked(frame, mag)
-        return replace(found, time_s=time.perf_counter() - before_s, asked=asked)
+        found = self._identify(frame, camera, mag, fov_error, prior)
+        # A frozen dataclass refuses assignments; nobody else has this one yet.
+        vars(found).update(time_s=time.perf_counter() - before_s, asked=self._asked(frame, mag))
+        return found
 
     def _checked_fov_error(self, fov_error: float) -> float:
         if self.method not in SCALE_FREE:
@@ -431,7 +406,12 @@ class Matcher:
         return float(fov_error)
 
     def _identify(
-        self, frame: Array, camera: Camera, mag: Array | None, fov_error: float = 0.0
+        self,
+        frame: Array,
+        camera: Camera,
+        mag: Array | None,
+        fov_error: float = 0.0,
+        prior: Prior | None = None,
     ) -> MatchResult:
         """Identify a frame with numpy."""
         if self.database.image is not None:
@@ -450,17 +430,20 @@ class Matcher:
             min_share=self.min_share,
             budget=Budget(self.max_steps, self.time_limit_s),
         )
+        origin: Origin = "lost_in_space" if prior is None else "tracking"
         if len(observation) < MIN_STARS:
-            return unidentified("too_few_stars", observation)
-        found, reason = self._search(observation)
-        if found is None:
-            return unidentified("no_match", observation, Refusal(reason or "no_candidate"))
-        if found.false_match_probability > self.max_false_match_probability:
-            return unidentified("no_match", observation, _refusal(found, reason))
-        return identified(found, observation, self.database.star_id)
+            return unidentified("too_few_stars", observation, origin=origin)
+        found, limit = self._search(observation, prior)
+        if found is None or found.false_match_probability > self.max_false_match_probability:
+            why = _refusal(found, limit, prior)
+            return unidentified("no_match", observation, why, origin=origin)
+        answer = identified(found, observation, self.database.star_id, origin)
+        if prior is None:
+            return answer
+        return expected_near(prior, answer, camera, self.tolerance_px)
 
     def _search(
-        self, observation: Observation
+        self, observation: Observation, prior: Prior | None
     ) -> tuple[Agreement | None, Literal["time", "steps"] | None]:
         """Return the first agreement that is certain, or the best one, and what ended the search.
 
@@ -469,9 +452,13 @@ class Matcher:
         limit = self.max_false_match_probability
         certain = limit if limit <= CERTAIN else max(CERTAIN, 0.01 * limit)
         best = BestOf(certain)
-        proposals = METHODS[self.method].propose(observation, self.database, self.selection)
+        propose = METHODS[self.method].propose
+        whole_sky = islice(propose(observation, self.database, self.selection), self.max_batches)
         try:
-            for candidates in islice(proposals, self.max_batches):
+            if prior is not None:
+                search_near(prior, observation, self.database, best, whole_sky)
+                return best.found, None
+            for candidates in whole_sky:
                 verify(candidates, observation, self.database, best)
                 if best.is_certain:
                     break
@@ -480,6 +467,10 @@ class Matcher:
         return best.found, None
 
 
-def _refusal(found: Agreement, limit: Literal["time", "steps"] | None) -> Refusal:
-    """Return why the best agreement is no answer."""
+def _refusal(
+    found: Agreement | None, limit: Literal["time", "steps"] | None, prior: Prior | None
+) -> Refusal:
+    """Return why the best agreement, if there is one, is no answer."""
+    if found is None or (prior is not None and found.chance >= 1.0):
+        return Refusal(limit or ("no_candidate" if prior is None else "prior"))
     return Refusal(limit or found.withheld or "chance", found.n_matched, found.chance, found.share)

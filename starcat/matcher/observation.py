@@ -173,8 +173,11 @@ def observe(
     """
     given, mag = as_frame(centroids_px, magnitudes)
     usable = camera.contains(given)
-    rows, dropped = np.flatnonzero(usable), _unusable(given, usable)
-    rows = rows[_own_order(given[rows], None if mag is None else mag[rows], camera)]
+    if usable.all():
+        dropped, rows = [], _own_order(given, mag, camera)
+    else:
+        rows, dropped = usable.nonzero()[0], _unusable(given, usable)
+        rows = rows[_own_order(given[rows], None if mag is None else mag[rows], camera)]
     rows, repeats = _without_repeats(rows, given)
     kept = given[rows]
     known = None if mag is None or not np.isfinite(mag[rows]).any() else mag[rows]
@@ -230,8 +233,6 @@ def as_frame(
 
 
 def _unusable(given: Array, usable: NDArray[np.bool_]) -> list[tuple[int, str]]:
-    if usable.all():
-        return []
     finite = np.asarray(np.isfinite(given).all(axis=1))
     return [
         (int(row), "out_of_frame" if finite[row] else "not_finite")
@@ -241,8 +242,7 @@ def _unusable(given: Array, usable: NDArray[np.bool_]) -> list[tuple[int, str]]:
 
 def _own_order(centroids_px: Array, mag: Array | None, camera: Camera) -> NDArray[np.int64]:
     """Return the brightest first (unknown ones last), or the nearest to the centre."""
-    x = centroids_px[:, 0] - 0.5 * camera.width_px
-    y = centroids_px[:, 1] - 0.5 * camera.height_px
+    x, y = (centroids_px - camera.middle_px).T
     distance = x * x + y * y
     return np.lexsort((y, x, distance) if mag is None else (y, x, distance, mag))
 
@@ -250,6 +250,9 @@ def _own_order(centroids_px: Array, mag: Array | None, camera: Camera) -> NDArra
 def _without_repeats(
     rows: NDArray[np.int64], given: Array
 ) -> tuple[NDArray[np.int64], list[tuple[int, str]]]:
+    x = np.sort(given[rows, 0])
+    if not (x[1:] == x[:-1]).any():
+        return rows, []
     place = given[rows, 0] + 1j * given[rows, 1]
     order = np.argsort(place, kind="stable")
     same = np.diff(place[order]) == 0.0

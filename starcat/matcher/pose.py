@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.errors import ConfigError
-from starcat.geometry.attitude import solve_wahba_svd
+from starcat.geometry.attitude import solve_wahba_near, solve_wahba_svd
 from starcat.geometry.camera import Camera
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.observation import Observation
@@ -157,7 +157,8 @@ def refitted(
         method for both, which squares the error that it has.
     """
     if not observation.fov_error:
-        return Pose(solve_wahba_svd(pose.body[matched], stars), pose.camera, pose.body)
+        near = solve_wahba_near(pose.body[matched], stars, pose.matrix)
+        return Pose(near, pose.camera, pose.body)
     seen = pose.body[matched]
     predicted = stars @ pose.matrix.T
     left = seen - predicted

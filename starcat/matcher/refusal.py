@@ -8,12 +8,13 @@ from typing import Literal
 from starcat.matcher.chance import MIN_STARS
 
 Reason = Literal[
-    "too_few_stars", "no_candidate", "chance", "share_of_frame", "scale", "time", "steps"
+    "too_few_stars", "no_candidate", "prior", "chance", "share_of_frame", "scale", "time", "steps"
 ]
 
 WORDS: dict[Reason, str] = {
     "too_few_stars": f"fewer than {MIN_STARS} spots of the frame are usable",
     "no_candidate": "no pattern of the frame is one of the database",
+    "prior": "no attitude as near to the prior as its error says explains the frame",
     "chance": "chance would agree as well",
     "share_of_frame": "the best agreement explains too little of the frame",
     "scale": "the frame is of another scale than the camera",
@@ -31,6 +32,7 @@ ADVICE: dict[Reason, str] = {
         "check the field of view of the camera, try the image flipped, allow a wider tolerance "
         "of centroids, or use a database of fainter stars"
     ),
+    "prior": "state a larger error of the prior (prior_error_deg), or identify without a prior",
     "chance": (
         "give brightnesses of the spots, state their noise (noise_px, noise_mag) in place of a "
         "tolerance, or find more spots; check the field of view, and try the image flipped"
@@ -58,7 +60,8 @@ class Refusal:
     ----------
     reason : str
         ``too_few_stars``, ``no_candidate`` (no pattern of the frame is in the database),
-        ``chance``, ``share_of_frame`` and ``scale`` (why the best agreement was withheld), or
+        ``prior`` (no attitude near the prior explains the frame), ``chance``,
+        ``share_of_frame`` and ``scale`` (why the best agreement was withheld), or
         ``time`` and ``steps`` (the limit that ended the search).
     n_matched : int
         Centroids with a star in the best agreement; 0 where there was none.

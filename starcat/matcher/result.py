@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from html import escape
 from typing import TYPE_CHECKING, Any, Literal
@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
 Status = Literal["identified", "no_match", "too_few_stars"]
 
+Origin = Literal["lost_in_space", "tracking"]
+
 
 @dataclass(frozen=True)
 class MatchResult:
@@ -70,6 +72,8 @@ class MatchResult:
         was found where it was looked for. None unless identified.
     focal_length_error_px : float or None
         Standard error of that focal length; None where it was not looked for.
+    origin : {"lost_in_space", "tracking"}
+        Whether the whole sky was searched, or what is near a prior attitude.
     time_s : float
         Time that the answer took; NaN where nobody measured. It is no part of the answer.
     """
@@ -87,6 +91,7 @@ class MatchResult:
     dropped: tuple[tuple[int, str], ...] = ()
     camera: Camera | None = None
     focal_length_error_px: float | None = None
+    origin: Origin = "lost_in_space"
     time_s: float = field(default=math.nan, compare=False)
     # What follows is what the properties are made of, when they are asked for.
     asked: Asked | None = field(default=None, repr=False, compare=False)
@@ -251,7 +256,10 @@ class MatchResult:
 
 
 def unidentified(
-    status: Status, observation: Observation, refusal: Refusal | None = None
+    status: Status,
+    observation: Observation,
+    refusal: Refusal | None = None,
+    origin: Origin = "lost_in_space",
 ) -> MatchResult:
     """Return the answer to a frame that was not identified.
 
@@ -264,6 +272,8 @@ def unidentified(
     refusal : Refusal, optional
         The best agreement that was withheld, and why; that there were too few stars is said
         without it.
+    origin : {"lost_in_space", "tracking"}
+        Where the stars were looked for.
 
     Returns
     -------
@@ -286,12 +296,16 @@ def unidentified(
         nan,
         1.0,
         observation.dropped,
+        origin=origin,
         why=refusal,
     )
 
 
 def identified(
-    found: Agreement, observation: Observation, star_id: NDArray[np.int64]
+    found: Agreement,
+    observation: Observation,
+    star_id: NDArray[np.int64],
+    origin: Origin = "lost_in_space",
 ) -> MatchResult:
     """Return the answer to an identified frame.
 
@@ -303,6 +317,8 @@ def identified(
         The frame.
     star_id : ndarray of int64, shape (S,)
         Permanent numbers of the database's stars.
+    origin : {"lost_in_space", "tracking"}
+        Where the stars were looked for.
 
     Returns
     -------
@@ -310,12 +326,12 @@ def identified(
         An answer whose quaternion and angles are the same attitude.
     """
     count = len(observation) + len(observation.dropped)
-    index = np.full(count, -1, dtype=np.int32)
+    index, ids = np.empty(count, dtype=np.int32), np.empty(count, dtype=np.int64)
+    index.fill(-1)
     index[observation.rows] = found.star_index
-    ids = np.full(count, -1, dtype=np.int64)
-    has_star = index >= 0
-    ids[has_star] = star_id[index[has_star]]
-    pose, matched = found.pose, np.flatnonzero(found.star_index >= 0)
+    np.take(star_id, index, out=ids, mode="wrap")
+    ids[index < 0] = -1
+    pose = found.pose
     ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(pose.matrix)
     return MatchResult(
         "identified",
@@ -326,11 +342,49 @@ def identified(
         dec_deg,
         roll_deg,
         found.n_matched,
-        float(np.degrees(found.residual_rad) * 3600.0),
+        math.degrees(found.residual_rad) * 3600.0,
         found.false_match_probability,
         observation.dropped,
         pose.camera,
-        focal_length_error_px(pose, matched, found.residual_rad, observation)
-        if observation.fov_error
-        else None,
+        _focal_length_error_px(found, observation) if observation.fov_error else None,
+        origin,
+    )
+
+
+def _focal_length_error_px(found: Agreement, observation: Observation) -> float:
+    matched = np.flatnonzero(found.star_index >= 0)
+    return focal_length_error_px(found.pose, matched, found.residual_rad, observation)
+
+
+def withheld(answer: MatchResult, refusal: Refusal) -> MatchResult:
+    """Return the answer to a frame whose stars and attitude are not given away.
+
+    Parameters
+    ----------
+    answer : MatchResult
+        An identified frame.
+    refusal : Refusal
+        Why it is withheld.
+
+    Returns
+    -------
+    MatchResult
+        ``no_match``.
+    """
+    nan, count = math.nan, len(answer.star_ids)
+    return replace(
+        answer,
+        status="no_match",
+        star_ids=np.full(count, -1, dtype=np.int64),
+        star_index=np.full(count, -1, dtype=np.int32),
+        q_body_from_icrs=np.full(4, nan),
+        boresight_ra_deg=nan,
+        boresight_dec_deg=nan,
+        roll_deg=nan,
+        n_matched=0,
+        residual_arcsec=nan,
+        false_match_probability=1.0,
+        camera=None,
+        focal_length_error_px=None,
+        why=refusal,
     )

@@ -13,6 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.geometry.attitude import inverse
 from starcat.geometry.camera import Camera
 from starcat.matcher.observation import Observation
 
@@ -25,7 +26,11 @@ _UNIT = np.eye(3)
 
 
 def share_of_frame(
-    matched: Array, stars: Array, residual_rad: float, observation: Observation
+    matched: Array,
+    stars: Array,
+    residual_rad: float,
+    observation: Observation,
+    enough: float = 1.0,
 ) -> float:
     """Return which share of a frame an attitude explains, by weight.
 
@@ -39,6 +44,8 @@ def share_of_frame(
         Root mean square separation of the matched centroids and their stars.
     observation : Observation
         The frame, with all centroids.
+    enough : float
+        The share of the stars is returned if it is as large as this.
 
     Returns
     -------
@@ -52,10 +59,14 @@ def share_of_frame(
     with_scale = observation.fov_error > 0.0
     try:
         normal = information(matched, with_scale=with_scale)
-        covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+        covariance = np.asarray(
+            np.linalg.inv(normal) if with_scale else inverse(normal), dtype=np.float64
+        )
     except np.linalg.LinAlgError:
         return 0.0
     of_stars = explained_share(covariance, stars)
+    if of_stars >= enough:
+        return of_stars
     of_centroids = explained_share(covariance, observation.body)
     if of_centroids <= of_stars:
         return of_stars
@@ -155,8 +166,7 @@ def corner_deviation(covariance: Array, camera: Camera) -> float:
         Root mean square over both axes of the worst corner, in units of the error of a
         direction along one axis.
     """
-    w, h = float(camera.width_px), float(camera.height_px)
-    corners = camera.directions_from_pixels(np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]]))
+    corners = camera.corner_directions
     if len(covariance) == 3:
         along = np.einsum("ni,ij,nj->n", corners, covariance, corners)
         variance = float(np.trace(covariance) - along.min())

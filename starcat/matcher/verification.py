@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.geometry.zones import Zones, zones_of
+from starcat.matcher.around import stars_around
 from starcat.matcher.budget import AGREEMENT
 from starcat.matcher.chance import MIN_STARS, false_match_probability
 from starcat.matcher.database import Database
@@ -62,9 +62,6 @@ FOCAL_MARGIN = 0.02
 
 MAX_REFINEMENTS = 4
 """Largest number of refinements; after the first one the matched stars rarely change."""
-
-MANY_STARS = 15_000
-"""So many stars are searched by zones; a product of all is faster for fewer."""
 
 AT_ONCE = 256
 """Number of candidates whose agreeing centroids are counted together."""
@@ -234,19 +231,12 @@ def agreeing_centroids(
     return np.asarray(near.reshape(len(matrices), -1).sum(axis=1))
 
 
-def _near(axis: Array, radius_rad: float, database: Database) -> NDArray[np.int64]:
-    """Return the stars around an axis."""
-    if len(database.directions) < MANY_STARS:
-        return np.flatnonzero(database.directions @ axis >= math.cos(radius_rad))
-    return database.derived(_zones).near(axis, radius_rad)
-
-
-def _zones(database: Database) -> Zones:
-    return zones_of(database.directions)
-
-
 def agree(
-    pose: Pose, observation: Observation, database: Database, certain: float = 1.0
+    pose: Pose,
+    observation: Observation,
+    database: Database,
+    certain: float = 1.0,
+    first: tuple[float, ...] = (),
 ) -> Agreement:
     """Match the centroids of a frame with the stars that an attitude predicts.
 
@@ -260,6 +250,9 @@ def agree(
         The stars.
     certain : float
         With a false-match probability as low as this no smaller reach is tried; with 1, none is.
+    first : tuple of float
+        Reaches of first refinements, one after the other, in units of the final reach, where
+        the attitude is only roughly known.
 
     Returns
     -------
@@ -269,7 +262,7 @@ def agree(
         much of the frame is unexplained (``min_share``) or if the frame is scaled.
     """
     observation.budget.spend(AGREEMENT)
-    rough = ROUGH if observation.fov_error else ()
+    rough = ROUGH if observation.fov_error and not first else first
     fit = _refined(pose, observation, database, rough)
     found = _judged(fit, observation)
     if found.false_match_probability < 1.0:
@@ -317,15 +310,15 @@ def _within_less(
 
 def _rivals(fit: _Fit, observation: Observation) -> list[tuple[int, int]]:
     """Return centroids without a star, each with the one that has the star nearest to it."""
-    loose, matched = np.flatnonzero(fit.star < 0), fit.matched
-    if not len(loose) or not len(matched):
+    loose, matched = (fit.star < 0).nonzero()[0], fit.matched
+    reach_px = RIVAL_REACH * REACH * observation.tolerance_px
+    if not len(loose) or not len(matched) or fit.square_px[loose].min() >= reach_px * reach_px:
         return []
     star = fit.star[matched]
-    x, y = observation.centroids_px[loose].T
-    dx, dy = x[:, None] - fit.predicted_px[star, 0], y[:, None] - fit.predicted_px[star, 1]
-    square = dx * dx + dy * dy
+    offset = observation.centroids_px[loose][:, None] - fit.predicted_px[star]
+    offset *= offset
+    square = offset[..., 0] + offset[..., 1]
     nearest = square.argmin(axis=1)
-    reach_px = RIVAL_REACH * REACH * observation.tolerance_px
     near = square[np.arange(len(loose)), nearest] < reach_px * reach_px
     if fit.compatible is not None:
         near &= fit.compatible[loose, star[nearest]]
@@ -368,20 +361,19 @@ def _refined(
     radius_rad = pose.camera.radius_rad
     if observation.fov_error:
         radius_rad *= 1.0 + FOCAL_MARGIN
-    near = _near(pose.matrix[2], radius_rad, database)
-    u = database.directions[near]
+    near, u = stars_around(database).near(pose.matrix[2], radius_rad)
     compatible = None
     if observation.mag is not None and observation.noise_mag is not None:
         compatible = compatible_pairs(observation.mag, database.mag[near], observation.noise_mag)
-    before: NDArray[np.int64] = np.empty(0, dtype=np.int64)
+    before: list[int] = []
     for step, factor in enumerate((*wider, *MAX_REFINEMENTS * (last,))):
         predicted = pose.camera.pixels_from_directions(u @ pose.matrix.T)
         reach_px = factor * REACH * observation.tolerance_px
         star, square_px = _mutually_nearest(predicted, observation, reach_px, compatible)
-        matched = np.flatnonzero(star >= 0)
-        if len(matched) < MIN_STARS or (step >= len(wider) and np.array_equal(star, before)):
+        matched, after = (star >= 0).nonzero()[0], star.tolist()
+        if len(matched) < MIN_STARS or (step >= len(wider) and after == before):
             break
-        before = star
+        before = after
         pose = refitted(pose, matched, u[star[matched]], observation)
     return _Fit(pose, near, u, compatible, predicted, star, matched, square_px)
 
@@ -389,7 +381,8 @@ def _refined(
 def _judged(fit: _Fit, observation: Observation) -> Agreement:
     """Return the agreement of a fit, and whether it is withheld."""
     pose, matched, star = fit.pose, fit.matched, fit.star[fit.matched]
-    index = np.full(len(observation), -1, dtype=np.int32)
+    index = np.empty(len(observation), dtype=np.int32)
+    index.fill(-1)
     index[matched] = fit.near[star]
     if len(matched) < MIN_STARS:
         return Agreement(pose, index, math.nan, 1.0)
@@ -397,7 +390,7 @@ def _judged(fit: _Fit, observation: Observation) -> Agreement:
     difference = seen - fit.icrs[star] @ pose.matrix.T
     residual_rad = math.sqrt(float(np.vdot(difference, difference)) / len(matched))
     within = _within_reach_of_frame(fit.predicted_px, observation)
-    square_px = float(fit.square_px[matched].sum())
+    square_px = math.fsum(fit.square_px[matched].tolist())
     chance = false_match_probability(
         square_px,
         seen,
@@ -406,12 +399,13 @@ def _judged(fit: _Fit, observation: Observation) -> Agreement:
         pose.camera,
         noise_px=observation.noise_px,
         compatible=None if fit.compatible is None else fit.compatible[:, within],
-        log_scales=observation.focal_range.log_width,
+        log_scales=observation.focal_range.log_width if observation.fov_error else 0.0,
     )
     share = 1.0
     if chance < 1.0 and len(matched) < len(within):
         stars = fit.icrs[within] @ pose.matrix.T
-        share = share_of_frame(seen, stars, residual_rad, observation)
+        enough = max(SURE_SHARE, observation.min_share)
+        share = share_of_frame(seen, stars, residual_rad, observation, enough)
     withheld: Withheld = None
     if share < observation.min_share:
         withheld = "share_of_frame"
@@ -425,9 +419,8 @@ def _judged(fit: _Fit, observation: Observation) -> Agreement:
 def _within_reach_of_frame(predicted_px: Array, observation: Observation) -> NDArray[np.int64]:
     """Return which stars some centroid of the frame could agree with."""
     camera, reach_px = observation.camera, REACH * observation.tolerance_px
-    size = np.array([camera.width_px, camera.height_px])
-    near = np.abs(predicted_px - 0.5 * size) <= 0.5 * size + reach_px
-    return np.flatnonzero(near[:, 0] & near[:, 1])
+    near = np.abs(predicted_px - camera.middle_px) <= camera.middle_px + reach_px
+    return (near[:, 0] & near[:, 1]).nonzero()[0]
 
 
 def _mutually_nearest(
@@ -444,10 +437,10 @@ def _mutually_nearest(
     count = len(observation)
     if not len(predicted_px):
         return np.full(count, -1), np.full(count, np.inf)
-    x, y = observation.centroids_px.T
-    dx, dy = x[:, None] - predicted_px[:, 0], y[:, None] - predicted_px[:, 1]
+    offset = observation.centroids_px[:, None] - predicted_px
+    offset *= offset
     # The distance is NaN where the lens forms no image of a star; it must not be the minimum.
-    square = np.fmin(dx * dx + dy * dy, np.inf)
+    square = np.fmin(offset[..., 0] + offset[..., 1], np.inf)
     if compatible is not None:
         square[~compatible] = np.inf
     star, rows = square.argmin(axis=1), np.arange(count)

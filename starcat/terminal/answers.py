@@ -43,7 +43,8 @@ def facts(result: MatchResult) -> Content:
     dict
         Attitude and certainty where it is identified, else why it is not, and the time.
     """
-    found: Content = {"status": result.status, "n_matched": result.n_matched}
+    found: Content = {"status": result.status, "origin": result.origin}
+    found["n_matched"] = result.n_matched
     if result.ok:
         camera = result.camera
         found |= {

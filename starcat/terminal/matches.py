@@ -155,7 +155,9 @@ def _shown(value: float | None) -> str:
 
 def _print_many(answered: Sequence[Answered], database: Database) -> None:
     rows = []
+    is_tracked = any(result.origin == "tracking" for _, result in answered)
     for frame, result in answered:
+        origin = (result.origin.replace("_", " "),) if is_tracked else ()
         angles = (result.boresight_ra_deg, result.boresight_dec_deg, result.roll_deg)
         why = result.refusal
         rows.append(
@@ -166,9 +168,11 @@ def _print_many(answered: Sequence[Answered], database: Database) -> None:
                 *(f"{angle:.5f}" if result.ok else "" for angle in angles),
                 f"{result.residual_arcsec:.2f}" if result.ok else "",
                 f"{result.false_match_probability:.1e}" if result.ok else "",
+                *origin,
             )
         )
-    heads = ("frame", "status", "stars", "RA deg", "Dec deg", "roll deg", "rms arcsec", "chance")
+    names = ("frame", "status", "stars", "RA deg", "Dec deg", "roll deg", "rms arcsec", "chance")
+    heads = (*names, "origin") if is_tracked else names
     print_table(f"{len(answered)} frames, {database.name}", heads, rows, numbers=(2, 3, 4, 5, 6, 7))
 
 

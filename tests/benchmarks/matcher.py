@@ -187,6 +187,7 @@ def drive(
 def asked() -> dict[str, dict[str, Any]]:
     """Return how starcat is asked, by name of the row: in C first, then every method in numpy."""
     c = {"method": "triangle", "magnitudes": True, "engine": "c"}
+    numpy = {"method": "triangle", "magnitudes": True}
     rows: dict[str, dict[str, Any]] = {
         "C triangle, stated": c | {"stated": STATED},
         "C triangle": c,
@@ -194,6 +195,8 @@ def asked() -> dict[str, dict[str, Any]]:
         "C pyramid": c | {"method": "pyramid"},
         "C track, stated": c | {"track": True, "stated": STATED},
         "C track, no mag.": c | {"track": True, "magnitudes": False},
+        "track, stated": numpy | {"track": True, "stated": STATED},
+        "track, no mag.": numpy | {"track": True, "magnitudes": False},
         "triangle, stated": {"method": "triangle", "magnitudes": True, "stated": STATED},
         "triangle, no mag.": {"method": "triangle", "magnitudes": False},
         "triangle, 2 % off": {"method": "triangle", "magnitudes": True, "off": 0.02},

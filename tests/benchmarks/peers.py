@@ -122,7 +122,9 @@ def drive_starcat(
     def solve(given: Any) -> Any:
         px, mag, prior, camera = given
         if track:
-            return matcher.track(px, prior, PRIOR_DEG, magnitudes=mag)
+            return matcher.identify(
+                px, camera, magnitudes=mag, fov_error=off, prior=prior, prior_error_deg=PRIOR_DEG
+            )
         return matcher.identify(px, camera, magnitudes=mag, fov_error=off)
 
     def prepare(px: np.ndarray, mag: np.ndarray, prior: np.ndarray, part: float) -> Any:

@@ -1,0 +1,121 @@
+"""Candidates near a prior attitude: triangles of stars, each near where the prior predicts it.
+
+Nothing is looked up. A centroid may be the stars around its predicted direction, so that the
+separations between those of three centroids tell which triangle they are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.matcher.budget import LOOKUP
+from starcat.matcher.database import Database
+from starcat.matcher.methods.candidates import Candidates
+from starcat.matcher.observation import Observation
+from starcat.matcher.ways import compatible_pairs
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
+
+MOST_CENTROIDS = 12
+"""Centroids that triangles are made of; of more, some are left out, evenly in their order."""
+
+MOST_TRIANGLES = 40
+"""Triangles of centroids that are compared with stars."""
+
+MOST_STARS = 1500
+"""Stars around a prior attitude; where there are more, looking up patterns is quicker."""
+
+USED_AGAIN = 0.3
+"""What the area of a triangle counts, once for every triangle before that it shares a centroid
+with."""
+
+SIDE_TOLERANCE = 1.5
+"""Largest error of a side, in units of the largest error of a centroid."""
+
+
+def candidates(
+    observation: Observation, database: Database, predicted: Array, near: Rows, reach_rad: float
+) -> Iterator[Candidates]:
+    """Propose the triangles of stars that are near their predicted places.
+
+    Parameters
+    ----------
+    observation : Observation
+        The frame.
+    database : Database
+        The stars.
+    predicted : ndarray of float64, shape (N, 3)
+        ICRS directions of the centroids with the prior attitude.
+    near : ndarray of int64, shape (M,)
+        Rows of the stars that may be in the frame.
+    reach_rad : float
+        Largest separation of a star from the predicted direction of its centroid.
+
+    Yields
+    ------
+    Candidates
+        Three stars each, of the same handedness as the centroids. Large triangles come first,
+        and those whose centroids were in none before: a false spot spoils one of them only.
+    """
+    stars = database.directions[near]
+    may_be = predicted @ stars.T >= math.cos(min(math.pi, reach_rad))
+    if observation.mag is not None and observation.noise_mag is not None:
+        may_be &= compatible_pairs(observation.mag, database.mag[near], observation.noise_mag)
+    chosen = np.arange(len(observation))
+    if len(chosen) > MOST_CENTROIDS:
+        chosen = np.linspace(0, len(chosen) - 1, MOST_CENTROIDS).astype(np.int64)
+    stars_of = {n: np.flatnonzero(may_be[n]) for n in chosen.tolist()}
+    for triangle in _disjoint_first(chosen, observation.body):
+        rows = [stars_of[n] for n in triangle]
+        observation.budget.spend(LOOKUP)
+        found = _same_triangles(
+            observation.body[triangle],
+            [stars[row] for row in rows],
+            SIDE_TOLERANCE * observation.tolerance_rad,
+        )
+        if len(found):
+            columns = [near[row[place]] for row, place in zip(rows, found.T, strict=True)]
+            centroids = np.broadcast_to(triangle, found.shape)
+            yield Candidates(centroids, np.stack(columns, axis=-1))
+
+
+def _disjoint_first(chosen: Rows, body: Array) -> Iterator[list[int]]:
+    """Return triangles of centroids, the largest first, and those without a common centroid."""
+    triples = chosen[np.array(list(combinations(range(len(chosen)), 3)))]
+    a, b, c = np.moveaxis(body[triples], 1, 0)
+    normal = np.cross(b - a, c - a)
+    weight = np.einsum("ij,ij->i", normal, normal)
+    for _ in range(min(len(triples), MOST_TRIANGLES)):
+        best = int(weight.argmax())
+        triangle = triples[best].tolist()
+        yield triangle
+        shared = np.isin(triples, triangle).any(axis=1)
+        weight[shared] *= USED_AGAIN**2
+        weight[best] = -1.0
+
+
+def _same_triangles(body: Array, stars: list[Array], tolerance_rad: float) -> Rows:
+    """Return the triangles with the sides of an observed one, as places in the lists of stars."""
+    a, b, c = stars
+    first, second = np.nonzero(_is_apart(a @ b.T, body[0], body[1], tolerance_rad))
+    fits = _is_apart(a @ c.T, body[0], body[2], tolerance_rad)[first]
+    fits &= _is_apart(b @ c.T, body[1], body[2], tolerance_rad)[second]
+    pair, third = np.nonzero(fits)
+    first, second = first[pair], second[pair]
+    turned = np.einsum("ij,ij->i", np.cross(a[first], b[second]), c[third])
+    same = turned * float(np.cross(body[0], body[1]) @ body[2]) > 0.0
+    return np.stack([first[same], second[same], third[same]], axis=-1)
+
+
+def _is_apart(cosines: Array, one: Array, other: Array, tolerance_rad: float) -> NDArray[np.bool_]:
+    """Return which pairs of stars are as far apart as two centroids."""
+    chord = one - other
+    apart = 2.0 * math.asin(min(1.0, 0.5 * math.sqrt(float(chord @ chord))))
+    low, high = max(0.0, apart - tolerance_rad), min(math.pi, apart + tolerance_rad)
+    return np.asarray((cosines <= math.cos(low)) & (cosines >= math.cos(high)))

@@ -1,0 +1,205 @@
+"""Tracking: a sequence of frames, each looked for near where the ones before it lead to.
+
+The camera is taken to go on turning as it did, about the same axes of its own frame. How far that
+may be wrong follows from how far it last was. A frame that is not there is searched for in the
+whole sky at once, so that a jump costs one slow frame and no answer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+
+from numpy.typing import ArrayLike
+
+from starcat.errors import ConfigError
+from starcat.geometry.attitude import Quaternion, Turn, after_turn, turn_between
+from starcat.geometry.camera import Camera
+from starcat.matcher.matcher import Matcher
+from starcat.matcher.prior import WIDEST_PRIOR_DEG, turn_of_noise_rad
+from starcat.matcher.result import MatchResult
+
+FLOOR = 2.0
+"""Smallest error of a prediction, in units of the largest error of a centroid."""
+
+MARGIN = 2.0
+"""Error that is allowed for a prediction, over that of the last ones."""
+
+FADING = 0.5
+"""What the error of an earlier prediction counts, for every frame since."""
+
+MOST_STEPS = 5.0
+"""Time since the last answer after which it tells nothing, over that between the last two."""
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """What the last answers say of the next one."""
+
+    q_body_from_icrs: Quaternion
+    time: float
+    step: float = 1.0
+    turn: Turn = (0.0, 0.0, 0.0)
+    change_rad: float = math.inf
+
+
+@dataclass
+class Tracker:
+    """A matcher that follows a sequence of frames.
+
+    Attributes
+    ----------
+    matcher : Matcher
+        Of any method and engine.
+    max_turn_deg : float
+        Largest error of a prediction that is tried, and the largest turn from the first frame to
+        the second; above 0, at most 20. A frame beyond it is found in the whole sky.
+
+    Examples
+    --------
+    >>> tracker = Tracker(matcher)  # doctest: +SKIP
+    >>> [tracker.identify(px).origin for px in frames]  # doctest: +SKIP
+    ['lost_in_space', 'tracking', 'tracking']
+    """
+
+    matcher: Matcher
+    max_turn_deg: float = 5.0
+    _motion: _Motion | None = field(default=None, init=False, repr=False)
+    _time: float = field(default=-math.inf, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Check the largest turn."""
+        if not 0.0 < self.max_turn_deg <= WIDEST_PRIOR_DEG:
+            raise ConfigError(
+                f"max_turn_deg is {self.max_turn_deg}; expected above 0, at most "
+                f"{WIDEST_PRIOR_DEG:g}",
+                key="max_turn_deg",
+                value=self.max_turn_deg,
+            )
+
+    def reset(self) -> None:
+        """Forget all frames: the next one is searched for in the whole sky."""
+        self._motion, self._time = None, -math.inf
+
+    def identify(
+        self,
+        centroids_px: ArrayLike,
+        camera: Camera | None = None,
+        *,
+        magnitudes: ArrayLike | None = None,
+        fov_error: float = 0.0,
+        prior: ArrayLike | None = None,
+        prior_error_deg: float | None = None,
+        time_s: float | None = None,
+    ) -> MatchResult:
+        """Identify the stars of the next frame.
+
+        Parameters
+        ----------
+        centroids_px, camera, magnitudes, fov_error
+            As for `Matcher.identify`.
+        prior, prior_error_deg
+            As for `Matcher.identify`; they take the place of the prediction, as what a gyroscope
+            says does.
+        time_s : float, optional
+            Time of the frame, later than that of the one before; frames without a time are
+            one after the other at equal intervals. Give it for every frame, or for none.
+
+        Returns
+        -------
+        MatchResult
+            ``origin`` says whether it was found near the prediction, ``tracking``, or in the
+            whole sky, ``lost_in_space``. The verification is the same.
+
+        Raises
+        ------
+        ConfigError, ValueError
+            As `Matcher.identify`, or if the time is no later than the one before.
+        """
+        now = self._next_time(time_s)
+        camera = camera or self.matcher.database.camera
+        expected, error_deg = prior, prior_error_deg
+        if expected is None and error_deg is None:
+            expected, error_deg = self._predicted(now, camera)
+        found = None
+        if expected is not None or error_deg is not None:
+            found = self.matcher.identify(
+                centroids_px,
+                camera,
+                magnitudes=magnitudes,
+                fov_error=fov_error,
+                prior=expected,
+                prior_error_deg=error_deg,
+            )
+        if found is None or found.status == "no_match":
+            found = self.matcher.identify(
+                centroids_px, camera, magnitudes=magnitudes, fov_error=fov_error
+            )
+        self._time = now
+        if found.ok:
+            x, y, z, w = found.q_body_from_icrs.tolist()
+            is_new = found.origin == "lost_in_space"
+            # Beyond the prediction the motion is another one: the next attitude is expected to be
+            # the same, within the largest turn.
+            self._motion = (
+                _Motion((x, y, z, w), now)
+                if is_new or self._motion is None
+                else self._learnt(self._motion, (x, y, z, w), now, camera)
+            )
+        return found
+
+    def follow(self, frames: Iterable[ArrayLike]) -> Iterator[MatchResult]:
+        """Identify frames one after the other, each when its answer is asked for.
+
+        Parameters
+        ----------
+        frames : iterable of array_like of float64, shape (n, 2)
+            Centroids of each frame, pixels.
+
+        Yields
+        ------
+        MatchResult
+            As `identify` gives it.
+        """
+        return (self.identify(frame) for frame in frames)
+
+    def _next_time(self, time_s: float | None) -> float:
+        if time_s is None:
+            return 0.0 if math.isinf(self._time) else self._time + 1.0
+        if not self._time < time_s < math.inf:
+            raise ConfigError(
+                f"time_s is {time_s}; expected a number above {self._time}, the time of the frame "
+                "before",
+                key="time_s",
+                value=time_s,
+            )
+        return float(time_s)
+
+    def _predicted(
+        self, now: float, camera: Camera
+    ) -> tuple[Quaternion, float] | tuple[None, None]:
+        """Return the attitude that is expected, and its largest error; None where none is."""
+        motion = self._motion
+        steps = math.inf if motion is None else (now - motion.time) / motion.step
+        if motion is None or steps > MOST_STEPS:
+            return None, None
+        floor_rad = FLOOR * self.matcher.tolerance_px / camera.focal_length_px
+        # What is not a constant velocity grows with the square of the time.
+        error_deg = math.degrees(floor_rad + MARGIN * motion.change_rad * steps * steps)
+        x, y, z = motion.turn
+        expected = after_turn(motion.q_body_from_icrs, (x * steps, y * steps, z * steps))
+        return expected, min(self.max_turn_deg, error_deg)
+
+    def _learnt(self, before: _Motion, q: Quaternion, now: float, camera: Camera) -> _Motion:
+        """Return what an answer near the prediction says of the motion."""
+        step = now - before.time
+        x, y, z = (part * step / before.step for part in before.turn)
+        x, y, z = turn_between(after_turn(before.q_body_from_icrs, (x, y, z)), q)
+        # The noise of centroids turns a narrow field about its axis by much more than across.
+        noise_rad = turn_of_noise_rad(camera, self.matcher.tolerance_px)
+        about_axis = max(abs(z) * math.tan(camera.radius_rad), abs(z) - noise_rad)
+        change_rad = math.hypot(x, y) + about_axis
+        if math.isfinite(before.change_rad):
+            change_rad = max(change_rad, FADING * before.change_rad)
+        return _Motion(q, now, step, turn_between(before.q_body_from_icrs, q), change_rad)

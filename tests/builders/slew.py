@@ -1,0 +1,48 @@
+"""Frames of a camera that turns, at a rate that changes slowly, and sometimes jumps."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterator
+
+import numpy as np
+
+from starcat.geometry.attitude import after_turn, matrix_from_quaternion
+from starcat.matcher.database import Database
+from starcat.simulation.simulate import Frame, Noise, simulate_frame
+from starcat.simulation.sky import Sky
+
+JUMP_RAD = 0.7
+"""Angle of a jump, 40 deg."""
+
+RATES_DEG = (0.1, 2.0)
+"""Slowest and fastest turn from a frame to the next."""
+
+SHARE = 0.02
+"""Largest change of the rate from a frame to the next, as a share of it."""
+
+
+def slew(
+    database: Database, count: int, noise: Noise, seed: int, jumps: Container[int] = ()
+) -> Iterator[Frame]:
+    """Simulate the frames of a slew.
+
+    The rate goes from its slowest to its fastest and back, and its axis wanders. Before the frames
+    of ``jumps`` the camera turns by `JUMP_RAD`.
+    """
+    generator = np.random.default_rng(seed)
+    stars = np.arange(len(database.mag), dtype=np.int32)
+    sky = Sky(database.directions, database.mag, stars)
+    q, axis, grows = (0.0, 0.0, 0.0, 1.0), np.array([1.0, 0.0, 0.0]), 1.0
+    rate_deg = RATES_DEG[0]
+    for number in range(count):
+        rate_deg *= 1.0 + grows * SHARE * generator.uniform()
+        if not RATES_DEG[0] <= rate_deg <= RATES_DEG[1]:
+            rate_deg, grows = float(np.clip(rate_deg, *RATES_DEG)), -grows
+        axis = axis + 0.01 * generator.normal(size=3)
+        axis /= np.linalg.norm(axis)
+        x, y, z = (np.radians(rate_deg) * axis).tolist()
+        q = after_turn(q, (x, y, z))
+        if number in jumps:
+            q = after_turn(q, (JUMP_RAD, 0.0, 0.0))
+        matrix = matrix_from_quaternion(np.array(q))
+        yield simulate_frame(sky, database.camera, matrix, noise, generator)

@@ -1,0 +1,105 @@
+"""``starcat identify`` where frames are expected somewhere: a prior attitude, a sequence."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from slew import slew
+
+from starcat.geometry.attitude import quaternion_from_matrix
+from starcat.matcher.database import open_database
+from starcat.simulation.simulate import Frame, Noise
+
+Run = Callable[[list[Any]], Any]
+
+
+@pytest.fixture(scope="module")
+def frames(small_artifact: Path) -> list[Frame]:
+    return list(slew(open_database(small_artifact), 12, Noise(0.3), 3, (6,)))
+
+
+@pytest.fixture
+def sequence(frames: list[Frame], tmp_path: Path) -> Path:
+    path = tmp_path / "slew.json"
+    content = [{"centroids_px": frame.centroids_px.tolist()} for frame in frames]
+    path.write_text(json.dumps({"frames": content}))
+    return path
+
+
+def prior(frame: Frame) -> str:
+    return ",".join(map(str, quaternion_from_matrix(frame.matrix).tolist()))
+
+
+def test_a_sequence_is_followed(starcat: Run, small_artifact: Path, sequence: Path) -> None:
+    answers = json.loads(starcat(["identify", small_artifact, sequence, "--track", "--json"]).out)
+    assert [answer["status"] for answer in answers] == ["identified"] * 12
+    found = [answer["origin"] for answer in answers]
+    assert found[0] == found[6] == "lost_in_space"
+    assert found[1:6] + found[7:] == ["tracking"] * 10
+    alone = json.loads(starcat(["identify", small_artifact, sequence, "--json"]).out)
+    for one, other in zip(alone, answers, strict=True):
+        assert one["origin"] == "lost_in_space"
+        names = [[star["star"] for star in answer["stars"]] for answer in (one, other)]
+        assert names[0] == names[1]
+
+
+def test_a_table_of_a_sequence_says_where_frames_were_found(
+    starcat: Run, small_artifact: Path, sequence: Path
+) -> None:
+    lines = starcat(["identify", small_artifact, sequence, "--track"]).out.splitlines()
+    assert sum("tracking" in line for line in lines) == 10
+    assert sum("lost in space" in line for line in lines) == 2
+    assert "origin" not in starcat(["identify", small_artifact, sequence]).out
+
+
+def test_a_stream_is_followed(
+    starcat: Run, small_artifact: Path, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = "".join(
+        json.dumps({"centroids_px": frame.centroids_px.tolist()}) + "\n" for frame in frames[:4]
+    )
+    monkeypatch.setattr("sys.stdin", StringIO(text))
+    run = starcat(["identify", small_artifact, "-", "--track", "--ndjson"])
+    origins = [json.loads(line)["origin"] for line in run.out.splitlines()]
+    assert origins == ["lost_in_space", "tracking", "tracking", "tracking"]
+
+
+def test_a_prior_attitude_is_used(
+    starcat: Run, small_artifact: Path, frames: list[Frame], tmp_path: Path
+) -> None:
+    path = tmp_path / "frame.json"
+    path.write_text(json.dumps({"centroids_px": frames[1].centroids_px.tolist()}))
+    asked = ["identify", small_artifact, path, "--json", "--prior-error-deg", "3"]
+    [near] = json.loads(starcat([*asked, "--prior-q", prior(frames[0])]).out)
+    assert (near["status"], near["origin"]) == ("identified", "tracking")
+    truth = quaternion_from_matrix(frames[1].matrix)
+    assert abs(float(np.dot(near["q_body_from_icrs"], truth))) == pytest.approx(1.0, abs=1e-6)
+    [far] = json.loads(starcat([*asked, "--prior-q", prior(frames[8])]).out)
+    assert (far["status"], far["origin"]) == ("no_match", "tracking")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--prior-q", "0,0,0,1"], "--prior-q and --prior-error-deg go together"),
+        (["--prior-error-deg", "1"], "--prior-q and --prior-error-deg go together"),
+        (["--prior-q", "0,0,1", "--prior-error-deg", "1"], "'0,0,1' is not X,Y,Z,W"),
+        (["--prior-q", "0,0,0,one", "--prior-error-deg", "1"], "is not X,Y,Z,W, four numbers"),
+        (["--prior-q", "0,0,0,0", "--prior-error-deg", "1"], "four finite numbers, not all 0"),
+        (["--prior-q", "0,0,0,1", "--prior-error-deg", "30"], "is 30.0; expected above 0"),
+        (["--prior-q", "0,0,0,1", "--prior-error-deg", "1", "--track"], "leave out --prior-q"),
+        (["--track", "--time", "2026-01-01T00:00:00"], "leave out --time, or --track"),
+    ],
+)
+def test_options_that_say_no_prior_are_refused(
+    starcat: Run, small_artifact: Path, sequence: Path, options: list[str], words: str
+) -> None:
+    run = starcat(["identify", small_artifact, sequence, *options])
+    assert run.code == 2
+    assert words in run.err

@@ -1,0 +1,325 @@
+"""Tracking: frames near a prior attitude, and sequences of frames."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from slew import JUMP_RAD, slew
+
+from starcat.geometry.attitude import (
+    after_turn,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    turn_between,
+)
+from starcat.geometry.camera import Camera
+from starcat.matcher import fast
+from starcat.matcher.database import Database
+from starcat.matcher.matcher import Matcher
+from starcat.matcher.methods import nearby
+from starcat.matcher.result import MatchResult
+from starcat.matcher.tracking import MOST_STEPS, Tracker
+from starcat.simulation.simulate import Frame, Noise, simulate_frame, simulate_frames
+from starcat.simulation.sky import Sky
+
+HARD = Noise(0.5, drop_probability=0.1, false_stars=3)
+
+both_engines = pytest.mark.parametrize(
+    "engine",
+    [
+        "numpy",
+        pytest.param("c", marks=pytest.mark.skipif(not fast.is_compiled(), reason="no C library")),
+    ],
+)
+
+
+@pytest.fixture(scope="module")
+def sky(sky_of, random_directions) -> Database:
+    return sky_of(random_directions(2000, 1))
+
+
+def frames(sky: Database, count: int, noise: Noise = HARD, seed: int = 31) -> list[Frame]:
+    return list(simulate_frames(sky.directions, sky.camera, count, noise, seed, sky.mag))
+
+
+def wrong_by(frame: Frame, angle_deg: float, seed: int) -> np.ndarray:
+    """Return an attitude that is wrong by an angle about a random axis."""
+    x, y, z = np.random.default_rng(seed).normal(size=3)
+    scale = math.radians(angle_deg) / math.hypot(x, y, z)
+    q = quaternion_from_matrix(frame.matrix).tolist()
+    return np.array(after_turn(q, (x * scale, y * scale, z * scale)))
+
+
+def is_right(answer: MatchResult, frame: Frame) -> bool:
+    """Whether boresight and roll are within 0.05 and 0.5 deg."""
+    truth = quaternion_from_matrix(frame.matrix).tolist()
+    x, y, z = np.degrees(turn_between(truth, answer.q_body_from_icrs.tolist()))
+    return bool(np.hypot(x, y) <= 0.05 and abs(z) <= 0.5)
+
+
+# --- A prior attitude
+
+
+@both_engines
+@pytest.mark.parametrize("error_deg", [1e-3, 0.1, 0.5, 2.0, 10.0, 20.0])
+def test_a_frame_near_a_prior_gets_the_stars_that_it_gets_lost_in_space(sky, engine, error_deg):
+    matcher, same = Matcher(sky, engine=engine), 0
+    for number, frame in enumerate(frames(sky, 40)):
+        lost = matcher.identify(frame.centroids_px)
+        prior = wrong_by(frame, 0.999 * error_deg, number)
+        found = matcher.identify(frame.centroids_px, prior=prior, prior_error_deg=error_deg)
+        assert (lost.origin, found.origin) == ("lost_in_space", "tracking")
+        if lost.ok:
+            assert found.star_ids.tolist() == lost.star_ids.tolist()
+            same += 1
+    assert same >= 36
+
+
+@both_engines
+def test_magnitudes_and_stated_noises_hold_near_a_prior_too(sky, engine):
+    matcher = Matcher(sky, engine=engine, noise_px=0.5, noise_mag=0.3)
+    noise, same = Noise(0.5, 0.1, 3, noise_mag=0.3), 0
+    for error_deg in (0.1, 3.0):
+        for number, frame in enumerate(frames(sky, 20, noise)):
+            lost = matcher.identify(frame.centroids_px, magnitudes=frame.mag)
+            prior = wrong_by(frame, error_deg, number)
+            found = matcher.identify(
+                frame.centroids_px, magnitudes=frame.mag, prior=prior, prior_error_deg=error_deg
+            )
+            assert found.ok == lost.ok
+            # A centroid at the end of the reach may move the attitude so that it is within.
+            both = (found.star_ids >= 0) & (lost.star_ids >= 0)
+            assert (found.star_ids == lost.star_ids)[both].all()
+            same += found.star_ids.tolist() == lost.star_ids.tolist()
+    assert same >= 38
+
+
+@pytest.mark.parametrize("most_stars", [nearby.MOST_STARS, 0], ids=["few stars", "many stars"])
+def test_what_is_near_the_prior_takes_few_steps(sky, monkeypatch, most_stars):
+    monkeypatch.setattr(nearby, "MOST_STARS", most_stars)
+    budget = 2_500 if most_stars else 1_000_000
+    matcher = Matcher(sky, engine="numpy", max_steps=budget)
+    found = [
+        matcher.identify(frame.centroids_px, prior=wrong_by(frame, 4.0, n), prior_error_deg=5.0)
+        for n, frame in enumerate(frames(sky, 10))
+    ]
+    assert [answer.status for answer in found] == ["identified"] * 10
+
+
+def test_a_prior_needs_no_product(sky):
+    bare = Database(**{name: value for name, value in vars(sky).items() if name[0] != "_"})
+    bare = Database(
+        *(getattr(bare, name) for name in ("name", "camera", "epoch_jyear", "star_id")),
+        *(getattr(bare, name) for name in ("directions", "mag", "designation")),
+    )
+    (frame,) = frames(sky, 1)
+    for error_deg in (0.1, 5.0):
+        found = Matcher(bare, engine="numpy").identify(
+            frame.centroids_px, prior=wrong_by(frame, error_deg, 1), prior_error_deg=error_deg
+        )
+        assert is_right(found, frame)
+
+
+@both_engines
+@pytest.mark.parametrize("error_deg", [0.1, 2.0])
+def test_an_attitude_far_from_the_prior_is_no_answer(sky, engine, error_deg):
+    matcher = Matcher(sky, engine=engine)
+    for number, frame in enumerate(frames(sky, 20)):
+        for away_deg in (30.0, error_deg + 1.0):
+            found = matcher.identify(
+                frame.centroids_px,
+                prior=wrong_by(frame, away_deg, number),
+                prior_error_deg=error_deg,
+            )
+            assert (found.status, found.n_matched, found.origin) == ("no_match", 0, "tracking")
+            assert np.isnan(found.q_body_from_icrs).all()
+            assert (found.star_ids == -1).all()
+            assert (found.star_index == -1).all()
+            assert found.refusal is not None
+            assert found.refusal.reason in ("prior", "chance", "share_of_frame")
+
+
+def test_only_false_spots_are_no_answer_near_any_prior(sky):
+    generator = np.random.default_rng(3)
+    matcher = Matcher(sky, engine="numpy")
+    for number, frame in enumerate(frames(sky, 30)):
+        px = generator.random((15, 2)) * 1024.0
+        for error_deg in (0.1, 5.0):
+            prior = wrong_by(frame, 0.0, number)
+            assert not matcher.identify(px, prior=prior, prior_error_deg=error_deg).ok
+
+
+def test_an_unknown_scale_and_a_prior_are_found_together(sky):
+    matcher = Matcher(sky, engine="numpy")
+    for number, frame in enumerate(frames(sky, 5)):
+        camera = sky.camera.with_focal_length(1.015 * sky.camera.focal_length_px)
+        asked = {"fov_error": 0.02, "prior_error_deg": 2.0}
+        near = wrong_by(frame, 1.9, number)
+        found = matcher.identify(frame.centroids_px, camera, prior=near, **asked)
+        assert is_right(found, frame)
+        assert found.origin == "tracking"
+        away = wrong_by(frame, 9.0, number)
+        found = matcher.identify(frame.centroids_px, camera, prior=away, **asked)
+        assert found.status == "no_match"
+
+
+@pytest.mark.parametrize(
+    ("prior", "error_deg", "words"),
+    [
+        ([0.0, 0.0, 0.0, 0.0], 1.0, "not all 0"),
+        ([0.0, 0.0, np.nan, 1.0], 1.0, "four finite numbers"),
+        ([0.0, 0.0, 1.0], 1.0, "expected a quaternion"),
+        ([[0.0, 0.0, 0.0, 1.0]], 1.0, "expected a quaternion"),
+        ([0.0, 0.0, 0.0, 1.0], 0.0, "above 0, at most 20"),
+        ([0.0, 0.0, 0.0, 1.0], 21.0, "above 0, at most 20"),
+        ([0.0, 0.0, 0.0, 1.0], np.nan, "above 0, at most 20"),
+        ([0.0, 0.0, 0.0, 1.0], None, "prior_error_deg is missing"),
+        (None, 1.0, "prior is missing"),
+    ],
+)
+def test_a_prior_that_is_none_is_refused(sky, prior, error_deg, words):
+    with pytest.raises(ValueError, match=words):
+        Matcher(sky).identify(np.zeros((5, 2)), prior=prior, prior_error_deg=error_deg)
+
+
+def test_the_length_of_the_prior_does_not_matter(sky):
+    (frame,) = frames(sky, 1)
+    matcher, prior = Matcher(sky, engine="numpy"), wrong_by(frame, 0.1, 2)
+    one, other = (
+        matcher.identify(frame.centroids_px, prior=scale * prior, prior_error_deg=0.2)
+        for scale in (1.0, -3.0)
+    )
+    np.testing.assert_allclose(one.q_body_from_icrs, other.q_body_from_icrs, atol=1e-12)
+
+
+# --- Sequences
+
+
+def follow(sky: Database, engine: str, count: int, jumps: tuple[int, ...], **asked) -> list:
+    """Return (frame, answer) of a slew, checked to be right."""
+    tracker = Tracker(Matcher(sky, engine=engine, **asked))
+    answered = []
+    for frame in slew(sky, count, HARD, 7, jumps):
+        found = tracker.identify(frame.centroids_px)
+        assert not found.ok or is_right(found, frame)
+        answered.append((frame, found))
+    return answered
+
+
+@both_engines
+def test_a_slew_is_tracked_and_a_jump_costs_no_frame(sky, engine):
+    answered = follow(sky, engine, 300, (150,))
+    origins = [found.origin for _, found in answered]
+    assert all(found.ok for _, found in answered)
+    assert origins[0] == origins[150] == "lost_in_space"
+    assert Counter(origins)["tracking"] >= 295
+    assert origins[1] == origins[151] == "tracking"
+
+
+@pytest.mark.slow
+@both_engines
+@pytest.mark.timeout(600)
+def test_ten_thousand_frames_of_a_slew(sky, engine):
+    jumps = (2_500, 5_000, 7_501)
+    answered = follow(sky, engine, 10_000, jumps)
+    assert sum(found.ok for _, found in answered) >= 9_990
+    for jump in jumps:
+        assert answered[jump][1].ok
+        assert answered[jump][1].origin == "lost_in_space"
+        assert answered[jump + 1][1].origin == "tracking"
+    assert Counter(found.origin for _, found in answered)["tracking"] >= 9_950
+
+
+@both_engines
+def test_frames_without_stars_are_bridged(sky, engine):
+    tracker = Tracker(Matcher(sky, engine=engine))
+    origins = {}
+    for number, frame in enumerate(slew(sky, 60, HARD, 7)):
+        # Two dark frames, then so many that the last answer tells nothing.
+        dark = number in (20, 21) or 40 <= number <= 40 + MOST_STEPS
+        found = tracker.identify(np.zeros((0, 2)) if dark else frame.centroids_px)
+        assert found.status == ("too_few_stars" if dark else "identified")
+        assert dark or is_right(found, frame)
+        origins[number] = found.origin
+    assert origins[22] == origins[39] == "tracking"
+    assert origins[41 + int(MOST_STEPS)] == "lost_in_space"
+
+
+@both_engines
+def test_times_that_are_not_equally_apart(sky, engine):
+    every = list(slew(sky, 90, HARD, 9))
+    times = [n for n in range(90) if n < 10 or n % 3 != 1]
+    tracker = Tracker(Matcher(sky, engine=engine))
+    found = [tracker.identify(every[n].centroids_px, time_s=0.1 * n) for n in times]
+    assert all(is_right(answer, every[n]) for answer, n in zip(found, times, strict=True))
+    assert [answer.origin for answer in found[1:]] == ["tracking"] * (len(times) - 1)
+
+
+def test_a_time_that_goes_back_is_refused(sky):
+    tracker = Tracker(Matcher(sky, engine="numpy"))
+    tracker.identify(np.zeros((0, 2)), time_s=2.0)
+    for time_s in (2.0, 1.0, math.nan, math.inf):
+        with pytest.raises(ValueError, match=r"expected a number above 2\.0"):
+            tracker.identify(np.zeros((0, 2)), time_s=time_s)
+    tracker.reset()
+    tracker.identify(np.zeros((0, 2)), time_s=1.0)
+
+
+def test_a_narrow_field_is_tracked(sky_of, random_directions):
+    """The noise of its centroids turns it about its axis by many pixels of a shift."""
+    camera = Camera(1024, 1024, fov_x_deg=2.0)
+    around = random_directions(400_000, 4)
+    u = around[around[:, 0] > math.cos(math.radians(12.0))]
+    narrow = sky_of(u, camera, 3000)
+    tracker = Tracker(Matcher(narrow, engine="numpy"), max_turn_deg=1.0)
+    generator = np.random.default_rng(5)
+    q = (0.5, 0.5, 0.5, 0.5)
+    boresight = matrix_from_quaternion(np.array(q))[2]
+    assert boresight[0] > 0.99
+    all_stars = Sky(u, narrow.mag, np.arange(len(u), dtype=np.int32))
+    origins = []
+    for _ in range(40):
+        q = after_turn(q, (0.002, 0.001, 0.01))
+        matrix = matrix_from_quaternion(np.array(q))
+        frame = simulate_frame(all_stars, camera, matrix, HARD, generator)
+        found = tracker.identify(frame.centroids_px)
+        assert is_right(found, frame)
+        origins.append(found.origin)
+    assert origins[1:] == ["tracking"] * 39
+
+
+def test_frames_are_followed_as_they_come(sky):
+    frames_px = (frame.centroids_px for frame in slew(sky, 5, HARD, 7))
+    answers = Tracker(Matcher(sky)).follow(frames_px)
+    assert next(answers).origin == "lost_in_space"
+    assert len(list(frames_px)) == 4
+    assert not list(answers)
+
+
+def test_the_same_frames_get_the_same_answers(sky):
+    some = [frame.centroids_px for frame in slew(sky, 30, HARD, 7, (20,))]
+    one, other = (
+        [answer.q_body_from_icrs.tobytes() for answer in Tracker(Matcher(sky)).follow(some)]
+        for _ in range(2)
+    )
+    assert one == other
+
+
+@pytest.mark.parametrize("max_turn_deg", [0.0, -1.0, 21.0, math.nan])
+def test_a_largest_turn_out_of_range_is_refused(sky, max_turn_deg):
+    with pytest.raises(ValueError, match=r"max_turn_deg is .*; expected above 0, at most 20"):
+        Tracker(Matcher(sky), max_turn_deg=max_turn_deg)
+
+
+def test_the_slew_is_what_it_says(sky):
+    some = list(slew(sky, 200, HARD, 7, (100,)))
+    q = [quaternion_from_matrix(frame.matrix).tolist() for frame in some]
+    turns = [math.hypot(*turn_between(one, other)) for one, other in pairwise(q)]
+    jump = turns.pop(99)
+    assert jump == pytest.approx(JUMP_RAD, abs=math.radians(2.5))
+    assert 0.09 < math.degrees(min(turns)) < 0.2
+    assert math.degrees(max(turns)) < 2.01
