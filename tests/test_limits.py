@@ -115,3 +115,11 @@ def test_frames_that_no_answer_belongs_to_get_none(sky):
         kind, px, mag, fov_error = hostile_frame(number, sky)
         result = matcher.identify(px, magnitudes=mag, fov_error=fov_error)
         assert not result.ok, (number, kind)
+
+
+def test_a_wide_tolerance_is_for_the_matcher_that_tries_smaller_reaches(sky):
+    for frame in hard_frames(sky, 6, 60, 0.2):
+        narrow, wide = Matcher(sky, tolerance_px=1.0), Matcher(sky, tolerance_px=6.0)
+        assert wide._fast is None
+        if narrow.identify(frame.centroids_px, magnitudes=frame.mag).ok:
+            assert wide.identify(frame.centroids_px, magnitudes=frame.mag).ok

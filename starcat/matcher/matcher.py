@@ -62,6 +62,9 @@ Engine = Literal["auto", "c", "numpy"]
 SCALE_FREE = ("triangle",)
 """Methods that find the focal length with the attitude."""
 
+WIDE_PX = 4.0
+"""With a wider tolerance, ``auto`` is ``numpy``, which tries smaller reaches too."""
+
 MAX_BATCHES = 200
 """Batches of candidates that are tried before giving up."""
 
@@ -103,8 +106,8 @@ class Matcher:
         Steps that a frame may take (`starcat.matcher.budget`), then the best answer so far is
         given, or none. The same steps give the same answer. Infinite by default.
     time_limit_s : float
-        Seconds that a frame may take. Infinite by default. Where this, ``min_share`` or
-        ``max_steps`` is given, ``auto`` is ``numpy``.
+        Seconds that a frame may take. Infinite by default. Where this, ``min_share``,
+        ``max_steps`` or a tolerance above 4 px is given, ``auto`` is ``numpy``.
     """
 
     database: Database
@@ -173,7 +176,8 @@ class Matcher:
     @property
     def _fast(self) -> FastMatcher | None:
         """The C library with this matcher's image, where it serves."""
-        if self.engine == "numpy" or not self._is_default:
+        is_wide = self.engine == "auto" and self.tolerance_px > WIDE_PX
+        if self.engine == "numpy" or not self._is_default or (is_wide and not self.database.image):
             return None
         return fast_matcher(self.database, self.method, self.engine == "c")
 
