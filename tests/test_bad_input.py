@@ -632,6 +632,16 @@ def identify_at(place: Place, *options: str) -> Call:
     return [*place.identify("x_px,y_px\n1,2\n"), *options]
 
 
+@case("error of a field that is no share", 2)
+def _(place: Place) -> Call:
+    return identify_at(place, "--fov-error", "2 deg")
+
+
+@case("error of a field for a method that needs it", 2)
+def _(place: Place) -> Call:
+    return identify_at(place, "--fov-error", "2%", "--method", "hausdorff_l1")
+
+
 @case("prior attitude without its error", 2)
 def _(place: Place) -> Call:
     return identify_at(place, "--prior-q", "0,0,0,1")

@@ -401,6 +401,9 @@ class Matcher:
         return found
 
     def _checked_fov_error(self, fov_error: float) -> float:
+        if self.database.image is not None:
+            text = "an onboard image needs the focal length; open the artifact that it is of"
+            raise ConfigError(text, key="fov_error", value=fov_error)
         if self.method not in SCALE_FREE:
             text = f"method {self.method!r} needs the focal length; only 'triangle' can find it"
             raise ConfigError(text, key="method", value=self.method)
