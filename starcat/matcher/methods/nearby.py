@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from starcat.geometry.attitude import determinant
 from starcat.matcher.budget import LOOKUP
+from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.observation import Observation
@@ -29,6 +30,12 @@ MOST_CENTROIDS = 12
 
 MOST_TRIANGLES = 40
 """Triangles of centroids that are compared with stars."""
+
+MOST_PAIRS = 250
+"""Pairs of a centroid and a star near its predicted direction that are compared with each other."""
+
+ROUNDING = 1e-20
+"""Square of a difference of two cosines that is due to their rounding, and much more."""
 
 MOST_STARS = 1500
 """Stars around a prior attitude; where there are more, looking up patterns is quicker."""
@@ -62,13 +69,21 @@ def candidates(
     Yields
     ------
     Candidates
-        Three stars each, of the same handedness as the centroids. Large triangles come first,
+        All stars first that agree with one, where few come into question. Then three stars each,
+        of the same handedness as the centroids. Large triangles come first,
         and those whose centroids were in none before: a false spot spoils one of them only.
     """
     stars = database.directions[near]
     may_be = predicted @ stars.T >= math.cos(min(math.pi, reach_rad))
     if observation.mag is not None and observation.noise_mag is not None:
         may_be &= compatible_pairs(observation.mag, database.mag[near], observation.noise_mag)
+    tolerance_rad = SIDE_TOLERANCE * observation.tolerance_rad
+    centroid, star = may_be.nonzero()
+    if len(centroid) <= MOST_PAIRS:
+        observation.budget.spend(len(centroid))
+        rigid = _largest_rigid(observation.body[centroid], stars[star], tolerance_rad)
+        if len(rigid) >= MIN_STARS:
+            yield Candidates(centroid[rigid][None], near[star[rigid]][None])
     count = len(observation)
     chosen = np.arange(min(count, MOST_CENTROIDS))
     if count > MOST_CENTROIDS:
@@ -79,12 +94,29 @@ def candidates(
         found = _same_triangles(
             observation.body[triangle],
             [stars[row] for row in rows],
-            SIDE_TOLERANCE * observation.tolerance_rad,
+            tolerance_rad,
         )
         if found:
             columns = [near[row[place]] for row, place in zip(rows, found, strict=True)]
             centroids = np.array([triangle] * len(columns[0]))
             yield Candidates(centroids, np.array(columns).T)
+
+
+def _largest_rigid(body: Array, stars: Array, tolerance_rad: float) -> Rows:
+    """Return the pairs of a centroid and a star that are as far from one of them as their stars.
+
+    Of all pairs that one is taken which the most others agree with.
+    """
+    seen, true = body @ body.T, stars @ stars.T
+    # The cosine of a separation changes by its sine. A centroid is as far as nothing from itself,
+    # so that of its stars there is one.
+    true -= seen
+    true *= true
+    seen *= seen
+    agrees = true <= tolerance_rad**2 * (1.0 - seen) + ROUNDING
+    if not len(agrees):
+        return np.empty(0, dtype=np.int64)
+    return agrees[int(agrees.sum(axis=1).argmax())].nonzero()[0]
 
 
 def _disjoint_first(chosen: Rows, body: Array) -> Iterator[list[int]]:
