@@ -116,7 +116,8 @@ def _largest_rigid(body: Array, stars: Array, tolerance_rad: float) -> Rows:
     agrees = true <= tolerance_rad**2 * (1.0 - seen) + ROUNDING
     if not len(agrees):
         return np.empty(0, dtype=np.int64)
-    return agrees[int(agrees.sum(axis=1).argmax())].nonzero()[0]
+    best = agrees[int(agrees.sum(axis=1).argmax())]
+    return np.asarray(best.nonzero()[0])
 
 
 def _disjoint_first(chosen: Rows, body: Array) -> Iterator[list[int]]:
