@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from starcat.commands.expected import PriorAttitude, PriorErrorDeg, Track, chosen_prior
 from starcat.commands.shared import (
     Dark,
     FailOnNoMatch,
@@ -23,16 +24,12 @@ from starcat.commands.shared import (
     NoisePx,
     Orbit,
     Plane,
-    PriorAttitude,
-    PriorErrorDeg,
     PsfSigmaPx,
     Threshold,
     Time,
     TimeLimit,
-    Track,
     Velocity,
     WcsFile,
-    chosen_prior,
     field_range,
     limits_of_options,
     observer_of_options,

@@ -439,8 +439,10 @@ def _mutually_nearest(
         return np.full(count, -1), np.full(count, np.inf)
     offset = observation.centroids_px[:, None] - predicted_px
     offset *= offset
+    square = offset[..., 0]
+    square += offset[..., 1]
     # The distance is NaN where the lens forms no image of a star; it must not be the minimum.
-    square = np.fmin(offset[..., 0] + offset[..., 1], np.inf)
+    np.fmin(square, np.inf, out=square)
     if compatible is not None:
         square[~compatible] = np.inf
     star, rows = square.argmin(axis=1), np.arange(count)
