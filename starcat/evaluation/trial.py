@@ -14,7 +14,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, Literal, get_type_hints
 
 import numpy as np
 import pyarrow as pa
@@ -26,6 +26,7 @@ from starcat.evaluation.catalog_sky import sky_of_artifact
 from starcat.evaluation.judge import Verdict, judge
 from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
 from starcat.geometry.camera import Camera
+from starcat.matcher.fast import library_version
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.triangle_order import TriangleOrder
 from starcat.matcher.observation import MIN_SHARE
@@ -100,6 +101,8 @@ class Trial:
         Whether nothing but guide stars shines.
     min_share : float
         Smallest share of the frame that an answer explains, as the matcher is told.
+    engine : {"numpy", "auto"}
+        ``numpy``, whose records are the same everywhere, or the C library where it is installed.
     seed : int
         Seed of all that is random. Each frame has its own, so that their number changes none.
     """
@@ -117,6 +120,7 @@ class Trial:
     selection: TriangleOrder = field(default_factory=TriangleOrder)
     guide_stars_only: bool = False
     min_share: float = MIN_SHARE
+    engine: Literal["numpy", "auto"] = "numpy"
     seed: int = 1
 
     @property
@@ -195,11 +199,14 @@ def description(trial: Trial, artifact: Path) -> bytes:
     Returns
     -------
     bytes
-        JSON with sorted keys, with the digests of the artifact's manifest and of the code.
+        JSON with sorted keys, with the digests of the artifact's manifest and of the code, and the
+        version of the C library where it may serve.
     """
     manifest = (artifact / "manifest.json").read_bytes()
     facts = {**asdict(trial), "artifact": artifact.name, "code_sha256": code_sha256()}
     facts["manifest_sha256"] = hashlib.sha256(manifest).hexdigest()
+    if trial.engine == "auto":
+        facts["c_library"] = library_version()
     return json.dumps(facts, sort_keys=True, default=str).encode()
 
 
@@ -279,7 +286,7 @@ def _opened(artifact: Path, trial: Trial) -> tuple[Matcher, Sky]:
         max_false_match_probability=trial.max_false_match_probability,
         selection=trial.selection,
         min_share=trial.min_share,
-        engine="numpy",  # so that records are the same where there is no compiler
+        engine=trial.engine,
     )
     # Stars that noise may lift over the limit belong to the sky.
     sky = _whole_sky(artifact).brighter(trial.noise.limit_mag + 6.0 * trial.noise.noise_mag)

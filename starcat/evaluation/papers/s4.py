@@ -98,6 +98,10 @@ def _mixed(count: int) -> list[Row]:
     return [
         Row(group, METHODS["triangle"], PRESET, _trial("mixed", "triangle", count, MIXED),
             "attitude", 95.5, 14.27, 98.0, 1.5, "4+", note=note),
+        Row(group, f"{METHODS['triangle']}, C library", PRESET,
+            replace(_trial("mixed-installed", "triangle", count, MIXED), engine="auto"),
+            "attitude", 95.5, 14.27, 98.0, 1.5, "4+",
+            note="as it is installed: the C library, numpy where there was no compiler"),
         Row(group, METHODS["pairs"], PRESET, _trial("mixed", "pairs", count, MIXED),
             "attitude", 82.4, 68.45, note=note),
     ]  # fmt: skip
