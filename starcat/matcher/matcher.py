@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import checked_number
+from starcat.matcher.blind import identify_blind
 from starcat.matcher.budget import Budget, BudgetSpentError
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database, open_database, open_image, products_in
@@ -238,7 +239,7 @@ class Matcher:
             engine = "c" if engine == "auto" else engine
         else:
             chosen = best_method(products_in(path)) if method is None else method
-            database = open_database(path, method_named(chosen).products)
+            database = open_database(path, _products_of(chosen, products_in(path)))
         return cls(
             database,
             chosen,
@@ -260,6 +261,7 @@ class Matcher:
         *,
         magnitudes: ArrayLike | None = None,
         fov_error: float = 0.0,
+        fov_deg: tuple[float, float] | None = None,
     ) -> MatchResult:
         """Identify the stars of a frame.
 
@@ -276,6 +278,10 @@ class Matcher:
         fov_error : float
             Largest relative error of the camera's focal length, 0 to 0.5. Above 0 the focal
             length is found with the attitude, which the method ``triangle`` can.
+        fov_deg : pair of float, optional
+            Narrowest and widest field across the frame's width where nothing else is known: of
+            the camera only the size is used then. The database needs the product ``levels``, and
+            the brightness of the spots helps much.
 
         Returns
         -------
@@ -289,6 +295,9 @@ class Matcher:
         """
         camera = camera or self.database.camera
         frame, mag = as_frame(centroids_px, magnitudes)
+        if fov_deg is not None:
+            blind = partial(identify_blind, fov_deg=fov_deg, certain=self._certain)
+            return self._timed(frame, camera, mag, search=blind)
         if fov_error:
             return self._timed(frame, camera, mag, self._checked_fov_error(fov_error))
         return self._answers([(frame, mag)], camera)[0]
@@ -410,11 +419,19 @@ class Matcher:
         return Refusal("no_candidate") if found.ok and is_tracked else found.refusal
 
     def _timed(
-        self, frame: Array, camera: Camera, mag: Array | None, fov_error: float = 0.0
+        self,
+        frame: Array,
+        camera: Camera,
+        mag: Array | None,
+        fov_error: float = 0.0,
+        search: Callable[[Matcher, Array, Camera, Array | None], MatchResult] | None = None,
     ) -> MatchResult:
         """Identify a frame with numpy, and say how long that took and what was asked."""
         before_s = time.perf_counter()
-        found = self._identify(frame, camera, mag, fov_error)
+        if search is None:
+            found = self._identify(frame, camera, mag, fov_error)
+        else:
+            found = search(self, frame, camera, mag)
         asked = self._asked(frame, mag)
         return replace(found, time_s=time.perf_counter() - before_s, asked=asked)
 
@@ -456,6 +473,12 @@ class Matcher:
             return unidentified("no_match", observation, _refusal(found, reason))
         return identified(found, observation, self.database.star_id)
 
+    @property
+    def _certain(self) -> float:
+        """A false-match probability as low as this ends a search."""
+        limit = self.max_false_match_probability
+        return limit if limit <= CERTAIN else max(CERTAIN, 0.01 * limit)
+
     def _search(
         self, observation: Observation
     ) -> tuple[Agreement | None, Literal["time", "steps"] | None]:
@@ -463,9 +486,7 @@ class Matcher:
 
         The best one is that which chance explains least, among those that are withheld too.
         """
-        limit = self.max_false_match_probability
-        certain = limit if limit <= CERTAIN else max(CERTAIN, 0.01 * limit)
-        best = BestOf(certain)
+        best = BestOf(self._certain)
         proposals = METHODS[self.method].propose(observation, self.database, self.selection)
         try:
             for candidates in islice(proposals, self.max_batches):
@@ -480,3 +501,9 @@ class Matcher:
 def _refusal(found: Agreement, limit: Literal["time", "steps"] | None) -> Refusal:
     """Return why the best agreement is no answer."""
     return Refusal(limit or found.withheld or "chance", found.n_matched, found.chance, found.share)
+
+
+def _products_of(method: str, there: Collection[str]) -> tuple[str, ...]:
+    """Return the products that a method needs, and those that it can use and that are there."""
+    known = method_named(method)
+    return (*known.products, *(name for name in known.optional if name in there))
