@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import islice, pairwise
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -21,12 +21,14 @@ from starcat.geometry.camera import Camera
 from starcat.matcher.budget import Budget, BudgetSpentError
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.levels import Level, levels
+from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.table import METHODS
 from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder
 from starcat.matcher.observation import WIDEST_FOV_ERROR, Observation, observe
+from starcat.matcher.pose import first_poses, pose_at
 from starcat.matcher.refusal import Refusal
 from starcat.matcher.result import MatchResult, identified, unidentified
-from starcat.matcher.verification import Agreement, BestOf, verify
+from starcat.matcher.verification import AT_ONCE, Agreement, BestOf, agree, agreeing_centroids
 
 if TYPE_CHECKING:
     from starcat.matcher.matcher import Matcher
@@ -39,6 +41,12 @@ of its size, and 40 a frame that is wider by half."""
 
 BRIGHTEST = TriangleOrder(most_centroids=12)
 """Triangles where magnitudes are known: those of the stars that a level's triangles are of."""
+
+BY_CHANCE = 1.0
+"""Candidates of a batch that are worked out although they agree by chance, on average."""
+
+_OWN = 3
+"""Centroids of a candidate, which its attitude was computed from."""
 
 FIELD_MARGIN = 1e-6
 """Relative difference of focal lengths that is rounding."""
@@ -116,7 +124,7 @@ def parts_of_range(
         )
     low_px, high_px = (_focal_px(camera, angle) for angle in (wide_deg, narrow_deg))
     focal = [level.focal_length_px(camera) for level in known]
-    inner = [math.sqrt(a * b) for a, b in zip(focal, focal[1:], strict=False)]
+    inner = [math.sqrt(a * b) for a, b in pairwise(focal)]
     # The outer ends are as far from their levels as the inner ones are.
     ends = [focal[0] ** 2 / inner[0], *inner, focal[-1] ** 2 / inner[-1]]
     if high_px > ends[0] * (1.0 + FIELD_MARGIN) or low_px < ends[-1] * (1.0 - FIELD_MARGIN):
@@ -130,7 +138,7 @@ def parts_of_range(
         )
     parts = [
         Part(level, max(low_px, low), min(high_px, high))
-        for level, high, low in zip(known, ends, ends[1:], strict=False)
+        for level, (high, low) in zip(known, pairwise(ends), strict=True)
     ]
     return [part for part in reversed(parts) if part.low_px < part.high_px]
 
@@ -285,8 +293,47 @@ def _steps(search: _Search, matcher: Matcher) -> Iterator[bool]:
     propose, database = METHODS[matcher.method].propose, search.part.level.database
     proposals = propose(search.used, database, selection)
     for candidates in islice(proposals, matcher.max_batches):
-        verify(candidates, search.used, database, search.best)
+        _verify(candidates, search)
         yield True
+
+
+def _verify(candidates: Candidates, search: _Search) -> None:
+    """Work out the agreements of the candidates that stand out, until one is certain.
+
+    Each level has thousands of candidates for a frame, nearly all of them false. Beside its own
+    three, each has as many agreeing centroids as chance brings near stars: a Poisson variate,
+    whose mean is that of the batch. Those are worked out that hardly any of the batch reaches.
+    """
+    frame, database = search.used, search.part.level.database
+    matrices, factors, counts = [], [], []
+    for first in range(0, len(candidates), AT_ONCE):
+        part = candidates[first : first + AT_ONCE]
+        frame.budget.spend(len(part))
+        turned, scaled = first_poses(part, frame, database.directions)
+        matrices.append(turned)
+        factors.append(scaled)
+        counts.append(agreeing_centroids(turned, frame, database, scaled))
+    count = np.concatenate(counts)
+    order = np.argsort(-count, kind="stable")
+    for row in order[count[order] >= _standing_out(count)].tolist():
+        batch, place = divmod(row, AT_ONCE)
+        pose = pose_at(matrices[batch][place], float(factors[batch][place]), frame)
+        found = agree(pose, frame, database, search.best.certain)
+        if found.is_better_than(search.best.found):
+            search.best.found = found
+        if search.best.is_certain:
+            return
+
+
+def _standing_out(count: NDArray[np.int64]) -> int:
+    """Return how many centroids agree with no more than `BY_CHANCE` of some false candidates."""
+    mean = float(np.maximum(count - _OWN, 0).mean())
+    expected, term, more = float(len(count)), math.exp(-mean), 0
+    while expected > BY_CHANCE:
+        expected -= len(count) * term
+        more += 1
+        term *= mean / more
+    return max(MIN_STARS, _OWN + more)
 
 
 def _of_the_artifact(search: _Search, parts: int) -> Agreement:

@@ -98,7 +98,7 @@ class Radial(Product):
 
 
 class Levels(Product):
-    """Stars and triangles for wider fields than the camera's, so that one artifact serves a range."""
+    """Stars and triangles for fields wider than the camera's: one artifact for a range of them."""
 
     enabled: bool = Field(False, description="whether the artifact has this product")
     widest_fov_x_deg: FieldDeg = Field(
