@@ -48,8 +48,9 @@ BY_CHANCE = 1.0
 _OWN = 3
 """Centroids of a candidate, which its attitude was computed from."""
 
-FIELD_MARGIN = 1e-6
-"""Relative difference of focal lengths that is rounding."""
+BEYOND = 1.25
+"""Factor by which the outer levels serve focal lengths beyond those that they are made for: a
+frame of other proportions than the camera's has another width for the same area."""
 
 
 @dataclass(frozen=True)
@@ -106,13 +107,13 @@ def parts_of_range(
     Returns
     -------
     list of Part
-        The widest field first. They meet in the middle between two levels and do not overlap.
+        The widest field first; they do not overlap. A level's part goes from its own field to
+        that of the next level.
 
     Raises
     ------
     ConfigError
-        If the range is none, or goes beyond the levels by more than half of the ratio between
-        two of them.
+        If the range is none, or goes beyond what the levels are made for by more than `BEYOND`.
     """
     narrow_deg, wide_deg = (float(angle) for angle in fov_deg)
     if not 0.0 < narrow_deg < wide_deg < 180.0:
@@ -123,11 +124,9 @@ def parts_of_range(
             value=fov_deg,
         )
     low_px, high_px = (_focal_px(camera, angle) for angle in (wide_deg, narrow_deg))
-    focal = [level.focal_length_px(camera) for level in known]
-    inner = [math.sqrt(a * b) for a, b in pairwise(focal)]
-    # The outer ends are as far from their levels as the inner ones are.
-    ends = [focal[0] ** 2 / inner[0], *inner, focal[-1] ** 2 / inner[-1]]
-    if high_px > ends[0] * (1.0 + FIELD_MARGIN) or low_px < ends[-1] * (1.0 - FIELD_MARGIN):
+    ends = [level.focal_length_px(camera) for level in known]
+    ends.append(ends[-1] ** 2 / ends[-2])
+    if high_px > ends[0] * BEYOND or low_px < ends[-1] / BEYOND:
         reach = [2.0 * math.degrees(math.atan(0.5 * camera.width_px / end)) for end in ends]
         raise ConfigError(
             f"fov_deg is {narrow_deg:g} to {wide_deg:g}; the levels of {known[0].database.name} "
@@ -136,6 +135,7 @@ def parts_of_range(
             key="fov_deg",
             value=fov_deg,
         )
+    ends[0], ends[-1] = ends[0] * BEYOND, ends[-1] / BEYOND
     parts = [
         Part(level, max(low_px, low), min(high_px, high))
         for level, (high, low) in zip(known, pairwise(ends), strict=True)

@@ -63,28 +63,35 @@ def level_fields(
     narrowest : FieldSize
         The camera: its field is level 0, and all others have its proportions.
     widest_fov_x_deg : float
-        Full angle across the width of the last level, degrees.
+        Full angle across the width of the widest frames, degrees.
     max_ratio : float
         Largest ratio of the focal lengths of neighbouring levels, above 1.
 
     Returns
     -------
     tuple of NominalField
-        The narrowest first, without level 0. Their focal lengths have the same ratio.
+        The narrowest first, without level 0. Their focal lengths have the same ratio, and the
+        widest frames are wider than the last one's by that ratio too.
+
+    Notes
+    -----
+    A level serves frames that are as wide as its fields, or wider, up to those of the next level.
+    Such a frame holds fields of the level whole, so that their triangles are in it. In a frame
+    that is narrower than these by a sixth there may be no triangle at all.
 
     Examples
     --------
-    >>> fields = level_fields(NominalField(10.0, 7.5), 20.0, 1.5)
+    >>> fields = level_fields(NominalField(10.0, 7.5), 30.0, 1.5)
     >>> [round(field.fov_x_deg, 2) for field in fields]
-    [14.19, 20.0]
+    [14.48, 20.9]
     """
     across, down = (
         math.tan(math.radians(0.5 * angle)) for angle in (narrowest.fov_x_deg, narrowest.fov_y_deg)
     )
     whole = math.tan(math.radians(0.5 * widest_fov_x_deg)) / across
     # A range of exactly so many ratios has no level more because of rounding.
-    steps = max(1, math.ceil(math.log(whole) / math.log(max_ratio) - 1e-9))
-    factors = [whole ** (step / steps) for step in range(1, steps + 1)]
+    steps = max(2, math.ceil(math.log(whole) / math.log(max_ratio) - 1e-9))
+    factors = [whole ** (step / steps) for step in range(1, steps)]
     return tuple(
         NominalField(
             2.0 * math.degrees(math.atan(across * factor)),
