@@ -20,35 +20,46 @@ if TYPE_CHECKING:
     from starcat.errors import StarcatError
     from starcat.face.artifact import open_artifact as open  # noqa: A004 - as numpy, gzip and PIL have it
     from starcat.face.connection import connect
-    from starcat.face.functions import build, ingest, verify
+    from starcat.face.functions import build, calibrate, ingest, verify
     from starcat.geometry.camera import Camera
     from starcat.matcher.matcher import Matcher
+    from starcat.sky.in_time import sky_in_time
+    from starcat.sky.observer import Observer
+    from starcat.sky.spots import identify_in_time
     from starcat.specs.reading import preset, read_spec
 
 __all__ = [
     "Camera",
     "Matcher",
+    "Observer",
     "StarcatError",
     "__version__",
     "build",
+    "calibrate",
     "connect",
+    "identify_in_time",
     "ingest",
     "open",
     "preset",
     "read_spec",
+    "sky_in_time",
     "verify",
 ]
 
 _HOMES = {
     "Camera": ("starcat.geometry.camera", "Camera"),
     "Matcher": ("starcat.matcher.matcher", "Matcher"),
+    "Observer": ("starcat.sky.observer", "Observer"),
     "StarcatError": ("starcat.errors", "StarcatError"),
     "build": ("starcat.face.functions", "build"),
+    "calibrate": ("starcat.face.functions", "calibrate"),
     "connect": ("starcat.face.connection", "connect"),
+    "identify_in_time": ("starcat.sky.spots", "identify_in_time"),
     "ingest": ("starcat.face.functions", "ingest"),
     "open": ("starcat.face.artifact", "open_artifact"),
     "preset": ("starcat.specs.reading", "preset"),
     "read_spec": ("starcat.specs.reading", "read_spec"),
+    "sky_in_time": ("starcat.sky.in_time", "sky_in_time"),
     "verify": ("starcat.face.functions", "verify"),
 }
 """Module and name of what each public name is."""

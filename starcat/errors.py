@@ -187,6 +187,10 @@ class BuildError(StarcatError):
     """A build that ran but has no usable result: no stars left, or a failed self-test."""
 
 
+class CalibrationError(StarcatError):
+    """A calibration of frames of which too few could be identified."""
+
+
 class NotIdentifiedError(StarcatError):
     """A frame that was not identified, where only an identified one will do."""
 

@@ -26,6 +26,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from astropy.io import fits
 from genuine_records import PSC
 from hats_stores import write_catalog, write_facts
 
@@ -42,6 +43,7 @@ from starcat.onboard.blocks import check_blocks
 from starcat.onboard.image import Contents, make_image
 from starcat.onboard.reading import read_image
 from starcat.releases.publishing import publish_artifact
+from starcat.sky.observer import Observer
 from starcat.store.pixels import Pixel
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "errors.md"
@@ -626,6 +628,58 @@ def _(place: Place) -> Call:
     return ["identify", place.artifact, frame, "--tolerance-px", "2", "--noise-px", "0.5"]
 
 
+def identify_at(place: Place, *options: str) -> Call:
+    return [*place.identify("x_px,y_px\n1,2\n"), *options]
+
+
+@case("time that is none", 2)
+def _(place: Place) -> Call:
+    return identify_at(place, "--time", "22 November")
+
+
+@case("time beyond the ephemeris", 2)
+def _(place: Place) -> Call:
+    return identify_at(place, "--time", "2150-01-01T00:00:00")
+
+
+@case("velocity without a time", 2)
+def _(place: Place) -> Call:
+    return identify_at(place, "--velocity", "0,7.5,0")
+
+
+@case("velocity of two numbers", 2)
+def _(place: Place) -> Call:
+    return identify_at(place, "--time", "2026-11-22T10:00:00", "--velocity", "1,2")
+
+
+@case("velocity beside an orbit", 2)
+def _(place: Place) -> Call:
+    both = ("--velocity", "0,7.5,0", "--orbit", "7000,0,0,0,7.5,0")
+    return identify_at(place, "--time", "2026-11-22T10:00:00", *both)
+
+
+@case("velocity above that of light", 2)
+def _(place: Place) -> Call:
+    return identify_at(place, "--time", "2026-11-22T10:00:00", "--velocity", "299900,0,0")
+
+
+@case("position that is no three numbers", 2)
+def _(place: Place) -> Call:
+    return lambda: Observer.at("2026-11-22T10:00:00", position_km=[7000.0])
+
+
+@case("barycentre without a position", 2)
+def _(place: Place) -> Call:
+    return lambda: Observer.at(
+        "2026-11-22T10:00:00", velocity_km_s=[0.0, 30.0, 0.0], origin="barycentre"
+    )
+
+
+@case("origin unknown", 2)
+def _(place: Place) -> Call:
+    return lambda: Observer.at("2026-11-22T10:00:00", origin="moon")  # type: ignore[arg-type]
+
+
 @case("noise of centroids that is none", 2)
 def _(place: Place) -> Call:
     return lambda: Matcher.open(place.artifact, noise_px=0.0)
@@ -804,7 +858,7 @@ def _(place: Place) -> Call:
 
 @case("frame of a kind that is not written", 2)
 def _(place: Place) -> Call:
-    return ["simulate", place.artifact, "-o", place.folder / "frame.jpg"]
+    return ["simulate", place.artifact, "-o", place.folder / "frame.gif"]
 
 
 @case("frame missing", 2)
@@ -866,6 +920,48 @@ def _(place: Place) -> Call:
     return ["identify", place.artifact, place.write("frame.png", b"no picture")]
 
 
+@case("image that shows trails", 2)
+def _(place: Place) -> Call:
+    path, image = place.folder / "frame.fits", np.full((512, 512), 100, dtype=np.uint16)
+    image[::2] += 3
+    for number in range(12):
+        along = np.arange(20)
+        image[40 * number + 20 + along // 2, 30 * number + 30 + along] += np.uint16(
+            2000 + 200 * number
+        )
+    write_image(path, image)
+    return ["identify", place.artifact, path]
+
+
+@case("dark frame of another size", 2)
+def _(place: Place) -> Call:
+    image, dark = place.folder / "frame.fits", place.folder / "dark.fits"
+    write_image(image, np.zeros((512, 512), dtype=np.uint16))
+    write_image(dark, np.zeros((48, 64), dtype=np.uint16))
+    return ["identify", place.artifact, image, "--dark", dark]
+
+
+@case("mask without a hole", 2)
+def _(place: Place) -> Call:
+    image = place.folder / "frame.png"
+    write_image(image, np.ones((512, 512), dtype=np.uint8))
+    return ["identify", place.artifact, image, "--mask", image]
+
+
+@case("cube of more than colours", 2)
+def _(place: Place) -> Call:
+    path = place.folder / "frame.fits"
+    fits.PrimaryHDU(np.zeros((5, 32, 32))).writeto(path)
+    return ["identify", place.artifact, path]
+
+
+@case("plane that is not there", 2)
+def _(place: Place) -> Call:
+    path = place.folder / "frame.fits"
+    fits.PrimaryHDU(np.zeros((5, 32, 32))).writeto(path)
+    return ["identify", place.artifact, path, "--plane", "7"]
+
+
 @case("image of another size than the camera", 2)
 def _(place: Place) -> Call:
     path = place.folder / "frame.fits"
@@ -893,6 +989,59 @@ def _(place: Place) -> Call:
 @case("frame not identified, with --fail-on-no-match", 6)
 def _(place: Place) -> Call:
     return [*place.identify("x_px,y_px\n1,2\n"), "--fail-on-no-match"]
+
+
+@case("calibration of frames that are not identified", 1)
+def _(place: Place) -> Call:
+    frame = place.write("frame.csv", "x_px,y_px\n100,2\n3,400\n")
+    return ["calibrate", place.artifact, frame, "-o", place.out]
+
+
+@case("calibration of images of two cameras", 2)
+def _(place: Place) -> Call:
+    paths = [place.folder / "1.fits", place.folder / "2.fits"]
+    for path, side in zip(paths, (48, 64), strict=True):
+        write_image(path, np.zeros((side, 64), dtype=np.uint16))
+    return ["calibrate", place.artifact, *paths, "-o", place.out]
+
+
+@case("calibration of a camera of unknown field", 2)
+def _(place: Place) -> Call:
+    frame = place.write("frame.csv", "x_px,y_px\n1,2\n")
+    return ["calibrate", place.artifact, frame, "--size", "1280x960", "-o", place.out]
+
+
+@case("calibration of a camera of another size than the images", 2)
+def _(place: Place) -> Call:
+    path = place.folder / "1.fits"
+    write_image(path, np.zeros((48, 64), dtype=np.uint16))
+    return ["calibrate", place.artifact, path, "--size", "1280x960", "-o", place.out]
+
+
+@case("range of fields that is none", 2)
+def _(place: Place) -> Call:
+    frame = place.write("frame.csv", "x_px,y_px\n1,2\n")
+    return ["calibrate", place.artifact, frame, "--fov", "5-20", "-o", place.out]
+
+
+@case("range of fields that is swapped", 2)
+def _(place: Place) -> Call:
+    frame = place.write("frame.csv", "x_px,y_px\n1,2\n")
+    return ["calibrate", place.artifact, frame, "--fov", "20:5", "-o", place.out]
+
+
+@case("camera and size of a calibration", 2)
+def _(place: Place) -> Call:
+    frame = place.write("frame.csv", "x_px,y_px\n1,2\n")
+    camera = place.write("camera.toml", "width_px = 9\nheight_px = 9\nfocal_length_px = 9.0\n")
+    known = ["--camera", camera, "--size", "1280x960"]
+    return ["calibrate", place.artifact, frame, *known, "-o", place.out]
+
+
+@case("plot of residuals of a kind that is not drawn", 2)
+def _(place: Place) -> Call:
+    frame = place.write("frame.csv", "x_px,y_px\n1,2\n")
+    return ["calibrate", place.artifact, frame, "--plot", "left.pdf", "-o", place.out]
 
 
 @case("method unknown", 2)

@@ -304,13 +304,34 @@ def test_each_command_has_json(name: str) -> None:
 def test_a_frame_of_an_unknown_kind_is_not_written(
     starcat: Run, small_artifact: Path, tmp_path: Path
 ) -> None:
-    for name in ("f.jpg", "f", "f.json", "f.csv.gz"):
+    for name in ("f.gif", "f", "f.json", "f.csv.gz"):
         run = starcat(["simulate", small_artifact, "-o", tmp_path / name])
         assert (run.code, run.out) == (2, "")
         assert "end it with one of .csv (centroids), .fits" in run.err
     assert not list(tmp_path.iterdir())
     for name in ("F.CSV", "f.TIFF", "f.fts"):
         assert starcat(["simulate", small_artifact, "-o", tmp_path / name]).code == 0
+
+
+def test_a_jpeg_frame_is_an_image(starcat: Run, small_artifact: Path, tmp_path: Path) -> None:
+    path = tmp_path / "frame.JPG"
+    assert starcat(["simulate", small_artifact, "-o", path, "--seed", 3]).code == 0
+    assert path.read_bytes()[:3] == b"\xff\xd8\xff"
+    run = starcat(["identify", small_artifact, path, "--psf-sigma-px", 1, "--threshold", 6])
+    assert run.code == 0
+    assert "identified" in run.out
+
+
+def test_centroids_may_count_y_upwards(starcat: Run, small_artifact: Path, tmp_path: Path) -> None:
+    path = tmp_path / "frame.csv"
+    assert starcat(["simulate", small_artifact, "-o", path, "--seed", 3]).code == 0
+    rows = [line.split(",") for line in path.read_text().splitlines()[1:]]
+    text = "\n".join(f"{x},{512.0 - float(y)},{10 ** (-0.4 * float(mag))},1" for x, y, mag in rows)
+    path.write_text(f"x_px,y_px,flux,colour\n{text}\n")
+    run = starcat(["identify", small_artifact, path, "--flip", "--json"])
+    assert '"identified"' in run.out
+    assert "not used, because the name is unknown: colour" in run.err
+    assert '"identified"' not in starcat(["identify", small_artifact, path, "--json"]).out
 
 
 def test_a_build_of_nothing_lists_the_presets(

@@ -31,6 +31,7 @@ WALKED = [
     "README.md",
     pytest.param("docs/tutorial.md", marks=pytest.mark.slow),
     pytest.param("docs/howto-prove.md", marks=pytest.mark.slow),
+    pytest.param("docs/howto-calibrate.md", marks=pytest.mark.slow),
     pytest.param("docs/howto-query.md", marks=pytest.mark.slow),
     pytest.param("docs/howto-release.md", marks=pytest.mark.slow),
 ]

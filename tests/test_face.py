@@ -18,14 +18,18 @@ ROOT = Path(__file__).parents[1]
 PUBLIC = [
     "Camera",
     "Matcher",
+    "Observer",
     "StarcatError",
     "__version__",
     "build",
+    "calibrate",
     "connect",
+    "identify_in_time",
     "ingest",
     "open",
     "preset",
     "read_spec",
+    "sky_in_time",
     "verify",
 ]
 

@@ -7,6 +7,7 @@ the other examples speak of, built from a small sky so that most of this takes n
 from __future__ import annotations
 
 import gzip
+import json
 import re
 import shlex
 import shutil
@@ -19,7 +20,9 @@ import typer
 
 from starcat.cli import app
 from starcat.commands.shared import chosen_spec
+from starcat.matcher.database import open_database
 from starcat.pipeline.build import build
+from starcat.simulation.simulate import Noise, simulate_frames
 
 Run = Callable[[list[Any]], Any]
 
@@ -49,7 +52,7 @@ def examples() -> dict[str, str]:
 def workplace(
     tmp_path_factory: pytest.TempPathFactory, small_spec: str, sao_lines: list[bytes]
 ) -> Path:
-    """An archive file, and two versions of a database called as in the examples."""
+    """An archive file, two versions of a database called as in the examples, and frames."""
     folder = tmp_path_factory.mktemp("examples")
     (folder / "sao.dat.gz").write_bytes(gzip.compress(b"".join(sao_lines), mtime=0))
     for version in ("1.0.0", "1.1.0"):
@@ -60,6 +63,10 @@ def workplace(
             {"sao": [folder / "sao.dat.gz"]},
             folder / "dist",
         )
+    database = open_database(folder / "dist" / "gaia-12deg-1.0.0")
+    frames = simulate_frames(database.directions, database.camera, 6, Noise(0.2), 1)
+    content = [{"centroids_px": frame.centroids_px.tolist()} for frame in frames]
+    (folder / "frames.json").write_text(json.dumps(content))
     return folder
 
 
@@ -87,7 +94,7 @@ def test_an_example_runs_as_printed(name: str, starcat: Run, here: Path) -> None
         assert run_example(other, starcat).code == 0
     run = run_example(name, starcat)
     assert run.code == 0, run.err
-    for path in re.findall(r"(?:-o|--picture) (\S+)", examples()[name]):
+    for path in re.findall(r"(?:-o|--picture|--plot) (\S+)", examples()[name]):
         assert (here / path).exists()
 
 

@@ -24,8 +24,9 @@ from scipy.spatial import cKDTree
 
 from starcat.errors import ConfigError, OutputError
 from starcat.geometry.attitude import matrix_from_radec_roll
-from starcat.images.background import SMALLEST_PX, repair_hot_pixels, subtract_background
+from starcat.images.background import SMALLEST_PX, Levels, repair_hot_pixels, subtract_background
 from starcat.images.centroiding import Spots, brightest_first, find_spots
+from starcat.images.detection import detect
 from starcat.images.image_file import read_image, write_image
 from starcat.images.labels import place_labels
 from starcat.images.picture import compass_from_matrix, draw_identified
@@ -226,7 +227,7 @@ def test_spots_are_in_order_of_brightness():
     index = found_at(spots, places)
     assert sorted(index) == list(range(100))
     zero_point = spots.mag[index] - mag
-    assert np.median(zero_point) == pytest.approx(-2.5 * np.log10(600_000.0), abs=0.02)
+    assert np.median(zero_point) == pytest.approx(-2.5 * np.log10(600_000.0), abs=0.03)
     faint = mag > 5.0
     pull = (zero_point - np.median(zero_point)) * spots.snr[index] / 1.0857
     assert 0.7 < pull[faint].std() < 1.6  # the errors are what snr says
@@ -460,12 +461,22 @@ def test_a_faint_star_beside_a_bright_one_keeps_its_place():
         (np.zeros((40, SMALLEST_PX - 1)), "16 px or more"),
         (np.full((40, 40), "a"), "grey values"),
         (np.full((40, 40), np.nan), "no finite value"),
-        (np.random.default_rng(1).exponential(size=(1000, 1000)) ** 4, "too much in it"),
     ],
 )
 def test_what_is_no_image_is_refused(image, word):
     with pytest.raises(ConfigError, match=word):
         find_spots(image)
+
+
+def test_where_too_much_stands_out_it_says_what_to_do():
+    light = 5.0 + np.random.default_rng(1).exponential(size=(1000, 1000)).astype(np.float32)
+    nothing = np.zeros(light.shape, dtype=np.bool_)
+    levels = Levels(light, light, np.full_like(light, 1e-3), nothing)
+    with pytest.raises(ConfigError, match="too much in it") as caught:
+        detect(levels, 1.0, 5.0)
+    assert "buffer" not in str(caught.value)
+    for option in ("--psf-sigma-px", "--threshold"):
+        assert option in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -535,14 +546,14 @@ def test_fits_may_be_compressed(tmp_path):
 
 def test_of_several_fits_images_the_first_plane_is_read(tmp_path, caplog):
     parts = [
-        fits.PrimaryHDU(np.zeros((3, 4, 5))),
+        fits.PrimaryHDU(np.zeros((4, 4, 5))),
         fits.ImageHDU(GREY16[None]),
         fits.ImageHDU(GREY8),
     ]
     fits.HDUList(parts).writeto(tmp_path / "a.fits")
     with caplog.at_level(logging.INFO, "starcat.images.image_file"):
         np.testing.assert_array_equal(read_image(tmp_path / "a.fits"), GREY16)
-    assert "HDU 1 of 3 (HDU 0 3x4x5; HDU 1 1x20x31; HDU 2 20x31)" in caplog.text
+    assert "HDU 1 of 3 (HDU 0 4x4x5; HDU 1 1x20x31; HDU 2 20x31)" in caplog.text
     np.testing.assert_array_equal(read_image(tmp_path / "a.fits", hdu=2), GREY8)
     for hdu in (0, 3, -1):
         with pytest.raises(ConfigError, match="expected an image of two dimensions"):
@@ -563,7 +574,7 @@ def test_the_first_row_of_fits_is_the_top_unless_the_file_says_otherwise(tmp_pat
 
 
 def test_colour_becomes_luminance(tmp_path):
-    expected = COLOUR8 @ [0.299, 0.587, 0.114]
+    expected = np.rint(COLOUR8 @ [0.299, 0.587, 0.114])
     for name in ("a.png", "a.tif"):
         Image.fromarray(COLOUR8).save(tmp_path / name)
         np.testing.assert_allclose(read_image(tmp_path / name), expected, rtol=1e-12)
@@ -622,20 +633,72 @@ def test_files_of_other_programs_are_read_right(tmp_path):
         np.testing.assert_array_equal(read_image(tmp_path / name), GREY16, err_msg=name)
 
 
+COLOUR16 = np.random.default_rng(2).integers(0, 65_536, (20, 31, 3), dtype=np.uint16)
+LUMINANCE = [0.299, 0.587, 0.114]
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("a.png", png(COLOUR16, 2)),
+        ("a.png", png(np.dstack([COLOUR16, GREY16]), 6)),
+        ("a.tif", tiff(COLOUR16, "<", 2, 3)),
+        ("a.tif", tiff(COLOUR16, ">", 2, 3)),
+    ],
+)
+def test_colour_of_16_bits_keeps_them(name, data, tmp_path):
+    (tmp_path / name).write_bytes(data)
+    np.testing.assert_allclose(read_image(tmp_path / name), COLOUR16 @ LUMINANCE, rtol=1e-12)
+
+
+def test_transparency_is_left_out(tmp_path):
+    (tmp_path / "a.png").write_bytes(png(np.dstack([GREY16, GREY16[::-1]]), 4))
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png"), GREY16)
+
+
+def test_colour_of_16_bits_without_the_extra_says_how_to_get_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imagecodecs", None)
+    (tmp_path / "a.png").write_bytes(png(COLOUR16, 2))
+    with pytest.raises(ConfigError, match=r"pip install 'starcat-guide-stars\[images\]'"):
+        read_image(tmp_path / "a.png")
+
+
+def test_three_planes_are_colours_and_one_may_be_chosen(tmp_path):
+    planes = np.moveaxis(COLOUR16, 2, 0)
+    fits.PrimaryHDU(planes).writeto(tmp_path / "a.fits")
+    colours = COLOUR16 @ LUMINANCE
+    np.testing.assert_allclose(read_image(tmp_path / "a.fits"), colours, rtol=1e-7)
+    for number in range(3):
+        found = read_image(tmp_path / "a.fits", plane=number)
+        np.testing.assert_array_equal(found, planes[number])
+    for number in (3, -1):
+        with pytest.raises(ConfigError, match="there is no plane"):
+            read_image(tmp_path / "a.fits", plane=number)
+
+
+def test_jpeg_is_written_and_read(tmp_path):
+    y, x = np.mgrid[:40, :56]
+    smooth = (2 * x + 3 * y).astype(np.uint8)
+    write_image(tmp_path / "a.jpg", smooth)
+    assert (tmp_path / "a.jpg").read_bytes()[:3] == b"\xff\xd8\xff"
+    assert np.abs(read_image(tmp_path / "a.jpg") - smooth).max() <= 4
+    write_image(tmp_path / "b.jpeg", smooth, quality=30)
+    assert (tmp_path / "b.jpeg").stat().st_size < (tmp_path / "a.jpg").stat().st_size
+
+
 @pytest.mark.parametrize(
     ("name", "data", "word"),
     [
-        ("a.png", png(np.dstack([GREY16] * 3), 2), "colour of 16 bits"),
-        ("a.png", png(np.dstack([GREY16] * 2), 4), "colour of 16 bits"),
-        ("a.tif", tiff(np.dstack([GREY16] * 3), "<", 2, 3), "colour of 16 bits"),
+        ("a.png", png(np.dstack([GREY16] * 3), 2)[:900], "cannot be read as PNG"),
+        ("a.tif", tiff(np.dstack([GREY16] * 3), "<", 2, 3)[:900], "TIFF|variety"),
         ("a.png", png(GREY16, 0)[:900], "cannot be read as PNG"),
         ("a.png", b"\x89PNG\r\n\x1a\nxyz", "damaged, or a variety"),
         ("a.tif", tiff(GREY16, "<", 1)[:900], "TIFF|variety"),
         ("a.tif", b"II*\0xyz", "TIFF|variety"),
         ("a.gz", b"\x1f\x8bxyz", "damaged gzip file"),
-        ("a.gz", gzip.compress(b"hello", mtime=0), "neither FITS nor PNG nor TIFF"),
-        ("a.jpg", b"\xff\xd8\xff\xe0", "neither FITS nor PNG nor TIFF"),
-        ("a.fits", b"", "neither FITS nor PNG nor TIFF"),
+        ("a.gz", gzip.compress(b"hello", mtime=0), "neither FITS nor PNG, TIFF or JPEG"),
+        ("a.jpg", b"\xff\xd8\xff\xe0", "damaged, or a variety"),
+        ("a.fits", b"", "neither FITS nor PNG, TIFF or JPEG"),
     ],
 )
 def test_damaged_and_unknown_files_are_refused(name, data, word, tmp_path):
@@ -662,14 +725,14 @@ def test_fits_without_its_last_filling_is_whole_enough(tmp_path):
 
 
 def test_what_is_not_one_plane_is_refused(tmp_path):
-    fits.PrimaryHDU(np.zeros((3, 4, 5))).writeto(tmp_path / "cube.fits")
+    fits.PrimaryHDU(np.zeros((4, 4, 5))).writeto(tmp_path / "cube.fits")
     column = fits.Column("a", "E", array=np.zeros(1))
     table = fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns([column])])
     table.writeto(tmp_path / "table.fits")
     pages = [Image.fromarray(GREY8), Image.fromarray(GREY8)]
     pages[0].save(tmp_path / "pages.tif", save_all=True, append_images=pages[1:])
     for name, word in (
-        ("cube.fits", "HDU 0 3x4x5; expected an image of two dimensions"),
+        ("cube.fits", "HDU 0 4x4x5; expected an image of two dimensions"),
         ("table.fits", "HDU 0 no image; HDU 1 no image"),
         ("pages.tif", "holds 2 images; expected one"),
         ("absent.fits", "No such file"),
@@ -680,11 +743,13 @@ def test_what_is_not_one_plane_is_refused(tmp_path):
 
 def test_writing_refuses_what_does_not_fit(tmp_path):
     with pytest.raises(ConfigError, match="unknown kind"):
-        write_image(tmp_path / "a.jpg", GREY8)
+        write_image(tmp_path / "a.gif", GREY8)
     with pytest.raises(ValueError, match="two dimensions"):
         write_image(tmp_path / "a.fits", COLOUR8)
     with pytest.raises(ValueError, match="takes uint8 and uint16"):
         write_image(tmp_path / "a.png", GREY16.astype(float))
+    with pytest.raises(ValueError, match="JPEG takes uint8"):
+        write_image(tmp_path / "a.jpg", GREY16)
     with pytest.raises(OutputError, match="No such file"):
         write_image(tmp_path / "absent" / "a.png", GREY8)
 

@@ -7,7 +7,34 @@ from typing import Annotated
 
 import typer
 
-from starcat.commands.shared import FailOnNoMatch, Json, JsonLines, MethodName, NoisePx, WcsFile
+from starcat.commands.shared import (
+    Dark,
+    FailOnNoMatch,
+    FieldRange,
+    FovError,
+    Json,
+    JsonLines,
+    Mask,
+    MaxSteps,
+    MethodName,
+    MinShare,
+    Mosaic,
+    MostSpots,
+    NoisePx,
+    Orbit,
+    Plane,
+    PsfSigmaPx,
+    Threshold,
+    Time,
+    TimeLimit,
+    Velocity,
+    WcsFile,
+    field_range,
+    limits_of_options,
+    observer_of_options,
+    share_of_percent,
+    size_in_px,
+)
 
 app = typer.Typer()
 
@@ -26,7 +53,7 @@ def methods(json: Json = False) -> None:
 @app.command()
 def simulate(
     artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="CSV, FITS, PNG or TIFF.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="CSV, FITS, PNG, TIFF, JPEG.")],
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same frame.")] = 0,
     noise_px: NoisePx = 0.5,
     false_stars: Annotated[int, typer.Option(min=0, help="Spots that are no stars.")] = 0,
@@ -54,9 +81,7 @@ def identify(
     artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
     file: Annotated[
         Path,
-        typer.Argument(
-            help="Centroids (CSV: x_px,y_px[,mag]; JSON; - for stdin) or image (FITS, PNG, TIFF)."
-        ),
+        typer.Argument(help="Centroids (CSV, JSON, - for stdin) or image (FITS, PNG, TIFF, JPEG)."),
     ],
     method: MethodName = None,
     camera: Annotated[
@@ -77,12 +102,26 @@ def identify(
     max_false_match_probability: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Less certain answers are withheld.")
     ] = 1e-9,
+    fov_error: FovError = None,
+    min_share: MinShare = None,
+    max_steps: MaxSteps = None,
+    time_limit_s: TimeLimit = None,
     flip: Annotated[
-        bool | None, typer.Option("--flip/--no-flip", help="First row of the image at the bottom.")
+        bool | None, typer.Option("--flip/--no-flip", help="First row at the bottom; y upwards.")
     ] = None,
+    psf_sigma_px: PsfSigmaPx = None,
+    threshold: Threshold = 5.0,
+    most_spots: MostSpots = 200,
+    plane: Plane = None,
+    bayer: Mosaic = False,
+    dark: Dark = None,
+    mask: Mask = None,
     picture: Annotated[
         Path | None, typer.Option(help="PNG or SVG of the first frame, its stars named.")
     ] = None,
+    time: Time = None,
+    velocity: Velocity = None,
+    orbit: Orbit = None,
     wcs: WcsFile = None,
     fail_on_no_match: FailOnNoMatch = False,
     ndjson: JsonLines = False,
@@ -93,11 +132,14 @@ def identify(
     Example: starcat identify dist/gaia-12deg-1.0.0 frame.csv --picture frame.png
     """
     from starcat.images.answering import answer_each, measure_input, write_extras
+    from starcat.images.identification import PictureOptions
+    from starcat.matcher.centroids import said_of_columns
     from starcat.matcher.matcher import Matcher
     from starcat.specs.camera_file import read_camera
     from starcat.terminal.console import say
     from starcat.terminal.matches import print_answers
 
+    observer = observer_of_options(time, velocity, orbit)
     matcher = Matcher.open(
         artifact,
         method,
@@ -105,17 +147,73 @@ def identify(
         max_false_match_probability=max_false_match_probability,
         noise_px=noise_px,
         noise_mag=noise_mag,
+        **limits_of_options(min_share, max_steps, time_limit_s),
     )
     eye = read_camera(camera) if camera else matcher.database.camera
-    measured = measure_input(file, flip=flip, wcs=wcs)
-    answered = answer_each(matcher, measured, eye)
-    told = print_answers(answered, matcher.database, as_json=json, as_lines=ndjson)
+    how = PictureOptions(threshold, psf_sigma_px, most_spots, plane, bayer, dark, mask)
+    measured = measure_input(file, flip=flip, wcs=wcs, options=how)
+    error = share_of_percent(fov_error)
+    answered = answer_each(matcher, measured, eye, observer, flip=flip, fov_error=error)
+    told = print_answers(
+        answered, matcher.database, as_json=json, as_lines=ndjson, observer=observer
+    )
+    if told.first and (unknown := said_of_columns([told.first[0]])):
+        say(unknown)
     if measured.image is not None and not told.identified:
         say("An image that was read upside down is never identified: try --flip or --no-flip.")
     if told.first is not None:
-        write_extras(file, measured, *told.first, eye, picture=picture, wcs=wcs, flip=flip)
+        write_extras(
+            file, measured, *told.first, eye, picture=picture, wcs=wcs, flip=flip, observer=observer
+        )
     if fail_on_no_match:
         told.expect_all_identified()
+
+
+@app.command()
+def calibrate(
+    artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FRAMES...", help="As 'starcat identify' takes them.")
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Camera file (TOML) to write.")],
+    camera: Annotated[
+        Path | None, typer.Option(help="Camera file to start from; default: the database's camera.")
+    ] = None,
+    size: Annotated[
+        str | None, typer.Option(metavar="WxH", help="Pixels, such as 1280x960, in its place.")
+    ] = None,
+    fov: FieldRange = None,
+    method: MethodName = None,
+    flip: Annotated[
+        bool | None, typer.Option("--flip/--no-flip", help="First row of the image at the bottom.")
+    ] = None,
+    plot: Annotated[Path | None, typer.Option(help="PNG or SVG of the residuals.")] = None,
+    json: Json = False,
+) -> None:
+    """Find focal length, principal point and distortion of a camera from frames of stars.
+
+    Example: starcat calibrate dist/gaia-12deg-1.0.0 frames.json -o camera.toml --plot left.svg
+    """
+    from starcat.calibration.camera_text import write_camera
+    from starcat.calibration.files import calibrate_files
+    from starcat.calibration.residual_plot import checked_kind, draw_residuals
+    from starcat.matcher.matcher import Matcher
+    from starcat.specs.camera_file import read_camera
+    from starcat.terminal.calibrations import print_calibration
+    from starcat.terminal.console import progress_bars
+
+    checked_kind(plot)
+    known = read_camera(camera) if camera else None
+    size_px, fov_deg = size_in_px(size), field_range(fov)
+    with progress_bars() as progress:
+        found = calibrate_files(
+            Matcher.open(artifact, method), files, camera=known, size_px=size_px, fov_deg=fov_deg,
+            flip=flip, progress=progress,
+        )  # fmt: skip
+    write_camera(found, output)
+    if plot:
+        draw_residuals(found, plot)
+    print_calibration(found, output, as_json=json)
 
 
 @app.command()

@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypedDict, overload
 
 import typer
 
 from starcat.errors import ConfigError
 
 if TYPE_CHECKING:
+    from starcat.sky.observer import Observer
     from starcat.specs.build_spec import BuildSpec, CameraSpec
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
@@ -28,6 +29,54 @@ Workers = Annotated[
 Scheduler = Annotated[
     str | None,
     typer.Option(metavar="tcp://HOST:PORT", help="A Dask cluster to use instead of this machine."),
+]
+FieldRange = Annotated[
+    str | None,
+    typer.Option(metavar="LOW:HIGH", help="Fields across the width that are possible, degrees."),
+]
+Time = Annotated[
+    str | None,
+    typer.Option(metavar="UTC", help="When, such as 2026-11-22T10:00:00: aberration, planets."),
+]
+Velocity = Annotated[
+    str | None,
+    typer.Option(metavar="VX,VY,VZ", help="Relative to the Earth, km/s, GCRS; with --time."),
+]
+Orbit = Annotated[
+    str | None,
+    typer.Option(metavar="X,Y,Z,VX,VY,VZ", help="Position too, km; instead of --velocity."),
+]
+FovError = Annotated[
+    str | None,
+    typer.Option(metavar="2%", help="Error of the field that is allowed; default: 2% for images."),
+]
+MinShare = Annotated[
+    float | None,
+    typer.Option(min=0, max=1, help="Least share of the frame to be explained; default: a third."),
+]
+MaxSteps = Annotated[
+    int | None, typer.Option(min=1, help="Steps of a search, each some microseconds.")
+]
+TimeLimit = Annotated[
+    float | None, typer.Option("--time-limit", min=0.001, help="Seconds that a frame may take.")
+]
+PsfSigmaPx = Annotated[
+    float | None,
+    typer.Option(min=0.3, max=20, help="Width (sigma) of a star in an image; default: measured."),
+]
+Threshold = Annotated[
+    float, typer.Option(min=1, max=1000, help="Least signal over noise of a spot in an image.")
+]
+MostSpots = Annotated[int, typer.Option(min=4, help="The brightest spots of an image are used.")]
+Plane = Annotated[
+    int | None, typer.Option(min=0, help="Plane of a FITS cube, from 0; default: colours as one.")
+]
+Mosaic = Annotated[
+    bool, typer.Option("--bayer", help="The image is a raw colour mosaic, in any order.")
+]
+Dark = Annotated[Path | None, typer.Option(help="Image with the lid on, to be subtracted.")]
+Mask = Annotated[
+    Path | None, typer.Option(help="Image, not zero where pixels are dead or hot: no spots there.")
 ]
 NoisePx = Annotated[float, typer.Option(min=0, max=50, help="Noise of a centroid, each axis.")]
 
@@ -135,12 +184,10 @@ def camera_of_options(
     from starcat.specs.build_spec import CameraSpec
     from starcat.specs.reading import what_is_wrong
 
-    found = re.fullmatch(r"([0-9]{1,6})\s*[xX]\s*([0-9]{1,6})", size.strip())
-    if found is None:
-        raise ConfigError(f"--size {size!r} is not WIDTHxHEIGHT in pixels, such as 1280x960")
+    width_px, height_px = size_in_px(size)
     content = {
-        "width_px": int(found[1]),
-        "height_px": int(found[2]),
+        "width_px": width_px,
+        "height_px": height_px,
         "focal_length_mm": focal_mm,
         "pixel_um": pixel_um,
         "fov_x_deg": fov_x_deg,
@@ -151,6 +198,63 @@ def camera_of_options(
         )
     except ValidationError as error:
         raise what_is_wrong(error, "camera") from error
+
+
+@overload
+def size_in_px(text: str) -> tuple[int, int]: ...
+@overload
+def size_in_px(text: str | None) -> tuple[int, int] | None: ...
+def size_in_px(text: str | None) -> tuple[int, int] | None:
+    """Return the width and height of a ``--size``.
+
+    Parameters
+    ----------
+    text : str, optional
+        ``1280x960``.
+
+    Returns
+    -------
+    tuple of int, or None
+        Pixels; None for no text.
+
+    Raises
+    ------
+    ConfigError
+        If the text is of another form.
+    """
+    if text is None:
+        return None
+    found = re.fullmatch(r"([0-9]{1,6})\s*[xX]\s*([0-9]{1,6})", text.strip())
+    if found is None:
+        raise ConfigError(f"--size {text!r} is not WIDTHxHEIGHT in pixels, such as 1280x960")
+    return int(found[1]), int(found[2])
+
+
+def field_range(text: str | None) -> tuple[float, float] | None:
+    """Return the smallest and the largest field of a ``--fov``.
+
+    Parameters
+    ----------
+    text : str, optional
+        ``5:20``, or ``12`` for both.
+
+    Returns
+    -------
+    tuple of float, or None
+        Degrees; None for no text.
+
+    Raises
+    ------
+    ConfigError
+        If the text is of another form.
+    """
+    if text is None:
+        return None
+    low, separator, high = text.partition(":")
+    try:
+        return float(low), float(high if separator else low)
+    except ValueError:
+        raise ConfigError(f"--fov {text!r} is not LOW:HIGH in degrees, such as 5:20") from None
 
 
 def inputs_by_source(given: list[str] | None, only: str | None = None) -> Mapping[str, list[Path]]:
@@ -184,3 +288,115 @@ def inputs_by_source(given: list[str] | None, only: str | None = None) -> Mappin
             raise ConfigError(f"--input {text!r} is not SOURCE=PATH, such as sao=sao.dat.gz")
         inputs.setdefault(data_source(name).name, []).append(Path(path))
     return inputs
+
+
+class SearchLimits(TypedDict, total=False):
+    """The limits of a search, as keywords of `Matcher.open`."""
+
+    min_share: float
+    max_steps: float
+    time_limit_s: float
+
+
+def limits_of_options(
+    min_share: float | None, max_steps: int | None, time_limit_s: float | None
+) -> SearchLimits:
+    """Return the limits of a search that are given.
+
+    Parameters
+    ----------
+    min_share, max_steps, time_limit_s : float, optional
+        As those of `Matcher`.
+
+    Returns
+    -------
+    SearchLimits
+        Without those that are not given.
+    """
+    given: SearchLimits = {}
+    if min_share is not None:
+        given["min_share"] = min_share
+    if max_steps is not None:
+        given["max_steps"] = max_steps
+    if time_limit_s is not None:
+        given["time_limit_s"] = time_limit_s
+    return given
+
+
+def share_of_percent(text: str | None) -> float | None:
+    """Return the number that a share stands for.
+
+    Parameters
+    ----------
+    text : str, optional
+        Such as ``2%`` or ``0.02``.
+
+    Returns
+    -------
+    float or None
+        None where nothing is given.
+
+    Raises
+    ------
+    ConfigError
+        If the text is no number from 0 to a half.
+
+    Examples
+    --------
+    >>> share_of_percent("2%"), share_of_percent("0.1")
+    (0.02, 0.1)
+    """
+    if text is None:
+        return None
+    number, percent, rest = text.strip().partition("%")
+    try:
+        share = float(number) / (100.0 if percent else 1.0)
+        if not rest and 0.0 <= share <= 0.5:
+            return share
+    except ValueError:
+        pass
+    raise ConfigError(
+        f"--fov-error is {text!r}; expected a share from 0 to 50 %, such as 2% or 0.02",
+        key="fov_error",
+        value=text,
+    )
+
+
+def observer_of_options(
+    time: str | None, velocity: str | None, orbit: str | None
+) -> Observer | None:
+    """Return the observer that a command line tells of.
+
+    Parameters
+    ----------
+    time : str, optional
+        UTC.
+    velocity : str, optional
+        ``VX,VY,VZ``: relative to the Earth, km/s.
+    orbit : str, optional
+        ``X,Y,Z,VX,VY,VZ``: position and velocity relative to the Earth, km and km/s, instead.
+
+    Returns
+    -------
+    Observer or None
+        None without a time.
+
+    Raises
+    ------
+    ConfigError
+        If a text is of another form, or they do not go together.
+    """
+    if time is None:
+        if velocity is not None or orbit is not None:
+            word = "--velocity" if velocity is not None else "--orbit"
+            raise ConfigError(f"{word} is given without --time, the time that it is of")
+        return None
+    from starcat.sky.observer import Observer, numbers_of
+
+    if orbit is not None:
+        if velocity is not None:
+            raise ConfigError("give either --velocity or --orbit, which holds the velocity too")
+        state = numbers_of("--orbit", orbit, 6)
+        return Observer.at(time, position_km=state[:3], velocity_km_s=state[3:])
+    speed = None if velocity is None else numbers_of("--velocity", velocity, 3)
+    return Observer.at(time, velocity_km_s=speed)

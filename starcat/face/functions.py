@@ -15,7 +15,9 @@ from starcat.resources import PathLike
 
 if TYPE_CHECKING:  # a program that only matches has none of the libraries behind these
     from starcat.artifact.verify import Verification
+    from starcat.calibration.calibrate import Calibration
     from starcat.catalog.ingest import Ingested
+    from starcat.geometry.camera import Camera
     from starcat.pipeline.build import Built
     from starcat.progress import Progress
     from starcat.specs.build_spec import BuildSpec
@@ -120,6 +122,67 @@ def ingest(
         band=band,
         epoch_jyear=epoch_jyear,
         read_limit_mag=read_limit_mag,
+        progress=progress or no_progress,
+    )
+
+
+def calibrate(
+    artifact: PathLike,
+    frames: PathLike | Sequence[PathLike],
+    *,
+    camera: Camera | None = None,
+    size_px: tuple[int, int] | None = None,
+    fov_deg: tuple[float, float] | None = None,
+    method: str | None = None,
+    flip: bool | None = None,
+    progress: Progress | None = None,
+) -> Calibration:
+    """Find focal length, principal point and distortion of a camera from frames of stars.
+
+    Parameters
+    ----------
+    artifact : str or path-like
+        The folder ``<name>-<version>`` of a database for about this field.
+    frames : path or sequence of paths
+        Images or files of centroids, of one camera.
+    camera : Camera, optional
+        To start from; the database's own by default.
+    size_px : tuple of int, optional
+        Width and height, where there is no camera; those of the images by default.
+    fov_deg : tuple of float, optional
+        Smallest and largest field across the width, degrees; by default that of the camera, with
+        a focal length that may be wrong by a tenth.
+    method : str, optional
+        A way to identify; the best that the artifact's products allow by default.
+    flip : bool, optional
+        Whether the first row of an image is its bottom; the file's own word by default.
+    progress : callable, optional
+        Called with (stage, done, total).
+
+    Returns
+    -------
+    Calibration
+        With ``camera``, the errors and covariance of what was fitted, and the comparison of
+        models on frames that were left out.
+
+    Raises
+    ------
+    ConfigError, ProductError
+        If a file cannot be read, or what is known of the camera contradicts itself.
+    CalibrationError
+        If too few frames can be identified; says which and why.
+    """
+    from starcat.calibration.files import calibrate_files
+    from starcat.matcher.matcher import Matcher
+    from starcat.progress import no_progress
+
+    return calibrate_files(
+        Matcher.open(artifact, method),
+        _paths(frames),
+        camera=camera,
+        size_px=size_px,
+        fov_deg=fov_deg,
+        flip=flip,
         progress=progress or no_progress,
     )
 

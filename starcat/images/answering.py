@@ -6,20 +6,36 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
-from starcat.images.identification import MeasuredFile, draw, identify_frames, measure
+from starcat.images.identification import (
+    MeasuredFile,
+    PictureOptions,
+    draw,
+    identify_frames,
+    measure,
+)
 from starcat.images.wcs_file import expect_room_for_wcs, write_wcs
-from starcat.matcher.centroids import MeasuredFrame, read_stream
+from starcat.matcher.centroids import MeasuredFrame, read_stream, upside_down
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
+
+if TYPE_CHECKING:
+    from starcat.sky.in_time import SkyInTime
+    from starcat.sky.observer import Observer
 
 STDIN = Path("-")
 
 
-def measure_input(path: Path, *, flip: bool | None = None, wcs: Path | None = None) -> MeasuredFile:
+def measure_input(
+    path: Path,
+    *,
+    flip: bool | None = None,
+    wcs: Path | None = None,
+    options: PictureOptions | None = None,
+) -> MeasuredFile:
     """Read centroids from a file or from stdin, or find them in an image.
 
     Parameters
@@ -30,6 +46,8 @@ def measure_input(path: Path, *, flip: bool | None = None, wcs: Path | None = No
         As for `measure`.
     wcs : Path, optional
         FITS copy of the picture that is to be written.
+    options : PictureOptions, optional
+        As for `measure`.
 
     Returns
     -------
@@ -45,7 +63,7 @@ def measure_input(path: Path, *, flip: bool | None = None, wcs: Path | None = No
         # Its frames are only ever gone through.
         measured = MeasuredFile(cast(Sequence[MeasuredFrame], _frames_of_stdin()))
     else:
-        measured = measure(path, flip=flip)
+        measured = measure(path, flip=flip, options=options)
     if wcs is not None:
         expect_room_for_wcs(wcs, path, is_picture=measured.image is not None)
     return measured
@@ -59,23 +77,61 @@ def _frames_of_stdin() -> Iterator[MeasuredFrame]:
 
 
 def answer_each(
-    matcher: Matcher, measured: MeasuredFile, camera: Camera
+    matcher: Matcher,
+    measured: MeasuredFile,
+    camera: Camera,
+    observer: Observer | None = None,
+    *,
+    flip: bool | None = None,
+    fov_error: float | None = None,
 ) -> Iterator[tuple[MeasuredFrame, MatchResult]]:
     """Identify the frames of a file or stream, one when it is asked for.
 
     Parameters
     ----------
-    matcher, measured, camera
+    matcher, measured, camera, observer, fov_error
         As for `identify_frames`.
+    flip : bool, optional
+        Whether y of centroids was counted from the bottom; images were turned when read.
 
     Yields
     ------
     (MeasuredFrame, MatchResult)
         A frame and its answer.
     """
-    for frame in measured.frames:
-        [result] = identify_frames(matcher, replace(measured, frames=[frame]), camera)
+    for given in measured.frames:
+        turned = bool(flip) and measured.image is None
+        frame = upside_down(given, camera.height_px) if turned else given
+        one = replace(measured, frames=[frame])
+        [result] = identify_frames(matcher, one, camera, observer, fov_error)
         yield frame, result
+
+
+def sky_of_answer(
+    frame: MeasuredFrame, result: MatchResult, observer: Observer | None
+) -> SkyInTime | None:
+    """Return what a time adds to the answer to a frame.
+
+    Parameters
+    ----------
+    frame : MeasuredFrame
+        The frame.
+    result : MatchResult
+        Its answer.
+    observer : Observer or None
+        When and where it was taken.
+
+    Returns
+    -------
+    SkyInTime or None
+        None where it is not identified, or the time is not known.
+    """
+    if observer is None or result.asked is None or result.camera is None:
+        return None
+    from starcat.sky.in_time import sky_in_time
+
+    database = result.asked.database
+    return sky_in_time(result, database, frame.centroids_px, result.camera, observer)
 
 
 def write_extras(
@@ -88,6 +144,7 @@ def write_extras(
     picture: Path | None = None,
     wcs: Path | None = None,
     flip: bool | None = None,
+    observer: Observer | None = None,
 ) -> None:
     """Write what is asked for beside the answer to a frame.
 
@@ -109,6 +166,8 @@ def write_extras(
         FITS copy of the picture with the world coordinates; only if it was identified.
     flip : bool, optional
         As for `measure`.
+    observer : Observer, optional
+        When and where the frame was taken: its planets are in the picture.
 
     Raises
     ------
@@ -121,6 +180,8 @@ def write_extras(
     """
     if picture is not None and result.asked is not None:
         database = result.asked.database
-        draw(picture, replace(measured, frames=[frame]), result, database, camera)
+        eye = result.camera or camera
+        sky = sky_of_answer(frame, result, observer)
+        draw(picture, replace(measured, frames=[frame]), result, database, eye, sky)
     if wcs is not None and measured.image is not None:
         write_wcs(wcs, source, measured.image, result, flip=flip)

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import erf
+from scipy.ndimage import gaussian_filter, maximum_filter
+from scipy.special import erf, ndtri
 
 from starcat.errors import ConfigError
 from starcat.version import install_command
@@ -24,6 +25,17 @@ SMALLEST_PX = 16
 PIXEL_VARIANCE = 1.0 / 12.0
 """What a square pixel adds to the variance of a spot, and rounding to whole numbers to noise."""
 _BOX_PX = 64
+_BOXES_PX = (64, 32, 16)
+"""Boxes of the background, tried one after the other where there are clouds."""
+_SAMPLE_PX, _SAMPLES = 48, 6
+_EXCESS_SIGMA_PX = (1.0, 4.0)
+_CUT_SHARE = (0.2, 0.985)
+"""Share of the pixels at the black point between which the noise is told from the others."""
+_STAR_NOISE = 4.5
+_FLAT_EXCESS = 0.3
+"""Smoothed pixels with so little of the noise of white ones are flat, not noisy."""
+_WHITE_EXCESS, _CLOUD_EXCESS = 1.3, 1.6
+"""Noise is white up to the first; the background has structure beyond the second."""
 _HOT_NOISE = 4.0
 _HOT_PART = 0.25
 """A hot pixel's neighbours have less than this part of the light that a star would give them."""
@@ -43,12 +55,22 @@ class Levels:
         Standard deviation of the background, grey values.
     mask : ndarray of bool, shape (height, width)
         Pixels left out, because their values are not finite.
+    is_rough : bool
+        Whether the noise of filtered pixels is larger than that of white noise: coarse digits,
+        a clipped background, JPEG, clouds.
+    is_flat : bool
+        Whether there is next to no noise: what compression left of it are steps.
+    box_px : int
+        Side of the boxes in which the background was found.
     """
 
     raw: Grey
     above: Grey
     noise: Grey
     mask: NDArray[np.bool_]
+    is_rough: bool = False
+    is_flat: bool = False
+    box_px: int = _BOX_PX
 
 
 def load_sep() -> Any:
@@ -92,7 +114,6 @@ def subtract_background(image: ArrayLike) -> Levels:
     ConfigError
         If sep is not installed, or the image is not 2-D, too small or without a finite value.
     """
-    sep = load_sep()
     values = np.asarray(image)
     if values.ndim != 2 or min(values.shape) < SMALLEST_PX or values.dtype.kind not in "buif":
         raise ConfigError(
@@ -105,21 +126,130 @@ def subtract_background(image: ArrayLike) -> Levels:
     if mask.all():
         raise ConfigError("the image has no finite value; expected grey values")
     raw[mask] = 0.0
+    return _leveled(raw, mask)
+
+
+def _leveled(raw: Grey, mask: NDArray[np.bool_]) -> Levels:
+    """Return levels with boxes as large as the structure of the background allows."""
+    least = _least_noise(raw[~mask])
+    levels = _in_boxes(raw, raw, mask, least, _BOX_PX)
+    excess = _excess(levels)
+    if max(excess) < _FLAT_EXCESS:
+        # Compression took the noise away and left steps that are no light.
+        noise = np.maximum(levels.noise, _step(raw[~mask]))
+        return replace(levels, noise=noise, is_flat=True)
+    if max(excess) < _WHITE_EXCESS:
+        return levels
+    # The mode of coarse digits is a digit: that of smoothed ones is near the mean.
+    smooth = gaussian_filter(raw, 1.0, mode="nearest", truncate=3.0)
+    for box in _BOXES_PX:
+        levels = _in_boxes(raw, smooth, mask, least, box)
+        fine, coarse = _excess(levels)
+        if coarse < _CLOUD_EXCESS * fine:
+            break
+    return replace(levels, is_rough=True)
+
+
+def _in_boxes(
+    raw: Grey, shown: Grey, mask: NDArray[np.bool_], least: np.float32, box: int
+) -> Levels:
+    """Return levels whose background is that of an image, its own or a smoothed one."""
     height, width = raw.shape
-    box = {"bw": min(_BOX_PX, width), "bh": min(_BOX_PX, height)}
-    background = sep.Background(raw, mask=mask, **box)
+    sep = load_sep()
+    background = sep.Background(shown, mask=mask, bw=min(box, width), bh=min(box, height))
     above = raw - background.back(dtype=np.float32)
     above[mask] = 0.0
-    noise = np.maximum(background.rms(dtype=np.float32), _least_noise(raw[~mask]))
-    return Levels(raw, above, noise, mask)
+    noise = background.rms(dtype=np.float32)
+    if shown is not raw:
+        noise *= np.float32(np.sqrt(4.0 * np.pi) * 1.0)  # what the smoothing took of white noise
+    return Levels(raw, above, np.maximum(noise, least), mask, box_px=box)
+
+
+def _excess(levels: Levels) -> tuple[float, float]:
+    """Return the noise of smoothed pixels over that of smoothed white noise, for two widths.
+
+    Some boxes of the image stand for all of it, and of them those with less. Stars are left
+    out; where nothing else is left, the noise is without bounds.
+    """
+    boxes = _sample(levels)
+    fine, coarse = _EXCESS_SIGMA_PX
+    smooth = _smooth_boxes(boxes, fine)
+    star = maximum_filter(np.abs(smooth), (1, 9, 9)) > _STAR_NOISE * _white(fine)
+    sky = star.mean(axis=(1, 2)) < 0.5
+    if not sky.any():
+        return 1.0, np.inf
+    smoother = _smooth_boxes(np.where(star, 0.0, boxes), coarse)
+    return (
+        float(np.quantile(_spread(smooth, star)[sky], 0.25)) / _white(fine),
+        float(np.quantile(_spread(smoother, star)[sky], 0.25)) / _white(coarse),
+    )
+
+
+def _white(sigma: float) -> float:
+    """Return the standard deviation of white noise of 1 after smoothing."""
+    return float(1.0 / (np.sqrt(4.0 * np.pi) * sigma))
+
+
+def _smooth_boxes(boxes: NDArray[Any], sigma: float) -> NDArray[np.float32]:
+    smooth = gaussian_filter(boxes, (0.0, sigma, sigma), mode="reflect", truncate=3.0)
+    return np.asarray(smooth, dtype=np.float32)
+
+
+def _spread(boxes: NDArray[np.float32], left_out: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return a standard deviation of each box."""
+    return np.asarray(np.ma.masked_array(boxes, left_out).std(axis=(1, 2)).filled(np.inf))
+
+
+def _sample(levels: Levels) -> NDArray[np.float32]:
+    """Return squares from all over the image, in units of the noise."""
+    height, width = levels.raw.shape
+    side = min(_SAMPLE_PX, height, width)
+    tops, lefts = (
+        np.unique(np.linspace(0, length - side, _SAMPLES).astype(np.int64))
+        for length in (height, width)
+    )
+    return np.stack(
+        [
+            levels.above[top : top + side, left : left + side]
+            / levels.noise[top : top + side, left : left + side]
+            for top in tops
+            for left in lefts
+        ]
+    )
 
 
 def _least_noise(values: Grey) -> np.float32:
     """Return the least noise there can be: a clipped background seems to have none at all."""
-    rounded = bool((values == np.rint(values)).all())
     lowest, highest = float(values.min()), float(values.max())
     digits = 1e-6 * max(abs(lowest), abs(highest))
-    return np.float32(max(rounded * PIXEL_VARIANCE**0.5, 1e-5 * (highest - lowest), digits))
+    steps = float(_step(values)) * PIXEL_VARIANCE**0.5
+    return np.float32(max(steps, 1e-5 * (highest - lowest), digits, _noise_above_black(values)))
+
+
+def _step(values: Grey) -> np.float32:
+    """Return the step of whole numbers, 0 of others; it is found in some of the values."""
+    some = np.unique(values[:: max(values.size // 50_000, 1)])
+    if not (some == np.rint(some)).all():
+        return np.float32(0.0)
+    return np.float32(np.diff(some).min() if len(some) > 1 else 1.0)
+
+
+def _noise_above_black(values: Grey) -> float:
+    """Return the noise of a background of which most lies below the black point; else 0.
+
+    How many values are cut, and how many of the others are above one value, gives the standard
+    deviation of a Gaussian. Where hardly any of the noise is left, the rest may be stars.
+    """
+    black = float(values.min())
+    cut = float((values == black).mean())
+    if not _CUT_SHARE[0] < cut < _CUT_SHARE[1]:
+        return 0.0
+    left = values[values > black]
+    value = np.quantile(left, 0.6, method="lower")
+    beyond = (1.0 - cut) * float((left > value).mean())
+    if not beyond:
+        return 0.0
+    return float((value - black) / (ndtri(1.0 - beyond) - ndtri(cut)))
 
 
 def repair_hot_pixels(levels: Levels, psf_sigma_px: float) -> Levels:

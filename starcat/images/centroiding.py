@@ -2,12 +2,12 @@
 
 Input is one grey image, output are centroids and brightness, brightest first. Background,
 detection, windowed centroids and apertures are those of sep, Source Extractor as a library,
-which the extra ``images`` brings. Trails and blooming are not handled.
+which the extra ``images`` brings. Trails are told and refused; blooming is not handled.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -22,14 +22,12 @@ from starcat.images.background import (
     repair_hot_pixels,
     subtract_background,
 )
+from starcat.images.detection import detect
+from starcat.images.spot_width import SIGMA_RANGE_PX, is_sharp, sigma_of_stars
+from starcat.images.trails import trail_px
 
 Array = NDArray[np.float64]
 
-_SIGMA_RANGE_PX = (0.3, 5.0)
-_SIGMA_SPOTS = 50
-_CLEAR_NOISE = 100.0
-"""Flux in units of one pixel's noise: 100 is a signal over noise of 28 where sigma is 1 px."""
-_WIDEST_RADIUS_PX = 15.0
 _NARROWEST_WINDOW_PX = 1.0  # a narrower window follows the pixel grid (docs/decisions.md)
 _APERTURE_SIGMA, _EDGE_SIGMA = 2.0, 3.0
 _PLATEAU_NOISE, _PLATEAU_DEPTH, _PLATEAU_PIXELS = 6.0, 0.005, 3
@@ -73,6 +71,22 @@ class Spots:
         """Return the number of spots."""
         return len(self.flux)
 
+    def brightest(self, count: int) -> Spots:
+        """Return the first spots.
+
+        Parameters
+        ----------
+        count : int
+            How many there are to be at most.
+
+        Returns
+        -------
+        Spots
+            The brightest ones, in the same order.
+        """
+        columns = {field.name: getattr(self, field.name)[:count] for field in fields(self)[:-1]}
+        return Spots(**columns, psf_sigma_px=self.psf_sigma_px)
+
 
 def find_spots(
     image: ArrayLike,
@@ -81,6 +95,7 @@ def find_spots(
     psf_sigma_px: float | None = None,
     saturation: float | None = None,
     gain_e_per_adu: float | None = None,
+    most_spots: int | None = None,
 ) -> Spots:
     """Find the spots of an image and measure them.
 
@@ -99,6 +114,8 @@ def find_spots(
     gain_e_per_adu : float, optional
         Electrons of one grey step, for the photon noise in ``snr``; without it only the noise
         of the background counts.
+    most_spots : int, optional
+        The brightest so many are returned; all by default.
 
     Returns
     -------
@@ -109,7 +126,8 @@ def find_spots(
     ------
     ConfigError
         If sep is not installed; if the image is not 2-D, too small, without a finite value, or
-        has too much in it to tell stars from the sky; if a parameter is not positive.
+        has too much in it to tell stars from the sky; if the stars are trails; if a parameter
+        is not positive.
 
     References
     ----------
@@ -120,15 +138,23 @@ def find_spots(
         psf_sigma_px=psf_sigma_px,
         saturation=saturation,
         gain_e_per_adu=gain_e_per_adu,
+        most_spots=most_spots,
     )
     levels = subtract_background(image)
     sigma = psf_sigma_px
     if sigma is None:
-        levels = repair_hot_pixels(levels, _SIGMA_RANGE_PX[0])
-        sigma = _measured_sigma(levels, _detect(levels, 1.0, threshold_sigma))
+        levels = repair_hot_pixels(levels, SIGMA_RANGE_PX[0])
+        first = detect(levels, 1.0, threshold_sigma)
+        first = first[~_is_saturated(levels, first, saturation)]
+        _refuse_trails(first)
+        sigma = sigma_of_stars(levels, np.stack([first["x"], first["y"]], axis=1), first["peak"])
     levels = repair_hot_pixels(levels, sigma)
-    found = _detect(levels, float(sigma), threshold_sigma)
-    return _measured(levels, found, float(sigma), saturation, gain_e_per_adu)
+    found = detect(levels, float(sigma), threshold_sigma)
+    if psf_sigma_px is None:
+        places = np.stack([found["x"], found["y"]], axis=1)
+        found = found[~is_sharp(levels, places, float(sigma))]
+    spots = _measured(levels, found, float(sigma), saturation, gain_e_per_adu)
+    return spots if most_spots is None else spots.brightest(most_spots)
 
 
 def _check_positive(**values: float | None) -> None:
@@ -139,46 +165,14 @@ def _check_positive(**values: float | None) -> None:
             )
 
 
-def _detect(levels: Levels, sigma: float, threshold: float) -> NDArray[Any]:
-    """Return sep's table of what stands out after smoothing with a star's shape.
-
-    Filter "conv" with the threshold in units of the smoothed noise, and no cleaning: sep's
-    matched filter followed by its cleaning loses real stars (docs/decisions.md).
-    """
-    reach = np.arange(-int(np.ceil(2.5 * sigma)), int(np.ceil(2.5 * sigma)) + 1)
-    profile = np.exp(-0.5 * (reach / sigma) ** 2)
-    kernel = np.outer(profile, profile) / profile.sum() ** 2
-    smoothed = threshold * float(np.sqrt((kernel**2).sum()))
-    try:
-        found = load_sep().extract(
-            levels.above, smoothed, err=levels.noise, mask=levels.mask, minarea=1, clean=False,
-            filter_kernel=kernel, filter_type="conv",
-        )  # fmt: skip
-    except Exception as error:  # sep raises nothing more special when a buffer is full
+def _refuse_trails(found: NDArray[Any]) -> None:
+    length = trail_px(found)
+    if length is not None:
         raise ConfigError(
-            f"the image has too much in it to tell stars from the sky ({error}); raise the "
-            f"threshold ({threshold:g} sigma) or check that it is a star image"
-        ) from error
-    return np.asarray(found)
-
-
-def _measured_sigma(levels: Levels, found: NDArray[Any]) -> float:
-    """Return sigma of the spots that stand out well, from the radius with half of their light.
-
-    The middle ones by brightness are taken: the brightest may be saturated and so too wide.
-    """
-    order = np.argsort(-found["flux"], kind="stable")
-    clear = int((found["flux"] > _CLEAR_NOISE * levels.noise[found["ypeak"], found["xpeak"]]).sum())
-    first = max(clear - _SIGMA_SPOTS, 0) // 2
-    chosen = found[order[first : first + min(max(clear, 3), _SIGMA_SPOTS)]]
-    if not len(chosen):
-        return 1.0
-    widest = np.full(len(chosen), _WIDEST_RADIUS_PX)
-    radius, _ = load_sep().flux_radius(
-        levels.above, chosen["x"], chosen["y"], widest, 0.5, mask=levels.mask, subpix=5
-    )
-    variance = np.median(radius) ** 2 / (2.0 * np.log(2.0)) - PIXEL_VARIANCE
-    return float(np.clip(np.sqrt(max(variance, 0.0)), *_SIGMA_RANGE_PX))
+            f"the stars are trails of {length:.0f} px in one direction, whose ends are not known "
+            "to a pixel; expose shorter or follow the sky, or state the width of a star "
+            "(--psf-sigma-px 1.5) to measure the middles all the same"
+        )
 
 
 def _measured(

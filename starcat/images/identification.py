@@ -4,22 +4,38 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import matrix_from_quaternion
 from starcat.geometry.camera import Camera
-from starcat.matcher.centroids import MeasuredFrame, read_frames, write_centroids
+from starcat.matcher.centroids import (
+    MeasuredFrame,
+    read_frames,
+    write_centroids,
+)
 from starcat.matcher.database import Database
-from starcat.matcher.matcher import Matcher
+from starcat.matcher.matcher import SCALE_FREE, Matcher
 from starcat.matcher.result import MatchResult
 from starcat.simulation.simulate import Frame
 
-IMAGE_SUFFIXES = (".fits", ".fit", ".fts", ".gz", ".fz", ".png", ".tif", ".tiff")
+if TYPE_CHECKING:
+    from starcat.sky.in_time import SkyInTime
+    from starcat.sky.observer import Observer
+
+IMAGE_SUFFIXES = (
+    ".fits", ".fit", ".fts", ".gz", ".fz", ".png", ".tif", ".tiff", ".jpg", ".jpeg",
+)  # fmt: skip
 """Files that are read as images; all others hold centroids."""
+
+FOV_ERROR_OF_IMAGES = 0.02
+"""Error of the focal length that is allowed for an image where none is stated: who describes a
+camera by its data sheet is seldom farther off."""
 
 CENTROIDS_SUFFIX = ".csv"
 """Suffix of the file that a simulated frame's centroids are written to."""
@@ -41,15 +57,48 @@ class MeasuredFile:
     image: NDArray[Any] | None = None
 
 
-def measure(path: Path, *, flip: bool | None = None) -> MeasuredFile:
+@dataclass(frozen=True)
+class PictureOptions:
+    """How a picture is read, and spots are found in it.
+
+    Attributes
+    ----------
+    threshold_sigma, psf_sigma_px, most_spots
+        As those of `find_spots`. The matcher gets the brightest 200 spots: measured, further
+        ones find no further picture, and each costs time.
+    plane : int, optional
+        Plane of a FITS cube, counted from 0.
+    is_mosaic : bool
+        Whether the pixels are behind a mosaic of colour filters.
+    dark : Path, optional
+        Image with the lid on, which is subtracted.
+    mask : Path, optional
+        Image that is not zero where no stars are wanted.
+    """
+
+    threshold_sigma: float = 5.0
+    psf_sigma_px: float | None = None
+    most_spots: int = 200
+    plane: int | None = None
+    is_mosaic: bool = False
+    dark: Path | None = None
+    mask: Path | None = None
+
+
+def measure(
+    path: Path, *, flip: bool | None = None, options: PictureOptions | None = None
+) -> MeasuredFile:
     """Read centroids, or find them in an image.
 
     Parameters
     ----------
     path : Path
-        CSV, JSON, FITS, PNG or TIFF.
+        CSV, JSON, FITS, PNG, TIFF or JPEG.
     flip : bool, optional
-        Whether the first row of an image is its bottom; the file's own word by default.
+        Whether the first row of an image is its bottom; the file's own word by default. Those
+        of centroids, whose camera is not known here, are turned when they are answered.
+    options : PictureOptions, optional
+        How a picture is read and measured.
 
     Returns
     -------
@@ -64,14 +113,63 @@ def measure(path: Path, *, flip: bool | None = None) -> MeasuredFile:
     if path.suffix.lower() not in IMAGE_SUFFIXES:
         return MeasuredFile(read_frames(path))
     from starcat.images.centroiding import find_spots
-    from starcat.images.image_file import read_image
 
-    image = read_image(path, flip=flip)
-    spots = find_spots(image)
+    how = options or PictureOptions()
+    image = read_picture(path, flip, how)
+    try:
+        spots = find_spots(
+            image,
+            threshold_sigma=how.threshold_sigma,
+            psf_sigma_px=how.psf_sigma_px,
+            most_spots=how.most_spots,
+        )
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}", key=error.key, value=error.value) from error
     return MeasuredFile([MeasuredFrame(path.stem, spots.centroids_px, spots.mag)], image)
 
 
-def identify_frames(matcher: Matcher, measured: MeasuredFile, camera: Camera) -> list[MatchResult]:
+def read_picture(path: Path, flip: bool | None, options: PictureOptions) -> NDArray[Any]:
+    """Read an image and repair it as the options say: dark frame, mask, mosaic.
+
+    Parameters
+    ----------
+    path : Path
+        Image file.
+    flip : bool, optional
+        As that of `measure`; dark frame and mask are turned like the image.
+    options : PictureOptions
+        What is to be done.
+
+    Returns
+    -------
+    ndarray, shape (height, width)
+        Grey values; NaN where the mask is not zero.
+
+    Raises
+    ------
+    ConfigError
+        If a file cannot be read or is not of the image's size.
+    """
+    from starcat.images.frame_repair import grey_of_mosaic, without_dark, without_dead_zones
+    from starcat.images.image_file import read_image
+
+    image: NDArray[Any] = read_image(path, flip=flip, plane=options.plane)
+    if options.dark is not None:
+        image = without_dark(image, read_image(options.dark, flip=flip))
+    if options.is_mosaic:
+        image = grey_of_mosaic(image)
+    if options.mask is not None:
+        image = without_dead_zones(image, read_image(options.mask, flip=flip))
+    return image
+
+
+def identify_frames(
+    matcher: Matcher,
+    measured: MeasuredFile,
+    camera: Camera,
+    observer: Observer | None = None,
+    fov_error: float | None = None,
+) -> list[MatchResult]:
     """Identify the frames of a file.
 
     Parameters
@@ -82,6 +180,11 @@ def identify_frames(matcher: Matcher, measured: MeasuredFile, camera: Camera) ->
         The frames.
     camera : Camera
         That took them.
+    observer : Observer, optional
+        When and where they were taken: then the spots of planets are named.
+    fov_error : float, optional
+        Largest relative error of the camera's focal length. By default 2 % for an image, where
+        the matcher can find it, and 0 for centroids.
 
     Returns
     -------
@@ -100,8 +203,25 @@ def identify_frames(matcher: Matcher, measured: MeasuredFile, camera: Camera) ->
                 f"the image has {width} x {height} px, the camera {camera.width_px} x "
                 f"{camera.height_px}; describe the camera that took it with --camera"
             )
+    if fov_error is None:
+        can = matcher.method in SCALE_FREE and matcher.database.image is None
+        fov_error = FOV_ERROR_OF_IMAGES if measured.image is not None and can else 0.0
+    identify = partial(matcher.identify, camera=camera, fov_error=fov_error)
+    if observer is None:
+        return [identify(frame.centroids_px, magnitudes=frame.mag) for frame in measured.frames]
+    from starcat.sky.spots import identify_in_time
+
     return [
-        matcher.identify(frame.centroids_px, camera, magnitudes=frame.mag)
+        identify_in_time(
+            identify,
+            matcher.database,
+            frame.centroids_px,
+            camera,
+            observer,
+            magnitudes=frame.mag,
+            tolerance_px=matcher.tolerance_px,
+            max_false_match_probability=matcher.max_false_match_probability,
+        )
         for frame in measured.frames
     ]
 
@@ -112,7 +232,7 @@ def write_simulated(path: Path, frame: Frame, camera: Camera, seed: int) -> None
     Parameters
     ----------
     path : Path
-        CSV, FITS, PNG or TIFF.
+        CSV, FITS, PNG or TIFF; JPEG with eight bits.
     frame : Frame
         Centroids and magnitudes.
     camera : Camera
@@ -140,13 +260,23 @@ def write_simulated(path: Path, frame: Frame, camera: Camera, seed: int) -> None
         )
 
     from starcat.images.render import Optics, render_image
+    from starcat.images.scene import Scene, in_file_steps
 
+    eight_bits = Scene(bits=8, black_adu=90.0, adu_per_step=4.0)  # of the default optics
     size = camera.width_px, camera.height_px
-    write_image(path, render_image(frame.centroids_px, frame.mag, size, Optics(), seed))
+    image = render_image(frame.centroids_px, frame.mag, size, Optics(), seed)
+    if WRITTEN_KINDS[suffix] == "JPEG":
+        image = in_file_steps(image, eight_bits)
+    write_image(path, image)
 
 
 def draw(
-    path: Path, measured: MeasuredFile, result: MatchResult, database: Database, camera: Camera
+    path: Path,
+    measured: MeasuredFile,
+    result: MatchResult,
+    database: Database,
+    camera: Camera,
+    sky: SkyInTime | None = None,
 ) -> None:
     """Draw the first frame of a file with its stars circled and named.
 
@@ -161,7 +291,9 @@ def draw(
     database : Database
         Names of the stars.
     camera : Camera
-        The camera, for its size.
+        The camera.
+    sky : SkyInTime, optional
+        What the time adds: its planets are drawn.
 
     Raises
     ------
@@ -170,35 +302,57 @@ def draw(
     OutputError
         If it cannot be written.
     """
+    from starcat.images.overlay import overlay_from_attitude
     from starcat.images.picture import compass_from_matrix, draw_identified
 
     frame = measured.frames[0]
-    names = [
-        short_name(database.designation[row].decode()) if row >= 0 else None
-        for row in result.star_index
-    ]
-    title, below, compass = f"{frame.name}: {result.status.replace('_', ' ')}", database.name, None
+    title, below = f"{frame.name}: {result.status.replace('_', ' ')}", database.name
+    compass = overlay = None
     if result.status == "identified":
         title = (
             f"{frame.name}: RA {result.boresight_ra_deg:.4f}, "
             f"Dec {result.boresight_dec_deg:+.4f}, roll {result.roll_deg:.3f} deg"
         )
         below = (
-            f"{result.n_matched} of {len(names)} spots are stars of {database.name}, "
+            f"{result.n_matched} of {len(result.star_index)} spots are stars of {database.name}, "
             f"residual {result.residual_arcsec:.1f} arcsec"
         )
-        compass = compass_from_matrix(matrix_from_quaternion(result.q_body_from_icrs))
+        matrix = matrix_from_quaternion(result.q_body_from_icrs)
+        compass = compass_from_matrix(matrix)
+        bodies = () if sky is None else sky.bodies
+        overlay = overlay_from_attitude(matrix, camera, database.epoch_jyear, bodies)
     draw_identified(
         path,
         measured.image,
         (camera.width_px, camera.height_px),
         frame.centroids_px,
-        names,
+        _labels(result, database, sky),
         title,
         mag=frame.mag,
         below=below,
         compass=compass,
+        overlay=overlay,
     )
+
+
+def _labels(result: MatchResult, database: Database, sky: SkyInTime | None) -> list[str | None]:
+    """Return the names that stars are known by; the catalog's own where there is no other.
+
+    The spot of a planet has an empty name: it is identified, and named beside its place.
+    """
+    from starcat.sky.names import common_names
+
+    rows = np.flatnonzero(result.star_index >= 0)
+    stars = result.star_index[rows]
+    own = [name.decode() for name in database.designation[stars].tolist()]
+    known = common_names(own, database.directions[stars], database.mag[stars], database.epoch_jyear)
+    labels: list[str | None] = [None] * len(result.star_index)
+    for row, name, other in zip(rows.tolist(), known, own, strict=True):
+        labels[row] = name or short_name(other)
+    for body in () if sky is None else sky.bodies:
+        if body.row is not None:
+            labels[body.row] = ""
+    return labels
 
 
 def short_name(designation: str) -> str:
@@ -219,7 +373,7 @@ def short_name(designation: str) -> str:
     >>> short_name("Gaia DR3 3221269181884277504"), short_name("SAO 308")
     ('Gaia …84277504', 'SAO 308')
     """
-    words = designation.split()
+    words = designation.split() or [""]
     if len(words[-1]) <= 12:
         return designation
     return f"{words[0]} …{words[-1][-8:]}"

@@ -1,7 +1,9 @@
-"""Image files: FITS, PNG and TIFF to and from one array of grey values, row 0 at the top.
+"""Image files: FITS, PNG, TIFF and JPEG to and from one array of grey values, row 0 at the top.
 
-What kind a file is, its first bytes say, not its name. Colour becomes luminance. Stacks and
-cubes are refused, and so is what could only be read with fewer digits than the file has.
+What kind a file is, its first bytes say, not its name. Colour becomes luminance, also that of
+FITS files with three planes. Pillow reads what it keeps all bits of; colour of 16 bits is read
+by imagecodecs, which the extra ``images`` brings. Stacks of other numbers of planes are refused,
+unless one of them is chosen.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.errors import ConfigError, OutputError, reason
+from starcat.version import install_command
 
 Grey = NDArray[np.float32] | NDArray[np.float64]
 
@@ -30,22 +33,26 @@ _KINDS = {
     b"MM\0*": "TIFF",
     b"II+\0": "TIFF",
     b"MM\0+": "TIFF",
+    b"\xff\xd8\xff": "JPEG",
 }
 WRITTEN_KINDS = {
     ".fits": "FITS", ".fit": "FITS", ".fts": "FITS", ".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF",
+    ".jpg": "JPEG", ".jpeg": "JPEG",
 }  # fmt: skip
 """What is written under which suffix."""
 _LUMINANCE = np.array([0.299, 0.587, 0.114])
 """Weights of red, green and blue: ITU-R BT.601."""
 
 
-def read_image(path: Path, *, flip: bool | None = None, hdu: int | None = None) -> Grey:
+def read_image(
+    path: Path, *, flip: bool | None = None, hdu: int | None = None, plane: int | None = None
+) -> Grey:
     """Read the grey values of an image.
 
     Parameters
     ----------
     path : Path
-        FITS (also gzipped or tile-compressed), PNG or TIFF.
+        FITS (also gzipped or tile-compressed), PNG, TIFF or JPEG.
     flip : bool, optional
         Whether the first row of the file is the bottom of the picture. If not given, it is so
         where a FITS file says ``ROWORDER = 'BOTTOM-UP'``, and nowhere else.
@@ -61,7 +68,8 @@ def read_image(path: Path, *, flip: bool | None = None, hdu: int | None = None) 
     Raises
     ------
     ConfigError
-        If the file is missing, damaged, of another kind, not one plane, or colour of 16 bits.
+        If the file is missing, damaged, of another kind, not one plane, or if
+        colour of 16 bits is to be read without imagecodecs.
 
     Notes
     -----
@@ -80,9 +88,12 @@ def read_image(path: Path, *, flip: bool | None = None, hdu: int | None = None) 
             raise ConfigError(f"{path}: damaged gzip file ({error})") from error
     kind = next((kind for start, kind in _KINDS.items() if data.startswith(start)), None)
     if kind is None:
-        raise ConfigError(f"{path}: neither FITS nor PNG nor TIFF; convert it to one of these")
+        raise ConfigError(f"{path}: neither FITS nor PNG, TIFF or JPEG; convert it to one of these")
     try:
-        values, upside_down = _read_fits(data, path, hdu) if kind == "FITS" else _read_picture(data)
+        if kind == "FITS":
+            values, upside_down = _read_fits(data, path, hdu, plane)
+        else:
+            values, upside_down = _read_picture(data)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
     except Exception as error:  # damaged bytes make either library raise whatever it happens to
@@ -94,7 +105,9 @@ def read_image(path: Path, *, flip: bool | None = None, hdu: int | None = None) 
     return np.ascontiguousarray(values, dtype=np.float64)
 
 
-def _read_fits(data: bytes, path: Path, hdu: int | None) -> tuple[NDArray[Any], bool]:
+def _read_fits(
+    data: bytes, path: Path, hdu: int | None, plane: int | None
+) -> tuple[NDArray[Any], bool]:
     """Return the plane of a FITS file, and whether it says that its first row is the bottom."""
     from astropy.io import fits
     from astropy.utils.exceptions import AstropyWarning
@@ -103,23 +116,43 @@ def _read_fits(data: bytes, path: Path, hdu: int | None) -> tuple[NDArray[Any], 
         warnings.simplefilter("ignore", AstropyWarning)  # about headers, as cameras write them
         with fits.open(io.BytesIO(data), memmap=False) as parts:
             shapes = [part.shape if part.is_image else () for part in parts]
-            planes = [number for number, shape in enumerate(shapes) if _is_plane(shape)]
-            found = "; ".join(
-                f"HDU {number} {'x'.join(map(str, shape)) or 'no image'}"
-                for number, shape in enumerate(shapes)
-            )
-            if not planes or (hdu is not None and hdu not in planes):
-                raise ConfigError(f"{found}; expected an image of two dimensions")
-            chosen = planes[0] if hdu is None else hdu
-            _log.info("%s: HDU %d of %d (%s)", path, chosen, len(parts), found)
+            chosen = _part_of_fits(shapes, hdu, plane)
+            _log.info("%s: HDU %d of %d (%s)", path, chosen, len(parts), _shapes_told(shapes))
             values = np.asarray(parts[chosen].data)
             order = str(parts[chosen].header.get("ROWORDER", "")).strip().upper()
-    return values.reshape(values.shape[-2:]), order == "BOTTOM-UP"
+    planes = values.reshape(-1, *values.shape[-2:])
+    if plane is not None:
+        return planes[plane], order == "BOTTOM-UP"
+    grey = planes[0] if len(planes) == 1 else np.tensordot(_LUMINANCE, planes, axes=1)
+    return grey, order == "BOTTOM-UP"
 
 
-def _is_plane(shape: tuple[int, ...]) -> bool:
-    """Return whether an array is a plane, however many axes of length 1 it has before."""
-    return len(shape) >= 2 and min(shape) > 0 and all(length == 1 for length in shape[:-2])
+def _part_of_fits(shapes: list[tuple[int, ...]], hdu: int | None, plane: int | None) -> int:
+    """Return the HDU to be read: the first of one plane, else the first of three."""
+    counts = [
+        int(np.prod(shape[:-2])) if len(shape) >= 2 and min(shape) > 0 else 0 for shape in shapes
+    ]
+    wanted = [number for number, count in enumerate(counts) if hdu in (None, number) and count]
+    if plane is not None:
+        found = [number for number in wanted if 0 <= plane < counts[number]]
+        if not found:
+            raise ConfigError(f"{_shapes_told(shapes)}; there is no plane {plane} (from 0)")
+        return max(found, key=lambda number: counts[number] > 1)
+    for count in (1, 3):
+        for number in wanted:
+            if counts[number] == count:
+                return number
+    raise ConfigError(
+        f"{_shapes_told(shapes)}; expected an image of two dimensions, or three planes of colour; "
+        "choose one plane of a cube with --plane"
+    )
+
+
+def _shapes_told(shapes: list[tuple[int, ...]]) -> str:
+    return "; ".join(
+        f"HDU {number} {'x'.join(map(str, shape)) or 'no image'}"
+        for number, shape in enumerate(shapes)
+    )
 
 
 def _read_picture(data: bytes) -> tuple[NDArray[Any], bool]:
@@ -133,7 +166,7 @@ def _grey_of_picture(data: bytes) -> NDArray[Any]:
     from PIL import Image, UnidentifiedImageError
 
     try:
-        picture = Image.open(io.BytesIO(data), formats=("PNG", "TIFF"))
+        picture = Image.open(io.BytesIO(data), formats=("PNG", "TIFF", "JPEG"))
     except UnidentifiedImageError as error:
         raise ConfigError("damaged, or a variety that Pillow does not know") from error
     with picture:
@@ -142,33 +175,55 @@ def _grey_of_picture(data: bytes) -> NDArray[Any]:
         bits, is_negative = _bits(data, picture)
         is_grey = picture.mode in ("L", "I", "F") or picture.mode.startswith("I;16")
         if bits > 8 and not is_grey:
-            raise ConfigError(
-                f"colour of {bits} bits, of which 8 would be left; convert it to grey or FITS"
-            )
+            return _grey_of_many_bits(data, str(picture.format))
         if is_grey:
             values = np.asarray(picture)
             return 65_535 - values if is_negative else values
-        return np.asarray(np.asarray(picture.convert("RGB")) @ _LUMINANCE)
+        # Whole numbers, from which the step of the digits is seen: grey as colour stays as it is.
+        return np.asarray(np.rint(np.asarray(picture.convert("RGB")) @ _LUMINANCE))
+
+
+def _grey_of_many_bits(data: bytes, kind: str) -> NDArray[Any]:
+    """Return the grey values of a colour image of 16 bits, which Pillow would read as 8."""
+    try:
+        from imagecodecs import png_decode, tiff_decode
+    except ImportError as error:
+        raise ConfigError(
+            f"colour of 16 bits needs the package imagecodecs ({error}); "
+            f"{install_command('images')}"
+        ) from error
+    values = np.asarray((png_decode if kind == "PNG" else tiff_decode)(data))
+    if values.ndim == 3 and values.shape[0] in (3, 4) and values.shape[2] > 4:
+        values = np.moveaxis(values, 0, 2)  # each colour by itself
+    if values.ndim == 3 and values.shape[2] in (1, 2):
+        return np.asarray(values[..., 0])  # beside it is transparency
+    if values.ndim != 3 or values.shape[2] not in (3, 4):
+        raise ConfigError(f"an image of shape {values.shape}; expected grey or three colours")
+    return np.asarray(values[..., :3] @ _LUMINANCE)
 
 
 def _bits(data: bytes, picture: Any) -> tuple[int, bool]:
     """Return the bits of a value in the file, and whether 16 of them count from white down."""
     if picture.format == "PNG":
         return data[24], False
+    if picture.format == "JPEG":
+        return 8, False
     bits = max(picture.tag_v2.get(258, (1,)))  # BitsPerSample
     # Pillow turns 8-bit values around where white is zero, but not 16-bit ones.
     return bits, picture.tag_v2.get(262) == 0 and picture.mode.startswith("I;16")
 
 
-def write_image(path: Path, image: NDArray[Any]) -> None:
+def write_image(path: Path, image: NDArray[Any], *, quality: int = 95) -> None:
     """Write an image, the same bytes for the same values.
 
     Parameters
     ----------
     path : Path
-        ``.fits``, ``.png`` or ``.tif``, replaced if it exists.
+        ``.fits``, ``.png``, ``.tif`` or ``.jpg``, replaced if it exists.
     image : ndarray, shape (height, width)
-        Row 0 is the top row. PNG and TIFF take uint8 and uint16, FITS all numbers.
+        Row 0 is the top row. PNG and TIFF take uint8 and uint16, JPEG uint8, FITS all numbers.
+    quality : int, default 95
+        Quality of JPEG, up to 95.
 
     Raises
     ------
@@ -194,9 +249,11 @@ def write_image(path: Path, image: NDArray[Any]) -> None:
     else:
         from PIL import Image
 
-        if image.dtype not in (np.uint8, np.uint16):
-            raise ValueError(f"image of {image.dtype}; {kind} takes uint8 and uint16")
-        Image.fromarray(np.ascontiguousarray(image)).save(buffer, format=kind)
+        taken = ("uint8",) if kind == "JPEG" else ("uint8", "uint16")
+        if image.dtype.name not in taken:
+            raise ValueError(f"image of {image.dtype}; {kind} takes {' and '.join(taken)}")
+        options = {"quality": quality} if kind == "JPEG" else {}
+        Image.fromarray(np.ascontiguousarray(image)).save(buffer, format=kind, **options)
     try:
         path.write_bytes(buffer.getvalue())
     except OSError as error:

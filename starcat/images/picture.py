@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from starcat.errors import ConfigError, OutputError, reason
 from starcat.geometry.attitude import radec_roll_from_matrix
+from starcat.images.overlay import Overlay, draw_overlay
 from starcat.images.plate import (
     SKY,
     Plate,
@@ -54,6 +55,7 @@ def draw_identified(
     mag: Array | None = None,
     below: str = "",
     compass: tuple[Array, Array] | None = None,
+    overlay: Overlay | None = None,
 ) -> None:
     """Draw which spots of a frame are which stars.
 
@@ -78,6 +80,8 @@ def draw_identified(
         A second line, under the title.
     compass : tuple of two ndarrays of float64, shape (2,), optional
         Directions of north and of east in pixels (x right, y down).
+    overlay : Overlay, optional
+        Grid, lines of constellations, planets.
 
     Raises
     ------
@@ -95,9 +99,10 @@ def draw_identified(
         figure, axes, scale = _canvas(camera_size, title, below)
         plate = Plate(axes, scale, camera_size, centroids_px, names, mark_radii(len(names), mag))
         draw_sky(plate, image)
+        written = draw_overlay(plate, overlay or Overlay())
         draw_marks(plate)
         taken = draw_compass(plate, compass)
-        left_out = draw_names(plate, taken)
+        left_out = draw_names(plate, np.vstack([taken, written]))
         _draw_legend(figure, names, left_out)
         _write(figure, path)
 

@@ -21,8 +21,9 @@ SKY, STAR, LOST = "#0b1220", "#5ad1e6", "#ffb454"
 """Colours of the sky, of what is identified and of what is not."""
 _BRIGHT, _FAINT, _LARGE_PT = "#f4fbfd", "#a9bcc7", 7.0
 """Colours of names, and the radius of a mark above which the first one is taken."""
-_LABEL_PT = 8.0
-_LETTER_PT = 0.62 * _LABEL_PT
+LABEL_PT = 8.0
+LETTER_PT = 0.62 * LABEL_PT
+"""Size of names, and about the width of a letter."""
 _MOST_LABELS = 60
 _LABEL_GAP_PT = 4.0
 _COMPASS_PT = 76.0
@@ -183,8 +184,8 @@ def draw_names(plate: Plate, taken: Array) -> int:
     """
     from matplotlib.patheffects import withStroke
 
-    widths = [_LETTER_PT * len(name or "") + _LABEL_GAP_PT for name in plate.names]
-    sizes = np.array([[width, 1.25 * _LABEL_PT] for width in widths])
+    widths = [LETTER_PT * len(name or "") + _LABEL_GAP_PT for name in plate.names]
+    sizes = np.array([[width, 1.25 * LABEL_PT] for width in widths])
     order = np.argsort(-plate.radii, kind="stable")
     wanted = [int(spot) for spot in order if plate.names[spot]]
     places = place_labels(
@@ -195,7 +196,7 @@ def draw_names(plate: Plate, taken: Array) -> int:
         x, y = (np.array(corner) + 0.5 * sizes[spot]) / plate.scale
         colour = _BRIGHT if plate.radii[spot] > _LARGE_PT else _FAINT
         plate.axes.text(
-            x, y, str(plate.names[spot]), color=colour, size=_LABEL_PT, ha="center",
+            x, y, str(plate.names[spot]), color=colour, size=LABEL_PT, ha="center",
             va="center", path_effects=halo, parse_math=False,
         )  # fmt: skip
     return len(wanted) - len(places)

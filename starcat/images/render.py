@@ -143,6 +143,7 @@ def render_image(
     camera_size: tuple[int, int],
     optics: Optics,
     seed: int,
+    light_e: Array | None = None,
 ) -> NDArray[np.uint16]:
     """Return the image of stars as a detector would record it.
 
@@ -158,6 +159,8 @@ def render_image(
         Spot, zero point, noise and limits.
     seed : int
         Seed of all that is random; the same seed gives the same image.
+    light_e : ndarray of float64, shape (height, width), optional
+        Electrons of other light, such as that of `scene_light`.
 
     Returns
     -------
@@ -183,6 +186,8 @@ def render_image(
     """
     generator = np.random.default_rng(seed)
     mean = star_electrons(centroids_px, mag, camera_size, optics) + optics.background_e
+    if light_e is not None:
+        mean += light_e
     hot = generator.choice(mean.size, min(optics.hot_pixels, mean.size), replace=False)
     mean.flat[hot] += optics.full_well_e * generator.uniform(*_HOT_RANGE, size=len(hot))
     electrons = generator.poisson(np.minimum(mean, _MOST_ELECTRONS)).astype(np.float64)

@@ -2,17 +2,17 @@
 
 JSON is a frame, a list of frames, or an object with the key ``frames``; a frame is an object
 with ``centroids_px`` (pairs of numbers) and, optionally, ``mag`` (a number or null for each) and
-``name``.
+``name``. Instead of ``mag`` there may be ``magnitude``, or ``flux`` or ``sum``, which are light:
+the brighter, the larger.
 """
 
 from __future__ import annotations
 
 import csv
 import json
-import math
 import os
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,10 @@ from numpy.typing import NDArray
 from starcat.errors import ConfigError, OutputError, reason
 
 Array = NDArray[np.float64]
+
+BRIGHTNESS = ("mag", "magnitude", "flux", "sum")
+"""Names of a column of brightness; the first that a file has is used."""
+_LIGHT = ("flux", "sum")
 
 
 @dataclass(frozen=True)
@@ -36,12 +40,16 @@ class MeasuredFrame:
     centroids_px : ndarray of float64, shape (N, 2)
         Pixels, in the order of the file.
     mag : ndarray of float64, shape (N,), or None
-        Magnitudes, NaN where a centroid has none; None where the file has none.
+        Magnitudes, NaN where a centroid has none; None where the file has none. Those of light
+        are -2.5 log10 of it, their zero point unknown.
+    ignored : tuple of str
+        Columns or keys of the file that are not known, and so were not used.
     """
 
     name: str
     centroids_px: Array
     mag: Array | None = None
+    ignored: tuple[str, ...] = ()
 
 
 def read_frames(path: str | os.PathLike[str]) -> list[MeasuredFrame]:
@@ -81,25 +89,37 @@ def _csv_frame(text: str, path: Path) -> MeasuredFrame:
         if {"x_px", "y_px"} - set(names):
             raise ConfigError(
                 f"{path}: columns {', '.join(names) or 'none'}; the header has to name x_px and "
-                "y_px, and may name mag"
+                "y_px, and may name mag or flux"
             )
-        has_mag = "mag" in names
+        brightness = next((name for name in BRIGHTNESS if name in names), None)
+        columns = ["x_px", "y_px"] + ([] if brightness is None else [brightness])
         measured = [
-            (
-                _number(row["x_px"], "x_px", f"{path}: line {rows.line_num}"),
-                _number(row["y_px"], "y_px", f"{path}: line {rows.line_num}"),
-                _number(row["mag"] or "nan", "mag", f"{path}: line {rows.line_num}")
-                if has_mag
-                else math.nan,
-            )
+            [
+                _number(row[name] or "nan" if name == brightness else row[name], name,
+                        f"{path}: line {rows.line_num}")
+                for name in columns
+            ]
             for row in rows
-        ]
+        ]  # fmt: skip
     except csv.Error as error:
         raise ConfigError(
             f"{path}: not a CSV file ({error}); expected a header with x_px and y_px"
         ) from error
-    table = np.array(measured, dtype=np.float64).reshape(-1, 3)
-    return MeasuredFrame(path.stem, table[:, :2], table[:, 2] if has_mag else None)
+    table = np.array(measured, dtype=np.float64).reshape(-1, len(columns))
+    mag = None if brightness is None else _magnitudes(table[:, 2], brightness)
+    return MeasuredFrame(path.stem, table[:, :2], mag, _unknown(names, ("x_px", "y_px")))
+
+
+def _magnitudes(values: Array, name: str) -> Array:
+    """Return magnitudes of a column; NaN where there is no light."""
+    if name not in _LIGHT:
+        return values
+    bright = np.where(values > 0.0, values, np.nan)
+    return np.asarray(-2.5 * np.log10(bright))
+
+
+def _unknown(names: Iterable[str], places: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(str(name) for name in names if name not in (*places, *BRIGHTNESS))
 
 
 def _json_frames(text: str, path: Path) -> list[MeasuredFrame]:
@@ -134,19 +154,60 @@ def _json_frame(frame: Any, name: str, where: str) -> MeasuredFrame:
         if not isinstance(pair, list) or len(pair) != 2:
             raise ConfigError(f"{at}: {json.dumps(pair)}; expected a pair of numbers [x, y]")
         measured.append([_number(pair[0], "x", at), _number(pair[1], "y", at)])
-    mag = frame.get("mag")
-    if mag is not None:
-        if not isinstance(mag, list) or len(mag) != len(measured):
-            raise ConfigError(f"{where}: 'mag' has to be a list, one for each centroid")
-        mag = np.array(
-            [
-                _number("nan" if value is None else value, "mag", f"{where}: centroid {number}")
-                for number, value in enumerate(mag, start=1)
-            ],
-            dtype=np.float64,
-        )
+    brightness = next((key for key in BRIGHTNESS if frame.get(key) is not None), None)
+    mag = None
+    if brightness is not None:
+        given = frame[brightness]
+        if not isinstance(given, list) or len(given) != len(measured):
+            raise ConfigError(f"{where}: {brightness!r} has to be a list, one for each centroid")
+        values = [
+            _number("nan" if value is None else value, brightness, f"{where}: centroid {number}")
+            for number, value in enumerate(given, start=1)
+        ]
+        mag = _magnitudes(np.array(values, dtype=np.float64), brightness)
     centroids_px = np.array(measured, dtype=np.float64).reshape(-1, 2)
-    return MeasuredFrame(str(frame.get("name", name)), centroids_px, mag)
+    ignored = _unknown(frame, ("centroids_px", "name"))
+    return MeasuredFrame(str(frame.get("name", name)), centroids_px, mag, ignored)
+
+
+def upside_down(frame: MeasuredFrame, height_px: int) -> MeasuredFrame:
+    """Return a frame whose y was counted from the bottom, counted from the top.
+
+    Parameters
+    ----------
+    frame : MeasuredFrame
+        The frame.
+    height_px : int
+        Height of the camera's detector, pixels.
+
+    Returns
+    -------
+    MeasuredFrame
+        The same with ``height_px - y``.
+    """
+    return replace(frame, centroids_px=frame.centroids_px * (1.0, -1.0) + (0.0, height_px))
+
+
+def said_of_columns(frames: Sequence[MeasuredFrame]) -> str | None:
+    """Return what a user should know about columns that were not used.
+
+    Parameters
+    ----------
+    frames : sequence of MeasuredFrame
+        Frames of one file.
+
+    Returns
+    -------
+    str or None
+        One line; None if all were known.
+    """
+    names = sorted({name for frame in frames for name in frame.ignored})
+    if not names:
+        return None
+    return (
+        f"not used, because the name is unknown: {', '.join(names)}; known are x_px, y_px, "
+        f"centroids_px, name, and for the brightness {', '.join(BRIGHTNESS)}"
+    )
 
 
 def _number(value: Any, name: str, where: str) -> float:

@@ -59,6 +59,9 @@ Array = NDArray[np.float64]
 
 Engine = Literal["auto", "c", "numpy"]
 
+SCALE_FREE = ("triangle",)
+"""Methods that find the focal length with the attitude."""
+
 WIDEST_PRIOR_DEG = 20.0
 """Largest error of the prior attitude of a tracked frame."""
 
@@ -436,7 +439,7 @@ class Matcher:
         return replace(found, time_s=time.perf_counter() - before_s, asked=asked)
 
     def _checked_fov_error(self, fov_error: float) -> float:
-        if self.method != "triangle":
+        if self.method not in SCALE_FREE:
             text = f"method {self.method!r} needs the focal length; only 'triangle' can find it"
             raise ConfigError(text, key="method", value=self.method)
         if not 0.0 < fov_error <= WIDEST_FOV_ERROR:

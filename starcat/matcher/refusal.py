@@ -36,10 +36,12 @@ ADVICE: dict[Reason, str] = {
         "tolerance, or find more spots; check the field of view, and try the image flipped"
     ),
     "share_of_frame": (
-        "leave out spots that are no stars, give the camera its distortion, or use a database "
-        "that is as deep as the frame"
+        "leave out spots that are no stars, give the camera its distortion, use a database that "
+        "is as deep as the frame, or ask for a smaller share (min_share, --min-share)"
     ),
-    "scale": "give the camera its true focal length, or allow an error of the field of view",
+    "scale": (
+        "give the camera its true focal length, or allow an error of it (fov_error, --fov-error)"
+    ),
     "time": "allow more time, give brightnesses of the spots, or leave out spots that are no stars",
     "steps": (
         "allow more steps, give brightnesses of the spots, or leave out spots that are no stars"

@@ -237,7 +237,7 @@ def _cells(database: Database, reach_rad: float) -> StarCells:
 
 
 def agree(
-    pose: Pose, observation: Observation, database: Database, certain: float = 0.0
+    pose: Pose, observation: Observation, database: Database, certain: float = 1.0
 ) -> Agreement:
     """Match the centroids of a frame with the stars that an attitude predicts.
 
@@ -250,7 +250,7 @@ def agree(
     database : Database
         The stars.
     certain : float
-        With a false-match probability as low as this no smaller reach is tried.
+        With a false-match probability as low as this no smaller reach is tried; with 1, none is.
 
     Returns
     -------

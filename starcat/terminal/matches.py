@@ -12,13 +12,16 @@ import numpy as np
 
 from starcat.errors import NotIdentifiedError
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
+from starcat.images.answering import sky_of_answer
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.database import Database
 from starcat.matcher.methods.table import METHODS
 from starcat.matcher.result import MatchResult
 from starcat.simulation.simulate import Frame
+from starcat.sky.observer import Observer
 from starcat.terminal.answers import answer_content, facts
 from starcat.terminal.console import print_json, print_json_line, print_table
+from starcat.terminal.sky_in_time import print_sky_in_time, sky_as_dict
 
 Answered = tuple[MeasuredFrame, MatchResult]
 
@@ -58,7 +61,12 @@ class Told:
 
 
 def print_answers(
-    answered: Iterable[Answered], database: Database, *, as_json: bool, as_lines: bool = False
+    answered: Iterable[Answered],
+    database: Database,
+    *,
+    as_json: bool,
+    as_lines: bool = False,
+    observer: Observer | None = None,
 ) -> Told:
     """Print the answers to the frames of a file.
 
@@ -73,6 +81,8 @@ def print_answers(
     as_lines : bool, default False
         Whether to print such an object on a line of its own as soon as a frame is done; then
         no frame is kept, however many there are.
+    observer : Observer, optional
+        When and where the frames were taken: what that adds is printed too.
 
     Returns
     -------
@@ -89,16 +99,28 @@ def print_answers(
         if not result.ok and len(missing) < NAMED:
             missing.append(f"{frame.name}: {result.status}")
         if as_lines:
-            print_json_line(answer_content(frame, result))
+            print_json_line(_content(frame, result, observer))
         else:
             kept.append((frame, result))
     if as_json and not as_lines:
-        print_json([answer_content(frame, result) for frame, result in kept])
+        print_json([_content(frame, result, observer) for frame, result in kept])
     elif len(kept) == 1:
         _print_one(*kept[0], database)
     elif kept:
         _print_many(kept, database)
+    if observer is not None and not (as_json or as_lines):
+        skies = [sky_of_answer(frame, result, observer) for frame, result in kept]
+        print_sky_in_time([frame.name for frame, _ in kept], skies)
     return Told(count, identified, first, tuple(missing))
+
+
+def _content(
+    frame: MeasuredFrame, result: MatchResult, observer: Observer | None
+) -> dict[str, Any]:
+    content = answer_content(frame, result)
+    if observer is not None:
+        content["in_time"] = sky_as_dict(sky_of_answer(frame, result, observer))
+    return content
 
 
 def _print_one(frame: MeasuredFrame, result: MatchResult, database: Database) -> None:

@@ -61,7 +61,9 @@ ARCSEC = np.pi / 648_000.0
 
 NOTES = f"""
 *: starcat; C: the library that flies, else numpy. stated: the caller states noises, 0.5 px and 0.05
-mag (clean) or 0.3 (hard); track: a prior attitude that is wrong by up to {peers.PRIOR_DEG} deg.
+mag (clean) or 0.3 (hard); track: a prior attitude that is wrong by up to {peers.PRIOR_DEG} deg;
+off: the focal length is told wrong by up to so much, and as much is allowed (cedar-solve: its own
+default).
 right: boresight within {BORESIGHT_DEG} deg and roll within {ROLL_DEG} deg; wrong: another answer.
 ms: processor time of the call alone, one thread, a process each. x cedar: medians over those of
 cedar-solve, clean and hard. !: over {peers.SLOW_S * 1e3:.0f} ms, so {peers.SLOW_FRAMES} frames.
@@ -110,6 +112,7 @@ def make_frames(database: Database, count: int, path: Path) -> dict[str, list[Fr
         given[f"{kind}_starts"] = np.cumsum([0, *(len(m) for m in mag[:-1])])
         given[f"{kind}_px"], given[f"{kind}_mag"] = np.concatenate(px), np.concatenate(mag)
         given[f"{kind}_priors"] = priors([frame.matrix for frame in made[kind]])
+        given[f"{kind}_parts"] = np.random.default_rng(SEED).uniform(-1.0, 1.0, len(px))
     np.savez(
         path,
         directions=database.directions,
@@ -193,6 +196,8 @@ def asked() -> dict[str, dict[str, Any]]:
         "C track, no mag.": c | {"track": True, "magnitudes": False},
         "triangle, stated": {"method": "triangle", "magnitudes": True, "stated": STATED},
         "triangle, no mag.": {"method": "triangle", "magnitudes": False},
+        "triangle, 2 % off": {"method": "triangle", "magnitudes": True, "off": 0.02},
+        "triangle, 10 % off": {"method": "triangle", "magnitudes": True, "off": 0.1},
     }
     return rows | {name: {"method": name, "magnitudes": True} for name in METHODS}
 
@@ -209,7 +214,11 @@ def drive_all(
             )
             size = stored_mb(artifact, options["method"])
             rows.append(replace(row, build_s=build_s, database_mb=size))
-    return rows + [drive(name, name, frames, truth) for name in peers.REQUIREMENTS]
+    rows += [drive(name, name, frames, truth) for name in peers.REQUIREMENTS]
+    return rows + [
+        drive(f"cedar-solve, {off:.0%} off", "cedar-solve", frames, truth, {"off": off})
+        for off in (0.02, 0.1)
+    ]
 
 
 def stored_mb(artifact: Path, method: str) -> float:

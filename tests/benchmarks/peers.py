@@ -68,13 +68,14 @@ class Sky:
 class Driver:
     """How one identifier is asked. Only ``solve`` is timed.
 
-    ``prepare`` gets centroids, magnitudes and a prior attitude; ``attitude`` turns an answer into
+    ``prepare`` gets centroids, magnitudes, a prior attitude and a number from -1 to 1, by which
+    the focal length that it is told may be off; ``attitude`` turns an answer into
     a matrix, ``body = matrix @ icrs`` with x right and y down, or None. ``begin`` is told the kind
     of frames that follows. ``inside_s`` asks once more, and says how long compiled code takes
     without the call from Python.
     """
 
-    prepare: Callable[[np.ndarray, np.ndarray, np.ndarray], Any]
+    prepare: Callable[[np.ndarray, np.ndarray, np.ndarray, float], Any]
     solve: Callable[[Any], Any]
     attitude: Callable[[Any], np.ndarray | None]
     build_s: float = math.nan
@@ -91,8 +92,12 @@ def drive_starcat(
     engine: str = "numpy",
     stated: dict[str, dict[str, float]] | None = None,
     track: bool = False,
+    off: float = 0.0,
 ) -> Driver:
-    """Its database is built already. ``stated`` are the noises that each kind of frames has."""
+    """Its database is built already. ``stated`` are the noises that each kind of frames has.
+
+    Where the focal length is told wrong by up to ``off``, as much is allowed.
+    """
     from starcat.geometry.attitude import matrix_from_quaternion
     from starcat.matcher.fast import Limits, fast_matcher
     from starcat.matcher.matcher import Matcher
@@ -115,19 +120,21 @@ def drive_starcat(
         return matrix_from_quaternion(found.q_body_from_icrs) if is_answer else None
 
     def solve(given: Any) -> Any:
-        px, mag, prior = given
+        px, mag, prior, camera = given
         if track:
             return matcher.track(px, prior, PRIOR_DEG, magnitudes=mag)
-        return matcher.identify(px, magnitudes=mag)
+        return matcher.identify(px, camera, magnitudes=mag, fov_error=off)
 
-    def prepare(px: np.ndarray, mag: np.ndarray, prior: np.ndarray) -> Any:
-        return px, mag if magnitudes else None, prior
+    def prepare(px: np.ndarray, mag: np.ndarray, prior: np.ndarray, part: float) -> Any:
+        own = matcher.database.camera
+        camera = own.with_focal_length(own.focal_length_px * (1.0 + off * part)) if off else own
+        return px, mag if magnitudes else None, prior, camera
 
     def inside_s(given: Any) -> float:
         fast = fast_matcher(matcher.database, method) if engine == "c" else None
         if fast is None:
             return math.nan
-        px, mag, prior = given
+        px, mag, prior, _ = given
         noises = matcher.noise_px or 0.0, matcher.noise_mag or 0.0
         limits = Limits(matcher.tolerance_px, *noises, matcher.max_false_match_probability)
         mags = None if mag is None else [mag]
@@ -138,8 +145,11 @@ def drive_starcat(
     return Driver(prepare, solve, attitude, begin=begin, inside_s=inside_s)
 
 
-def drive_cedar_solve(sky: Sky) -> Driver:
-    """Its catalogs are files; ours is one in the layout of ``hip_main.dat``."""
+def drive_cedar_solve(sky: Sky, off: float = 0.0) -> Driver:
+    """Its catalogs are files; ours is one in the layout of ``hip_main.dat``.
+
+    Where the focal length is told wrong by up to ``off``, it allows what it does by default.
+    """
     # Its own handler formats every debug message of a solve and throws it away.
     logging.disable(logging.CRITICAL)
     from tetra3 import Tetra3
@@ -162,17 +172,20 @@ def drive_cedar_solve(sky: Sky) -> Driver:
         solver = Tetra3(load_database=saved)
     expect_all_stars(len(solver.star_table), sky)
     shape, fov = (sky.height_px, sky.width_px), sky.fov_deg
+    allowed = {} if off else {"fov_max_error": 0.01 * fov}
 
-    def solve(px: np.ndarray) -> Any:
-        return solver.solve_from_centroids(px, shape, fov_estimate=fov, fov_max_error=0.01 * fov)
+    def solve(given: Any) -> Any:
+        px, told = given
+        return solver.solve_from_centroids(px, shape, fov_estimate=told, **allowed)
 
     def attitude(found: Any) -> np.ndarray | None:
         if found["RA"] is None:
             return None
         return matrix_from_radec_roll(found["RA"], found["Dec"], found["Roll"])
 
-    def rows_first(px: np.ndarray, *_: np.ndarray) -> np.ndarray:
-        return np.ascontiguousarray(px[:, ::-1])
+    def rows_first(px: np.ndarray, mag: np.ndarray, prior: np.ndarray, part: float) -> Any:
+        half = math.tan(0.5 * math.radians(fov)) / (1.0 + off * part)
+        return np.ascontiguousarray(px[:, ::-1]), math.degrees(2.0 * math.atan(half))
 
     return Driver(rows_first, solve, attitude, build_s, size)
 
@@ -205,7 +218,7 @@ def drive_tetra3rs(sky: Sky) -> Driver:
     def solve(centroids: np.ndarray) -> Any:
         return database.solve_from_centroids(centroids, **known)
 
-    def from_middle(px: np.ndarray, mag: np.ndarray, _: np.ndarray) -> np.ndarray:
+    def from_middle(px: np.ndarray, mag: np.ndarray, *_: Any) -> np.ndarray:
         return np.column_stack([px - middle, 10.0 ** (-0.4 * mag)])
 
     def attitude(found: Any) -> np.ndarray | None:
@@ -283,8 +296,9 @@ def solve_frames(driver: Driver, frames: Any, kind: str) -> dict[str, np.ndarray
     centroids, mag = (np.split(frames[f"{kind}_{key}"], starts[1:]) for key in ("px", "mag"))
     matrices, seconds, inside = [], [], []
     driver.begin(kind)
-    for px, m, prior in zip(centroids, mag, frames[f"{kind}_priors"], strict=True):
-        given = driver.prepare(px, m, prior)
+    others = frames[f"{kind}_priors"], frames[f"{kind}_parts"]
+    for px, m, prior, part in zip(centroids, mag, *others, strict=True):
+        given = driver.prepare(px, m, prior, float(part))
         start = time.process_time()
         found = driver.solve(given)
         seconds.append(time.process_time() - start)

@@ -1,0 +1,1 @@
+"""Calibration: identified frames to a camera with its errors."""

@@ -1,0 +1,228 @@
+"""Frames and a range of focal lengths to a camera with its errors.
+
+Here the rounds of identification end in the last comparison of models, the camera of the terms
+that the frames support, and what the frames say about terms that they do not support.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.calibration.fit import Fit, fit_camera
+from starcat.calibration.lens import AXES, PARAMETERS, camera_of, values_of
+from starcat.calibration.models import COMPLETE, Trial, choose_model, chosen, is_enough, start_of
+from starcat.calibration.rounds import Identified, first_answer, identify_part, settled
+from starcat.errors import CalibrationError
+from starcat.geometry.attitude import quaternion_from_matrix
+from starcat.geometry.camera import Camera
+from starcat.matcher.centroids import MeasuredFrame
+from starcat.matcher.matcher import Matcher
+from starcat.matcher.result import MatchResult
+from starcat.progress import Progress, no_progress
+
+Array = NDArray[np.float64]
+
+MIN_FRAMES = 3
+"""Fewest identified frames of a calibration: with fewer, leaving some out says nothing."""
+
+MOST_NAMED = 10
+"""Frames that a message names at most."""
+
+SKEWED = 5.0
+"""Pixels are said not to be square if an axis is off by this many standard errors."""
+
+
+@dataclass(frozen=True)
+class CalibratedFrame:
+    """What became of one frame.
+
+    Attributes
+    ----------
+    name : str
+        Name of the frame.
+    status : str
+        As of `MatchResult`.
+    n_centroids, n_matched : int
+        Centroids, and those with a star.
+    residual_px : float
+        Root mean square residual on each axis; NaN unless identified.
+    q_body_from_icrs : ndarray of float64, shape (4,)
+        Attitude with the calibrated camera; NaN unless identified.
+    """
+
+    name: str
+    status: str
+    n_centroids: int
+    n_matched: int
+    residual_px: float
+    q_body_from_icrs: Array
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A camera that was found from frames of stars.
+
+    Attributes
+    ----------
+    camera : Camera
+        With the terms that the frames support; the others are 0, and the principal point in the
+        middle.
+    fit : Fit
+        These terms with covariance, noise and residuals.
+    complete : Fit
+        The same with all usual terms free, whether they are supported or not.
+    axes : Fit
+        The supported terms with aspect and skew free too, which no camera file has.
+    trials : tuple of Trial
+        The comparison of models on frames that they have not seen; empty for so few stars that
+        there is nothing to compare, where only the focal length is fitted.
+    frames : tuple of CalibratedFrame
+        One a frame, in the order that they were given in.
+    """
+
+    camera: Camera
+    fit: Fit
+    complete: Fit
+    axes: Fit
+    trials: tuple[Trial, ...]
+    frames: tuple[CalibratedFrame, ...]
+
+    @property
+    def n_identified(self) -> int:
+        """Number of frames that the camera was fitted to."""
+        return len(self.fit.seen.matrices)
+
+    @property
+    def has_square_pixels(self) -> bool:
+        """Whether aspect and skew are 0 within `SKEWED` of their errors."""
+        return all(
+            abs(self.axes.values[PARAMETERS.index(name)]) <= SKEWED * self.axes.errors[name]
+            for name in AXES
+        )
+
+    def __repr__(self) -> str:
+        """Return the camera and what it rests on in one line."""
+        return (
+            f"<Calibration {self.camera.in_words}: {self.n_identified} of {len(self.frames)} "
+            f"frames, {len(self.fit.seen)} stars, residual {self.fit.noise_px:.3f} px, "
+            f"{', '.join(self.fit.free)}>"
+        )
+
+
+def calibrate_frames(
+    matcher: Matcher,
+    frames: Sequence[MeasuredFrame],
+    camera: Camera,
+    focal_px: tuple[float, float],
+    progress: Progress = no_progress,
+) -> Calibration:
+    """Find the camera that took frames.
+
+    Parameters
+    ----------
+    matcher : Matcher
+        The database and the method. The tolerance is found here.
+    frames : sequence of MeasuredFrame
+        Centroids of the frames, of one camera.
+    camera : Camera
+        Its size, and principal point and distortion to start from.
+    focal_px : tuple of float
+        Shortest and longest focal length that it may have.
+    progress : callable, optional
+        Called with (stage, done, total).
+
+    Returns
+    -------
+    Calibration
+        The camera, its errors and how it was chosen.
+
+    Raises
+    ------
+    CalibrationError
+        If fewer than `MIN_FRAMES` frames can be identified; says which and why.
+    """
+    begun = first_answer(matcher, frames, camera, focal_px)
+    if begun is None:
+        asked = identify_part(matcher, frames, camera)
+        raise CalibrationError(_too_few(frames, asked, focal_px))
+    identified, fit = settled(matcher, frames, *begun, progress)
+    if fit is None or len(identified.found) < MIN_FRAMES:
+        raise CalibrationError(_too_few(frames, identified, focal_px))
+    progress("models", 0, None)
+    return _finished(matcher, frames, identified, fit)
+
+
+def _finished(
+    matcher: Matcher, frames: Sequence[MeasuredFrame], identified: Identified, fit: Fit
+) -> Calibration:
+    """Return the calibration that compares all models, once the stars are known."""
+    size_px = identified.camera.width_px, identified.camera.height_px
+    seen = identified.seen(frames, matcher)
+    trials, terms = [], fit.free
+    if is_enough(seen):
+        trials = choose_model(seen, fit.values, size_px, fit.noise_px)
+        terms = chosen(trials)
+    fit = fit_camera(seen, start_of(fit.values, terms, size_px), terms, fit.noise_px)
+    found = camera_of(fit.values, size_px)
+    # The camera of the last round may have had other terms: its stars are asked for once more.
+    last = replace(matcher, tolerance_px=identified.tolerance_px, noise_px=None)
+    again = identify_part(last, frames, found)
+    if len(again.found) >= len(identified.found):
+        identified = again
+    seen = identified.seen(frames, matcher)
+    fit = fit_camera(seen, values_of(found), terms, fit.noise_px)
+    every = tuple(name for name in PARAMETERS if name in {*terms, *COMPLETE})
+    return Calibration(
+        camera_of(fit.values, size_px),
+        fit,
+        fit_camera(seen, fit.values, every, fit.noise_px),
+        fit_camera(seen, fit.values, (*terms, *AXES), fit.noise_px),
+        tuple(trials),
+        _outcomes(frames, identified, fit),
+    )
+
+
+def _outcomes(
+    frames: Sequence[MeasuredFrame], identified: Identified, fit: Fit
+) -> tuple[CalibratedFrame, ...]:
+    outcomes = []
+    for k, (frame, result) in enumerate(zip(frames, identified.results, strict=True)):
+        residual_px, q = float("nan"), np.full(4, np.nan)
+        if result.status == "identified":
+            row = identified.found.index(k)
+            left = fit.residual_px[fit.seen.frame == row]
+            residual_px = float(np.sqrt(np.mean(left**2)))
+            q = quaternion_from_matrix(fit.seen.matrices[row])
+        count, matched = len(frame.centroids_px), result.n_matched
+        outcomes.append(CalibratedFrame(frame.name, result.status, count, matched, residual_px, q))
+    return tuple(outcomes)
+
+
+def _too_few(
+    frames: Sequence[MeasuredFrame], identified: Identified, focal_px: tuple[float, float]
+) -> str:
+    """Return the message about frames that were not identified."""
+    width_px = identified.camera.width_px
+    fields = sorted(float(2.0 * np.degrees(np.arctan(0.5 * width_px / f))) for f in focal_px)
+    failed = [
+        f"{frame.name} ({_why(frame, result)})"
+        for frame, result in zip(frames, identified.results, strict=True)
+        if result.status != "identified"
+    ]
+    more = len(failed) - MOST_NAMED
+    named = ", ".join(failed[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+    return (
+        f"{len(identified.found)} of {len(frames)} frames are identified with fields of "
+        f"{fields[0]:.4g} to {fields[1]:.4g} deg across the width; a calibration needs "
+        f"{MIN_FRAMES}. Not identified: {named}. Give more frames, a wider --fov, the other of "
+        "--flip and --no-flip, or an artifact that was built for about this field and these stars"
+    )
+
+
+def _why(frame: MeasuredFrame, result: MatchResult) -> str:
+    words = result.refusal.words if result.refusal else result.status.replace("_", " ")
+    return f"{len(frame.centroids_px)} centroids: {words}"

@@ -1,0 +1,55 @@
+"""A calibration as a camera file, with what is known about its errors in comments."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from starcat.calibration.calibrate import Calibration
+from starcat.calibration.lens import PARAMETERS
+from starcat.errors import OutputError, reason
+from starcat.specs.camera_file import camera_toml
+
+
+def calibrated_toml(calibration: Calibration) -> str:
+    """Return the TOML text of a calibrated camera.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Of some frames.
+
+    Returns
+    -------
+    str
+        As `read_camera` reads it; comments say the residual and the standard errors.
+    """
+    fit = calibration.fit
+    lines = [
+        f"# Calibrated from {calibration.n_identified} frames with {len(fit.seen)} stars.",
+        f"# Residual: {fit.noise_px:.3f} px on each axis. Standard errors:",
+    ]
+    for name, error in fit.errors.items():
+        value = fit.values[PARAMETERS.index(name)]
+        lines.append(f"#   {name} = {value:.6g} +- {error:.2g}")
+    return "\n".join([*lines, "", camera_toml(calibration.camera)])
+
+
+def write_camera(calibration: Calibration, path: Path) -> None:
+    """Write a calibrated camera as a camera file.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Of some frames.
+    path : Path
+        TOML file, replaced if it exists.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
+    try:
+        path.write_text(calibrated_toml(calibration), encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({reason(error)})", path=path) from error

@@ -1,0 +1,304 @@
+"""The least-squares fit of a camera to stars that are known in several frames.
+
+The attitude of every frame is unknown too. It is found inside, for every camera that is tried
+(variable projection), so that `scipy.optimize.least_squares` has as many unknowns as the camera,
+however many frames there are. The loss is Huber's: a star that is none does not pull.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from starcat.calibration.lens import (
+    FOCAL,
+    PARAMETERS,
+    project,
+    turn_derivatives,
+    value_derivatives,
+)
+
+Array = NDArray[np.float64]
+
+BEND = 3.0
+"""Where Huber's loss turns from a parabola to lines, in standard deviations of a centroid."""
+
+KEPT_VARIANCE = 0.9733
+"""Variance of a normal variable of variance 1 where those beyond `BEND` are left out."""
+
+TURNS = 30
+"""Most steps towards the attitudes of one camera; without wrong stars it takes three."""
+
+CAREFUL = 2
+"""First steps, in which stars beyond the bend count as if the loss were a parabola through them."""
+
+LEAST_CURVE = 0.01
+"""Curvature of a star beyond the bend in later steps, so that none is infinitely long."""
+
+STILL_RAD = 1e-6
+"""A smaller step ends the search for attitudes: what is left is a thousandth of it, 2e-4 arcsec."""
+
+EXACT = 1e-8
+"""Share of the sum of squares by which the last step of a fit lowers it at most."""
+
+PASSES = 4
+"""Most fits of one camera, until the noise is known."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The stars that were identified in some frames.
+
+    Attributes
+    ----------
+    frame : ndarray of int64, shape (N,)
+        Number of the frame of each star, ascending; every number from 0 to F - 1 occurs.
+    centroids_px : ndarray of float64, shape (N, 2)
+        Where they were seen.
+    icrs : ndarray of float64, shape (N, 3)
+        Where they are.
+    matrices : ndarray of float64, shape (F, 3, 3)
+        About the attitudes, ``body = matrix @ icrs``.
+    """
+
+    frame: NDArray[np.int64]
+    centroids_px: Array
+    icrs: Array
+    matrices: Array
+
+    def __len__(self) -> int:
+        """Return the number of stars."""
+        return len(self.frame)
+
+    def of(self, wanted: NDArray[np.bool_]) -> Seen:
+        """Return the stars of some of the frames.
+
+        Parameters
+        ----------
+        wanted : ndarray of bool, shape (F,)
+            Which frames.
+
+        Returns
+        -------
+        Seen
+            Their stars; the frames are counted anew.
+        """
+        stars, number = wanted[self.frame], np.cumsum(wanted) - 1
+        return Seen(
+            number[self.frame[stars]],
+            self.centroids_px[stars],
+            self.icrs[stars],
+            self.matrices[wanted],
+        )
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A camera that was fitted to stars.
+
+    Attributes
+    ----------
+    free : tuple of str
+        The parameters that were fitted.
+    values : ndarray of float64, shape (P,)
+        All parameters, in the order of `PARAMETERS`.
+    covariance : ndarray of float64, shape (len(free), len(free))
+        Of those that were fitted, with the attitudes as unknown as they are.
+    noise_px : float
+        Standard deviation of a centroid on each axis about the fit.
+    residual_px : ndarray of float64, shape (N, 2)
+        Where the stars were seen less where the camera puts them.
+    seen : Seen
+        The stars, with the attitudes that were found.
+    """
+
+    free: tuple[str, ...]
+    values: Array
+    covariance: Array
+    noise_px: float
+    residual_px: Array
+    seen: Seen
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """Standard error of each parameter that was fitted."""
+        return dict(zip(self.free, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+
+def fit_camera(
+    seen: Seen,
+    values: Array,
+    free: Sequence[str] = FOCAL,
+    noise_px: float = 1.0,
+    *,
+    passes: int = PASSES,
+    accuracy: float = EXACT,
+) -> Fit:
+    """Fit a camera to stars.
+
+    Parameters
+    ----------
+    seen : Seen
+        The stars; at least two a frame, and more numbers than there are unknowns.
+    values : ndarray of float64, shape (P,)
+        To start from, in the order of `PARAMETERS`; what is not free stays.
+    free : sequence of str
+        The parameters to fit.
+    noise_px : float, default 1
+        About the noise of a centroid on each axis, for the first fit.
+    passes : int, optional
+        Most fits, each with the noise that the one before has found; 1 where it is known.
+    accuracy : float, optional
+        The fit ends where a step lowers the sum of squares by a smaller share.
+
+    Returns
+    -------
+    Fit
+        The camera, its errors and what is left.
+    """
+    rows = [PARAMETERS.index(name) for name in free]
+    for _ in range(passes):
+        fitted = _one_fit(seen, values, rows, BEND * noise_px, accuracy)
+        values, before = fitted, noise_px
+        residual_px, matrices = turned_to(seen, values, BEND * noise_px)
+        seen = replace(seen, matrices=matrices)
+        unknowns = len(rows) + 3 * len(matrices)
+        noise_px = _noise_px(residual_px, unknowns)
+        if abs(noise_px - before) <= 0.01 * before:
+            break
+    inside = np.abs(residual_px) <= BEND * noise_px
+    reduced = reduced_derivatives(seen, values, rows, inside)[inside.ravel()]
+    covariance = noise_px**2 * _inverse_of_square(reduced)
+    return Fit(tuple(free), values, covariance, noise_px, residual_px, seen)
+
+
+def turned_to(seen: Seen, values: Array, bend_px: float) -> tuple[Array, Array]:
+    """Find the attitudes that fit the stars best with a given camera.
+
+    Parameters
+    ----------
+    seen : Seen
+        The stars and about the attitudes.
+    values : ndarray of float64, shape (P,)
+        The camera.
+    bend_px : float
+        Where Huber's loss bends.
+
+    Returns
+    -------
+    residual_px : ndarray of float64, shape (N, 2)
+        Where the stars were seen less where they then are.
+    matrices : ndarray of float64, shape (F, 3, 3)
+        The attitudes.
+    """
+    matrices = seen.matrices
+    first = np.flatnonzero(np.diff(seen.frame, prepend=-1))
+    for turn in range(TURNS):
+        body = _body(seen, matrices)
+        residual = seen.centroids_px - project(values, body)
+        by_turn = turn_derivatives(values, body)
+        weight = bend_px / np.maximum(np.abs(residual), bend_px)
+        # What lies beyond the bend pulls, and in the end adds nothing to the curvature.
+        curve = weight if turn < CAREFUL else np.where(weight < 1.0, LEAST_CURVE, 1.0)
+        normal = np.add.reduceat(np.swapaxes(by_turn * curve[:, :, None], 1, 2) @ by_turn, first)
+        pull = np.add.reduceat(np.einsum("nij,ni->nj", by_turn, weight * residual), first)
+        step = np.linalg.solve(normal, pull[:, :, None])[:, :, 0]
+        matrices = Rotation.from_rotvec(step).as_matrix() @ matrices
+        if np.abs(step).max() < STILL_RAD:
+            break
+    return seen.centroids_px - project(values, _body(seen, matrices)), matrices
+
+
+def _one_fit(seen: Seen, values: Array, rows: list[int], bend_px: float, accuracy: float) -> Array:
+    """Return all numbers, those of some rows fitted."""
+    last: tuple[bytes, Array, Array] = b"", np.empty(0), seen.matrices
+
+    def at(x: Array) -> tuple[Array, Array, Array]:
+        nonlocal last
+        tried = values.copy()
+        tried[rows] = x
+        if x.tobytes() != last[0]:
+            # The attitudes with a camera are near those with the camera that was tried before.
+            near = replace(seen, matrices=last[2])
+            last = x.tobytes(), *turned_to(near, tried, bend_px)
+        return tried, last[1], last[2]
+
+    def residual(x: Array) -> Array:
+        return at(x)[1].ravel()
+
+    def slope(x: Array) -> Array:
+        tried, residual_px, matrices = at(x)
+        turned = replace(seen, matrices=matrices)
+        return -reduced_derivatives(turned, tried, rows, np.abs(residual_px) <= bend_px)
+
+    start = values[rows]
+    low = np.where(np.array(rows) == 0, 1e-3, -np.inf)
+    found = least_squares(
+        residual, start, slope, (low, np.inf), x_scale="jac", loss="huber", f_scale=bend_px,
+        xtol=1e-8, ftol=accuracy, gtol=1e-8, max_nfev=60,
+    )  # fmt: skip
+    out = values.copy()
+    out[rows] = found.x
+    return out
+
+
+def reduced_derivatives(
+    seen: Seen, values: Array, rows: list[int], inside: NDArray[np.bool_]
+) -> Array:
+    """Return how pixels change with numbers of the camera when the attitudes follow.
+
+    Parameters
+    ----------
+    seen : Seen
+        The stars, with the attitudes that fit best.
+    values : ndarray of float64, shape (P,)
+        The camera.
+    rows : list of int
+        The numbers, as rows of ``values``.
+    inside : ndarray of bool, shape (N, 2)
+        Which coordinates have a say in the attitudes.
+
+    Returns
+    -------
+    ndarray of float64, shape (2 N, len(rows))
+        Derivatives; what the attitudes take up of them is taken out.
+    """
+    body = _body(seen, seen.matrices)
+    by_value, by_turn = value_derivatives(values, body)[:, :, rows], turn_derivatives(values, body)
+    first = np.flatnonzero(np.diff(seen.frame, prepend=-1))
+    across = np.swapaxes(by_turn * inside[:, :, None], 1, 2)
+    normal = np.add.reduceat(across @ by_turn, first)
+    mixed = np.add.reduceat(across @ by_value, first)
+    follows = np.linalg.pinv(normal, hermitian=True) @ mixed
+    return np.asarray((by_value - by_turn @ follows[seen.frame]).reshape(-1, len(rows)))
+
+
+def _inverse_of_square(slope: Array) -> Array:
+    """Return the inverse of ``slope.T @ slope``, whose columns have very different sizes."""
+    size = np.linalg.norm(slope, axis=0)
+    size[size == 0.0] = 1.0
+    _, single, rows = np.linalg.svd(slope / size, full_matrices=False)
+    half = rows.T / np.maximum(single, 1e-12) / size[:, None]
+    return np.asarray(half @ half.T)
+
+
+def _body(seen: Seen, matrices: Array) -> Array:
+    return np.asarray(np.einsum("nij,nj->ni", matrices[seen.frame], seen.icrs))
+
+
+def _noise_px(residual_px: Array, unknowns: int) -> float:
+    """Return the standard deviation of the residuals that belong to a normal distribution."""
+    size = np.abs(residual_px).ravel()
+    noise = 1.4826 * float(np.median(size))
+    for _ in range(20):
+        kept = size[size <= BEND * noise]
+        if not len(kept):
+            break
+        noise = float(np.sqrt(np.mean(kept**2) / KEPT_VARIANCE))
+    left = max(1, size.size - unknowns)
+    return max(noise * float(np.sqrt(size.size / left)), 1e-9)

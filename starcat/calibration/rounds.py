@@ -1,0 +1,310 @@
+"""Frames of a camera that is hardly known to stars that are identified in them.
+
+The first step finds any frame at any focal length of a range. From there on the camera is fitted
+to the stars of all frames that were identified, the frames are identified with that camera, within
+a smaller tolerance and farther out, and so on until the stars no longer change.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.calibration.fit import Fit, Seen, fit_camera
+from starcat.calibration.lens import CENTRE, FOCAL, camera_of, cropped, values_of
+from starcat.calibration.models import choose_model, chosen, is_enough, start_of
+from starcat.errors import ConfigError
+from starcat.geometry.attitude import matrix_from_quaternion
+from starcat.geometry.camera import Camera
+from starcat.matcher.centroids import MeasuredFrame
+from starcat.matcher.chance import MIN_STARS
+from starcat.matcher.matcher import NOISE_DEVIATIONS, Matcher
+from starcat.matcher.result import MatchResult
+from starcat.progress import Progress
+
+Array = NDArray[np.float64]
+
+WIDE_PX = 6.0
+"""Tolerance as long as the camera is hardly known."""
+
+NARROW_PX = 0.5
+"""Smallest tolerance, however good the centroids are."""
+
+STEP = 1.015
+"""Ratio of neighbouring focal lengths of the first step, for a method that has to be told the
+focal length. Within `WIDE_PX` it bears an error of half of that and more."""
+
+FOV_ERROR = 0.1
+"""Error of the focal length that the method ``triangle`` finds by itself."""
+
+FOUND_PX = 4.0
+"""Tolerance of the first step where the focal length is found with the attitude."""
+
+SHARES = (1.0, 0.7, 0.5)
+"""Middle parts of the frame that the first step tries: a lens distorts least in the middle."""
+
+FEW = 16
+"""Brightest centroids of a frame, without magnitudes those nearest to the middle, that the first
+step asks about: a question without an answer takes a tenth of the time that all take."""
+
+AT_ONCE = 3
+"""Frames that are tried together at all focal lengths, before others."""
+
+GROWTH = 1.3
+"""How much larger the part of the frame is that the next round identifies."""
+
+MAX_ROUNDS = 12
+"""Largest number of rounds; it takes four to seven."""
+
+ROUND_MODELS = (
+    FOCAL,
+    (*FOCAL, "k1"),
+    (*FOCAL, "k1", "k2"),
+    (*FOCAL, "k1", *CENTRE),
+    (*FOCAL, "k1", "k2", *CENTRE),
+)
+"""The models that a round chooses from."""
+
+
+@dataclass(frozen=True)
+class Identified:
+    """What the matcher says about the frames.
+
+    Attributes
+    ----------
+    results : tuple of MatchResult
+        One a frame, about the centroids as they were given; those outside of the part of the
+        frame that was asked about have no star.
+    camera : Camera
+        That they were identified with.
+    tolerance_px : float
+        Within which.
+    """
+
+    results: tuple[MatchResult, ...]
+    camera: Camera
+    tolerance_px: float
+
+    @property
+    def found(self) -> list[int]:
+        """Numbers of the frames that were identified."""
+        return [k for k, result in enumerate(self.results) if result.status == "identified"]
+
+    @property
+    def focal_length_px(self) -> float:
+        """The focal length that the first frame that was identified has found."""
+        found = self.results[self.found[0]].camera
+        return (found or self.camera).focal_length_px
+
+    @property
+    def stars(self) -> list[bytes]:
+        """Which centroid is which star, to be compared."""
+        return [result.star_index.tobytes() for result in self.results]
+
+    def seen(self, frames: Sequence[MeasuredFrame], matcher: Matcher) -> Seen:
+        """Return the stars of the frames that were identified.
+
+        Parameters
+        ----------
+        frames : sequence of MeasuredFrame
+            All frames.
+        matcher : Matcher
+            That identified them.
+
+        Returns
+        -------
+        Seen
+            With the attitudes that the matcher has found.
+        """
+        rows = [np.flatnonzero(self.results[k].star_index >= 0) for k in self.found]
+        star = [self.results[k].star_index[row] for k, row in zip(self.found, rows, strict=True)]
+        px = [frames[k].centroids_px[row] for k, row in zip(self.found, rows, strict=True)]
+        return Seen(
+            np.repeat(np.arange(len(rows)), [len(row) for row in rows]),
+            np.concatenate(px),
+            matcher.database.directions[np.concatenate(star)],
+            np.array(
+                [matrix_from_quaternion(self.results[k].q_body_from_icrs) for k in self.found]
+            ),
+        )
+
+
+def first_answer(
+    matcher: Matcher, frames: Sequence[MeasuredFrame], camera: Camera, focal_px: tuple[float, float]
+) -> tuple[Camera, float] | None:
+    """Find a focal length at which any frame is identified.
+
+    Parameters
+    ----------
+    matcher : Matcher
+        The database; its tolerance does not matter.
+    frames : sequence of MeasuredFrame
+        Those with a usual number of centroids are tried first.
+    camera : Camera
+        Size, principal point and distortion to start from.
+    focal_px : tuple of float
+        Shortest and longest focal length.
+
+    Returns
+    -------
+    camera : Camera
+        With the focal length, fitted to the stars of the frame.
+    share : float
+        Part of the frame that was identified.
+        None in place of both where no frame was identified.
+    """
+    size_px = camera.width_px, camera.height_px
+    finds_scale = matcher.method == "triangle" and matcher.database.image is None
+    error, step = (FOV_ERROR, (1.0 + FOV_ERROR) ** 2) if finds_scale else (0.0, STEP)
+    tolerance_px = FOUND_PX if finds_scale else WIDE_PX
+    wide = replace(matcher, tolerance_px=tolerance_px, noise_px=None)
+    usable = [frame for frame in frames if len(frame.centroids_px) >= MIN_STARS]
+    usual = np.median([len(frame.centroids_px) for frame in usable]) if usable else 0
+    usable.sort(key=lambda frame: abs(len(frame.centroids_px) - usual))
+    values = values_of(camera)
+    for first in range(0, len(usable), AT_ONCE):
+        for share, focal in product(SHARES, _focal_lengths(*focal_px, step)):
+            values[0] = focal
+            try:
+                about = camera_of(values, size_px)
+            except ConfigError:  # its distortion folds back at this focal length
+                continue
+            for frame in usable[first : first + AT_ONCE]:
+                asked = identify_part(wide, [frame], about, share, few=FEW, fov_error=error)
+                if asked.found:
+                    seen, noise_px = asked.seen([frame], matcher), tolerance_px / NOISE_DEVIATIONS
+                    values[0] = asked.focal_length_px
+                    fit = fit_camera(seen, values, FOCAL, noise_px)
+                    return camera_of(fit.values, size_px), share
+    return None
+
+
+def identify_part(
+    matcher: Matcher,
+    frames: Sequence[MeasuredFrame],
+    camera: Camera,
+    share: float = 1.0,
+    *,
+    few: int | None = None,
+    fov_error: float = 0.0,
+) -> Identified:
+    """Identify the middle of frames.
+
+    Parameters
+    ----------
+    matcher : Matcher
+        The database and the tolerance.
+    frames : sequence of MeasuredFrame
+        Their centroids.
+    camera : Camera
+        The camera, the whole of it.
+    share : float, default 1
+        Part of width and height to identify.
+    few : int, optional
+        Only so many centroids; all by default.
+    fov_error : float, default 0
+        As `Matcher.identify` takes it.
+
+    Returns
+    -------
+    Identified
+        The answers.
+    """
+    middle, corner_px = cropped(camera, share)
+    results = []
+    for frame in frames:
+        px = frame.centroids_px - corner_px
+        rows = np.flatnonzero(middle.contains(px))
+        if few is not None:
+            away = np.hypot(*(px[rows] - 0.5 * np.array([middle.width_px, middle.height_px])).T)
+            rows = np.sort(rows[np.argsort(away if frame.mag is None else frame.mag[rows])[:few]])
+        mag = None if frame.mag is None else frame.mag[rows]
+        result = matcher.identify(px[rows], middle, magnitudes=mag, fov_error=fov_error)
+        results.append(_of_all(result, rows, len(px)))
+    return Identified(tuple(results), camera, matcher.tolerance_px)
+
+
+def settled(
+    matcher: Matcher,
+    frames: Sequence[MeasuredFrame],
+    camera: Camera,
+    share: float,
+    progress: Progress,
+) -> tuple[Identified, Fit | None]:
+    """Identify and fit in turn until the stars no longer change.
+
+    Parameters
+    ----------
+    matcher : Matcher
+        The database.
+    frames : sequence of MeasuredFrame
+        All frames.
+    camera : Camera
+        About the camera.
+    share : float
+        Part of the frame that it holds for.
+    progress : callable
+        Called with (stage, done, total) after each round.
+
+    Returns
+    -------
+    identified : Identified
+        The frames with the last camera.
+    fit : Fit or None
+        The fit to these stars, with the terms that they support; None where no frame is
+        identified any more.
+    """
+    size_px, tolerance_px = (camera.width_px, camera.height_px), WIDE_PX
+    before: list[bytes] = []
+    fit = None
+    for number in range(MAX_ROUNDS):
+        asked = replace(matcher, tolerance_px=tolerance_px, noise_px=None)
+        identified = identify_part(asked, frames, camera, share)
+        progress("round", number + 1, None)
+        if not identified.found or (share == 1.0 and identified.stars == before):
+            return identified, fit if identified.found else None
+        fit = _supported(identified.seen(frames, matcher), values_of(camera), size_px, tolerance_px)
+        camera = camera_of(fit.values, size_px)
+        if share == 1.0:
+            before = identified.stars
+            needed_px = NOISE_DEVIATIONS * fit.noise_px
+            tolerance_px = min(tolerance_px, max(NARROW_PX, needed_px))
+        share = min(1.0, GROWTH * share)
+    return identified, fit
+
+
+def _supported(seen: Seen, values: Array, size_px: tuple[int, int], tolerance_px: float) -> Fit:
+    """Return the fit of the model that the stars support, of those of a round."""
+    free: tuple[str, ...] = FOCAL
+    noise_px = tolerance_px / NOISE_DEVIATIONS
+    if is_enough(seen):
+        free = chosen(choose_model(seen, values, size_px, noise_px, ROUND_MODELS))
+    for terms in (free, FOCAL):
+        fit = fit_camera(seen, start_of(values, terms, size_px), terms, noise_px)
+        with suppress(ConfigError):  # all frames together may fold where those of the trials do not
+            camera_of(fit.values, size_px)
+            break
+    return fit
+
+
+def _focal_lengths(shortest: float, longest: float, step: float) -> list[float]:
+    """Return the middles of the parts of a range that a step covers, the middle one first."""
+    parts = max(1, math.ceil(math.log(longest / shortest) / math.log(step)))
+    edges = np.geomspace(shortest, longest, parts + 1)
+    grid = np.sqrt(edges[:-1] * edges[1:])
+    away = np.abs(np.log(grid) - 0.5 * math.log(shortest * longest))
+    return list(grid[np.argsort(away, kind="stable")].tolist())
+
+
+def _of_all(result: MatchResult, rows: NDArray[np.int64], count: int) -> MatchResult:
+    """Return the answer about some centroids as one about all of them."""
+    ids, index = np.full(count, -1, dtype=np.int64), np.full(count, -1, dtype=np.int32)
+    ids[rows], index[rows] = result.star_ids, result.star_index
+    dropped = tuple((int(rows[row]), reason) for row, reason in result.dropped)
+    return replace(result, star_ids=ids, star_index=index, dropped=dropped)

@@ -1,0 +1,195 @@
+"""How wide the stars of an image are: from many spots, most of which may be something else.
+
+Input are an image above its background and places of light in it, output is one number, the
+standard deviation of a star's spot before the pixels sample it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf
+
+from starcat.images.background import Levels
+
+Array = NDArray[np.float64]
+
+SIGMA_RANGE_PX = (0.3, 5.0)
+"""Narrowest and widest spot that is looked for."""
+_STEP = 1.15
+_HALF_PX = 16
+"""A star is looked at this far to each side."""
+_REACH_SIGMA = 4.0
+_MOST_SPOTS = 150
+_SHARP_PX = 0.45
+"""A spot narrower than this is a hot pixel with its neighbour, if there is another explanation."""
+_CLEAR_SNR, _SHARP_SNR = 15.0, 12.0
+_FEW = 5
+_BRIGHT, _BRIGHT_SHARE = 10, 0.1
+"""In a flat image spots count that have this share of the signal of the tenth brightest."""
+
+
+def best_widths(levels: Levels, places: Array) -> tuple[Array, Array]:
+    """Return the Gaussian under which each spot stands out most.
+
+    Parameters
+    ----------
+    levels : Levels
+        An image above its background.
+    places : ndarray of float64, shape (N, 2)
+        Middles of spots, pixels, x and y, counted from the centre of the first pixel.
+
+    Returns
+    -------
+    sigma_px : ndarray of float64, shape (N,)
+        Standard deviation of the Gaussian with the largest signal over noise, before the pixels
+        sample it. A constant below the spot does not matter.
+    snr : ndarray of float64, shape (N,)
+        That signal over noise, of the noise of single pixels.
+    """
+    if not len(places):
+        return np.empty(0), np.empty(0)
+    low, high = SIGMA_RANGE_PX
+    steps = int(np.ceil(np.log(high / low) / np.log(_STEP)))
+    widths = np.asarray(low * _STEP ** np.arange(steps + 1), dtype=np.float64)
+    corner = np.floor(places + 0.5).astype(np.int64)
+    patches, shift = _patches(levels.above, corner), places - corner
+    # Scores in windows of different sizes do not compare to a tenth: the second round has one
+    # window for all widths, which the first has chosen.
+    windows = np.broadcast_to(_REACH_SIGMA * widths[:, None], (len(widths), len(places)))
+    rough = widths[_scores(patches, shift, widths, windows).argmax(axis=0)]
+    scores = _scores(patches, shift, widths, np.broadcast_to(_REACH_SIGMA * rough, windows.shape))
+    best = scores.argmax(axis=0)
+    height, width = levels.noise.shape
+    x, y = np.clip(corner, 0, (width - 1, height - 1)).T
+    return _between(np.log(widths), scores, best), scores.max(axis=0) / levels.noise[y, x]
+
+
+def is_sharp(levels: Levels, places: Array, sigma: float) -> NDArray[np.bool_]:
+    """Return which spots are too narrow for the light of a star, beyond their noise.
+
+    Parameters
+    ----------
+    levels : Levels
+        An image above its background.
+    places : ndarray of float64, shape (N, 2)
+        Middles of spots, counted from the centre of the first pixel.
+    sigma : float
+        Standard deviation of a star's spot, pixels.
+
+    Returns
+    -------
+    ndarray of bool, shape (N,)
+        Those that stand out more under a Gaussian of half the width, and clearly: their own
+        width is less than 0.7 of a star's. Two hot pixels side by side are so.
+    """
+    if not len(places):
+        return np.zeros(0, dtype=np.bool_)
+    corner = np.floor(places + 0.5).astype(np.int64)
+    widths = sigma * np.array([0.5, 1.0])
+    windows = np.full((2, len(places)), _REACH_SIGMA * sigma)
+    scores = _scores(_patches(levels.above, corner), places - corner, widths, windows)
+    height, width = levels.noise.shape
+    x, y = np.clip(corner, 0, (width - 1, height - 1)).T
+    clear = scores[0] > _SHARP_SNR * levels.noise[y, x]
+    return np.asarray((scores[0] > scores[1]) & clear)
+
+
+def _scores(patches: Array, shift: Array, widths: Array, windows: Array) -> Array:
+    """Return each spot's light through Gaussians without mean, over the norm of those."""
+    scores = np.empty(windows.shape)
+    for number, sigma in enumerate(widths):
+        half = np.minimum(np.ceil(windows[number]), _HALF_PX)
+        size = int(half.max())
+        reach = np.arange(-size, size + 1)
+        inner = slice(_HALF_PX - size, _HALF_PX + size + 1)
+        inside = (np.abs(reach) <= half[:, None]).astype(np.float64)
+        edges = np.arange(-size, size + 2) - 0.5
+        across, down = (
+            inside * np.diff(0.5 * erf((edges - shift[:, axis, None]) / (np.sqrt(2) * sigma)))
+            for axis in (0, 1)
+        )
+        cut = patches[:, inner, inner]
+        total = across.sum(axis=1) * down.sum(axis=1)
+        part = total / (2.0 * half + 1.0) ** 2
+        norm = (across**2).sum(axis=1) * (down**2).sum(axis=1) - total * part
+        signal = _through(cut, across, down) - part * _through(cut, inside, inside)
+        scores[number] = signal / np.sqrt(norm)
+    return scores
+
+
+def _through(patches: Array, across: Array, down: Array) -> Array:
+    """Return the light of each patch through a filter of columns and one of rows."""
+    return np.asarray(((patches @ across[:, :, None])[:, :, 0] * down).sum(axis=1))
+
+
+def _between(steps: Array, scores: Array, best: NDArray[np.intp]) -> Array:
+    """Return where the parabola through the best score and its neighbours is highest."""
+    middle = np.clip(best, 1, len(steps) - 2)
+    spot = np.arange(scores.shape[1])
+    before, at, after = (scores[middle + step, spot] for step in (-1, 0, 1))
+    bend = before - 2.0 * at + after
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shift = np.where(bend < 0.0, 0.5 * (before - after) / bend, 0.0)
+    shift = np.where(best == middle, np.clip(shift, -0.5, 0.5), best - middle)
+    return np.asarray(np.exp(steps[middle] + shift * np.log(_STEP)))
+
+
+def _patches(above: NDArray[np.float32], corner: NDArray[np.int64]) -> Array:
+    """Return the square around each place; 0 outside of the image."""
+    padded = np.pad(above, _HALF_PX)
+    reach = np.arange(2 * _HALF_PX + 1)
+    rows = corner[:, 1, None, None] + reach[:, None]
+    return np.asarray(padded[rows, corner[:, 0, None, None] + reach], dtype=np.float64)
+
+
+def sigma_of_stars(levels: Levels, places: Array, peak: Array) -> float:
+    """Return the width of an image's stars.
+
+    Parameters
+    ----------
+    levels : Levels
+        An image above its background.
+    places : ndarray of float64, shape (N, 2)
+        Middles of spots, without saturated ones, counted from the centre of the first pixel.
+    peak : ndarray of float64, shape (N,)
+        Largest value of each: the highest are looked at. Clouds have more light than stars, but
+        it is spread.
+
+    Returns
+    -------
+    float
+        Standard deviation, pixels: the width that most of them have, hot pixels and clouds
+        aside; 1 if there is none. It is 0.45 if all are narrower: those cannot be told from
+        hot pixels.
+    """
+    order = np.argsort(-peak, kind="stable")[: 2 * _MOST_SPOTS]
+    if not len(order):
+        return 1.0
+    sigma, snr = best_widths(levels, places[order])
+    least = _CLEAR_SNR
+    if levels.is_flat:  # its noise is not known, but steps are faint beside stars
+        least = max(least, _BRIGHT_SHARE * float(np.sort(snr)[-_BRIGHT:][0]))
+    clear = snr > least
+    if clear.sum() >= _FEW:
+        sigma = sigma[clear]
+    sound = sigma < 0.99 * SIGMA_RANGE_PX[1]
+    if sound.sum() >= _FEW:
+        sigma = sigma[sound]
+    if not (sigma > _SHARP_PX).any():
+        return _SHARP_PX
+    sigma = sigma[sigma > _SHARP_PX]
+    sigma = sigma[:_MOST_SPOTS]
+    # Not of logarithms: clouds are wide, and no width of theirs is as frequent as a star's.
+    near = np.abs(np.log(sigma / _densest(np.sort(sigma)))) < np.log(1.35)
+    return float(np.clip(np.median(sigma[near]), *SIGMA_RANGE_PX))
+
+
+def _densest(values: Array) -> float:
+    """Return the half-sample mode of sorted values."""
+    while len(values) > 3:
+        half = (len(values) + 1) // 2
+        spans = values[half - 1 :] - values[: len(values) - half + 1]
+        first = int(spans.argmin())
+        values = values[first : first + half]
+    return float(np.median(values))

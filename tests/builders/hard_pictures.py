@@ -1,0 +1,214 @@
+"""Rendered pictures that are hard to measure, of the embedded sky: twenty of each kind.
+
+Every picture is of 1024 x 1024 px over 12 deg, of all stars to G = 10; the guide stars of the
+preset gaia-12deg are those to 6. Run as a program it prints how many are identified:
+
+    python tests/builders/hard_pictures.py <artifact> [<pictures of a kind>] [<kind> ...]
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.catalog.archives.gaia import embedded_sky
+from starcat.catalog.ingest import ingest
+from starcat.catalog.stars import floats_of
+from starcat.geometry.attitude import matrix_from_quaternion, random_attitudes
+from starcat.geometry.camera import Camera
+from starcat.geometry.sphere import directions_from_radec
+from starcat.images.identification import identify_frames, measure
+from starcat.images.image_file import write_image
+from starcat.images.render import Optics, render_image
+from starcat.images.scene import Scene, in_file_steps, scene_light
+from starcat.matcher.matcher import Matcher
+
+Array = NDArray[np.float64]
+Rng = np.random.Generator
+
+RIGHT_PX = 3.0
+"""A right attitude puts no corner of the frame farther from its place."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What a picture is taken with; JPEG quality where it is a JPEG file."""
+
+    optics: Optics
+    scene: Scene
+    quality: int | None = None
+
+
+def _optics(rng: Rng, widest_px: float = 2.0, **changes: float | int) -> Optics:
+    return Optics(**{"psf_sigma_px": rng.uniform(0.7, widest_px), **changes})
+
+
+def _eight_bits(rng: Rng, coarsest_e: float = 20.0, **changes: object) -> Scene:
+    return Scene(
+        **{"bits": 8, "black_adu": 100.0, "adu_per_step": rng.uniform(4.0, coarsest_e), **changes}
+    )
+
+
+def _jpeg(rng: Rng) -> Picture:
+    return Picture(_optics(rng), _eight_bits(rng, 12.0), 60)
+
+
+def _clipped(rng: Rng) -> Picture:
+    # 100 of bias and 20 of background; their noise is 9.
+    return Picture(_optics(rng), _eight_bits(rng, black_adu=120.0 + 9.0 * rng.uniform(0.0, 3.0)))
+
+
+def _gradient(rng: Rng) -> Picture:
+    light, toward = 10.0 ** rng.uniform(2.0, 3.3), rng.uniform(0.0, 360.0)
+    bits = int(rng.choice([8, 16]))
+    step = 12.0 if bits == 8 else 1.0
+    scene = Scene(light, toward, bits=bits, adu_per_step=step, black_adu=0.0 if bits == 16 else 100)
+    return Picture(_optics(rng), scene)
+
+
+def _moon(rng: Rng) -> Picture:
+    place = rng.uniform(-80.0, 1104.0, 2)
+    glow = 10.0 ** rng.uniform(2.7, 4.0)
+    moon = Scene(
+        moon_px=(place[0], place[1]),
+        glow_e=glow,
+        glow_px=rng.uniform(40.0, 120.0),
+    )
+    return Picture(_optics(rng), moon)
+
+
+def _spots(rng: Rng) -> Picture:
+    optics = _optics(rng, 4.0)
+    return Picture(optics, _eight_bits(rng, 8.0) if rng.uniform() < 0.5 else Scene())
+
+
+KINDS: dict[str, Callable[[Rng], Picture]] = {
+    "8 bits": lambda rng: Picture(_optics(rng), _eight_bits(rng)),
+    "JPEG 60": _jpeg,
+    "clipped": _clipped,
+    "gradient": _gradient,
+    "Moon": _moon,
+    "hot pixels": lambda rng: Picture(
+        _optics(rng, hot_pixels=int(10.0 ** rng.uniform(2.5, 4.0))), Scene()
+    ),
+    "0.7 to 4 px": _spots,
+}
+"""The kinds of the acceptance."""
+
+MORE_KINDS: dict[str, Callable[[Rng], Picture]] = {
+    "nebula": lambda rng: Picture(
+        _optics(rng),
+        _eight_bits(rng, nebula_e=rng.uniform(50.0, 300.0), nebula_px=rng.uniform(6.0, 40.0)),
+    ),
+    "JPEG of nebula": lambda rng: Picture(
+        _optics(rng),
+        _eight_bits(rng, 10.0, nebula_e=rng.uniform(30.0, 100.0), nebula_px=rng.uniform(6, 40)),
+        60,
+    ),
+    "clean": lambda rng: Picture(_optics(rng), Scene()),
+}
+
+
+@cache
+def sky() -> tuple[Array, Array]:
+    """Directions and magnitudes of all stars of the embedded sky."""
+    stars = ingest("gaia", [embedded_sky()], neighbours=False).stars
+    ra, dec = floats_of(stars, "ra_deg"), floats_of(stars, "dec_deg")
+    return directions_from_radec(ra, dec), floats_of(stars, "mag")
+
+
+@dataclass(frozen=True)
+class Taken:
+    """A picture in a file, and the truth about it."""
+
+    kind: str
+    number: int
+    path: Path
+    matrix: Array
+    picture: Picture
+    centroids_px: Array
+    mag: Array
+
+
+def take(kind: str, number: int, camera: Camera, folder: Path) -> Taken:
+    """Render one picture and write it."""
+    kinds = KINDS | MORE_KINDS
+    rng = np.random.default_rng([2026, list(kinds).index(kind), number])
+    picture, matrix = kinds[kind](rng), random_attitudes(1, rng)[0]
+    directions, mag = sky()
+    body = directions @ matrix.T
+    near = np.flatnonzero(body[:, 2] > np.cos(0.6 * camera.diagonal_rad))
+    places = camera.pixels_from_directions(body[near])
+    size, seed = (camera.width_px, camera.height_px), int(rng.integers(2**31))
+    light = scene_light(picture.scene, size, picture.optics.full_well_e, seed)
+    adu = render_image(places, mag[near], size, picture.optics, seed, light)
+    image = in_file_steps(adu, picture.scene)
+    suffix = ".png" if picture.quality is None else ".jpg"
+    path = folder / f"{kind} {number}{suffix}".replace(" ", "_")
+    write_image(path, image, **({} if picture.quality is None else {"quality": picture.quality}))
+    return Taken(kind, number, path, matrix, picture, places, mag[near])
+
+
+def worst_px(taken: Taken, q_body_from_icrs: Array, camera: Camera) -> float:
+    """How far an attitude puts a corner of the frame from its place, pixels."""
+    width, height = camera.width_px, camera.height_px
+    corners = np.array([(0, 0), (width, 0), (0, height), (width, height)], dtype=np.float64)
+    icrs = camera.directions_from_pixels(corners) @ taken.matrix
+    there = camera.pixels_from_directions(icrs @ matrix_from_quaternion(q_body_from_icrs).T)
+    return float(np.hypot(*(there - corners).T).max())
+
+
+def verdict(matcher: Matcher, taken: Taken) -> str:
+    """``right``, ``wrong`` or the status, as the command would find it without an option."""
+    camera = matcher.database.camera
+    [result] = identify_frames(matcher, measure(taken.path), camera)
+    if result.status != "identified":
+        return result.status
+    return "right" if worst_px(taken, result.q_body_from_icrs, camera) < RIGHT_PX else "wrong"
+
+
+def verdicts(
+    matcher: Matcher, folder: Path, count: int, kinds: list[str]
+) -> Iterator[tuple[Taken, str]]:
+    """Take and identify pictures of each kind, and delete them."""
+    for kind in kinds:
+        for number in range(count):
+            taken = take(kind, number, matcher.database.camera, folder)
+            yield taken, verdict(matcher, taken)
+            taken.path.unlink()
+
+
+def main(artifact: str, count: str = "20", *kinds: str) -> None:
+    from starcat.images.centroiding import find_spots
+    from starcat.images.image_file import read_image
+
+    matcher, tally = Matcher.open(artifact), {}
+    with tempfile.TemporaryDirectory() as folder:
+        for kind in kinds or (*KINDS, *MORE_KINDS):
+            for number in range(int(count)):
+                taken = take(kind, number, matcher.database.camera, Path(folder))
+                try:
+                    said = verdict(matcher, taken)
+                except Exception as error:
+                    said = str(error)[:150]
+                tally.setdefault(kind, []).append(said)
+                if said == "right":
+                    continue
+                try:
+                    spots = find_spots(read_image(taken.path))
+                    seen = f"sigma {spots.psf_sigma_px:.2f}, {len(spots)} spots"
+                except Exception:
+                    seen = ""
+                print(f"  {kind} {number}: {said}; {taken.picture.optics.psf_sigma_px:.2f} {seen}")
+            print(f"{kind}: {tally[kind].count('right')} of {count}", flush=True)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,222 @@
+"""Pictures as cameras take them: coarse, clipped, compressed, with town light, Moon and defects."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import hard_pictures
+import numpy as np
+import pytest
+from hard_pictures import KINDS, MORE_KINDS, verdicts
+from scipy.spatial import cKDTree
+
+from starcat.errors import ConfigError
+from starcat.images.background import subtract_background
+from starcat.images.centroiding import find_spots
+from starcat.images.frame_repair import grey_of_mosaic, without_dark, without_dead_zones
+from starcat.images.identification import PictureOptions, measure
+from starcat.images.image_file import write_image
+from starcat.images.render import Optics, render_image, star_electrons
+from starcat.images.scene import Scene, in_file_steps, scene_light
+from starcat.images.spot_width import best_widths
+from starcat.matcher.matcher import Matcher
+from starcat.pipeline.build import build
+from starcat.specs.reading import preset
+
+SIZE = (400, 300)
+
+
+@pytest.fixture(scope="module")
+def matcher(tmp_path_factory: pytest.TempPathFactory) -> Matcher:
+    built = build(preset("gaia-12deg"), {}, tmp_path_factory.mktemp("sky"))
+    return Matcher.open(built.folder)
+
+
+def stars(count: int, seed: int, faintest: float = 6.0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return rng.uniform(10, [SIZE[0] - 10, SIZE[1] - 10], (count, 2)), rng.uniform(
+        3, faintest, count
+    )
+
+
+def picture(seed: int = 1, scene: Scene | None = None, **optics: float) -> np.ndarray:
+    scene, eye = scene or Scene(), Optics(**optics)
+    light = scene_light(scene, SIZE, eye.full_well_e, seed)
+    return in_file_steps(render_image(*stars(40, seed), SIZE, eye, seed, light), scene)
+
+
+# The acceptance
+
+
+@pytest.mark.timeout(1800)
+@pytest.mark.slow
+def test_hard_pictures_are_identified(matcher: Matcher, tmp_path: Path) -> None:
+    said = list(verdicts(matcher, tmp_path, 20, list(KINDS)))
+    for kind in KINDS:
+        of_kind = [word for taken, word in said if taken.kind == kind]
+        assert "wrong" not in of_kind
+        assert of_kind.count("right") >= 19, (kind, of_kind)
+
+
+@pytest.mark.timeout(1800)
+@pytest.mark.slow
+def test_clouds_are_seen_through(matcher: Matcher, tmp_path: Path) -> None:
+    for kind in MORE_KINDS:
+        words = [word for _, word in verdicts(matcher, tmp_path, 20, [kind])]
+        assert "wrong" not in words
+        assert words.count("right") >= 16, (kind, words)
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.slow
+def test_no_kind_of_hard_picture_is_lost(matcher: Matcher, tmp_path: Path) -> None:
+    said = [word for _, word in verdicts(matcher, tmp_path, 3, list(KINDS))]
+    assert said == ["right"] * len(said)
+
+
+@pytest.mark.parametrize("kind", ["8 bits", "JPEG 60", "clipped", "hot pixels"])
+def test_stars_of_a_hard_picture_are_found(kind: str, tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    taken = hard_pictures.KINDS[kind](rng)
+    places, mag = stars(30, 4, 5.0)
+    optics = Optics(psf_sigma_px=taken.optics.psf_sigma_px, hot_pixels=taken.optics.hot_pixels // 8)
+    image = in_file_steps(render_image(places, mag, SIZE, optics, 5), taken.scene)
+    path = tmp_path / ("a.png" if taken.quality is None else "a.jpg")
+    write_image(path, image, **({} if taken.quality is None else {"quality": taken.quality}))
+    [frame] = measure(path).frames
+    distance, _ = cKDTree(frame.centroids_px).query(places)
+    assert (distance < 0.7).sum() >= 26
+    if taken.quality is None:  # of what compression leaves of the noise some stands out
+        assert len(frame.centroids_px) <= 45
+    assert (distance[np.argsort(mag)[:10]] < 0.7).all()
+
+
+# Spot width and noise
+
+
+@pytest.mark.parametrize("sigma", [0.6, 1.0, 2.0, 4.0])
+def test_the_width_of_each_spot_is_that_of_its_gaussian(sigma: float) -> None:
+    places = np.stack(np.meshgrid(np.arange(40, 400, 60), np.arange(40, 300, 60)), -1).reshape(
+        -1, 2
+    )
+    places = places + np.random.default_rng(1).uniform(-0.5, 0.5, places.shape)
+    optics = Optics(psf_sigma_px=sigma, full_well_e=1e9)
+    image = render_image(places, np.full(len(places), 4.0), SIZE, optics, 2)
+    widths, snr = best_widths(subtract_background(image), places - 0.5)
+    assert np.median(widths) == pytest.approx(sigma, rel=0.02)
+    assert widths == pytest.approx(sigma, rel=0.15)
+    assert (snr > 50.0).all()
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        Scene(bits=8, black_adu=100.0, adu_per_step=12.0),
+        Scene(bits=8, black_adu=135.0, adu_per_step=6.0),
+        Scene(bits=8, black_adu=90.0, adu_per_step=6.0, nebula_e=100.0, nebula_px=12.0),
+        Scene(moon_px=(350.0, 40.0), glow_e=3000.0),
+        Scene(town_light_e=2000.0),
+    ],
+    ids=["coarse", "clipped", "nebula", "Moon", "town"],
+)
+def test_the_width_is_measured_in_any_picture(scene: Scene) -> None:
+    spots = find_spots(picture(7, scene, psf_sigma_px=1.3))
+    assert spots.psf_sigma_px == pytest.approx(1.3, rel=0.25)
+    places, mag = stars(40, 7)
+    distance, _ = cKDTree(spots.centroids_px).query(places[mag < 4.5])
+    assert (distance < 0.5).mean() > 0.8
+
+
+def test_a_clipped_background_has_few_false_spots() -> None:
+    scene = Scene(bits=8, black_adu=133.0, adu_per_step=4.0)
+    light = render_image(np.empty((0, 2)), np.empty(0), (1024, 1024), Optics(), 3)
+    assert len(find_spots(in_file_steps(light, scene))) <= 40
+
+
+def test_the_brightest_spots_are_kept() -> None:
+    image = picture(2)
+    every, some = find_spots(image), find_spots(image, most_spots=10)
+    assert len(every) > 30
+    assert len(some) == len(some.saturated) == 10
+    np.testing.assert_array_equal(some.flux, every.flux[:10])
+
+
+def test_trails_are_told_and_refused() -> None:
+    places, mag = stars(25, 3, 4.0)
+    parts = np.linspace(-0.5, 0.5, 25)[:, None, None] * np.array([12.0, 9.0]) + places
+    trails = parts.reshape(-1, 2), np.repeat(mag[None] + 2.5 * np.log10(25), 25, axis=0).ravel()
+    image = render_image(*trails, SIZE, Optics(), 4)
+    with pytest.raises(ConfigError, match=r"trails of 1[4-7] px.*expose shorter"):
+        find_spots(image)
+    assert len(find_spots(image, psf_sigma_px=1.5)) > 10
+
+
+def test_long_spots_of_a_lens_are_no_trails() -> None:
+    places, mag = stars(25, 3, 4.0)
+    outwards = places - 0.5 * np.array(SIZE)
+    outwards *= 12.0 / np.linalg.norm(outwards, axis=1)[:, None]
+    parts = np.linspace(-0.5, 0.5, 25)[:, None, None] * outwards + places
+    coma = parts.reshape(-1, 2), np.repeat(mag[None] + 2.5 * np.log10(25), 25, axis=0).ravel()
+    assert len(find_spots(render_image(*coma, SIZE, Optics(), 4))) > 10
+
+
+# Dark frame, mask, mosaic
+
+
+def test_a_dark_frame_takes_hot_pixels_out(tmp_path: Path) -> None:
+    rng = np.random.default_rng(8)
+    current = np.where(rng.uniform(size=SIZE[::-1]) < 0.01, rng.uniform(500, 3e4, SIZE[::-1]), 0.0)
+    lid = render_image(np.empty((0, 2)), np.empty(0), SIZE, Optics(background_e=0.0), 1, current)
+    image = render_image(*stars(40, 5), SIZE, Optics(full_well_e=6e4), 2, current)
+    write_image(tmp_path / "image.fits", image)
+    write_image(tmp_path / "dark.fits", lid)
+    [bare] = measure(tmp_path / "image.fits", options=PictureOptions(psf_sigma_px=1.0)).frames
+    how = PictureOptions(psf_sigma_px=1.0, dark=tmp_path / "dark.fits")
+    [frame] = measure(tmp_path / "image.fits", options=how).frames
+    assert len(frame.centroids_px) < len(bare.centroids_px)
+    distance, _ = cKDTree(frame.centroids_px).query(stars(40, 5)[0])
+    assert (distance < 0.5).sum() >= 36
+
+
+def test_no_spot_is_found_in_a_dead_zone(tmp_path: Path) -> None:
+    mask = np.zeros(SIZE[::-1], dtype=np.uint8)
+    mask[:, 200:] = 255
+    write_image(tmp_path / "image.png", picture(5))
+    write_image(tmp_path / "mask.png", mask)
+    [frame] = measure(
+        tmp_path / "image.png", options=PictureOptions(mask=tmp_path / "mask.png")
+    ).frames
+    places, _ = stars(40, 5)
+    assert (frame.centroids_px[:, 0] < 201.0).all()
+    distance, _ = cKDTree(frame.centroids_px).query(places[places[:, 0] < 195.0])
+    assert (distance < 0.5).mean() > 0.9
+
+
+@pytest.mark.parametrize("repair", [without_dark, without_dead_zones])
+def test_what_repairs_has_the_size_of_the_image(repair) -> None:
+    with pytest.raises(ConfigError, match="40 x 30 px, the image 50 x 30; expected the same"):
+        repair(np.zeros((30, 50)), np.zeros((30, 40)))
+
+
+def test_a_mask_leaves_something() -> None:
+    with pytest.raises(ConfigError, match="leaves no pixel"):
+        without_dead_zones(np.zeros((30, 50)), np.ones((30, 50)))
+
+
+@pytest.mark.parametrize("order", ["RGGB", "BGGR", "GRBG", "GBRG"])
+@pytest.mark.parametrize("star", [(1.0, 0.6, 0.3), (0.2, 0.5, 1.0)], ids=["red", "blue"])
+def test_centroids_behind_a_mosaic_do_not_depend_on_colour(order: str, star: tuple) -> None:
+    places = np.stack(np.meshgrid(np.arange(30, 390, 30), np.arange(30, 290, 30)), -1).reshape(
+        -1, 2
+    )
+    places = places + np.random.default_rng(1).uniform(-1.0, 1.0, places.shape)
+    light = star_electrons(places, np.full(len(places), 2.0), SIZE, Optics(psf_sigma_px=1.2))
+    mosaic = np.empty(SIZE[::-1])
+    for number, colour in enumerate(order):
+        cell = slice(number // 2, None, 2), slice(number % 2, None, 2)
+        at = "RGB".index(colour)
+        mosaic[cell] = star[at] * light[cell] + (300.0, 900.0, 500.0)[at]
+    spots = find_spots(grey_of_mosaic(mosaic), psf_sigma_px=1.4)
+    distance, index = cKDTree(spots.centroids_px).query(places)
+    assert distance.max() < 0.12
+    assert np.abs((spots.centroids_px[index] - places).mean(axis=0)).max() < 0.01

@@ -1,0 +1,117 @@
+"""Limits of a search: reach, share of the frame, steps and time; and what is said of them."""
+
+import numpy as np
+import pytest
+from hostile_frames import hostile_frame
+
+from starcat.errors import ConfigError
+from starcat.geometry.camera import Camera
+from starcat.matcher.budget import Budget, BudgetSpentError
+from starcat.matcher.matcher import Matcher
+from starcat.matcher.methods.table import METHODS
+from starcat.matcher.observation import observe
+from starcat.matcher.pose import pose_at
+from starcat.matcher.verification import agree
+from starcat.simulation.simulate import Noise, simulate_frames
+
+
+@pytest.fixture(scope="module")
+def sky(sky_of, random_directions):
+    return sky_of(random_directions(1200, 1))
+
+
+def hard_frames(sky, count, false_stars=3, noise_px=0.3):
+    noise = Noise(noise_px, 0.1, false_stars)
+    return simulate_frames(sky.directions, sky.camera, count, noise, 4, sky.mag)
+
+
+def test_a_wider_tolerance_loses_no_agreement(sky):
+    # 400 false spots: within 16 px of their places most stars have one of them.
+    counts = {}
+    for tolerance_px in (1.0, 4.0, 16.0):
+        counts[tolerance_px] = 0
+        for frame in hard_frames(sky, 12, 400, 0.2):
+            seen = observe(frame.centroids_px, sky.camera, tolerance_px)
+            found = agree(pose_at(frame.matrix, 1.0, seen), seen, sky, 1e-9)
+            counts[tolerance_px] += found.false_match_probability <= 1e-9
+    assert counts[1.0] >= 11
+    assert counts[16.0] >= counts[4.0] >= counts[1.0] - 1
+
+
+def test_a_share_of_the_frame_that_is_too_small_is_told_and_can_be_allowed(
+    sky_of, random_directions
+):
+    # Ten stars of a cluster are seen, and nothing else of all that the camera should see.
+    camera, generator = Camera(1024, 1024, fov_x_deg=12.0), np.random.default_rng(2)
+    cluster_px = 512.0 + generator.uniform(-40.0, 40.0, (10, 2))
+    others_px = generator.uniform(0.0, 1024.0, (30, 2))
+    seen = camera.directions_from_pixels(np.concatenate([cluster_px, others_px]))
+    sky = sky_of(np.concatenate([random_directions(1200, 1), seen]))
+    px = np.concatenate([cluster_px, generator.uniform(0.0, 1024.0, (30, 2))])
+    for min_share, withheld in ((1.0 / 3.0, "share_of_frame"), (0.0, None)):
+        observation = observe(px, camera, 2.0, min_share=min_share)
+        found = agree(pose_at(np.eye(3), 1.0, observation), observation, sky)
+        assert found.withheld == withheld
+        assert 0.0 < found.share < 1.0 / 3.0
+        assert found.n_matched >= 10
+        assert found.chance < 1e-9
+        assert found.false_match_probability == (1.0 if withheld else found.chance)
+
+
+def test_the_reason_of_chance_has_the_best_agreement(sky):
+    for frame in hard_frames(sky, 3, 0):
+        strict = Matcher(sky, engine="numpy", max_false_match_probability=1e-300)
+        refusal = strict.identify(frame.centroids_px).refusal
+        answer = Matcher(sky, engine="numpy").identify(frame.centroids_px)
+        assert (refusal.reason, refusal.n_matched) == ("chance", answer.n_matched)
+        assert 1e-300 < refusal.false_match_probability <= answer.false_match_probability
+
+
+@pytest.mark.parametrize("method", ["triangle", "pairs", "pyramid"])
+def test_the_same_budget_of_steps_gives_the_same_answer(sky, method):
+    px = np.random.default_rng(0).uniform(0.0, 1024.0, (40, 2))
+    refusals = []
+    for _ in range(2):
+        matcher = Matcher(sky, method, max_steps=400)
+        refusals.append(matcher.identify(px).refusal)
+    assert refusals[0] == refusals[1]
+    assert refusals[0].reason == "steps"
+    [frame] = hard_frames(sky, 1)
+    assert Matcher(sky, method, max_steps=100_000).identify(frame.centroids_px).ok
+
+
+def test_no_more_steps_are_taken_than_there_are(sky):
+    budget = Budget(max_steps=700)
+    seen = observe(
+        np.random.default_rng(0).uniform(0.0, 1024.0, (40, 2)), sky.camera, 2.0, budget=budget
+    )
+    proposals = METHODS["triangle"].propose(seen, sky, Matcher(sky).selection)
+    with pytest.raises(BudgetSpentError, match="steps"):
+        list(proposals)
+    assert budget.steps <= 700
+
+
+def test_a_limit_of_time_ends_a_search_that_finds_nothing(sky):
+    px = np.random.default_rng(0).uniform(0.0, 1024.0, (300, 2))
+    result = Matcher(sky, tolerance_px=8.0, time_limit_s=1e-3).identify(px)
+    assert result.refusal.reason == "time"
+    assert "time limit" in repr(result.refusal)
+
+
+def test_limits_that_are_none_are_refused(sky):
+    for given, text in (
+        ({"min_share": 1.5}, "min_share is 1.5; expected 0 to 1"),
+        ({"max_steps": 0}, "max_steps is 0; expected a number above 0"),
+        ({"time_limit_s": float("nan")}, "time_limit_s is nan; expected a number above 0"),
+        ({"engine": "c", "max_steps": 10}, "no other selection, share of the frame and limits"),
+    ):
+        with pytest.raises(ConfigError, match=text):
+            Matcher(sky, **given)
+
+
+def test_frames_that_no_answer_belongs_to_get_none(sky):
+    matcher = Matcher(sky, max_steps=3_000)
+    for number in range(120):
+        kind, px, mag, fov_error = hostile_frame(number, sky)
+        result = matcher.identify(px, magnitudes=mag, fov_error=fov_error)
+        assert not result.ok, (number, kind)
