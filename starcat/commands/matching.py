@@ -12,6 +12,7 @@ from starcat.commands.shared import (
     FailOnNoMatch,
     FieldRange,
     FovError,
+    FrameSize,
     Json,
     JsonLines,
     Mask,
@@ -34,6 +35,7 @@ from starcat.commands.shared import (
     observer_of_options,
     share_of_percent,
     size_in_px,
+    unknown_field,
 )
 
 app = typer.Typer()
@@ -103,6 +105,8 @@ def identify(
         float, typer.Option(min=0.0, max=1.0, help="Less certain answers are withheld.")
     ] = 1e-9,
     fov_error: FovError = None,
+    fov: FieldRange = None,
+    size: FrameSize = None,
     min_share: MinShare = None,
     max_steps: MaxSteps = None,
     time_limit_s: TimeLimit = None,
@@ -131,7 +135,7 @@ def identify(
 
     Example: starcat identify dist/gaia-12deg-1.0.0 frame.csv --picture frame.png
     """
-    from starcat.images.answering import answer_each, measure_input, write_extras
+    from starcat.images.answering import answer_each, camera_of_size, measure_input, write_extras
     from starcat.images.identification import PictureOptions
     from starcat.matcher.centroids import said_of_columns
     from starcat.matcher.matcher import Matcher
@@ -152,8 +156,12 @@ def identify(
     eye = read_camera(camera) if camera else matcher.database.camera
     how = PictureOptions(threshold, psf_sigma_px, most_spots, plane, bayer, dark, mask)
     measured = measure_input(file, flip=flip, wcs=wcs, options=how)
-    error = share_of_percent(fov_error)
-    answered = answer_each(matcher, measured, eye, observer, flip=flip, fov_error=error)
+    error, (size_px, fov_deg) = share_of_percent(fov_error), unknown_field(size, fov, fov_error)
+    if fov_deg is not None:
+        eye = camera_of_size(measured, size_px, eye)
+    answered = answer_each(
+        matcher, measured, eye, observer, flip=flip, fov_error=error, fov_deg=fov_deg
+    )
     told = print_answers(
         answered, matcher.database, as_json=json, as_lines=ndjson, observer=observer
     )

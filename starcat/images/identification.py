@@ -169,6 +169,7 @@ def identify_frames(
     camera: Camera,
     observer: Observer | None = None,
     fov_error: float | None = None,
+    fov_deg: tuple[float, float] | None = None,
 ) -> list[MatchResult]:
     """Identify the frames of a file.
 
@@ -185,6 +186,8 @@ def identify_frames(
     fov_error : float, optional
         Largest relative error of the camera's focal length. By default 2 % for an image, where
         the matcher can find it, and 0 for centroids.
+    fov_deg : pair of float, optional
+        Narrowest and widest field across the width, in place of what the camera says of it.
 
     Returns
     -------
@@ -203,10 +206,12 @@ def identify_frames(
                 f"the image has {width} x {height} px, the camera {camera.width_px} x "
                 f"{camera.height_px}; describe the camera that took it with --camera"
             )
+    if fov_deg is not None:
+        fov_error = 0.0
     if fov_error is None:
         can = matcher.method in SCALE_FREE and matcher.database.image is None
         fov_error = FOV_ERROR_OF_IMAGES if measured.image is not None and can else 0.0
-    identify = partial(matcher.identify, camera=camera, fov_error=fov_error)
+    identify = partial(matcher.identify, camera=camera, fov_error=fov_error, fov_deg=fov_deg)
     if observer is None:
         return [identify(frame.centroids_px, magnitudes=frame.mag) for frame in measured.frames]
     from starcat.sky.spots import identify_in_time
