@@ -61,6 +61,7 @@ bench: $(READY) ## time and memory beside bare parsers and other star trackers, 
 	$(BIN)/python tests/benchmarks/products.py
 	$(BIN)/python tests/benchmarks/matcher.py
 	$(BIN)/python tests/benchmarks/hostile.py
+	$(BIN)/python tests/benchmarks/fields.py
 	$(BIN)/python tests/benchmarks/sql.py
 
 reproduction: $(READY) ## measure what the papers print (half an hour), rewrite docs/reproduction.md

@@ -184,7 +184,15 @@ class DownloadError(SourceError):
 
 
 class BuildError(StarcatError):
-    """A build that ran but has no usable result: no stars left, or a failed self-test."""
+    """A build that ran but has no usable result: no stars left, or a failed self-test.
+
+    After a failed self-test ``built`` is what was made (`starcat.pipeline.build.Built`), whose
+    folder is gone; else it is None.
+    """
+
+    def __init__(self, message: str, *, built: object = None) -> None:
+        super().__init__(message)
+        self.built = built
 
 
 class CalibrationError(StarcatError):

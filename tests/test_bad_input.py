@@ -716,6 +716,11 @@ def _(place: Place) -> Call:
     return place.build("fov_x_deg = 40.0", "fov_x_deg = 4.0")
 
 
+@case("build that does not fit", 1)
+def _(place: Place) -> Call:
+    return [*place.build(), "--max-memory", "0.1"]
+
+
 @case("output below a file", 1)
 def _(place: Place) -> Call:
     place.out = place.write("file", b"") / "dist"

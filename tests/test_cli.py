@@ -480,10 +480,12 @@ def test_selftest(starcat: Run, small_artifact: Path) -> None:
     run = starcat(arguments)
     assert run.code == 0
     assert fits(run.out)
-    assert re.search(r"^clean +0\.5 +0% +0 +20 ", run.out, re.MULTILINE)
+    assert re.search(r"^clean +0\.5 +0\.2 +0% +0 +20 ", run.out, re.MULTILINE)
     rates = json.loads(starcat([*arguments, "--json"]).out)
-    assert [rate["name"] for rate in rates] == ["clean", "hard"]
-    assert [rate["frames"] for rate in rates] == [20, 20]
+    names = ["clean", "hard", "clean, no magnitudes", "hard, no magnitudes"]
+    assert [rate["name"] for rate in rates] == names
+    assert [rate["frames"] for rate in rates] == [20] * 4
+    assert [rate["noise_mag"] for rate in rates] == [0.2, 0.2, None, None]
     assert all(rate["wrong"] == 0 for rate in rates)
 
 

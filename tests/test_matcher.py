@@ -698,7 +698,8 @@ def test_lists_do_as_well_as_arrays(triangles):
 
 
 def test_the_self_test_counts_what_it_sees(triangles):
-    clean, hard = self_test(triangles, frames=20, noise_px=0.2, seed=8)
+    clean, hard, *bare = self_test(triangles, frames=20, noise_px=0.2, seed=8, without_magnitudes=7)
+    assert [(rate.frames, rate.identified, rate.noise_mag) for rate in bare] == [(7, 7, None)] * 2
     assert (clean.name, clean.frames, clean.identified, clean.wrong) == ("clean", 20, 20, 0)
     assert (hard.name, hard.frames, hard.wrong) == ("hard", 20, 0)
     assert clean.identified_share == 1.0

@@ -235,7 +235,9 @@ def test_equal_keys_keep_the_order_of_the_centroids():
 
 @pytest.mark.parametrize("most", [4, 7, 40])
 def test_only_the_first_centroids_take_part(most):
-    found = select_triangles(frame(40, 26), TriangleOrder(min_angle_deg=1.0, most_centroids=most))
+    found = select_triangles(
+        frame(40, 26), TriangleOrder("compact", min_angle_deg=1.0, most_centroids=most)
+    )
     assert found.max() == most - 1
     assert (np.diff(found, axis=1) > 0).all()
 
@@ -243,3 +245,38 @@ def test_only_the_first_centroids_take_part(most):
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_no_triangle_of_fewer_than_three(count):
     assert select_triangles(frame(count, 27)).shape == (0, 3)
+
+
+# --- Crowded frames
+
+
+def test_every_centroid_of_a_crowded_frame_has_its_turn():
+    seen = frame(120, 4)
+    found = select_triangles(seen)
+    # Every triangle has one turn, that of its owner: after 120 of them nearly all have been in one.
+    assert len(set(found[:120].ravel().tolist())) > 100
+    before = select_triangles(seen, TriangleOrder(order="compact"))
+    assert set(before.ravel().tolist()) == set(range(32))
+    assert len({tuple(row) for row in found.tolist()}) == len(found)
+    assert (np.diff(found, axis=1) > 0).all()
+
+
+def test_triangles_of_a_crowded_frame_are_of_near_centroids():
+    seen = frame(80, 5)
+    for row in select_triangles(seen).tolist():
+        apart = seen.separation_rad[np.ix_(row, row)]
+        nearer = [(seen.separation_rad[star] < apart[n].max()).sum() for n, star in enumerate(row)]
+        assert min(nearer) <= 21
+
+
+@pytest.mark.parametrize(("count", "magnitudes"), [(32, False), (60, True)])
+def test_other_frames_are_as_they_were(count, magnitudes):
+    seen = frame(count, 6, magnitudes)
+    order = TriangleOrder(order="brightness" if magnitudes else "compact")
+    assert select_triangles(seen).tolist() == select_triangles(seen, order).tolist()
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 4])
+def test_few_centroids_can_be_spread(count):
+    found = select_triangles(frame(count, 1), TriangleOrder(order="spread", min_angle_deg=0.0))
+    assert len(found) == math.comb(count, 3)

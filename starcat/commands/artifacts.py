@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from starcat.commands.shared import Input, Json, chosen_spec, inputs_by_source
-from starcat.errors import ConfigError, ProductError
+from starcat.errors import BuildError, ConfigError, ProductError
 
 app = typer.Typer()
 
@@ -35,21 +35,33 @@ def build(
     workers: Annotated[
         int, typer.Option(min=1, max=64, help="Threads; the artifact is the same for any number.")
     ] = 2,
+    max_memory: Annotated[
+        float | None,
+        typer.Option(min=0.1, help="GiB; refuse a build that takes more. Default: what is left."),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Build a guide-star database, check it, and prove that it identifies its own fields.
 
     Example: starcat build --preset gaia-12deg -o dist
     """
+    from starcat.pipeline.build import Built
     from starcat.pipeline.build import build as run_build
-    from starcat.terminal.builds import print_built
+    from starcat.terminal.builds import print_built, print_cost, print_refused
     from starcat.terminal.console import progress_bars
 
     given, chosen = inputs_by_source(inputs), chosen_spec(spec, preset, changes)
-    with progress_bars() as progress:
-        built = run_build(
-            chosen, given, output, replace=replace, workers=workers, progress=progress
-        )
+    most = None if max_memory is None else int(max_memory * 2**30)
+    try:
+        with progress_bars() as progress:
+            built = run_build(
+                chosen, given, output, replace=replace, workers=workers, progress=progress,
+                announce=print_cost, max_memory_bytes=most,
+            )  # fmt: skip
+    except BuildError as error:
+        if isinstance(error.built, Built):
+            print_refused(error.built, as_json=json)
+        raise
     print_built(built, as_json=json)
 
 

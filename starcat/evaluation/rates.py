@@ -10,6 +10,7 @@ from typing import Any
 import duckdb
 
 from starcat.matcher.matcher import CERTAIN
+from starcat.simulation.interval import wilson_interval
 
 _ACCEPTED = f"status = 'identified' AND false_match_probability <= {CERTAIN!r}"
 _HOLDS = "coalesce(attitude_error_px <= $reach_px, false)"
@@ -58,9 +59,6 @@ WHERE NOT ({rule})
 GROUP BY cause
 """
 
-Z95 = 1.959963984540054
-"""Standard deviations of a two-sided interval of 95 %."""
-
 
 @dataclass(frozen=True)
 class Share:
@@ -82,18 +80,9 @@ class Share:
 
     @property
     def interval_percent(self) -> tuple[float, float]:
-        """Wilson's interval of 95 %, in percent; all of 0 to 100 for no frames.
-
-        References
-        ----------
-        Wilson 1927, Journal of the American Statistical Association 22, 209.
-        """
-        if not self.count:
-            return 0.0, 100.0
-        p, n, z2 = self.hits / self.count, self.count, Z95 * Z95
-        middle = (p + 0.5 * z2 / n) / (1.0 + z2 / n)
-        half = Z95 / (1.0 + z2 / n) * (p * (1.0 - p) / n + 0.25 * z2 / (n * n)) ** 0.5
-        return 100.0 * max(0.0, middle - half), 100.0 * min(1.0, middle + half)
+        """Wilson's interval of 95 %, in percent; all of 0 to 100 for no frames."""
+        least, most = wilson_interval(self.hits, self.count)
+        return 100.0 * least, 100.0 * most
 
     def as_dict(self) -> dict[str, Any]:
         """Return the share as plain values.

@@ -35,11 +35,11 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-MOST_CENTROIDS = 60
+MOST_CENTROIDS = 40
 """Brightest centroids of a frame that are compared with a level, which has about 20 stars a field
 of its size, and 40 a frame that is wider by half."""
 
-BRIGHTEST = TriangleOrder(most_centroids=12)
+BRIGHTEST = TriangleOrder(most_centroids=10)
 """Triangles where magnitudes are known: those of the stars that a level's triangles are of."""
 
 BY_CHANCE = 1.0

@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.geometry.zones import Zones, zones_of
 from starcat.matcher.budget import AGREEMENT
 from starcat.matcher.chance import MIN_STARS, false_match_probability
 from starcat.matcher.database import Database
@@ -61,6 +62,9 @@ FOCAL_MARGIN = 0.02
 
 MAX_REFINEMENTS = 4
 """Largest number of refinements; after the first one the matched stars rarely change."""
+
+MANY_STARS = 15_000
+"""So many stars are searched by zones; a product of all is faster for fewer."""
 
 AT_ONCE = 256
 """Number of candidates whose agreeing centroids are counted together."""
@@ -236,6 +240,17 @@ def _cells(database: Database, reach_rad: float) -> StarCells:
     return star_cells(database.directions, reach_rad)
 
 
+def _near(axis: Array, radius_rad: float, database: Database) -> NDArray[np.int64]:
+    """Return the stars around an axis."""
+    if len(database.directions) < MANY_STARS:
+        return np.flatnonzero(database.directions @ axis >= math.cos(radius_rad))
+    return database.derived(_zones).near(axis, radius_rad)
+
+
+def _zones(database: Database) -> Zones:
+    return zones_of(database.directions)
+
+
 def agree(
     pose: Pose, observation: Observation, database: Database, certain: float = 1.0
 ) -> Agreement:
@@ -359,7 +374,7 @@ def _refined(
     radius_rad = pose.camera.radius_rad
     if observation.fov_error:
         radius_rad *= 1.0 + FOCAL_MARGIN
-    near = np.flatnonzero(database.directions @ pose.matrix[2] >= math.cos(radius_rad))
+    near = _near(pose.matrix[2], radius_rad, database)
     u = database.directions[near]
     compatible = None
     if observation.mag is not None and observation.noise_mag is not None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import replace as changed
 from pathlib import Path
@@ -25,15 +25,17 @@ from starcat.catalog.stars import directions_of, sort_rows
 from starcat.catalog.variability import AmplitudeTable, join_amplitudes, read_amplitudes
 from starcat.errors import BuildError, ConfigError
 from starcat.matcher.matcher import Matcher
+from starcat.pipeline.cost import Cost, check_memory, estimate_cost
 from starcat.pipeline.counterparts import match_catalogs
 from starcat.pipeline.facts import (
     FilterCoverage,
     Results,
     build_facts,
-    filter_coverage,
+    filter_coverages,
     source_facts,
 )
 from starcat.pipeline.guide_stars import select_stars
+from starcat.pipeline.judgement import advice_without_magnitudes, check_rates
 from starcat.pipeline.log import Stopwatch, write_build_log
 from starcat.pipeline.recipes import (
     RECIPES,
@@ -53,6 +55,10 @@ from starcat.store.reading import read_catalog
 from starcat.tables.schema import product_schema
 
 Inputs = Mapping[str, Sequence[Path]]
+
+WITHOUT_MAGNITUDES = 50
+"""So many frames of each kind are also identified without magnitudes, at the most: where that is
+hopeless, each takes half a second."""
 
 _logger = logging.getLogger(__name__)
 
@@ -74,7 +80,7 @@ class Built:
     coverage : CoverageReport
         Coverage by the guide stars.
     rates : tuple of Rates
-        Rates of the self-test: clean and hard frames.
+        Rates of the self-test: clean and hard frames, and the same without magnitudes.
     problems : tuple of str
         The first malformed records.
     warnings : tuple of str
@@ -88,14 +94,14 @@ class Built:
     manifest: dict[str, Any]
     filters: tuple[FilterCoverage, ...]
     coverage: CoverageReport
-    rates: tuple[Rates, Rates]
+    rates: tuple[Rates, ...]
     problems: tuple[str, ...]
     warnings: tuple[str, ...]
     times_s: dict[str, float]
 
     def __repr__(self) -> str:
         """Return the artifact and how it identifies in one line."""
-        clean, hard = self.rates
+        clean, hard = self.rates[:2]
         stars = self.manifest["products"]["stars"]["rows"]
         return (
             f"<Built {self.folder} ({self.outcome}): {stars:,} guide stars, identified "
@@ -111,6 +117,8 @@ def build(
     replace: bool = False,
     workers: int = 2,
     progress: Progress = no_progress,
+    announce: Callable[[Cost], None] | None = None,
+    max_memory_bytes: int | None = None,
 ) -> Built:
     """Build an artifact.
 
@@ -128,6 +136,11 @@ def build(
         Threads; the artifact is the same for any number.
     progress : Progress
         Called with (stage, done, total).
+    announce : callable, optional
+        Called with what the products will cost, before any is made.
+    max_memory_bytes : int, optional
+        A build that would take more is refused before it begins. By default what the machine has
+        left.
 
     Returns
     -------
@@ -137,33 +150,49 @@ def build(
     Raises
     ------
     ConfigError, SourceError, BuildError, OutputError
-        If the spec or an input cannot be used, too few stars are left, the database cannot
-        identify its own fields, or the output cannot be written.
+        If the spec or an input cannot be used, too few stars are left, the products would not
+        fit into the memory, the database cannot identify its own fields, or the output cannot be
+        written. After a failed self-test the error has what was made as its ``built``.
     """
     final = output / f"{spec.name}-{spec.version}"
     clock = Stopwatch()
     with whole_folder(final) as partial:
-        made = _make(partial, spec, inputs, workers, clock, progress)
+        plan = _Plan(spec, inputs, workers, announce, max_memory_bytes)
+        made = _make(partial, plan, clock, progress)
         progress("verify", 0, None)
-        outcome = _release(partial, final, spec, made.rates, replace=replace)
+        check_artifact(partial)
+        try:
+            check_rates(made.rates, spec, made.coverage.gap)
+        except BuildError as error:
+            raise BuildError(str(error), built=made) from None
+        outcome = move_into_place(partial, final, replace=replace)
         clock.lap("verify")
     write_build_log(final, outcome, clock.times_s)
     return changed(made, folder=final, outcome=outcome, times_s=clock.times_s)
 
 
-def _make(
-    partial: Path,
-    spec: BuildSpec,
-    inputs: Inputs,
-    workers: int,
-    clock: Stopwatch,
-    progress: Progress,
-) -> Built:
+@dataclass(frozen=True)
+class _Plan:
+    """What was asked for."""
+
+    spec: BuildSpec
+    inputs: Inputs
+    workers: int
+    announce: Callable[[Cost], None] | None
+    max_memory_bytes: int | None
+
+
+def _make(partial: Path, plan: _Plan, clock: Stopwatch, progress: Progress) -> Built:
     """Go through all stages up to the manifest, in a folder that has no name yet."""
+    spec, inputs, workers = plan.spec, plan.inputs, plan.workers
     catalog, amplitudes = read_sources(spec, inputs, workers, progress)
     stars, joined = _join_all(catalog.stars, amplitudes)
     clock.lap("read")
     selected, fields = select_stars(stars, spec)
+    cost = estimate_cost(catalog, selected, fields, spec)
+    if plan.announce is not None:
+        plan.announce(cost)
+    check_memory(cost, spec, plan.max_memory_bytes)
     clock.lap("select")
     products = make_products(spec, catalog, selected, fields, progress)
     matched = match_catalogs(stars, selected, spec, inputs, workers, progress)
@@ -175,24 +204,22 @@ def _make(
     clock.lap("self-test")
     progress("report", 0, None)
     sources = [*source_facts(catalog, selected, amplitudes, joined), *matched.sources]
-    filters = tuple(filter_coverage(step, spec) for step in selected.steps)
+    filters = filter_coverages(selected.steps, fields, spec)
     results = Results(spec, sources, products, facts, fields, filters, rates)
     report = report_build(partial, results)
     clock.lap("report")
     manifest = write_manifest(partial, spec.recorded(), sources, facts)
-    told = dict.fromkeys((*catalog.notes, *matched.notes, holes_warning(report.gap)))
+    told = dict.fromkeys(
+        (
+            *catalog.notes,
+            *matched.notes,
+            holes_warning(report.gap),
+            advice_without_magnitudes(rates, spec),
+        )
+    )
     warnings = tuple(filter(None, told))
     problems = catalog.problems
     return Built(partial, "written", manifest, filters, report, rates, problems, warnings, {})
-
-
-def _release(
-    partial: Path, final: Path, spec: BuildSpec, rates: tuple[Rates, Rates], *, replace: bool
-) -> Outcome:
-    """Read a finished artifact back, hold it against its spec and give it its name."""
-    check_artifact(partial)
-    check_rates(rates, spec)
-    return move_into_place(partial, final, replace=replace)
 
 
 def read_sources(
@@ -363,7 +390,7 @@ def database_facts(spec: BuildSpec) -> dict[str, str | float]:
     }
 
 
-def run_self_test(folder: Path, spec: BuildSpec, progress: Progress) -> tuple[Rates, Rates]:
+def run_self_test(folder: Path, spec: BuildSpec, progress: Progress) -> tuple[Rates, ...]:
     """Identify simulated fields with a database.
 
     Parameters
@@ -377,37 +404,17 @@ def run_self_test(folder: Path, spec: BuildSpec, progress: Progress) -> tuple[Ra
 
     Returns
     -------
-    clean, hard : Rates
-        How they fared.
+    tuple of Rates
+        How they fared, as `starcat.simulation.selftest.self_test` says.
     """
     test = spec.self_test
     matcher = Matcher.open(folder, None, tolerance_px=max(0.5, 4.0 * test.noise_px), engine="numpy")
-    return self_test(matcher, test.frames, test.noise_px, test.seed, progress)
-
-
-def check_rates(rates: tuple[Rates, Rates], spec: BuildSpec) -> None:
-    """Check that a database identifies its own fields.
-
-    Parameters
-    ----------
-    rates : tuple of Rates
-        Rates of the self-test.
-    spec : BuildSpec
-        ``self_test.min_identified``.
-
-    Raises
-    ------
-    BuildError
-        If the clean frames fall short, or any answer was wrong.
-    """
-    clean = rates[0]
-    if clean.identified_share < spec.self_test.min_identified:
-        raise BuildError(
-            f"{spec.name}: the database identifies {clean.identified} of {clean.identifiable} "
-            f"simulated fields with at least 4 stars ({clean.frames} in all); "
-            f"self_test.min_identified asks for {spec.self_test.min_identified:.1%}. A fainter "
-            "faint_limit_mag or a wider camera gives more stars a field"
-        )
-    wrong = sum(rate.wrong for rate in rates)
-    if wrong:
-        raise BuildError(f"{spec.name}: {wrong} simulated fields got a wrong answer")
+    return self_test(
+        matcher,
+        test.frames,
+        test.noise_px,
+        test.seed,
+        progress,
+        noise_mag=test.noise_mag,
+        without_magnitudes=WITHOUT_MAGNITUDES,
+    )

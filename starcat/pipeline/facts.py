@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from starcat.artifact.manifest import (
     DATABASE_NAME,
@@ -71,14 +72,21 @@ def filter_coverage(step: Step, spec: BuildSpec) -> FilterCoverage:
     FilterCoverage
         One line of the table of filters.
     """
-    fields = tile_sphere(
+    return _filter_coverage(step, _counts(step, spec))
+
+
+def _counts(step: Step, spec: BuildSpec) -> NDArray[np.int64]:
+    """Return the stars in each field of the tiling."""
+    return tile_sphere(
         spec.boresights.count,
         step.directions,
         np.zeros(len(step.directions)),
         field_size(spec),
         spec.boresights.field,
-    )
-    count = fields.count
+    ).count
+
+
+def _filter_coverage(step: Step, count: NDArray[np.int64]) -> FilterCoverage:
     return FilterCoverage(
         step.name,
         len(step.directions),
@@ -86,6 +94,34 @@ def filter_coverage(step: Step, spec: BuildSpec) -> FilterCoverage:
         int(count.min()),
         round(float((count < MIN_GUIDE_STARS).mean()), 9),
     )
+
+
+def filter_coverages(
+    steps: Sequence[Step], fields: FieldStars, spec: BuildSpec
+) -> tuple[FilterCoverage, ...]:
+    """Count what each filter leaves in the fields of the tiling.
+
+    Parameters
+    ----------
+    steps : sequence of Step
+        The stars left by each filter, a part of those before it.
+    fields : FieldStars
+        The tiling of the stars that the last one left.
+    spec : BuildSpec
+        The tiling.
+
+    Returns
+    -------
+    tuple of FilterCoverage
+        One a filter. Fields are counted anew only where stars were left out.
+    """
+    found: dict[int, FilterCoverage] = {}
+    for step in steps:
+        stars = len(step.directions)
+        if stars not in found:
+            count = fields.count if stars == len(steps[-1].directions) else _counts(step, spec)
+            found[stars] = _filter_coverage(step, count)
+    return tuple(replace(found[len(step.directions)], step=step.name) for step in steps)
 
 
 def coverage_report(coverage: Coverage, spec: BuildSpec) -> CoverageReport:

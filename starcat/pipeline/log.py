@@ -60,6 +60,30 @@ def peak_memory_bytes() -> int | None:
     return peak if sys.platform == "darwin" else 1024 * peak
 
 
+def available_memory_bytes() -> int | None:
+    """Return how much memory this process may have in all.
+
+    Returns
+    -------
+    int or None
+        What it has, and what the machine and the group of processes that it is in have left; all
+        memory of the machine where only that is known, None where the system does not say.
+    """
+    try:
+        fields = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
+        own = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        left = 1024 * int(fields["MemAvailable"].split()[0]) + own
+    except (OSError, KeyError, ValueError, IndexError):
+        try:
+            return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        except (AttributeError, OSError, ValueError):
+            return None
+    try:
+        return min(left, int(Path("/sys/fs/cgroup/memory.max").read_text()))
+    except (OSError, ValueError):  # no group, or one without a limit
+        return left
+
+
 def write_build_log(artifact: Path, outcome: str, times_s: Mapping[str, float]) -> Path:
     """Write the log of a build beside its artifact.
 

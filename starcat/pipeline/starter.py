@@ -1,4 +1,8 @@
-"""A first spec for a camera: the limit, the tiling, and how many stars a field then has."""
+"""A first spec for a camera: the limit, the tiling, the density, and what a field then has.
+
+A matcher looks up triangles, and a database holds those of the brightest stars of each field. So
+the stars are thinned to few more than these, and a frame has hardly any without triangles.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +17,11 @@ import pyarrow as pa
 
 from starcat.catalog.fetching.locate import locate
 from starcat.catalog.ingest import ingest
-from starcat.catalog.selection import select_guide_stars
+from starcat.catalog.selection import reject_dense, select_guide_stars
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.errors import OutputError
-from starcat.pipeline.recipes import field_size, tile_guide_stars
+from starcat.pipeline.cost import BASE_BYTES, CATALOG_FACTOR, Cost, product_cost
+from starcat.pipeline.recipes import RECIPES, Ingredients, field_size, tile_guide_stars
 from starcat.products.boresights import tile_sphere
 from starcat.products.coverage import Spread, field_coverage, summarise_coverage
 from starcat.progress import Progress, no_progress
@@ -30,8 +35,26 @@ SOURCE, BAND = "gaia", "G"
 EPOCH_JYEAR = 2016.0
 """Of the embedded sky, whose stars have no proper motions."""
 
-ENOUGH_STARS = 8
-"""So many stars in the emptiest hundredth of the fields leave some when spots are missing."""
+ENOUGH_STARS = 10
+"""So many stars in nearly every field leave some when spots are missing."""
+
+ENOUGH_SHARE = 0.995
+"""Share of the fields that have as many."""
+
+BRIGHTEST = 10
+"""Stars of a field that make its triangles, 120 of ten."""
+
+STARS_A_FIELD = 12
+"""The spec thins to so many: the brightest of every field of the tiling."""
+
+OVERLAP = 4
+"""Times as many boresights as leave no hole, so that frames at any roll find their triangles."""
+
+MEMORY_BYTES, SECONDS = 1.6e9, 15.0
+"""A spec leaves out products, but never the triangles, of which the estimate is higher."""
+
+MANY_FIELDS = 5
+"""A camera that sees so many times more stars than the database holds should know the brightest."""
 
 _STEPS_MAG = (-1.0, -0.5, 0.0, 0.5, 1.0)
 _SPREAD_PX = 4.0
@@ -69,11 +92,23 @@ class Starter:
         The spec's own limit, and some that are brighter and fainter.
     deepest_mag : float
         Faintest star of the catalog; fainter limits add none.
+    thinned : LimitRow
+        What the spec's thinning leaves at its own limit.
+    cost : Cost
+        What the build will cost, by estimate.
     """
 
     spec: BuildSpec
     limits: tuple[LimitRow, ...]
     deepest_mag: float
+    thinned: LimitRow
+    cost: Cost
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Products that the camera could use, and that would cost too much."""
+        products = self.spec.products
+        return tuple(name for name in RECIPES if not getattr(products, name).enabled)
 
     @property
     def own(self) -> LimitRow:
@@ -98,7 +133,7 @@ def starter_spec(
         The camera.
     faint_limit_mag : float, optional
         What the camera sees, Gaia's G. By default the limit that leaves at least
-        `ENOUGH_STARS` stars in 99 of 100 fields, a tenth of a magnitude at a time.
+        `ENOUGH_STARS` stars in `ENOUGH_SHARE` of the fields, a tenth of a magnitude at a time.
     progress : Progress
         Passed on.
 
@@ -118,11 +153,11 @@ def starter_spec(
     shape = _spec(name, camera, float(mag[-1]))
     limit = faint_limit_mag
     if limit is None:
-        limit = min(_enough(sky, shape), round(float(mag[-1]), 1))
-    spec = _spec(name, camera, limit)
+        limit = _enough(sky, shape)
+    spec, thinned, cost = _affordable(sky, _spec(name, camera, limit))
     limits = sorted({round(limit + step, 2) for step in _STEPS_MAG} | {limit})
     rows = [_row(sky, _spec(name, camera, one)) for one in limits if one <= mag[-1] or one == limit]
-    return Starter(spec, tuple(rows), float(mag[-1]))
+    return Starter(spec, tuple(rows), float(mag[-1]), thinned, cost)
 
 
 def write_starter(starter: Starter, path: Path, *, replace: bool) -> None:
@@ -159,8 +194,8 @@ def boresight_count(camera: CameraSpec) -> int:
     Returns
     -------
     int
-        Eight times as many as leave no hole between the circles inside the fields, from 2,000
-        to 50,000; more only where a hole would be left.
+        `OVERLAP` times as many as leave no hole between the circles inside the fields, from 2,000
+        to 30,000; more only where a hole would be left.
 
     Notes
     -----
@@ -168,7 +203,7 @@ def boresight_count(camera: CameraSpec) -> int:
     this distance shrinks with the root of their number.
     """
     least = 1.05 * 10_000 * (1.5 / camera.half_field_deg) ** 2
-    wanted = max(least, min(8.0 * least, 50_000.0))
+    wanted = max(least, min(OVERLAP * least, 30_000.0))
     return int(np.clip(100 * np.ceil(wanted / 100.0), 2000, 1_000_000))
 
 
@@ -183,6 +218,7 @@ def _spec(name: str, camera: CameraSpec, faint_limit_mag: float) -> BuildSpec:
         "catalog": {"source": SOURCE, "band": BAND},
         "selection": {
             "faint_limit_mag": faint_limit_mag,
+            "max_stars_per_field": STARS_A_FIELD,
             "doubles": {
                 "min_separation_deg": float(
                     f"{min(10.0, _SPREAD_PX * field.fov_x_deg / field.width_px):.2g}"
@@ -191,13 +227,36 @@ def _spec(name: str, camera: CameraSpec, faint_limit_mag: float) -> BuildSpec:
             },
         },
         "camera": camera.model_dump(exclude_none=True),
-        "boresights": {"count": boresight_count(camera)},
+        "boresights": {"count": boresight_count(camera), "brightest": BRIGHTEST},
     }
     return BuildSpec.model_validate(content)
 
 
+def _affordable(sky: pa.Table, spec: BuildSpec) -> tuple[BuildSpec, LimitRow, Cost]:
+    """Return a spec without the products that cost too much, what thinning leaves, and the cost."""
+    selected = select_guide_stars(sky, spec.selection)
+    fields = tile_guide_stars(selected.guide_stars, spec)
+    _, brightest = fields.brightest(STARS_A_FIELD)
+    guide_stars = reject_dense(selected, brightest).guide_stars
+    fields = tile_guide_stars(guide_stars, spec)
+    base = BASE_BYTES + CATALOG_FACTOR * sky.nbytes
+    directions = directions_of(guide_stars)
+    cost = product_cost(Ingredients(directions, fields, spec), base)
+    while cost.memory_bytes > MEMORY_BYTES or cost.seconds > SECONDS:
+        others = [name for name in cost.rows if name != "triangles"]
+        if not others:
+            break
+        costly = max(others, key=lambda name: cost.bytes[name])
+        content = spec.model_dump(mode="json")
+        content["products"][costly]["enabled"] = False
+        spec = BuildSpec.model_validate(content)
+        cost = product_cost(Ingredients(directions, fields, spec), base)
+    stars = summarise_coverage(field_coverage(fields, BRIGHTEST)).stars
+    return spec, LimitRow(spec.selection.faint_limit_mag, len(guide_stars), stars), cost
+
+
 def _enough(sky: pa.Table, spec: BuildSpec) -> float:
-    """Return the limit that leaves enough stars in 99 of 100 fields."""
+    """Return the limit that leaves enough stars in nearly all fields."""
     field = spec.camera.camera()
     fields = 4.0 * np.pi / np.radians(field.fov_x_deg) / np.radians(field.fov_y_deg)
     mag = floats_of(sky, "mag")
@@ -210,8 +269,8 @@ def _enough(sky: pa.Table, spec: BuildSpec) -> float:
     faintest = np.full(len(tiled.count), np.inf)
     rows = tiled.star_index[tiled.offsets[:-1][has_enough] + ENOUGH_STARS - 1]
     faintest[has_enough] = mag[near][rows]
-    limit = float(np.sort(faintest)[int(0.99 * len(faintest))])
-    return float(np.ceil(limit * 10.0) / 10.0) if np.isfinite(limit) else float(mag.max())
+    limit = float(np.sort(faintest)[int(ENOUGH_SHARE * len(faintest))])
+    return float(np.ceil(min(limit, float(mag.max())) * 10.0) / 10.0)
 
 
 def _row(sky: pa.Table, spec: BuildSpec) -> LimitRow:
@@ -236,20 +295,31 @@ def advice(starter: Starter) -> Sequence[str]:
         One sentence each; empty where the limit is a good one.
     """
     own, told = starter.own, []
-    if starter.spec.selection.faint_limit_mag > starter.deepest_mag:
+    if starter.spec.selection.faint_limit_mag > starter.deepest_mag + 0.1:
         told.append(
             f"the embedded sky ends at {BAND} = {starter.deepest_mag:.2f}; take a deeper catalog "
             "for a fainter limit"
         )
-    if own.stars.one_percent < ENOUGH_STARS:
+    if own.stars.one_percent < ENOUGH_STARS - 2:
         told.append(
             f"1 % of the fields have {own.stars.one_percent} stars or fewer; a frame needs 4, and "
-            f"{ENOUGH_STARS} leave some where spots are missing: a fainter limit gives more"
+            f"{ENOUGH_STARS} leave some where spots are missing: "
+            + (
+                "the embedded sky has no fainter ones, so many frames will have no answer"
+                if own.faint_limit_mag >= starter.deepest_mag
+                else "a fainter limit gives more"
+            )
         )
-    if own.stars.median > 10 * ENOUGH_STARS:
+    if own.stars.median > MANY_FIELDS * STARS_A_FIELD:
         told.append(
-            f"the middle field has {own.stars.median} stars, many more than a matcher uses: a "
-            "brighter limit, or selection.max_stars_per_field, makes the database smaller and "
-            "its answers faster"
+            f"the middle field has {own.stars.median} stars up to the limit, and the database "
+            f"keeps the {STARS_A_FIELD} brightest of each field "
+            "(selection.max_stars_per_field): give the matcher the brightness of the spots, so "
+            "that it begins with these"
+        )
+    if starter.left_out:
+        told.append(
+            f"left out, as they would cost too much: {', '.join(starter.left_out)}; "
+            "products.<name>.enabled = true makes them"
         )
     return told

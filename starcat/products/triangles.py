@@ -24,6 +24,9 @@ Array = NDArray[np.float64]
 _PACKED_BITS = 21
 """Three row numbers of so many bits fit into one int64."""
 
+AT_ONCE = 1 << 19
+"""Number of triangles whose features are computed together."""
+
 
 @dataclass(frozen=True)
 class Triangles:
@@ -79,15 +82,7 @@ def find_triangles(fields: FieldStars, directions: Array, brightest: int) -> Tri
     Liao and Zhang 2024 (S4), eqs. 4 and 7.
     """
     stars, seen = distinct_triangles(fields, len(directions), brightest)
-    u, v, w = (directions[stars[:, n]] for n in range(3))
-    a, b, c = separation(v, w), separation(u, w), separation(u, v)
-    area = triangle_area(a, b, c)
-    circumradius = np.full(len(area), np.inf)
-    inradius = np.zeros(len(area))
-    real = area > 0.0
-    np.divide(a * b * c, 4.0 * area, out=circumradius, where=real)
-    np.divide(2.0 * area, a + b + c, out=inradius, where=real)
-    narrow = area.astype(np.float32)
+    narrow, circumradius, inradius = _features(stars, directions)
     # The triangles come in order of (i, j, k), which a stable sort keeps for equal areas.
     order = np.argsort(narrow, kind="stable")
     kvector = kvector_index(build_kvector(narrow[order].astype(np.float64)))
@@ -97,11 +92,30 @@ def find_triangles(fields: FieldStars, directions: Array, brightest: int) -> Tri
         j,
         k,
         narrow[order],
-        circumradius[order].astype(np.float32),
-        inradius[order].astype(np.float32),
+        circumradius[order],
+        inradius[order],
         seen[order].astype(np.int32),
         Index(kvector.datasets, {**kvector.attributes, "records": float(seen.sum())}),
     )
+
+
+def _features(
+    stars: NDArray[np.int64], directions: Array
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Return area, circumradius and inradius of triangles, some at a time to save memory."""
+    found = np.empty((3, len(stars)), dtype=np.float32)
+    for first in range(0, len(stars), AT_ONCE):
+        part = slice(first, first + AT_ONCE)
+        u, v, w = (directions[stars[part, n]] for n in range(3))
+        a, b, c = separation(v, w), separation(u, w), separation(u, v)
+        area = triangle_area(a, b, c)
+        circumradius = np.full(len(area), np.inf)
+        inradius = np.zeros(len(area))
+        real = area > 0.0
+        np.divide(a * b * c, 4.0 * area, out=circumradius, where=real)
+        np.divide(2.0 * area, a + b + c, out=inradius, where=real)
+        found[:, part] = area, circumradius, inradius
+    return found[0], found[1], found[2]
 
 
 def distinct_triangles(

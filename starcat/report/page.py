@@ -236,12 +236,18 @@ def _products(products: Mapping[str, Mapping[str, Any]], database_bytes: int) ->
 
 def _self_test(rates: Sequence[Mapping[str, Any]]) -> str:
     names = (
-        "name", "noise_px", "drop_probability", "false_stars", "frames", "identifiable",
-        "identified", "wrong", "median_residual_arcsec",
+        "name", "noise_px", "noise_mag", "drop_probability", "false_stars", "frames",
+        "identifiable", "identified", "wrong", "median_residual_arcsec",
     )  # fmt: skip
-    rows = [(*(rate[name] for name in names), f"{rate['identified_share']:.2%}") for rate in rates]
+    rows = [
+        (
+            *("" if rate[name] is None else rate[name] for name in names),
+            f"{rate['identified_share']:.2%}",
+        )
+        for rate in rates
+    ]
     heads = (
-        "fields", "noise, px", "missing", "false", "tried", "4 stars or more", "right", "wrong",
-        "residual, arcsec", "rate",
+        "fields", "noise, px", "noise, mag", "missing", "false", "tried", "4 stars or more",
+        "right", "wrong", "residual, arcsec", "rate",
     )  # fmt: skip
-    return table("Simulated fields", heads, rows, range(1, 10))
+    return table("Simulated fields", heads, rows, range(1, 11))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,12 @@ from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.progress import Progress, no_progress
+from starcat.simulation.interval import wilson_interval
 from starcat.simulation.simulate import Frame, Noise, simulate_frames
+
+NOISE_MAG = 0.2
+"""Standard deviation of a magnitude that a camera measures of a star, unless a spec says another:
+the colour of a star alone makes so much of a difference between two bands."""
 
 HARD = {"drop_probability": 0.1, "false_stars": 3}
 """What the harder half of the self-test adds to the noise of the spec."""
@@ -26,33 +30,44 @@ class Rates:
     Attributes
     ----------
     name : str
-        Which frames: ``clean`` or ``hard``.
+        Which frames: ``clean`` or ``hard``, and ``, no magnitudes`` where none were given.
     noise_px, drop_probability : float
         What they suffered.
     false_stars : int
         The same.
+    noise_mag : float or None
+        Standard deviation of the magnitudes; None where none were given.
     frames, identifiable : int
         All, and those with at least 4 stars.
     identified, wrong : int
         Identified rightly; answered with a wrong star or attitude.
     median_residual_arcsec : float
         Median over the identified frames; 0 where there are none.
+    missed : tuple of int
+        Stars in each of the identifiable frames that were not identified rightly.
     """
 
     name: str
     noise_px: float
     drop_probability: float
     false_stars: int
+    noise_mag: float | None
     frames: int
     identifiable: int
     identified: int
     wrong: int
     median_residual_arcsec: float
+    missed: tuple[int, ...] = ()
 
     @property
     def identified_share(self) -> float:
         """Identified over identifiable; 0 where no frame can be."""
         return self.identified / self.identifiable if self.identifiable else 0.0
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Wilson's interval of 95 % of that share; 0 to 1 where no frame can be identified."""
+        return wilson_interval(self.identified, self.identifiable)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the rates as the report holds them.
@@ -62,12 +77,27 @@ class Rates:
         dict
             Plain values.
         """
-        return {**asdict(self), "identified_share": round(self.identified_share, 6)}
+        content = asdict(self)
+        del content["missed"]
+        least, most = (round(end, 6) for end in self.interval)
+        return {
+            **content,
+            "identified_share": round(self.identified_share, 6),
+            "least_share": least,
+            "most_share": most,
+        }
 
 
 def self_test(
-    matcher: Matcher, frames: int, noise_px: float, seed: int, progress: Progress = no_progress
-) -> tuple[Rates, Rates]:
+    matcher: Matcher,
+    frames: int,
+    noise_px: float,
+    seed: int,
+    progress: Progress = no_progress,
+    *,
+    noise_mag: float = NOISE_MAG,
+    without_magnitudes: int | None = None,
+) -> tuple[Rates, ...]:
     """Identify simulated fields with the database that they were simulated from.
 
     Parameters
@@ -82,55 +112,81 @@ def self_test(
         Seed of the attitudes and the noise.
     progress : Progress
         Called with ("self-test", frames done, frames in all).
+    noise_mag : float
+        Standard deviation of the magnitudes that are given with the centroids. False spots have
+        those of stars drawn from the database.
+    without_magnitudes : int, optional
+        So many of the same frames are also identified without magnitudes; all by default.
 
     Returns
     -------
-    clean, hard : Rates
-        Rates with noise only, and with stars missing and false ones beside it.
+    tuple of Rates
+        Clean frames, which have noise only, and hard ones, with stars missing and false ones
+        beside it; then the same two without magnitudes.
     """
     kinds = {"clean": Noise(noise_px), "hard": Noise(noise_px, **HARD)}  # type: ignore[arg-type]
-    made = []
+    bare = frames if without_magnitudes is None else min(frames, without_magnitudes)
+    with_mag, without = [], []
     for step, (name, noise) in enumerate(kinds.items()):
+        counts = _Count(name, noise, noise_mag), _Count(f"{name}, no magnitudes", noise, None)
         simulated = simulate_frames(
-            matcher.database.directions, matcher.database.camera, frames, noise, seed
+            matcher.database.directions,
+            matcher.database.camera,
+            frames,
+            replace(noise, noise_mag=noise_mag),
+            seed,
+            matcher.database.mag,
         )
-        done = step * frames
-        made.append(_rates(matcher, name, noise, simulated, progress, done, 2 * frames))
-    return made[0], made[1]
+        for number, frame in enumerate(simulated):
+            counts[0].add(frame, matcher)
+            if number < bare:
+                counts[1].add(frame, matcher)
+            progress("self-test", step * frames + number + 1, 2 * frames)
+        with_mag.append(counts[0].rates())
+        without.append(counts[1].rates())
+    return (*with_mag, *without)
 
 
-def _rates(
-    matcher: Matcher,
-    name: str,
-    noise: Noise,
-    frames: Iterable[Frame],
-    progress: Progress,
-    done: int,
-    total: int,
-) -> Rates:
-    count = identifiable = right = wrong = 0
-    residuals = []
-    for frame in frames:
-        result = matcher.identify(frame.centroids_px)
-        count += 1
-        identifiable += frame.n_stars >= MIN_STARS
+class _Count:
+    """Frames of one kind, counted one by one."""
+
+    def __init__(self, name: str, noise: Noise, noise_mag: float | None) -> None:
+        self._name, self._noise, self._noise_mag = name, noise, noise_mag
+        self._frames = self._identifiable = self._identified = self._wrong = 0
+        self._residuals: list[float] = []
+        self._missed: list[int] = []
+
+    def add(self, frame: Frame, matcher: Matcher) -> None:
+        """Identify a frame and count how it fared."""
+        magnitudes = None if self._noise_mag is None else frame.mag
+        result = matcher.identify(frame.centroids_px, magnitudes=magnitudes)
+        is_identifiable = frame.n_stars >= MIN_STARS
+        is_right = False
         if result.status == "identified":
             is_right = answers_rightly(result, frame, matcher)
-            right += is_right
-            wrong += not is_right
-            residuals.append(result.residual_arcsec)
-        progress("self-test", done + count, total)
-    return Rates(
-        name,
-        noise.noise_px,
-        noise.drop_probability,
-        noise.false_stars,
-        count,
-        identifiable,
-        right,
-        wrong,
-        round(float(np.median(residuals)), 6) if residuals else 0.0,
-    )
+            self._residuals.append(result.residual_arcsec)
+            self._wrong += not is_right
+        self._frames += 1
+        self._identifiable += is_identifiable
+        self._identified += is_identifiable and is_right
+        if is_identifiable and not is_right:
+            self._missed.append(frame.n_stars)
+
+    def rates(self) -> Rates:
+        """Return what was counted."""
+        return Rates(
+            self._name,
+            self._noise.noise_px,
+            self._noise.drop_probability,
+            self._noise.false_stars,
+            self._noise_mag,
+            self._frames,
+            self._identifiable,
+            self._identified,
+            self._wrong,
+            round(float(np.median(self._residuals)), 6) if self._residuals else 0.0,
+            tuple(self._missed),
+        )
 
 
 def answers_rightly(result: MatchResult, frame: Frame, matcher: Matcher) -> bool:

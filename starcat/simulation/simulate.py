@@ -133,7 +133,7 @@ def simulate_frame(
     Frame
         Centroids that noise moves off the detector are lost, as they would be.
     """
-    near = np.flatnonzero(sky.directions @ matrix[2] >= np.cos(1.05 * camera.radius_rad))
+    near = sky.zones.near(matrix[2], 1.05 * camera.radius_rad)
     centroids = camera.pixels_from_directions(sky.directions[near] @ matrix.T)
     inside = camera.contains(centroids)
     centroids, star = centroids[inside], near[inside]

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+
+from starcat.geometry.zones import Zones, zones_of
 
 Array = NDArray[np.float64]
 
@@ -31,6 +34,11 @@ class Sky:
     def __len__(self) -> int:
         """Return the number of points."""
         return len(self.mag)
+
+    @cached_property
+    def zones(self) -> Zones:
+        """The points in order of declination."""
+        return zones_of(self.directions)
 
     def brighter(self, limit_mag: float) -> Sky:
         """Return the points up to a magnitude.

@@ -188,8 +188,19 @@ class SelfTest(Section):
     noise_px: float = Field(
         0.5, ge=0.0, le=50.0, description="noise of a centroid, standard deviation of each axis"
     )
+    noise_mag: float = Field(
+        0.2,
+        ge=0.0,
+        le=10.0,
+        description="noise of the magnitude of a spot, standard deviation; it decides what is "
+        "tried first",
+    )
     min_identified: float = Field(
-        0.9, ge=0.0, le=1.0, description="least share of the clean fields with at least 4 stars"
+        0.9,
+        ge=0.0,
+        le=1.0,
+        description="least share of the clean fields with at least 4 stars; the build fails if the "
+        "95 % interval of the share ends below",
     )
 
 

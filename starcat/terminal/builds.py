@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from starcat.catalog.fetching.fetch import FetchReport
     from starcat.catalog.ingest import Ingested
     from starcat.pipeline.build import Built
+    from starcat.pipeline.cost import Cost
     from starcat.simulation.selftest import Rates
     from starcat.store.ingest import Stored
 
@@ -220,6 +221,33 @@ def print_built(built: Built, *, as_json: bool) -> None:
             }
         )
         return
+    _print_contents(built)
+    seconds = [(stage, f"{taken:.2f}") for stage, taken in built.times_s.items()]
+    print_table("Times", ("stage", "seconds"), seconds, numbers=(1,))
+    print_problems(built.problems)
+    say(f"{built.outcome}: {built.folder}")
+    say(f"report: {report}")
+
+
+def print_refused(built: Built, *, as_json: bool) -> None:
+    """Print what a build made that failed its self-test, and what it warns of.
+
+    Parameters
+    ----------
+    built : Built
+        What the error carries.
+    as_json : bool
+        Whether JSON is wanted: tables are then left out, as what failed has no result.
+    """
+    for warning in built.warnings:
+        say(f"warning: {warning}")
+    if not as_json:
+        _print_contents(built)
+
+
+def _print_contents(built: Built) -> None:
+    """Print what went into a build, what it made and how that identifies."""
+    manifest = built.manifest
     for source in manifest["sources"]:
         print_table(
             f"{source['source']} ({source['role']})",
@@ -245,11 +273,17 @@ def print_built(built: Built, *, as_json: bool) -> None:
     print_products(manifest)
     print_coverage_table(built.coverage)
     print_rates(built.rates, as_json=False)
-    seconds = [(stage, f"{taken:.2f}") for stage, taken in built.times_s.items()]
-    print_table("Times", ("stage", "seconds"), seconds, numbers=(1,))
-    print_problems(built.problems)
-    say(f"{built.outcome}: {built.folder}")
-    say(f"report: {report}")
+
+
+def print_cost(cost: Cost) -> None:
+    """Print on stderr what a build will cost.
+
+    Parameters
+    ----------
+    cost : Cost
+        The estimate.
+    """
+    say(cost.in_words)
 
 
 def print_products(manifest: dict[str, Any]) -> None:
@@ -289,12 +323,13 @@ def print_rates(rates: Sequence[Rates], *, as_json: bool) -> None:
         print_json([rate.as_dict() for rate in rates])
         return
     print_table(
-        "Simulated fields",
-        ("fields", "noise px", "dropped", "false", "tried", "4+ stars", "right", "wrong", "rate"),
+        "Simulated fields, with noise of position (px) and of magnitude",
+        ("fields", "px", "mag", "dropped", "false", "tried", "4+ stars", "right", "wrong", "rate"),
         [
             (
                 rate.name,
                 f"{rate.noise_px:g}",
+                "" if rate.noise_mag is None else f"{rate.noise_mag:g}",
                 f"{rate.drop_probability:.0%}",
                 rate.false_stars,
                 rate.frames,
@@ -304,8 +339,9 @@ def print_rates(rates: Sequence[Rates], *, as_json: bool) -> None:
                 f"{rate.identified_share:.1%}",
             )
             for rate in rates
+            if rate.frames
         ],
-        numbers=tuple(range(1, 9)),
+        numbers=tuple(range(1, 10)),
     )
 
 

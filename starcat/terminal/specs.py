@@ -70,7 +70,7 @@ def print_starter(starter: Starter, path: Path, *, as_json: bool) -> None:
     as_json : bool
         Whether to print JSON.
     """
-    from starcat.pipeline.starter import ENOUGH_STARS, advice
+    from starcat.pipeline.starter import ENOUGH_STARS, STARS_A_FIELD, advice
 
     told = advice(starter)
     if as_json:
@@ -79,6 +79,8 @@ def print_starter(starter: Starter, path: Path, *, as_json: bool) -> None:
                 "file": str(path),
                 "spec": starter.spec.model_dump(mode="json"),
                 "limits": [asdict(row) for row in starter.limits],
+                "thinned": asdict(starter.thinned),
+                "estimate": asdict(starter.cost),
                 "advice": list(told),
             }
         )
@@ -99,10 +101,15 @@ def print_starter(starter: Starter, path: Path, *, as_json: bool) -> None:
     field = f"{camera.fov_x_deg:.4g} x {camera.fov_y_deg:.4g} deg"
     title = f"Stars in a field of {field} (* the spec's limit)"
     print_table(title, heads, rows, numbers=(0, 1, 2, 3, 4, 5))
+    thinned = starter.thinned
     out().print(
+        f"\nThe {STARS_A_FIELD} brightest of every field are kept: {thinned.guide_stars:,} guide "
+        f"stars, {thinned.stars.minimum:,} to\n{thinned.stars.maximum:,} a field, "
+        f"{thinned.stars.median:,} in the middle one."
         "\nA frame needs 4 stars. A limit is good when 1 % of the fields have about "
         f"{ENOUGH_STARS}:\nsome are left where spots are missing, and the database stays small."
     )
     for text in told:
         say(f"warning: {text}")
+    say(starter.cost.in_words)
     say(f"wrote {path}; change it as you like, then: starcat build {path}")

@@ -204,8 +204,9 @@ def near_rates(shot: Shot, title: str, noise: Noise) -> tuple[str, int, int, int
 def evaluation_section(shot: Shot) -> str:
     story, database = shot.story, shot.matcher.database
     wanted = story.spec.self_test
+    noise = Noise(wanted.noise_px, noise_mag=wanted.noise_mag)
     frames = simulate_frames(
-        database.directions, database.camera, wanted.frames, Noise(wanted.noise_px), wanted.seed
+        database.directions, database.camera, wanted.frames, noise, wanted.seed, database.mag
     )
     with_polaris = sum(story.row in frame.star_index for frame in frames)
     rows = [

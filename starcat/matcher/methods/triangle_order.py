@@ -1,9 +1,10 @@
 """The order in which triangles of centroids are looked up, and the ones that are left out.
 
 Three methods share this stage. Triangles of the brightest stars are first where magnitudes are
-known, as in S3; otherwise the most compact ones are. The order of S4, by the radius of the
-inscribed circle, can be chosen. Triangles with a short side or a narrow angle are left out,
-because the two centroids of a double star, or three centroids in a line, identify little.
+known, as in S3; otherwise the most compact ones are, which in a crowded frame are taken from all
+over it. The order of S4, by the radius of the inscribed circle, can be chosen. Triangles with a
+short side or a narrow angle are left out, because the two centroids of a double star, or three
+centroids in a line, identify little.
 """
 
 from __future__ import annotations
@@ -28,16 +29,19 @@ class TriangleOrder:
 
     Attributes
     ----------
-    order : {"auto", "brightness", "inradius", "compact"}
+    order : {"auto", "brightness", "inradius", "compact", "spread"}
         ``brightness`` is S3's, ``inradius`` S4's, the largest first; ``compact`` has the
-        triangles with the shortest long side first, which the most fields hold whole. ``auto``
-        is ``brightness`` where magnitudes are known, else ``compact``.
+        triangles with the shortest long side first, which the most fields hold whole. ``spread``
+        takes the most compact triangle at every centroid, then the second of each, and so on.
+        ``auto`` is ``brightness`` where magnitudes are known, else ``spread`` in frames with more
+        than ``most_centroids``, else ``compact``.
     min_side_px : float
         Triangles with a shorter side are left out, as those of double stars (d_min of S3).
     min_angle_deg : float
         Triangles with a narrower angle are left out, as three stars in a line (theta_min of S3).
     most_centroids : int
-        Number of centroids that take part: the first ones in the observation's order.
+        Number of centroids that take part: the first ones in the observation's order. With
+        ``spread`` all of them do.
     few_centroids : int
         In frames with at most this many centroids, the triangles that are left out are tried
         at the end.
@@ -48,7 +52,7 @@ class TriangleOrder:
     Liao and Zhang 2024 (S4), eq. 7.
     """
 
-    order: Literal["auto", "brightness", "inradius", "compact"] = "auto"
+    order: Literal["auto", "brightness", "inradius", "compact", "spread"] = "auto"
     min_side_px: float = 10.0
     min_angle_deg: float = 15.0
     most_centroids: int = 32
@@ -59,6 +63,12 @@ DEFAULT = TriangleOrder()
 
 LEAST_ANGLE_DEG = 4.0
 """Smallest angle of a triangle that is tried at all."""
+
+NEIGHBOURS = 20
+"""Number of the nearest centroids that a centroid makes triangles with in the order ``spread``."""
+
+SPREAD_CENTROIDS = 400
+"""Largest number of centroids of that order; more would take seconds to put in order."""
 
 
 def select_triangles(
@@ -79,6 +89,9 @@ def select_triangles(
         Rows of the observation, ascending within a triangle.
     """
     count = min(len(observation), selection.most_centroids)
+    is_crowded = count < len(observation) and observation.mag is None
+    if selection.order == "spread" or (selection.order == "auto" and is_crowded):
+        return _spread(observation, selection)
     stars = _triples(count)
     a, b, c = _sides(observation.separation_rad, stars)
     side = selection.min_side_px / observation.camera.focal_length_px
@@ -95,6 +108,36 @@ def select_triangles(
         return np.asarray(stars[order[good]])
     poor = is_well_shaped(a, b, c, observation.tolerance_rad, np.radians(LEAST_ANGLE_DEG))[order]
     return np.asarray(stars[np.concatenate([order[good], order[poor & ~good]])])
+
+
+def _spread(observation: Observation, selection: TriangleOrder) -> NDArray[np.intp]:
+    """Return triangles of near centroids from all over a frame, a round of all centroids at a time.
+
+    A database holds the triangles of the brightest stars of its fields. In a crowded frame most
+    stars are fainter, and the compact triangles of one place are often of the same few stars: if
+    one of these is faint, none of the triangles is held.
+    """
+    count = min(len(observation), SPREAD_CENTROIDS)
+    apart = observation.separation_rad[:count, :count]
+    most = min(NEIGHBOURS, count - 1)
+    near = np.argsort(apart, axis=1, kind="stable")[:, 1 : most + 1]
+    first, second = np.triu_indices(most, 1)
+    owner = np.repeat(np.arange(count), len(first))
+    stars = np.sort(
+        np.stack([owner, near[:, first].ravel(), near[:, second].ravel()], axis=-1), axis=-1
+    )
+    i, j, k = stars.T
+    _, fresh = np.unique((i * count + j) * count + k, return_index=True)
+    owner, stars = owner[fresh], stars[fresh]
+    a, b, c = _sides(apart, stars)
+    side = selection.min_side_px / observation.camera.focal_length_px
+    good = is_well_shaped(a, b, c, side, np.radians(selection.min_angle_deg))
+    owner, stars = owner[good], stars[good]
+    longest = np.maximum(np.maximum(a, b), c)[good]
+    order = np.lexsort((longest, owner))
+    own = owner[order]
+    turn = np.arange(len(own)) - np.searchsorted(own, own)
+    return np.asarray(stars[order][np.lexsort((longest[order], turn))])
 
 
 def optimised_triangle(

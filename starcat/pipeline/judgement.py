@@ -1,0 +1,132 @@
+"""The judgement of a self-test: whether a database passes, and what is wrong where it does not.
+
+A rate of some hundred frames is known to a few per cent, so that an interval is judged and not
+the rate itself: with another seed a database that is good enough must not fail.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from starcat.errors import BuildError
+from starcat.products.coverage import TilingGap
+from starcat.simulation.selftest import Rates
+from starcat.specs.build_spec import BuildSpec
+
+FEW_STARS = 8
+"""A frame with fewer guide stars may be beyond any matcher when some spots are missing or false."""
+
+CROWDED = 2.0
+"""A frame is crowded that has so many times as many stars as make a field's triangles."""
+
+THINNED = 1.5
+"""Stars a field, in units of those that make its triangles, that a thinned database should have."""
+
+
+def check_rates(rates: Sequence[Rates], spec: BuildSpec, gap: TilingGap) -> None:
+    """Check that a database identifies its own fields.
+
+    Parameters
+    ----------
+    rates : sequence of Rates
+        Rates of the self-test, those of the clean frames with magnitudes first.
+    spec : BuildSpec
+        ``self_test.min_identified``.
+    gap : TilingGap
+        The widest gap of the tiling.
+
+    Raises
+    ------
+    BuildError
+        If not even the upper end of the interval of the clean frames reaches what is asked for,
+        or any answer was wrong.
+    """
+    clean, wanted = rates[0], spec.self_test.min_identified
+    most = clean.interval[1] if clean.identifiable else 0.0
+    if most < wanted:
+        raise BuildError(
+            f"{spec.name}: the database identifies {clean.identified} of {clean.identifiable} "
+            f"simulated fields with at least 4 stars ({clean.frames} in all), which is "
+            f"{most:.1%} at the most; self_test.min_identified asks for {wanted:.1%}. "
+            + ". ".join(causes(clean, spec, gap))
+        )
+    wrong = sum(rate.wrong for rate in rates)
+    if wrong:
+        raise BuildError(f"{spec.name}: {wrong} simulated fields got a wrong answer")
+
+
+def causes(rates: Rates, spec: BuildSpec, gap: TilingGap) -> list[str]:
+    """Return why frames were not identified, and which keys of the spec to change.
+
+    Parameters
+    ----------
+    rates : Rates
+        Of the frames.
+    spec : BuildSpec
+        Of the database.
+    gap : TilingGap
+        The widest gap of the tiling.
+
+    Returns
+    -------
+    list of str
+        A sentence each, the most certain cause first; at least one.
+    """
+    return list(_causes(rates, spec, gap)) or [
+        "More of the triangles of a frame are held with a larger boresights.brightest or "
+        "boresights.count"
+    ]
+
+
+def _causes(rates: Rates, spec: BuildSpec, gap: TilingGap) -> Iterator[str]:
+    middle = float(np.median(rates.missed)) if rates.missed else 0.0
+    if middle < FEW_STARS:
+        have = f"The missed frames have {middle:g} stars (median)"
+        if not rates.identifiable:
+            have = "No simulated field has 4 stars"
+        yield (
+            f"{have}, too few: a fainter "
+            "selection.faint_limit_mag or a wider camera gives more stars a field"
+        )
+    if gap.has_holes:
+        yield (
+            f"The fields of boresights.count = {gap.boresights:,} leave holes between them, whose "
+            f"triangles are missing: boresights.count = {gap.boresights_needed} leaves none"
+        )
+    brightest = spec.boresights.brightest
+    if spec.products.triangles.enabled and middle > CROWDED * brightest:
+        thinned = round(THINNED * brightest)
+        yield (
+            f"The missed frames have {middle:g} stars (median), and the triangles are of the "
+            f"{brightest} brightest of each field: selection.max_stars_per_field = {thinned} "
+            "leaves the stars that have triangles"
+        )
+
+
+def advice_without_magnitudes(rates: Sequence[Rates], spec: BuildSpec) -> str | None:
+    """Return what to say of a database that is good only where magnitudes are given.
+
+    Parameters
+    ----------
+    rates : sequence of Rates
+        Rates of the self-test, as `starcat.simulation.selftest.self_test` returns them.
+    spec : BuildSpec
+        ``self_test.min_identified``, and the density.
+
+    Returns
+    -------
+    str or None
+        One line; None where it is as good without.
+    """
+    clean, bare = rates[0], rates[2]
+    wanted = spec.self_test.min_identified
+    if not bare.identifiable or bare.interval[1] >= min(wanted, clean.interval[0]):
+        return None
+    thinned = round(THINNED * spec.boresights.brightest)
+    return (
+        f"without magnitudes {bare.identified} of {bare.identifiable} simulated fields are "
+        f"identified, with them {clean.identified} of {clean.identifiable}: give the magnitudes "
+        f"of the spots, or set selection.max_stars_per_field = {thinned}"
+    )

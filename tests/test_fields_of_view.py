@@ -1,0 +1,271 @@
+"""Any field of view by default: the specs of `init`, their cost, rates and judgement."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from starcat.catalog.stars import directions_of
+from starcat.errors import BuildError
+from starcat.geometry.attitude import random_attitudes
+from starcat.geometry.camera import Camera
+from starcat.geometry.sphere import chord_from_separation, radec_from_directions, tangent_axes
+from starcat.geometry.zones import zones_of
+from starcat.pipeline.build import Built, build
+from starcat.pipeline.cost import Cost, product_cost
+from starcat.pipeline.judgement import advice_without_magnitudes, causes, check_rates
+from starcat.pipeline.recipes import Ingredients, cook
+from starcat.pipeline.starter import STARS_A_FIELD, Starter, advice, starter_spec
+from starcat.products.boresights import stars_in_fields, tile_sphere
+from starcat.products.coverage import TilingGap
+from starcat.products.triangles import find_triangles
+from starcat.simulation.interval import wilson_interval
+from starcat.simulation.selftest import Rates
+from starcat.specs.build_spec import BuildSpec, CameraSpec
+from starcat.specs.reading import preset
+
+GIB = 2**30
+
+
+def started(fov_deg: float) -> Starter:
+    return starter_spec("camera", CameraSpec(width_px=1280, height_px=960, fov_x_deg=fov_deg))
+
+
+def built(spec: BuildSpec, folder: Path) -> tuple[Built, Cost]:
+    told: list[Cost] = []
+    made = build(spec, {}, folder, announce=told.append)
+    return made, told[0]
+
+
+def check_fields(fov_deg: float, folder: Path) -> None:
+    """Build what `init` chooses; 1 deg is as deep as the embedded sky is, and no deeper."""
+    starter = started(fov_deg)
+    made, cost = built(starter.spec, folder)
+    assert cost == starter.cost or cost.rows == starter.cost.rows
+    assert sum(rate.wrong for rate in made.rates) == 0
+    clean, hard, bare, bare_hard = (rate.identified_share for rate in made.rates)
+    if fov_deg > 1.0:
+        assert min(clean, bare) >= 0.99
+        assert min(hard, bare_hard) >= 0.97
+    else:
+        assert clean >= 0.85
+        assert any("the embedded sky has no fainter ones" in text for text in advice(starter))
+        # What is missed has few stars, and not a hole of the tiling or of the triangles.
+        assert np.median(made.rates[0].missed) < 6
+    assert not any("holes" in text for text in made.warnings)
+    for name, count in cost.rows.items():
+        if name in ("pairs", "triangles"):
+            assert made.manifest["products"][name]["rows"] == pytest.approx(count, rel=0.1)
+
+
+def test_a_camera_of_50_deg_identifies_its_frames(tmp_path):
+    check_fields(50.0, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fov_deg", [1.0, 2.0, 5.0, 8.0, 12.0, 20.0, 35.0, 90.0])
+def test_every_camera_identifies_its_frames(fov_deg, tmp_path):
+    check_fields(fov_deg, tmp_path)
+
+
+@pytest.mark.parametrize("fov_deg", [12.0, 90.0])
+def test_init_thins_to_a_number_of_stars_a_field(fov_deg):
+    starter = started(fov_deg)
+    assert starter.spec.selection.max_stars_per_field == STARS_A_FIELD
+    assert starter.thinned.guide_stars < starter.own.guide_stars
+    assert starter.thinned.stars.one_percent >= starter.own.stars.one_percent - 1
+    assert starter.left_out == ()
+
+
+# --- Cost
+
+
+@pytest.mark.parametrize("name", ["pairs", "triangles", "neighbours", "hausdorff_angular"])
+@pytest.mark.parametrize("limit_mag", [5.0, 6.0])
+def test_rows_are_estimated(name: str, limit_mag: float, sky_of: Any) -> None:
+    given = sky_of(limit_mag)
+    made = cook(name, given)
+    assert product_cost(given, 0.0).rows[name] == pytest.approx(len(made.table), rel=0.1)
+
+
+@pytest.fixture(scope="module")
+def sky_of() -> Any:
+    from starcat.catalog.fetching.locate import locate
+    from starcat.catalog.ingest import ingest
+    from starcat.pipeline.guide_stars import select_stars
+
+    stars = ingest("gaia", locate("gaia", {})).stars
+
+    def make(limit_mag: float) -> Ingredients:
+        spec = preset(
+            "gaia-12deg",
+            {"selection.faint_limit_mag": str(limit_mag), "boresights.count": "2000"},
+        )
+        selected, fields = select_stars(stars, spec)
+        return Ingredients(directions_of(selected.guide_stars), fields, spec)
+
+    return make
+
+
+def test_the_memory_of_a_build_is_estimated(starcat, tmp_path):
+    """In a process of its own, whose peak is that of one build."""
+    import subprocess
+    import sys
+
+    arguments = ["build", "--preset", "gaia-12deg", "-o", str(tmp_path)]
+    done = subprocess.run(
+        [sys.executable, "-m", "starcat", *arguments], capture_output=True, text=True, check=True
+    )
+    estimate = next(line for line in done.stderr.splitlines() if line.startswith("estimate: "))
+    assert "6,682 guide stars in 10,000 fields" in estimate
+    said_gib = float(estimate.rpartition("; ")[2].split()[0])
+    log = json.loads((tmp_path / "gaia-12deg-1.0.0.build.json").read_bytes())
+    assert 1.0 / 1.5 < said_gib * GIB / log["peak_memory_bytes"] < 1.5
+
+
+def test_what_does_not_fit_is_refused_before_anything_is_made(tmp_path):
+    stages: list[str] = []
+    spec = preset("gaia-12deg", {"products.triangles.enabled": "false"})
+    with pytest.raises(BuildError, match=r"products\.pairs\.enabled = false saves most") as refused:
+        build(
+            spec, {}, tmp_path, max_memory_bytes=GIB // 4,
+            progress=lambda stage, *_: stages.append(stage),
+        )  # fmt: skip
+    assert refused.value.built is None
+    assert not [stage for stage in stages if stage.startswith("product")]
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- Judgement
+
+
+def rates(identified: int, tried: int, missed: int, **more: Any) -> Rates:
+    found = Rates("clean", 0.5, 0.0, 0, 0.2, tried, tried, identified, 0, 1.0)
+    return replace(found, missed=(missed,) * (tried - identified), **more)
+
+
+def gap(covering_deg: float) -> TilingGap:
+    return TilingGap(1000, np.radians(3.0), np.radians(covering_deg), 10.0, 20.0)
+
+
+def test_another_seed_does_not_decide():
+    spec = preset("gaia-12deg")
+    check_rates([rates(86, 100, 20)], spec, gap(2.0))
+    with pytest.raises(BuildError, match=r"which is 86\.7% at the most"):
+        check_rates([rates(80, 100, 20)], spec, gap(2.0))
+    with pytest.raises(BuildError, match="wrong answer"):
+        check_rates([replace(rates(99, 100, 20), wrong=1)], spec, gap(2.0))
+    nobody = rates(0, 0, 0)
+    with pytest.raises(BuildError, match="No simulated field has 4 stars"):
+        check_rates([nobody], spec, gap(2.0))
+
+
+@pytest.mark.parametrize(
+    ("missed", "covering_deg", "keys"),
+    [
+        (5, 2.0, ["selection.faint_limit_mag"]),
+        (50, 2.0, ["selection.max_stars_per_field = 12"]),
+        (12, 4.0, ["boresights.count = 1867"]),
+        (50, 4.0, ["boresights.count = 1867", "selection.max_stars_per_field = 12"]),
+        (12, 2.0, ["boresights.brightest"]),
+    ],
+)
+def test_the_true_cause_is_named(missed, covering_deg, keys):
+    told = causes(rates(50, 100, missed), preset("gaia-12deg"), gap(covering_deg))
+    assert len(told) == len(keys)
+    for text, key in zip(told, keys, strict=True):
+        assert key in text
+
+
+def test_a_database_that_needs_magnitudes_says_so():
+    spec, good, poor = preset("gaia-12deg"), rates(100, 100, 9), rates(5, 50, 60)
+    assert advice_without_magnitudes([good, good, good, good], spec) is None
+    told = advice_without_magnitudes([good, good, poor, poor], spec)
+    assert told is not None
+    assert "give the magnitudes" in told
+    assert "max_stars_per_field = 12" in told
+
+
+def test_a_failing_build_prints_its_tables_and_its_holes(starcat, tmp_path):
+    options = ["--set", "camera.fov_x_deg=3", "--set", "self_test.frames=20"]
+    few = ["--set", "boresights.count=1500", "--set", "products.pairs.enabled=false"]
+    run = starcat(["build", "--preset", "gaia-12deg", *options, *few, "-o", tmp_path])
+    assert run.code == 1
+    assert "Simulated fields" in run.out
+    assert "What each filter leaves" in run.out
+    assert "leaves holes" in run.err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("hits", "count"), [(0, 10), (10, 10), (88, 100), (181, 200)])
+def test_the_interval_is_that_of_scipy(hits, count):
+    from scipy.stats import binomtest
+
+    expected = binomtest(hits, count).proportion_ci(method="wilson")
+    assert wilson_interval(hits, count) == pytest.approx((expected.low, expected.high), abs=1e-12)
+
+
+# --- Wide fields
+
+
+@pytest.mark.parametrize("fov_deg", [5.0, 90.0])
+def test_fields_hold_what_the_camera_sees(fov_deg):
+    """Membership of a field against the camera's own projection, at the field's roll."""
+    camera = Camera(1280, 960, fov_x_deg=fov_deg)
+    generator = np.random.default_rng(90)
+    u = random_attitudes(4000, generator)[:, 0]
+    axes = random_attitudes(40, generator)[:, 2]
+    fields = stars_in_fields(axes, u, generator.random(4000), camera)
+    east, north = tangent_axes(*radec_from_directions(axes))
+    for n, axis in enumerate(axes):
+        body = u @ np.stack([east[n], -north[n], axis]).T
+        seen = camera.contains(camera.pixels_from_directions(body))
+        held = fields.star_index[fields.offsets[n] : fields.offsets[n + 1]]
+        assert np.flatnonzero(seen).tolist() == sorted(held.tolist())
+
+
+def test_triangles_of_90_deg_have_great_circle_sides():
+    camera = Camera(1280, 960, fov_x_deg=90.0)
+    generator = np.random.default_rng(91)
+    u = random_attitudes(60, generator)[:, 0]
+    made = find_triangles(tile_sphere(200, u, generator.random(60), camera), u, 8)
+    corners = u[np.stack([made.i, made.j, made.k])]
+    a, b, c = (
+        np.arccos((corners[p] * corners[q]).sum(axis=-1)) for p, q in ((1, 2), (0, 2), (0, 1))
+    )
+    half = 0.5 * (a + b + c)
+    area = np.sqrt(np.maximum(half * (half - a) * (half - b) * (half - c), 0.0))
+    assert np.degrees(np.max([a, b, c])) > 80.0
+    np.testing.assert_allclose(made.area_rad2, area, rtol=1e-5, atol=1e-6)
+
+
+def test_the_sides_of_an_observed_triangle_are_those_of_its_stars_at_90_deg():
+    from starcat.matcher.observation import observe
+
+    camera = Camera(1280, 960, fov_x_deg=90.0)
+    places = np.array([[0.5, 0.5], [1279.5, 0.5], [1279.5, 959.5], [640.0, 480.0]])
+    seen = observe(places, camera, 2.0)
+    body = camera.directions_from_pixels(seen.centroids_px)
+    np.testing.assert_allclose(
+        seen.separation_rad, np.arccos(np.clip(body @ body.T, -1, 1)), atol=1e-7
+    )
+    # A pixel at a corner sees less sky than one in the middle, so that no error is underestimated.
+    step = camera.directions_from_pixels(np.array([[0.5, 0.5], [2.5, 0.5]]))
+    assert np.arccos(step[0] @ step[1]) < seen.tolerance_rad
+
+
+@pytest.mark.parametrize("radius_rad", [1e-9, 0.01, 0.4, 1.6, np.pi])
+def test_zones_find_what_lies_in_a_cap(radius_rad):
+    generator = np.random.default_rng(3)
+    u = random_attitudes(3000, generator)[:, 0]
+    u[:4] = [[0, 0, 1], [0, 0, -1], [1, 0, 0], [0, 1, 0]]
+    zones, tree = zones_of(u), cKDTree(u)
+    for axis in u[:40]:
+        expected = tree.query_ball_point(axis, chord_from_separation(radius_rad) * (1 + 1e-12))
+        assert zones.near(axis, radius_rad).tolist() == sorted(expected)
