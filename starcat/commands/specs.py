@@ -68,7 +68,6 @@ def init(
     Example: starcat init mycam.toml --size 1280x960 --focal-mm 25 --pixel-um 5.5 --faint-limit 5.8
     """
     from starcat.pipeline.starter import starter_spec, write_starter
-    from starcat.pipeline.starter_levels import with_levels
     from starcat.terminal.console import progress_bars
     from starcat.terminal.specs import print_starter
 
@@ -79,8 +78,6 @@ def init(
         fov_x_deg = fields[0]
     camera = camera_of_options(size, focal_mm, pixel_um, fov_x_deg)
     with progress_bars() as progress:
-        starter = starter_spec(file.stem, camera, faint_limit, progress)
-        if fields is not None:
-            starter = with_levels(starter, fields[1], keep_limit=faint_limit is not None)
+        starter = starter_spec(file.stem, camera, faint_limit, progress, fields and fields[1])
         write_starter(starter, file, replace=replace)
     print_starter(starter, file, as_json=json)
