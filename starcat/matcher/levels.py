@@ -97,15 +97,15 @@ def _levels(database: Database) -> tuple[Level, ...]:
 
 def _level(database: Database, product: ProductArrays, row: int) -> Level:
     stars = _list(product, "stars", row)
-    corners = np.stack([_list(product, name, row) for name in "ijk"])
-    place = np.searchsorted(stars, corners)
-    known = bool((stars[1:] > stars[:-1]).all())
-    if not known or not np.array_equal(stars[np.minimum(place, len(stars) - 1)], corners):
+    lists = [_list(product, name, row) for name in "ijk"]
+    is_sound = len({len(one) for one in lists}) == 1 and bool((stars[1:] > stars[:-1]).all())
+    if not is_sound or not all(np.isin(one, stars).all() for one in lists):
         raise ProductError(
             f"{PRODUCT}: the triangles of level {row + 1} are not of its stars; the database is "
             "damaged. Build the artifact again, or fetch it again",
             product=PRODUCT,
         )
+    place = np.searchsorted(stars, np.stack(lists))
     half = [math.tan(math.radians(0.5 * product[f"fov_{axis}_deg"][row])) for axis in "xy"]
     part = replace(
         database,
