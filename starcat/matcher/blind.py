@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice, pairwise
-from typing import TYPE_CHECKING, Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.matcher.budget import Budget, BudgetSpentError
 from starcat.matcher.chance import MIN_STARS
+from starcat.matcher.database import Database
 from starcat.matcher.levels import Level, levels
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.table import METHODS
@@ -29,9 +30,6 @@ from starcat.matcher.pose import first_poses, pose_at
 from starcat.matcher.refusal import Refusal
 from starcat.matcher.result import MatchResult, identified, unidentified
 from starcat.matcher.verification import AT_ONCE, Agreement, BestOf, agree, agreeing_centroids
-
-if TYPE_CHECKING:
-    from starcat.matcher.matcher import Matcher
 
 Array = NDArray[np.float64]
 
@@ -51,6 +49,54 @@ _OWN = 3
 BEYOND = 1.25
 """Factor by which the outer levels serve focal lengths beyond those that they are made for: a
 frame of other proportions than the camera's has another width for the same area."""
+
+
+class Asking(Protocol):
+    """What a `Matcher` states of a search."""
+
+    @property
+    def database(self) -> Database:
+        """The stars and the products."""
+
+    @property
+    def method(self) -> str:
+        """A key of `METHODS`."""
+
+    @property
+    def selection(self) -> TriangleOrder:
+        """Order and limits of triangles."""
+
+    @property
+    def max_batches(self) -> int:
+        """Batches of candidates of each level."""
+
+    @property
+    def tolerance_px(self) -> float:
+        """Largest error of a centroid."""
+
+    @property
+    def noise_px(self) -> float | None:
+        """Noise of a centroid, where it is stated."""
+
+    @property
+    def noise_mag(self) -> float | None:
+        """Noise of a magnitude, where it is stated."""
+
+    @property
+    def max_false_match_probability(self) -> float:
+        """Answers that chance would give more often are withheld."""
+
+    @property
+    def min_share(self) -> float:
+        """Least share of the frame to be explained."""
+
+    @property
+    def max_steps(self) -> float:
+        """Steps that a frame may take."""
+
+    @property
+    def time_limit_s(self) -> float:
+        """Seconds that a frame may take."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +194,7 @@ def _focal_px(camera: Camera, fov_x_deg: float) -> float:
 
 
 def identify_blind(
-    matcher: Matcher,
+    matcher: Asking,
     centroids_px: Array,
     camera: Camera,
     mag: Array | None,
@@ -159,8 +205,8 @@ def identify_blind(
 
     Parameters
     ----------
-    matcher : Matcher
-        Database, limits and method, which has to be ``triangle``.
+    matcher : Asking
+        A `Matcher`: its database, its limits, and its method, which has to be ``triangle``.
     centroids_px : ndarray of float64, shape (N, 2)
         Pixels.
     camera : Camera
@@ -220,7 +266,7 @@ def identify_blind(
     return identified(found, first.whole, matcher.database.star_id)
 
 
-def _checked_parts(matcher: Matcher, camera: Camera, fov_deg: tuple[float, float]) -> list[Part]:
+def _checked_parts(matcher: Asking, camera: Camera, fov_deg: tuple[float, float]) -> list[Part]:
     if matcher.database.image is not None:
         raise ConfigError(
             "an onboard image serves one field of view; open the artifact that it is of", key="fov"
@@ -236,7 +282,7 @@ def _checked_parts(matcher: Matcher, camera: Camera, fov_deg: tuple[float, float
 
 def _begun(
     part: Part,
-    matcher: Matcher,
+    matcher: Asking,
     camera: Camera,
     centroids_px: Array,
     mag: Array | None,
@@ -267,7 +313,7 @@ def _begun(
     return _Search(part, whole, used, BestOf(certain))
 
 
-def _run(searches: Sequence[_Search], matcher: Matcher) -> Literal["time", "steps"] | None:
+def _run(searches: Sequence[_Search], matcher: Asking) -> Literal["time", "steps"] | None:
     """Search a batch of each part in turn, and return the limit that ended it."""
     waiting = [(search, _steps(search, matcher)) for search in searches]
     try:
@@ -285,7 +331,7 @@ def _run(searches: Sequence[_Search], matcher: Matcher) -> Literal["time", "step
     return None
 
 
-def _steps(search: _Search, matcher: Matcher) -> Iterator[bool]:
+def _steps(search: _Search, matcher: Asking) -> Iterator[bool]:
     """Verify a batch of candidates each time that the next value is asked for."""
     selection = matcher.selection
     if selection == DEFAULT and search.used.mag is not None:
