@@ -246,6 +246,16 @@ def test_levels_that_contradict_themselves_are_damaged(sky, name):
         levels(wrong)
 
 
+def test_a_database_with_no_level_in_the_product_is_damaged(sky):
+    arrays = {
+        name: values[:1] if name.endswith("_offsets") else values[:0]
+        for name, values in sky.products["levels"].arrays.items()
+    }
+    wrong = replace(sky, products={**sky.products, "levels": ProductArrays(arrays)})
+    with pytest.raises(ProductError, match="there are none; the database is damaged"):
+        levels(wrong)
+
+
 def test_the_same_steps_give_the_same_end(sky):
     px, mag = np.random.default_rng(2).uniform(0, 768, (40, 2)), np.linspace(1.0, 5.0, 40)
     matcher = Matcher(sky, engine="numpy", max_steps=2000)

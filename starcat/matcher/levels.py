@@ -87,6 +87,8 @@ def _levels(database: Database) -> tuple[Level, ...]:
                 product=name,
             )
     camera, product = database.camera, database.products[PRODUCT]
+    if not len(product["level"]):
+        raise _damaged("there are none")
     own = Level(
         0.5 * math.sqrt(camera.width_px * camera.height_px) / camera.focal_length_px,
         database,
@@ -100,11 +102,7 @@ def _level(database: Database, product: ProductArrays, row: int) -> Level:
     lists = [_list(product, name, row) for name in "ijk"]
     is_sound = len({len(one) for one in lists}) == 1 and bool((stars[1:] > stars[:-1]).all())
     if not is_sound or not all(np.isin(one, stars).all() for one in lists):
-        raise ProductError(
-            f"{PRODUCT}: the triangles of level {row + 1} are not of its stars; the database is "
-            "damaged. Build the artifact again, or fetch it again",
-            product=PRODUCT,
-        )
+        raise _damaged(f"the triangles of level {row + 1} are not of its stars")
     place = np.searchsorted(stars, np.stack(lists))
     half = [math.tan(math.radians(0.5 * product[f"fov_{axis}_deg"][row])) for axis in "xy"]
     part = replace(
@@ -116,6 +114,13 @@ def _level(database: Database, product: ProductArrays, row: int) -> Level:
         products={"triangles": _triangles(place, database.directions[stars])},
     )
     return Level(math.sqrt(half[0] * half[1]), part, stars)
+
+
+def _damaged(what: str) -> ProductError:
+    return ProductError(
+        f"{PRODUCT}: {what}; the database is damaged. Build the artifact again, or fetch it again",
+        product=PRODUCT,
+    )
 
 
 def _list(product: ProductArrays, name: str, row: int) -> NDArray[np.int64]:
