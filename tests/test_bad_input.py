@@ -677,6 +677,27 @@ def _(place: Place) -> Call:
     return identify_at(place, "--time", "22 November")
 
 
+@case("range of fields beside the error of one", 2)
+def _(place: Place) -> Call:
+    return identify_at(place, "--fov", "10:50", "--fov-error", "2%")
+
+
+@case("size of a frame without a range of fields", 2)
+def _(place: Place) -> Call:
+    return identify_at(place, "--size", "512x512")
+
+
+@case("range of fields for a database of one", 5)
+def _(place: Place) -> Call:
+    return identify_at(place, "--fov", "10:50")
+
+
+@case("levels no wider than the camera", 2)
+def _(place: Place) -> Call:
+    old = "boresights.count"
+    return place.build(old, f"products.levels.enabled = true\n{old}")
+
+
 @case("time beyond the ephemeris", 2)
 def _(place: Place) -> Call:
     return identify_at(place, "--time", "2150-01-01T00:00:00")

@@ -13,6 +13,7 @@ from starcat.commands.shared import (
     FailOnNoMatch,
     FieldRange,
     FovError,
+    FrameSize,
     Json,
     JsonLines,
     Mask,
@@ -35,6 +36,7 @@ from starcat.commands.shared import (
     observer_of_options,
     share_of_percent,
     size_in_px,
+    unknown_field,
 )
 
 app = typer.Typer()
@@ -104,6 +106,8 @@ def identify(
         float, typer.Option(min=0.0, max=1.0, help="Less certain answers are withheld.")
     ] = 1e-9,
     fov_error: FovError = None,
+    fov: FieldRange = None,
+    size: FrameSize = None,
     min_share: MinShare = None,
     max_steps: MaxSteps = None,
     time_limit_s: TimeLimit = None,
@@ -135,7 +139,7 @@ def identify(
 
     Example: starcat identify dist/gaia-12deg-1.0.0 frame.csv --picture frame.png
     """
-    from starcat.images.answering import answer_each, measure_input, write_extras
+    from starcat.images.answering import answer_each, camera_of_size, measure_input, write_extras
     from starcat.images.identification import PictureOptions
     from starcat.matcher.centroids import said_of_columns
     from starcat.matcher.matcher import Matcher
@@ -158,9 +162,13 @@ def identify(
     eye = read_camera(camera) if camera else matcher.database.camera
     how = PictureOptions(threshold, psf_sigma_px, most_spots, plane, bayer, dark, mask)
     measured = measure_input(file, flip=flip, wcs=wcs, options=how)
-    error = share_of_percent(fov_error)
+    error, (size_px, fov_deg) = share_of_percent(fov_error), unknown_field(size, fov, fov_error)
+    if fov_deg is not None:
+        eye = camera_of_size(measured, size_px, eye)
     near = Tracker(matcher) if track else prior
-    answered = answer_each(matcher, measured, eye, observer, flip=flip, fov_error=error, near=near)
+    answered = answer_each(
+        *(matcher, measured, eye, observer), flip=flip, fov_error=error, near=near, fov_deg=fov_deg
+    )
     told = print_answers(
         answered, matcher.database, as_json=json, as_lines=ndjson, observer=observer
     )

@@ -46,6 +46,10 @@ Orbit = Annotated[
     str | None,
     typer.Option(metavar="X,Y,Z,VX,VY,VZ", help="Position too, km; instead of --velocity."),
 ]
+FrameSize = Annotated[
+    str | None,
+    typer.Option(metavar="WxH", help="Size of a frame of centroids, such as 1280x960; with --fov."),
+]
 FovError = Annotated[
     str | None,
     typer.Option(metavar="2%", help="Error of the field that is allowed; default: 2% for images."),
@@ -321,6 +325,35 @@ def limits_of_options(
     if time_limit_s is not None:
         given["time_limit_s"] = time_limit_s
     return given
+
+
+def unknown_field(
+    size: str | None, fov: str | None, fov_error: str | None
+) -> tuple[tuple[int, int] | None, tuple[float, float] | None]:
+    """Return what is stated of frames whose field of view is not known.
+
+    Parameters
+    ----------
+    size, fov, fov_error : str, optional
+        Texts of ``--size``, ``--fov`` and ``--fov-error``.
+
+    Returns
+    -------
+    size_px : tuple of int, or None
+        Width and height.
+    fov_deg : tuple of float, or None
+        Smallest and largest field across the width, degrees.
+
+    Raises
+    ------
+    ConfigError
+        If a text is of another form, or two are given of which one alone has a meaning.
+    """
+    if fov is not None and fov_error is not None:
+        raise ConfigError("give either --fov, a range of fields, or --fov-error, not both")
+    if size is not None and fov is None:
+        raise ConfigError("--size is the size of frames with --fov; for others, --camera says it")
+    return size_in_px(size), field_range(fov)
 
 
 def share_of_percent(text: str | None) -> float | None:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from starcat.commands.shared import Json, camera_of_options
+from starcat.commands.shared import Json, camera_of_options, field_range
 from starcat.errors import ConfigError
 
 app = typer.Typer()
@@ -50,6 +50,10 @@ def init(
     fov_x_deg: Annotated[
         float | None, typer.Option(help="Field across the width, instead of lens and pixel.")
     ] = None,
+    fov_range: Annotated[
+        str | None,
+        typer.Option(metavar="LOW:HIGH", help="Fields across the width, instead: a range."),
+    ] = None,
     faint_limit: Annotated[
         float | None,
         typer.Option(min=-30, max=40, help="Magnitude G that the camera sees; default: enough."),
@@ -67,8 +71,13 @@ def init(
     from starcat.terminal.console import progress_bars
     from starcat.terminal.specs import print_starter
 
+    fields = field_range(fov_range)
+    if fields is not None:
+        if fov_x_deg is not None:
+            raise ConfigError("give either --fov-range or --fov-x-deg, not both")
+        fov_x_deg = fields[0]
     camera = camera_of_options(size, focal_mm, pixel_um, fov_x_deg)
     with progress_bars() as progress:
-        starter = starter_spec(file.stem, camera, faint_limit, progress)
+        starter = starter_spec(file.stem, camera, faint_limit, progress, fields and fields[1])
         write_starter(starter, file, replace=replace)
     print_starter(starter, file, as_json=json)

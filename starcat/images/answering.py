@@ -77,6 +77,42 @@ def _frames_of_stdin() -> Iterator[MeasuredFrame]:
         raise ConfigError(f"stdin: not text ({error}); expected CSV or JSON") from error
 
 
+def camera_of_size(
+    measured: MeasuredFile, size_px: tuple[int, int] | None, known: Camera
+) -> Camera:
+    """Return the camera of frames of which nothing is known but their size.
+
+    Parameters
+    ----------
+    measured : MeasuredFile
+        The frames; a picture says its size itself.
+    size_px : tuple of int, optional
+        Width and height as they were stated.
+    known : Camera
+        The camera whose size centroids have where none is stated.
+
+    Returns
+    -------
+    Camera
+        Of that size, with the field of the known camera and no distortion.
+
+    Raises
+    ------
+    ConfigError
+        If the picture is of another size than was stated.
+    """
+    width, height = size_px or (known.width_px, known.height_px)
+    if measured.image is not None:
+        height, width = measured.image.shape
+        if size_px not in (None, (width, height)):
+            raise ConfigError(
+                f"the image has {width} x {height} px, --size says {size_px[0]} x {size_px[1]}; "
+                "leave --size out",
+                key="size",
+            )
+    return Camera(width, height, fov_x_deg=known.fov_x_deg)
+
+
 def answer_each(
     matcher: Matcher,
     measured: MeasuredFile,
@@ -86,12 +122,13 @@ def answer_each(
     flip: bool | None = None,
     fov_error: float | None = None,
     near: Near | None = None,
+    fov_deg: tuple[float, float] | None = None,
 ) -> Iterator[tuple[MeasuredFrame, MatchResult]]:
     """Identify the frames of a file or stream, one when it is asked for.
 
     Parameters
     ----------
-    matcher, measured, camera, observer, fov_error, near
+    matcher, measured, camera, observer, fov_error, near, fov_deg
         As for `identify_frames`.
     flip : bool, optional
         Whether y of centroids was counted from the bottom; images were turned when read.
@@ -105,7 +142,7 @@ def answer_each(
         turned = bool(flip) and measured.image is None
         frame = upside_down(given, camera.height_px) if turned else given
         one = replace(measured, frames=[frame])
-        [result] = identify_frames(matcher, one, camera, observer, fov_error, near)
+        [result] = identify_frames(matcher, one, camera, observer, fov_error, near, fov_deg)
         yield frame, result
 
 

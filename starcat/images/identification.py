@@ -174,6 +174,7 @@ def identify_frames(
     observer: Observer | None = None,
     fov_error: float | None = None,
     near: Near | None = None,
+    fov_deg: tuple[float, float] | None = None,
 ) -> list[MatchResult]:
     """Identify the frames of a file.
 
@@ -192,6 +193,8 @@ def identify_frames(
         the matcher can find it, and 0 for centroids.
     near : Tracker or (list of float, float), optional
         What says where the frames are expected, with the same matcher.
+    fov_deg : pair of float, optional
+        Narrowest and widest field across the width, in place of what the camera says of it.
 
     Returns
     -------
@@ -210,10 +213,13 @@ def identify_frames(
                 f"the image has {width} x {height} px, the camera {camera.width_px} x "
                 f"{camera.height_px}; describe the camera that took it with --camera"
             )
+    if fov_deg is not None:
+        fov_error = 0.0
     if fov_error is None:
         can = matcher.method in SCALE_FREE and matcher.database.image is None
         fov_error = FOV_ERROR_OF_IMAGES if measured.image is not None and can else 0.0
-    identify = partial(_asked(matcher, near), camera=camera, fov_error=fov_error)
+    asked = _asked(matcher, near, fov_deg)
+    identify = partial(asked, camera=camera, fov_error=fov_error)
     if observer is None:
         return [identify(frame.centroids_px, magnitudes=frame.mag) for frame in measured.frames]
     if isinstance(near, Tracker):
@@ -235,10 +241,16 @@ def identify_frames(
     ]
 
 
-def _asked(matcher: Matcher, near: Near | None) -> Callable[..., MatchResult]:
+def _asked(
+    matcher: Matcher, near: Near | None, fov_deg: tuple[float, float] | None
+) -> Callable[..., MatchResult]:
     """Return what identifies frames where they are expected."""
     if near is None:
-        return matcher.identify
+        return partial(matcher.identify, fov_deg=fov_deg)
+    if fov_deg is not None:
+        raise ConfigError(
+            "--fov is for frames of an unknown camera; leave out --track and --prior-q"
+        )
     if isinstance(near, Tracker):
         return near.identify
     return partial(matcher.identify, prior=near[0], prior_error_deg=near[1])

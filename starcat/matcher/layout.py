@@ -29,6 +29,8 @@ RANGES = {
     "smallest_distance": (0.0, LARGEST),
     # Infinite where three stars are in a line.
     "circumradius_rad": (0.0, inf),
+    "fov_x_deg": (0.001, 179.0),
+    "fov_y_deg": (0.001, 179.0),
 }
 """Narrower and wider ranges of some real numbers, ends included."""
 
@@ -132,6 +134,11 @@ LAYOUT: dict[str, Layout] = {
         lists={"rings": lambda n, _: n["rings"]},
         bins={"ring": lambda n: n["rings"]},
         numbers=("radius_rad", "rings", "sectors"),
+    ),
+    "levels": Layout(
+        wholes=("level",),
+        reals=("fov_x_deg", "fov_y_deg"),
+        lists=dict.fromkeys(("stars", "i", "j", "k"), lambda _, count: count),
     ),
 }
 """The products of a database, by name."""

@@ -10,10 +10,9 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -23,27 +22,20 @@ from numpy.typing import ArrayLike, NDArray
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import checked_number
-from starcat.matcher.budget import Budget, BudgetSpentError
-from starcat.matcher.chance import MIN_STARS
+from starcat.matcher.blind import identify_blind
 from starcat.matcher.database import Database, open_database, open_image, products_in
 from starcat.matcher.fast import FastMatcher, Limits, fast_matcher, is_compiled
 from starcat.matcher.many import MatchResults
-from starcat.matcher.methods.table import METHODS, best_method, method_named
+from starcat.matcher.methods.table import best_method, method_named
 from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder
-from starcat.matcher.observation import MIN_SHARE, WIDEST_FOV_ERROR, Observation, as_frame, observe
-from starcat.matcher.prior import Prior, expected_near, prior_of, search_near
+from starcat.matcher.observation import MIN_SHARE, WIDEST_FOV_ERROR, as_frame
+from starcat.matcher.prior import Prior, expected_near, prior_of
 from starcat.matcher.refusal import Refusal
-from starcat.matcher.result import MatchResult, Origin, identified, unidentified
+from starcat.matcher.result import MatchResult
+from starcat.matcher.searching import CERTAIN, certainty, searched
 from starcat.matcher.stars import Asked
-from starcat.matcher.verification import Agreement, BestOf, verify
 from starcat.onboard.layout import FEATURES
 from starcat.onboard.reading import is_image
-
-CERTAIN = 1e-9
-"""Largest false-match probability of an answer, unless another one is asked for.
-
-Where more is allowed, a hundredth of it ends the search; else the best answer is taken.
-"""
 
 TOLERANCE_PX = 2.0
 """Tolerance where neither it nor the noise of a centroid is stated."""
@@ -243,7 +235,7 @@ class Matcher:
             engine = "c" if engine == "auto" else engine
         else:
             chosen = best_method(products_in(path)) if method is None else method
-            database = open_database(path, method_named(chosen).products)
+            database = open_database(path, _products_of(chosen, products_in(path)))
         return cls(
             database,
             chosen,
@@ -267,6 +259,7 @@ class Matcher:
         fov_error: float = 0.0,
         prior: ArrayLike | None = None,
         prior_error_deg: float | None = None,
+        fov_deg: tuple[float, float] | None = None,
     ) -> MatchResult:
         """Identify the stars of a frame.
 
@@ -288,6 +281,10 @@ class Matcher:
             compared, which no method and no product is needed for; the verification is the same.
         prior_error_deg : float, optional
             Largest error of the prior, as an angle of rotation; above 0, at most 20.
+        fov_deg : pair of float, optional
+            Narrowest and widest field across the frame's width where nothing else is known: of
+            the camera only the size is used then. The database needs the product ``levels``, and
+            the brightness of the spots helps much.
 
         Returns
         -------
@@ -304,6 +301,9 @@ class Matcher:
         camera = camera or self.database.camera
         frame, mag = as_frame(centroids_px, magnitudes)
         near = prior_of(prior, prior_error_deg)
+        if fov_deg is not None:
+            blind = partial(identify_blind, fov_deg=fov_deg, certain=certainty(self))
+            return self._timed(frame, camera, mag, search=blind)
         if fov_error:
             return self._timed(frame, camera, mag, self._checked_fov_error(fov_error), near)
         return self._answers([(frame, mag)], camera, near)[0]
@@ -382,7 +382,7 @@ class Matcher:
         """Return why the C library has no answer: what the search with numpy comes to."""
         # What is unlikely enough for one of the two searches near a prior may not be found by
         # the other.
-        found = self._identify(frame, camera, mag, 0.0, prior)
+        found = searched(self, frame, camera, mag, 0.0, prior)
         return Refusal("prior") if found.ok and prior is not None else found.refusal
 
     def _timed(
@@ -392,10 +392,14 @@ class Matcher:
         mag: Array | None,
         fov_error: float = 0.0,
         prior: Prior | None = None,
+        search: Callable[[Matcher, Array, Camera, Array | None], MatchResult] | None = None,
     ) -> MatchResult:
         """Identify a frame with numpy, and say how long that took and what was asked."""
         before_s = time.perf_counter()
-        found = self._identify(frame, camera, mag, fov_error, prior)
+        if search is None:
+            found = searched(self, frame, camera, mag, fov_error, prior)
+        else:
+            found = search(self, frame, camera, mag)
         # A frozen dataclass refuses assignments; nobody else has this one yet.
         vars(found).update(time_s=time.perf_counter() - before_s, asked=self._asked(frame, mag))
         return found
@@ -412,72 +416,8 @@ class Matcher:
             raise ConfigError(text, key="fov_error", value=fov_error)
         return float(fov_error)
 
-    def _identify(
-        self,
-        frame: Array,
-        camera: Camera,
-        mag: Array | None,
-        fov_error: float = 0.0,
-        prior: Prior | None = None,
-    ) -> MatchResult:
-        """Identify a frame with numpy."""
-        if self.database.image is not None:
-            raise ConfigError(
-                f"a frame of {len(frame)} centroids and this camera are beyond the C library, and "
-                "an onboard image holds nothing for numpy; open the artifact that it is of"
-            )
-        observation = observe(
-            frame,
-            camera,
-            self.tolerance_px,
-            mag,
-            noise_px=self.noise_px,
-            noise_mag=self.noise_mag,
-            fov_error=fov_error,
-            min_share=self.min_share,
-            budget=Budget(self.max_steps, self.time_limit_s),
-        )
-        origin: Origin = "lost_in_space" if prior is None else "tracking"
-        if len(observation) < MIN_STARS:
-            return unidentified("too_few_stars", observation, origin=origin)
-        found, limit = self._search(observation, prior)
-        if found is None or found.false_match_probability > self.max_false_match_probability:
-            why = _refusal(found, limit, prior)
-            return unidentified("no_match", observation, why, origin=origin)
-        answer = identified(found, observation, self.database.star_id, origin)
-        if prior is None:
-            return answer
-        return expected_near(prior, answer, camera, self.tolerance_px)
 
-    def _search(
-        self, observation: Observation, prior: Prior | None
-    ) -> tuple[Agreement | None, Literal["time", "steps"] | None]:
-        """Return the first agreement that is certain, or the best one, and what ended the search.
-
-        The best one is that which chance explains least, among those that are withheld too.
-        """
-        limit = self.max_false_match_probability
-        certain = limit if limit <= CERTAIN else max(CERTAIN, 0.01 * limit)
-        best = BestOf(certain)
-        propose = METHODS[self.method].propose
-        whole_sky = islice(propose(observation, self.database, self.selection), self.max_batches)
-        try:
-            if prior is not None:
-                search_near(prior, observation, self.database, best, whole_sky)
-                return best.found, None
-            for candidates in whole_sky:
-                verify(candidates, observation, self.database, best)
-                if best.is_certain:
-                    break
-        except BudgetSpentError as spent:
-            return best.found, spent.limit
-        return best.found, None
-
-
-def _refusal(
-    found: Agreement | None, limit: Literal["time", "steps"] | None, prior: Prior | None
-) -> Refusal:
-    """Return why the best agreement, if there is one, is no answer."""
-    if found is None or (prior is not None and found.chance >= 1.0):
-        return Refusal(limit or ("no_candidate" if prior is None else "prior"))
-    return Refusal(limit or found.withheld or "chance", found.n_matched, found.chance, found.share)
+def _products_of(method: str, there: Collection[str]) -> tuple[str, ...]:
+    """Return the products that a method needs, and those that it can use and that are there."""
+    known = method_named(method)
+    return (*known.products, *(name for name in known.optional if name in there))

@@ -37,7 +37,13 @@ from starcat.pipeline.facts import (
 from starcat.pipeline.guide_stars import select_stars
 from starcat.pipeline.judgement import advice_without_magnitudes, check_rates
 from starcat.pipeline.log import Stopwatch, write_build_log
-from starcat.pipeline.recipes import RECIPES, Ingredients, boresight_product, cook
+from starcat.pipeline.recipes import (
+    RECIPES,
+    Ingredients,
+    boresight_product,
+    cook,
+    level_product,
+)
 from starcat.products.boresights import FieldStars
 from starcat.progress import Progress, no_progress
 from starcat.report.coverage_report import CoverageReport, holes_warning
@@ -202,7 +208,7 @@ def _make(partial: Path, plan: _Plan, clock: Stopwatch, progress: Progress) -> B
     results = Results(spec, sources, products, facts, fields, filters, rates)
     report = report_build(partial, results)
     clock.lap("report")
-    manifest = write_manifest(partial, spec.model_dump(mode="json"), sources, facts)
+    manifest = write_manifest(partial, spec.recorded(), sources, facts)
     told = dict.fromkeys(
         (
             *catalog.notes,
@@ -352,6 +358,9 @@ def make_products(
         if getattr(spec.products, name).enabled:
             progress(f"product {name}", 0, None)
             products.append(cook(name, given))
+    if spec.products.levels.enabled:
+        progress("product levels", 0, None)
+        products.append(level_product(selected.guide_stars, spec))
     return products
 
 
@@ -370,7 +379,7 @@ def database_facts(spec: BuildSpec) -> dict[str, str | float]:
     """
     camera = spec.camera.camera()
     size = {"width_px": camera.width_px, "height_px": camera.height_px}
-    content = spec.model_dump(mode="json")
+    content = spec.recorded()
     return {
         "name": spec.name,
         "version": spec.version,

@@ -249,7 +249,7 @@ def build_facts(folder: Path, results: Results) -> BuildFacts:
     sources = [source.as_dict() for source in results.sources]
     found = {name for source in sources for name in source["rejected"]}
     return BuildFacts(
-        spec=spec.model_dump(mode="json"),
+        spec=spec.recorded(),
         sources=sources,
         reasons={reason.name: reason.value for reason in Reason if reason.name in found},
         products=products,

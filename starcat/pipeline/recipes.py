@@ -22,6 +22,7 @@ from starcat.products.grid import grid_patterns
 from starcat.products.hausdorff_angular import angular_reference_sets
 from starcat.products.hausdorff_l2 import planar_reference_sets
 from starcat.products.index import Index, Ragged
+from starcat.products.levels import find_levels, level_fields
 from starcat.products.neighbours import find_neighbours
 from starcat.products.pairs import find_pairs
 from starcat.products.radial import radial_patterns
@@ -243,6 +244,34 @@ def boresight_product(fields: FieldStars, brightest: int) -> Product:
         rows, ra_deg, dec_deg, u[0], u[1], u[2], count, Ragged(*fields.brightest(brightest))
     )
     return Product("boresights", table_from_result(result, product_schema("boresights")), Index())
+
+
+def level_product(guide_stars: pa.Table, spec: BuildSpec) -> Product:
+    """Return the levels of a range of fields as a product.
+
+    Parameters
+    ----------
+    guide_stars : pyarrow.Table
+        Guide stars, as the schema ``stars`` has them.
+    spec : BuildSpec
+        Its ``products.levels`` and ``boresights``.
+
+    Returns
+    -------
+    Product
+        One row a level; the camera's own field is none of them.
+    """
+    wanted, own = spec.products.levels, field_size(spec)
+    result = find_levels(
+        directions_of(guide_stars),
+        floats_of(guide_stars, "mag"),
+        own,
+        level_fields(own, wanted.widest_fov_x_deg, wanted.max_ratio),
+        boresights=spec.boresights.count,
+        stars_per_field=wanted.stars_per_field,
+        brightest=spec.boresights.brightest,
+    )
+    return Product("levels", table_from_result(result, product_schema("levels")), result.index)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,14 @@ from starcat.catalog.ingest import ingest
 from starcat.catalog.selection import reject_dense, select_guide_stars
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.errors import OutputError
+from starcat.geometry.camera import Camera
 from starcat.pipeline.cost import BASE_BYTES, CATALOG_FACTOR, Cost, product_cost
 from starcat.pipeline.recipes import RECIPES, Ingredients, field_size, tile_guide_stars
 from starcat.products.boresights import tile_sphere
 from starcat.products.coverage import Spread, field_coverage, summarise_coverage
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import BuildSpec, CameraSpec
+from starcat.specs.reading import spec_from_dict
 from starcat.specs.spec_toml import spec_toml
 from starcat.storage.atomic import whole_file
 
@@ -43,6 +46,9 @@ ENOUGH_SHARE = 0.995
 
 BRIGHTEST = 10
 """Stars of a field that make its triangles, 120 of ten."""
+
+BRIGHTEST_OF_LEVEL = 8
+"""The same for a range of fields: each candidate of an unknown field is one more to be tried."""
 
 STARS_A_FIELD = 12
 """The spec thins to so many: the brightest of every field of the tiling."""
@@ -108,6 +114,8 @@ class Starter:
     def left_out(self) -> tuple[str, ...]:
         """Products that the camera could use, and that would cost too much."""
         products = self.spec.products
+        if products.levels.enabled:
+            return ()
         return tuple(name for name in RECIPES if not getattr(products, name).enabled)
 
     @property
@@ -122,6 +130,7 @@ def starter_spec(
     camera: CameraSpec,
     faint_limit_mag: float | None = None,
     progress: Progress = no_progress,
+    widest_fov_x_deg: float | None = None,
 ) -> Starter:
     """Return a spec for a camera, from the embedded sky.
 
@@ -136,6 +145,10 @@ def starter_spec(
         `ENOUGH_STARS` stars in `ENOUGH_SHARE` of the fields, a tenth of a magnitude at a time.
     progress : Progress
         Passed on.
+    widest_fov_x_deg : float, optional
+        Field across the width that the database is to serve too, for cameras of which only a range
+        is known; ``camera`` is the narrow end of it. Only products that find a focal length are
+        made then.
 
     Returns
     -------
@@ -150,13 +163,14 @@ def starter_spec(
     name = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:64] or "camera"
     sky = ingest(SOURCE, locate(SOURCE, {}), progress=progress).stars
     mag = np.sort(floats_of(sky, "mag"))
-    shape = _spec(name, camera, float(mag[-1]))
+    spec_to = partial(_spec, name, camera, widest_fov_x_deg)
+    shape = spec_to(float(mag[-1]))
     limit = faint_limit_mag
     if limit is None:
         limit = _enough(sky, shape)
-    spec, thinned, cost = _affordable(sky, _spec(name, camera, limit))
+    spec, thinned, cost = _affordable(sky, spec_to(limit))
     limits = sorted({round(limit + step, 2) for step in _STEPS_MAG} | {limit})
-    rows = [_row(sky, _spec(name, camera, one)) for one in limits if one <= mag[-1] or one == limit]
+    rows = [_row(sky, spec_to(one)) for one in limits if one <= mag[-1] or one == limit]
     return Starter(spec, tuple(rows), float(mag[-1]), thinned, cost)
 
 
@@ -207,7 +221,9 @@ def boresight_count(camera: CameraSpec) -> int:
     return int(np.clip(100 * np.ceil(wanted / 100.0), 2000, 1_000_000))
 
 
-def _spec(name: str, camera: CameraSpec, faint_limit_mag: float) -> BuildSpec:
+def _spec(
+    name: str, camera: CameraSpec, widest_fov_x_deg: float | None, faint_limit_mag: float
+) -> BuildSpec:
     field = camera.camera()
     content: dict[str, Any] = {
         "name": name,
@@ -229,7 +245,21 @@ def _spec(name: str, camera: CameraSpec, faint_limit_mag: float) -> BuildSpec:
         "camera": camera.model_dump(exclude_none=True),
         "boresights": {"count": boresight_count(camera), "brightest": BRIGHTEST},
     }
-    return BuildSpec.model_validate(content)
+    if widest_fov_x_deg is not None:
+        content |= _for_a_range(field, widest_fov_x_deg, content["boresights"]["count"])
+    return spec_from_dict(content, "--fov-range")
+
+
+def _for_a_range(narrowest: Camera, widest_fov_x_deg: float, boresights: int) -> dict[str, Any]:
+    """Return what a spec has of its own where it serves a range of fields."""
+    others = {name: {"enabled": False} for name in RECIPES if name != "triangles"}
+    levels = {"enabled": True, "widest_fov_x_deg": widest_fov_x_deg}
+    return {
+        "description": f"Guide stars for fields of {narrowest.fov_x_deg:.4g} to "
+        f"{widest_fov_x_deg:.4g} deg across the width",
+        "boresights": {"count": boresights, "brightest": BRIGHTEST_OF_LEVEL},
+        "products": {**others, "levels": levels},
+    }
 
 
 def _affordable(sky: pa.Table, spec: BuildSpec) -> tuple[BuildSpec, LimitRow, Cost]:

@@ -6,12 +6,12 @@ spec travels in the manifest of the artifact. `starcat.specs.reading` reads one 
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
 from starcat.geometry.camera import Camera
-from starcat.specs.product_sections import Products
+from starcat.specs.product_sections import Levels, Products
 from starcat.specs.section import FieldDeg, Mag, Section
 from starcat.specs.version import NAME_PATTERN, VERSION_PATTERN
 
@@ -239,6 +239,23 @@ class BuildSpec(Section):
         return self
 
     @model_validator(mode="after")
+    def _levels_are_wider(self) -> BuildSpec:
+        wanted, own_deg = self.products.levels, self.camera.camera().fov_x_deg
+        if not wanted.enabled:
+            return self
+        if not self.products.triangles.enabled:
+            raise ValueError(
+                "products.levels: they begin where the product triangles ends; set "
+                "products.triangles.enabled = true"
+            )
+        if wanted.widest_fov_x_deg <= own_deg:
+            raise ValueError(
+                f"products.levels: widest_fov_x_deg {wanted.widest_fov_x_deg:g} is not above the "
+                f"camera's own field, {own_deg:.4g} deg; the camera is the narrow end of the range"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _look_up_table_of_a_size(self) -> BuildSpec:
         wanted = self.products.neighbours
         radius_deg = wanted.radius_deg or self.camera.half_field_deg
@@ -249,6 +266,20 @@ class BuildSpec(Section):
                 f"at most {MOST_BINS:,} fit. Make the bins wider or radius_deg smaller"
             )
         return self
+
+    def recorded(self) -> dict[str, Any]:
+        """Return what an artifact says of its spec.
+
+        Returns
+        -------
+        dict
+            All keys as JSON has them, but not those of ``products.levels`` where there are none:
+            artifacts are the same as before there was such a product.
+        """
+        content = self.model_dump(mode="json")
+        if self.products.levels == Levels():
+            del content["products"]["levels"]
+        return content
 
     @property
     def sources(self) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from starcat.specs.section import Mag, Section, SmallDeg
+from starcat.specs.section import FieldDeg, Mag, Section, SmallDeg
 
 _HALF_FIELD = "default: half of the camera's narrower field"
 PlanarDeg = Annotated[float, Field(ge=0.001, le=80.0)]
@@ -97,6 +97,21 @@ class Radial(Product):
     sectors: int = Field(16, ge=1, le=30, description="sectors of the full turn")
 
 
+class Levels(Product):
+    """Stars and triangles for fields wider than the camera's: one artifact for a range of them."""
+
+    enabled: bool = Field(False, description="whether the artifact has this product")
+    widest_fov_x_deg: FieldDeg = Field(
+        30.0, description="field across the width that the range goes up to, from the camera's own"
+    )
+    max_ratio: float = Field(
+        1.5, ge=1.1, le=2.0, description="largest ratio of the fields of neighbouring levels"
+    )
+    stars_per_field: int = Field(
+        20, ge=4, le=10_000, description="stars are kept that are the brightest of a level's field"
+    )
+
+
 class Crossmatch(Product):
     """Counterparts of the guide stars in other catalogs."""
 
@@ -164,4 +179,5 @@ class Products(Section):
     hausdorff_l2: HausdorffL2 = HausdorffL2()
     grid: Grid = Grid()
     radial: Radial = Radial()
+    levels: Levels = Levels()
     crossmatch: Crossmatch = Crossmatch()

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 from starcat.errors import ConfigError, ProductError
+from starcat.matcher import levels
 from starcat.matcher.database import Database
 from starcat.matcher.methods import (
     dynamic_angle,
@@ -40,16 +41,22 @@ class Method:
         Names of the products that it needs beside the stars.
     description : str
         Description in a few words.
+    optional : tuple of str
+        Names of products that it can use where they are there.
     """
 
     propose: Propose
     products: tuple[str, ...]
     description: str = ""
+    optional: tuple[str, ...] = ()
 
 
 METHODS: dict[str, Method] = {
     "triangle": Method(
-        triangle.candidates, triangle.PRODUCTS, "area and circumradius of triangles (S4)"
+        triangle.candidates,
+        triangle.PRODUCTS,
+        "area and circumradius of triangles (S4)",
+        (levels.PRODUCT,),
     ),
     "pairs": Method(pairs.candidates, pairs.PRODUCTS, "triangles joined from star pairs"),
     "pyramid": Method(pyramid.candidates, pyramid.PRODUCTS, "such triangles with a fourth star"),

@@ -1,0 +1,393 @@
+"""Frames of a camera of which only a range of fields of view is known.
+
+Each level of the database serves a part of the range, with its own stars and triangles; within
+that part the focal length is found with the attitude. All levels are searched together, a batch
+of candidates from each in turn, until one agreement is certain.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice, pairwise
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.errors import ConfigError
+from starcat.geometry.camera import Camera
+from starcat.matcher.budget import Budget, BudgetSpentError
+from starcat.matcher.chance import MIN_STARS
+from starcat.matcher.database import Database
+from starcat.matcher.levels import Level, levels
+from starcat.matcher.methods.candidates import Candidates
+from starcat.matcher.methods.table import METHODS
+from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder
+from starcat.matcher.observation import WIDEST_FOV_ERROR, Observation, observe
+from starcat.matcher.pose import first_poses, pose_at
+from starcat.matcher.refusal import Refusal
+from starcat.matcher.result import MatchResult, identified, unidentified
+from starcat.matcher.verification import AT_ONCE, Agreement, BestOf, agree, agreeing_centroids
+
+Array = NDArray[np.float64]
+
+MOST_CENTROIDS = 40
+"""Brightest centroids of a frame that are compared with a level, which has about 20 stars a field
+of its size, and 40 a frame that is wider by half."""
+
+BRIGHTEST = TriangleOrder(most_centroids=10)
+"""Triangles where magnitudes are known: those of the stars that a level's triangles are of."""
+
+BY_CHANCE = 1.0
+"""Candidates of a batch that are worked out although they agree by chance, on average."""
+
+_OWN = 3
+"""Centroids of a candidate, which its attitude was computed from."""
+
+BEYOND = 1.25
+"""Factor by which the outer levels serve focal lengths beyond those that they are made for: a
+frame of other proportions than the camera's has another width for the same area."""
+
+
+class Asking(Protocol):
+    """What a `Matcher` states of a search."""
+
+    @property
+    def database(self) -> Database:
+        """The stars and the products."""
+
+    @property
+    def method(self) -> str:
+        """A key of `METHODS`."""
+
+    @property
+    def selection(self) -> TriangleOrder:
+        """Order and limits of triangles."""
+
+    @property
+    def max_batches(self) -> int:
+        """Batches of candidates of each level."""
+
+    @property
+    def tolerance_px(self) -> float:
+        """Largest error of a centroid."""
+
+    @property
+    def noise_px(self) -> float | None:
+        """Noise of a centroid, where it is stated."""
+
+    @property
+    def noise_mag(self) -> float | None:
+        """Noise of a magnitude, where it is stated."""
+
+    @property
+    def max_false_match_probability(self) -> float:
+        """Answers that chance would give more often are withheld."""
+
+    @property
+    def min_share(self) -> float:
+        """Least share of the frame to be explained."""
+
+    @property
+    def max_steps(self) -> float:
+        """Steps that a frame may take."""
+
+    @property
+    def time_limit_s(self) -> float:
+        """Seconds that a frame may take."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a range of focal lengths, and the level that serves it.
+
+    Attributes
+    ----------
+    level : Level
+        Stars and triangles.
+    low_px, high_px : float
+        Ends, pixels.
+    """
+
+    level: Level
+    low_px: float
+    high_px: float
+
+    @property
+    def focal_length_px(self) -> float:
+        """The middle, of which both ends are the same factor away."""
+        return math.sqrt(self.low_px * self.high_px)
+
+    @property
+    def fov_error(self) -> float:
+        """Largest relative error of the middle."""
+        return 1.0 - math.sqrt(self.low_px / self.high_px)
+
+
+@dataclass(frozen=True)
+class _Search:
+    """One part's frame, its candidates, and the best that came of them."""
+
+    part: Part
+    whole: Observation
+    used: Observation
+    best: BestOf
+
+
+def parts_of_range(
+    known: Sequence[Level], camera: Camera, fov_deg: tuple[float, float]
+) -> list[Part]:
+    """Return the parts of a range of fields of view.
+
+    Parameters
+    ----------
+    known : sequence of Level
+        Levels of the database, the narrowest first.
+    camera : Camera
+        Its size is used.
+    fov_deg : pair of float
+        Narrowest and widest field across the width, degrees.
+
+    Returns
+    -------
+    list of Part
+        The widest field first; they do not overlap. A level's part goes from its own field to
+        that of the next level.
+
+    Raises
+    ------
+    ConfigError
+        If the range is none, or goes beyond what the levels are made for by more than `BEYOND`.
+    """
+    narrow_deg, wide_deg = (float(angle) for angle in fov_deg)
+    if not 0.0 < narrow_deg < wide_deg < 180.0:
+        raise ConfigError(
+            f"fov_deg is {narrow_deg:g} to {wide_deg:g}; expected two fields of view between 0 "
+            "and 180 deg, the narrower one first",
+            key="fov_deg",
+            value=fov_deg,
+        )
+    low_px, high_px = (_focal_px(camera, angle) for angle in (wide_deg, narrow_deg))
+    ends = [level.focal_length_px(camera) for level in known]
+    ends.append(ends[-1] ** 2 / ends[-2])
+    if high_px > ends[0] * BEYOND or low_px < ends[-1] / BEYOND:
+        reach = [2.0 * math.degrees(math.atan(0.5 * camera.width_px / end)) for end in ends]
+        raise ConfigError(
+            f"fov_deg is {narrow_deg:g} to {wide_deg:g}; the levels of {known[0].database.name} "
+            f"serve {reach[0]:.4g} to {reach[-1]:.4g} deg across a frame of {camera.width_px} x "
+            f"{camera.height_px} px. Give a range within these, or build for a wider one",
+            key="fov_deg",
+            value=fov_deg,
+        )
+    ends[0], ends[-1] = ends[0] * BEYOND, ends[-1] / BEYOND
+    parts = [
+        Part(level, max(low_px, low), min(high_px, high))
+        for level, (high, low) in zip(known, pairwise(ends), strict=True)
+    ]
+    return [part for part in reversed(parts) if part.low_px < part.high_px]
+
+
+def _focal_px(camera: Camera, fov_x_deg: float) -> float:
+    return 0.5 * camera.width_px / math.tan(math.radians(0.5 * fov_x_deg))
+
+
+def identify_blind(
+    matcher: Asking,
+    centroids_px: Array,
+    camera: Camera,
+    mag: Array | None,
+    fov_deg: tuple[float, float],
+    certain: float,
+) -> MatchResult:
+    """Identify a frame of a camera of which only a range of fields of view is known.
+
+    Parameters
+    ----------
+    matcher : Asking
+        A `Matcher`: its database, its limits, and its method, which has to be ``triangle``.
+    centroids_px : ndarray of float64, shape (N, 2)
+        Pixels.
+    camera : Camera
+        Its size is used. Its axis is taken to be in the middle, and its lens not to distort.
+    mag : ndarray of float64, shape (N,), or None
+        Magnitudes. Without them, frames of many more stars than a level's are hard to identify.
+    fov_deg : pair of float
+        Narrowest and widest field across the width, degrees.
+    certain : float
+        A false-match probability as low as this ends the search.
+
+    Returns
+    -------
+    MatchResult
+        With the camera that was found.
+
+    Raises
+    ------
+    ConfigError
+        If the method or the range cannot be used.
+    ProductError
+        If the database has no levels.
+
+    Notes
+    -----
+    The false-match probability of an answer is that of its level times the number of levels that
+    were searched. The bound of one level counts all attitudes and all focal lengths of its part
+    of the range (`false_match_probability`), with the number of its own stars in the frame. The
+    parts cover the whole range and do not overlap, and the probability that chance agrees in
+    any of K parts is at most the sum of those in each. So no answer is given in any of them
+    whose bound is above the limit divided by K. Only the brightest of many spots are compared;
+    which these are does not depend on where in the frame they lie, so that the bound holds for
+    them as for a frame that has no others.
+    """
+    parts = _checked_parts(matcher, camera, fov_deg)
+    budget = Budget(matcher.max_steps, matcher.time_limit_s)
+    searches = [
+        _begun(part, matcher, camera, centroids_px, mag, budget, certain / len(parts))
+        for part in parts
+    ]
+    whole = searches[0].whole
+    if len(whole) < MIN_STARS:
+        return unidentified("too_few_stars", whole)
+    limit = _run(searches, matcher)
+    done = [search for search in searches if search.best.found is not None]
+    if not done:
+        return unidentified("no_match", whole, Refusal(limit or "no_candidate"))
+    first = done[0]
+    for other in done[1:]:
+        if other.best.found is not None and other.best.found.is_better_than(first.best.found):
+            first = other
+    found = _of_the_artifact(first, len(parts))
+    if found.false_match_probability > matcher.max_false_match_probability:
+        reason = limit or found.withheld or "chance"
+        refusal = Refusal(reason, found.n_matched, found.chance, found.share)
+        return unidentified("no_match", whole, refusal)
+    return identified(found, first.whole, matcher.database.star_id)
+
+
+def _checked_parts(matcher: Asking, camera: Camera, fov_deg: tuple[float, float]) -> list[Part]:
+    if matcher.database.image is not None:
+        raise ConfigError(
+            "an onboard image serves one field of view; open the artifact that it is of", key="fov"
+        )
+    if matcher.method != "triangle":
+        raise ConfigError(
+            f"method {matcher.method!r} needs the focal length; only 'triangle' can find it",
+            key="method",
+            value=matcher.method,
+        )
+    return parts_of_range(levels(matcher.database), camera, fov_deg)
+
+
+def _begun(
+    part: Part,
+    matcher: Asking,
+    camera: Camera,
+    centroids_px: Array,
+    mag: Array | None,
+    budget: Budget,
+    certain: float,
+) -> _Search:
+    """Return the search of one part before its first candidate."""
+    whole = observe(
+        centroids_px,
+        Camera(camera.width_px, camera.height_px, part.focal_length_px),
+        matcher.tolerance_px,
+        mag,
+        noise_px=matcher.noise_px,
+        noise_mag=matcher.noise_mag,
+        fov_error=min(part.fov_error, WIDEST_FOV_ERROR),
+        min_share=matcher.min_share,
+        budget=budget,
+    )
+    used = whole
+    if whole.mag is not None and len(whole) > MOST_CENTROIDS:
+        used = replace(
+            whole,
+            rows=whole.rows[:MOST_CENTROIDS],
+            centroids_px=whole.centroids_px[:MOST_CENTROIDS],
+            body=whole.body[:MOST_CENTROIDS],
+            mag=whole.mag[:MOST_CENTROIDS],
+        )
+    return _Search(part, whole, used, BestOf(certain))
+
+
+def _run(searches: Sequence[_Search], matcher: Asking) -> Literal["time", "steps"] | None:
+    """Search a batch of each part in turn, and return the limit that ended it."""
+    waiting = [(search, _steps(search, matcher)) for search in searches]
+    try:
+        while waiting:
+            left = []
+            for search, steps in waiting:
+                if next(steps, None) is None:
+                    continue
+                if search.best.is_certain:
+                    return None
+                left.append((search, steps))
+            waiting = left
+    except BudgetSpentError as spent:
+        return spent.limit
+    return None
+
+
+def _steps(search: _Search, matcher: Asking) -> Iterator[bool]:
+    """Verify a batch of candidates each time that the next value is asked for."""
+    selection = matcher.selection
+    if selection == DEFAULT and search.used.mag is not None:
+        selection = BRIGHTEST
+    propose, database = METHODS[matcher.method].propose, search.part.level.database
+    proposals = propose(search.used, database, selection)
+    for candidates in islice(proposals, matcher.max_batches):
+        _verify(candidates, search)
+        yield True
+
+
+def _verify(candidates: Candidates, search: _Search) -> None:
+    """Work out the agreements of the candidates that stand out, until one is certain.
+
+    Each level has thousands of candidates for a frame, nearly all of them false. Beside its own
+    three, each has as many agreeing centroids as chance brings near stars: a Poisson variate,
+    whose mean is that of the batch. Those are worked out that hardly any of the batch reaches.
+    """
+    frame, database = search.used, search.part.level.database
+    matrices, factors, counts = [], [], []
+    for first in range(0, len(candidates), AT_ONCE):
+        part = candidates[first : first + AT_ONCE]
+        frame.budget.spend(len(part))
+        turned, scaled = first_poses(part, frame, database.directions)
+        matrices.append(turned)
+        factors.append(scaled)
+        counts.append(agreeing_centroids(turned, frame, database, scaled))
+    count = np.concatenate(counts)
+    order = np.argsort(-count, kind="stable")
+    for row in order[count[order] >= _standing_out(count)].tolist():
+        batch, place = divmod(row, AT_ONCE)
+        pose = pose_at(matrices[batch][place], float(factors[batch][place]), frame)
+        found = agree(pose, frame, database, search.best.certain)
+        if found.is_better_than(search.best.found):
+            search.best.found = found
+        if search.best.is_certain:
+            return
+
+
+def _standing_out(count: NDArray[np.int64]) -> int:
+    """Return how many centroids agree with no more than `BY_CHANCE` of some false candidates."""
+    mean = float(np.maximum(count - _OWN, 0).mean())
+    expected, term, more = float(len(count)), math.exp(-mean), 0
+    while expected > BY_CHANCE:
+        expected -= len(count) * term
+        more += 1
+        term *= mean / more
+    return max(MIN_STARS, _OWN + more)
+
+
+def _of_the_artifact(search: _Search, parts: int) -> Agreement:
+    """Return the best agreement with rows of the artifact, and the chance of all parts."""
+    found = search.best.found
+    if found is None:
+        raise ValueError("a search that came to nothing has no agreement")
+    index = np.full(len(search.whole), -1, dtype=np.int32)
+    has_star = np.flatnonzero(found.star_index >= 0)
+    index[has_star] = search.part.level.rows[found.star_index[has_star]]
+    return replace(found, star_index=index, chance=min(1.0, parts * found.chance))

@@ -1,0 +1,169 @@
+"""Levels: stars and triangles for fields wider than the camera's, each level thinned by itself.
+
+A frame shows its brightest stars best, and which these are depends on how wide it is. A database
+for fields of 5 to 30 deg therefore has one set of stars and triangles for each of some widths
+between the two: the wider the field, the brighter and the fewer the stars.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.products.boresights import FieldSize, NominalField, tile_sphere
+from starcat.products.index import Index, Ragged
+from starcat.products.triangles import distinct_triangles
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.int32]
+
+FEWEST_BORESIGHTS = 1000
+"""Boresights of a level, at the least: wide fields need few, and may have more for nothing."""
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Stars and triangles of each level, the narrowest first.
+
+    Attributes
+    ----------
+    level : ndarray of int32, shape (L,)
+        1 to L; level 0 is the camera's own field.
+    fov_x_deg, fov_y_deg : ndarray of float64, shape (L,)
+        Full angles of a level's fields.
+    stars : Ragged
+        Rows of the star table, ascending.
+    i, j, k : Ragged
+        Triangles: rows of the star table, i < j < k, in order.
+    index : Index
+        Nothing.
+    """
+
+    level: Rows
+    fov_x_deg: Array
+    fov_y_deg: Array
+    stars: Ragged
+    i: Ragged
+    j: Ragged
+    k: Ragged
+    index: Index
+
+
+def level_fields(
+    narrowest: FieldSize, widest_fov_x_deg: float, max_ratio: float
+) -> tuple[NominalField, ...]:
+    """Return the fields of the levels.
+
+    Parameters
+    ----------
+    narrowest : FieldSize
+        The camera: its field is level 0, and all others have its proportions.
+    widest_fov_x_deg : float
+        Full angle across the width of the widest frames, degrees.
+    max_ratio : float
+        Largest ratio of the focal lengths of neighbouring levels, above 1.
+
+    Returns
+    -------
+    tuple of NominalField
+        The narrowest first, without level 0. Their focal lengths have the same ratio, and the
+        widest frames are wider than the last one's by that ratio too.
+
+    Notes
+    -----
+    A level serves frames that are as wide as its fields, or wider, up to those of the next level.
+    Such a frame holds fields of the level whole, so that their triangles are in it. In a frame
+    that is narrower than these by a sixth there may be no triangle at all.
+
+    Examples
+    --------
+    >>> fields = level_fields(NominalField(10.0, 7.5), 30.0, 1.5)
+    >>> [round(field.fov_x_deg, 2) for field in fields]
+    [14.48, 20.9]
+    """
+    across, down = (
+        math.tan(math.radians(0.5 * angle)) for angle in (narrowest.fov_x_deg, narrowest.fov_y_deg)
+    )
+    whole = math.tan(math.radians(0.5 * widest_fov_x_deg)) / across
+    # A range of exactly so many ratios has no level more because of rounding.
+    steps = max(2, math.ceil(math.log(whole) / math.log(max_ratio) - 1e-9))
+    factors = [whole ** (step / steps) for step in range(1, steps)]
+    return tuple(
+        NominalField(
+            2.0 * math.degrees(math.atan(across * factor)),
+            2.0 * math.degrees(math.atan(down * factor)),
+        )
+        for factor in factors
+    )
+
+
+def find_levels(
+    directions: Array,
+    mag: Array,
+    narrowest: FieldSize,
+    fields: Sequence[FieldSize],
+    *,
+    boresights: int,
+    stars_per_field: int,
+    brightest: int,
+) -> Levels:
+    """Find the stars and the triangles of each level.
+
+    Parameters
+    ----------
+    directions : ndarray of float64, shape (N, 3)
+        ICRS directions of the stars.
+    mag : ndarray of float64, shape (N,)
+        Their magnitudes.
+    narrowest : FieldSize
+        Field of the camera, to which the number of boresights belongs.
+    fields : sequence of FieldSize
+        Field of each level, the narrowest first, as `level_fields` has them.
+    boresights : int
+        Points that tile the sphere for the camera's field; levels have fewer, as their fields
+        are larger, but `FEWEST_BORESIGHTS` at the least.
+    stars_per_field : int
+        A star is kept that is among the brightest so many of some field of the level.
+    brightest : int
+        Stars of a field that make its triangles.
+
+    Returns
+    -------
+    Levels
+        Each level is thinned from the one before, so that its stars are among those of all
+        narrower ones.
+    """
+    rows = np.arange(len(directions), dtype=np.int32)
+    stars, triangles = [], []
+    for field in fields:
+        count = max(FEWEST_BORESIGHTS, round(boresights * _shrink(narrowest, field)))
+        tiled = tile_sphere(count, directions[rows], mag[rows], field)
+        found, _ = distinct_triangles(tiled, len(rows), brightest)
+        triangles.append(rows[found])
+        rows = rows[np.unique(tiled.brightest(stars_per_field)[1])]
+        stars.append(rows)
+    i, j, k = (_ragged([found[:, n] for found in triangles]) for n in range(3))
+    return Levels(
+        np.arange(1, len(fields) + 1, dtype=np.int32),
+        np.array([field.fov_x_deg for field in fields]),
+        np.array([field.fov_y_deg for field in fields]),
+        _ragged(stars),
+        i,
+        j,
+        k,
+        Index(),
+    )
+
+
+def _shrink(narrow: FieldSize, wide: FieldSize) -> float:
+    """Return how much smaller one field is than another one, by area."""
+    return (narrow.fov_x_deg * narrow.fov_y_deg) / (wide.fov_x_deg * wide.fov_y_deg)
+
+
+def _ragged(lists: Sequence[Rows]) -> Ragged:
+    offsets = np.cumsum([0, *(len(one) for one in lists)]).astype(np.int64)
+    return Ragged(offsets, np.concatenate([np.empty(0, dtype=np.int32), *lists]))

@@ -1,0 +1,353 @@
+"""Frames of an unknown field of view: levels of stars and triangles, and searching all of them."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from itertools import combinations, pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from starcat.artifact.verify import check_artifact
+from starcat.errors import ConfigError, ProductError
+from starcat.geometry.attitude import random_attitudes
+from starcat.geometry.camera import Camera
+from starcat.geometry.sphere import saff_kuijlaars, tangent_axes
+from starcat.images.image_file import write_image
+from starcat.images.render import Optics, render_image
+from starcat.matcher.blind import BEYOND, parts_of_range
+from starcat.matcher.database import ProductArrays
+from starcat.matcher.levels import levels
+from starcat.matcher.matcher import Matcher
+from starcat.products.boresights import NominalField
+from starcat.products.levels import FEWEST_BORESIGHTS, find_levels, level_fields
+from starcat.simulation.simulate import Noise, simulate_frames
+
+CAMERA = Camera(1024, 768, fov_x_deg=10.0)
+RANGE_DEG = (10.0, 40.0)
+
+
+def with_levels(sky, stars_per_field=20):
+    """Return a database with levels up to 40 deg."""
+    fields = level_fields(sky.camera, RANGE_DEG[1], 1.5)
+    made = find_levels(
+        sky.directions, sky.mag, sky.camera, fields,
+        boresights=2000, stars_per_field=stars_per_field, brightest=8,
+    )  # fmt: skip
+    arrays = {name: getattr(made, name) for name in ("level", "fov_x_deg", "fov_y_deg")}
+    for name in ("stars", "i", "j", "k"):
+        ragged = getattr(made, name)
+        arrays |= {f"{name}_offsets": ragged.offsets, f"{name}_values": ragged.values}
+    return replace(sky, products={**sky.products, "levels": ProductArrays(arrays)})
+
+
+@pytest.fixture(scope="module")
+def sky(sky_of, random_directions):
+    return with_levels(sky_of(random_directions(7000, 3), CAMERA, boresights=2000))
+
+
+def frame_of(sky, fov_deg, seed, faintest=60):
+    """Return the brightest stars that a camera sees: centroids, magnitudes, rows and attitude."""
+    camera = Camera(CAMERA.width_px, CAMERA.height_px, fov_x_deg=fov_deg)
+    generator = np.random.default_rng(seed)
+    matrix = random_attitudes(1, generator)[0]
+    rows = np.flatnonzero(sky.directions @ matrix[2] > math.cos(camera.radius_rad))
+    px = camera.pixels_from_directions(sky.directions[rows] @ matrix.T)
+    inside = camera.contains(px)
+    rows, px = rows[inside], px[inside]
+    first = np.argsort(sky.mag[rows], kind="stable")[:faintest]
+    px = px[first] + generator.normal(scale=0.3, size=(len(first), 2))
+    return px, sky.mag[rows[first]] + generator.normal(scale=0.1, size=len(first)), rows[first]
+
+
+def test_levels_go_up_to_the_widest_field_by_one_ratio():
+    fields = [CAMERA, *level_fields(CAMERA, 40.0, 1.5)]
+    half = [math.tan(math.radians(0.5 * field.fov_x_deg)) for field in fields]
+    ratios = [wide / narrow for narrow, wide in pairwise(half)]
+    assert len(fields) == 4
+    np.testing.assert_allclose(ratios, ratios[0])
+    assert 1.3 < ratios[0] <= 1.5
+    assert half[-1] * ratios[0] == pytest.approx(math.tan(math.radians(20.0)))
+    shape = [math.tan(math.radians(0.5 * field.fov_y_deg)) for field in fields]
+    np.testing.assert_allclose(np.divide(shape, half), 0.75)
+
+
+def test_levels_by_brute_force(random_directions):
+    u = random_directions(700, 5)
+    mag = np.random.default_rng(6).uniform(1.0, 6.0, len(u))
+    narrow, fields = NominalField(20.0, 15.0), [NominalField(30.0, 22.0), NominalField(45.0, 33.0)]
+    made = find_levels(u, mag, narrow, fields, boresights=10, stars_per_field=9, brightest=5)
+    known = np.arange(len(u))
+    for n, field in enumerate(fields):
+        stars, triangles = set(), set()
+        for boresight in saff_kuijlaars(FEWEST_BORESIGHTS):
+            ra, dec = math.atan2(boresight[1], boresight[0]), math.asin(boresight[2])
+            east, north = tangent_axes(np.degrees([ra]), np.degrees([dec]))
+            along = u[known] @ boresight
+            x, y = u[known] @ east[0] / along, u[known] @ north[0] / along
+            half = [math.tan(math.radians(0.5 * a)) for a in (field.fov_x_deg, field.fov_y_deg)]
+            inside = known[(along > 0) & (np.abs(x) <= half[0]) & (np.abs(y) <= half[1])]
+            ordered = inside[np.argsort(mag[inside])].tolist()
+            stars |= set(ordered[:9])
+            triangles |= {tuple(sorted(three)) for three in combinations(ordered[:5], 3)}
+        part = slice(*made.stars.offsets[n : n + 2])
+        assert made.stars.values[part].tolist() == sorted(stars)
+        part = slice(*made.i.offsets[n : n + 2])
+        found = zip(*(getattr(made, name).values[part].tolist() for name in "ijk"), strict=True)
+        assert list(found) == sorted(triangles)
+        known = np.array(sorted(stars))
+    assert len(known) < 0.6 * len(u)
+
+
+def test_a_level_is_a_database_of_its_own_stars(sky):
+    own, *wider = levels(sky)
+    assert own.database is sky
+    before = set(range(len(sky.mag)))
+    for level in wider:
+        part = level.database
+        assert set(level.rows.tolist()) < before
+        np.testing.assert_array_equal(part.star_id, sky.star_id[level.rows])
+        np.testing.assert_array_equal(part.directions, sky.directions[level.rows])
+        assert part.products["triangles"]["i"].max() < len(part.mag)
+        before = set(level.rows.tolist())
+    assert levels(sky)[1] is wider[0]
+
+
+def test_the_columns_of_a_level_are_those_of_the_product_triangles(sky, sky_of):
+    """The triangles of the camera's own field, given as those of a level, are looked up alike."""
+    product = sky.products["triangles"]
+    whole = np.array([0, len(product["i"])])
+    arrays = {
+        "level": np.array([1]), "fov_x_deg": np.array([10.0]), "fov_y_deg": np.array([7.5]),
+        "stars_offsets": np.array([0, len(sky.mag)]), "stars_values": np.arange(len(sky.mag)),
+    }  # fmt: skip
+    for name in "ijk":
+        arrays |= {f"{name}_offsets": whole, f"{name}_values": product[name]}
+    both = replace(sky, products={**sky.products, "levels": ProductArrays(arrays)})
+    made = levels(both)[1].database.products["triangles"]
+    for name in ("area_rad2", "circumradius_rad"):
+        np.testing.assert_allclose(made[name], product[name], rtol=1e-5)
+
+
+@pytest.mark.parametrize("fov_deg", [10.1, 12.0, 15.5, 19.0, 24.0, 30.0, 39.9])
+def test_frames_of_all_fields_of_a_range_are_identified(sky, fov_deg):
+    matcher = Matcher(sky, engine="numpy")
+    true_px = Camera(1024, 768, fov_x_deg=fov_deg).focal_length_px
+    for seed in range(4):
+        px, mag, rows = frame_of(sky, fov_deg, seed)
+        result = matcher.identify(px, magnitudes=mag, fov_deg=RANGE_DEG)
+        assert result.ok, (fov_deg, seed, result.refusal)
+        has_star = result.star_index >= 0
+        assert has_star.sum() >= 8
+        np.testing.assert_array_equal(result.star_index[has_star], rows[has_star])
+        np.testing.assert_array_equal(result.star_ids[has_star], sky.star_id[rows[has_star]])
+        error_px = abs(result.camera.focal_length_px - true_px)
+        assert error_px < min(5.0 * result.focal_length_error_px, 0.005 * true_px)
+        assert len(result.stars.spot) == has_star.sum()
+
+
+def test_nothing_is_taken_for_a_frame_of_the_range(sky):
+    matcher = Matcher(sky, engine="numpy")
+    generator = np.random.default_rng(11)
+    frames = [frame_of(sky, fov_deg, seed)[:2] for fov_deg in (8.5, 70.0) for seed in range(3)]
+    for count in (6, 30, 90):
+        frames.append((generator.uniform(0, 768, (count, 2)), generator.uniform(1, 6, count)))
+    mirrored = frame_of(sky, 20.0, 1)
+    frames.append((np.array([1024.0, 0.0]) + mirrored[0] * [-1.0, 1.0], mirrored[1]))
+    for px, mag in frames:
+        result = matcher.identify(px, magnitudes=mag, fov_deg=RANGE_DEG)
+        assert result.status == "no_match"
+        assert result.refusal.reason in ("chance", "share_of_frame", "scale", "no_candidate")
+    few = matcher.identify(px[:3], magnitudes=mag[:3], fov_deg=RANGE_DEG)
+    assert few.status == "too_few_stars"
+
+
+def test_a_frame_outside_of_a_narrower_range_gets_no_answer(sky):
+    matcher = Matcher(sky, engine="numpy")
+    px, mag, _ = frame_of(sky, 20.0, 2)
+    assert matcher.identify(px, magnitudes=mag, fov_deg=(15.0, 25.0)).ok
+    for other in ((11.0, 18.0), (22.5, 38.0)):
+        assert matcher.identify(px, magnitudes=mag, fov_deg=other).status == "no_match"
+
+
+def test_an_answer_counts_the_chance_of_all_levels(sky):
+    px, mag, _ = frame_of(sky, 20.0, 2, faintest=9)
+    found = Matcher(sky, engine="numpy").identify(px, magnitudes=mag, fov_deg=RANGE_DEG)
+    chance = found.false_match_probability
+    assert found.ok
+    focal_px = found.camera.focal_length_px
+    parts = parts_of_range(levels(sky), CAMERA, RANGE_DEG)
+    [part] = [part for part in parts if part.low_px < focal_px < part.high_px]
+    ends = [
+        2.0 * math.degrees(math.atan(512.0 / focal_px)) for focal_px in (part.high_px, part.low_px)
+    ]
+    alone = Matcher(sky, engine="numpy").identify(px, magnitudes=mag, fov_deg=tuple(ends))
+    assert chance == pytest.approx(4.0 * alone.false_match_probability, rel=1e-6)
+    strict = Matcher(sky, engine="numpy", max_false_match_probability=0.9 * chance)
+    assert strict.identify(px, magnitudes=mag, fov_deg=RANGE_DEG).refusal.reason == "chance"
+
+
+def test_parts_cover_the_range_once(sky):
+    parts = parts_of_range(levels(sky), CAMERA, (9.0, 41.0))
+    ends = [(part.low_px, part.high_px) for part in parts]
+    focal = [Camera(1024, 768, fov_x_deg=fov).focal_length_px for fov in (41.0, 9.0)]
+    assert ends[0][0] == pytest.approx(focal[0])
+    assert ends[-1][1] == pytest.approx(focal[1])
+    assert [high for _, high in ends[:-1]] == [low for low, _ in ends[1:]]
+    for part in parts:
+        middle = part.focal_length_px
+        assert middle * (1.0 - part.fov_error) == pytest.approx(part.low_px)
+        assert middle / (1.0 - part.fov_error) == pytest.approx(part.high_px)
+    # A portrait of the same detector has the same levels.
+    upright = parts_of_range(levels(sky), Camera(768, 1024, fov_x_deg=10.0), (8.0, 30.0))
+    assert {part.level.half_width for part in upright} == {p.level.half_width for p in parts}
+
+
+@pytest.mark.parametrize(
+    ("fov_deg", "words"),
+    [
+        ((20.0, 10.0), "the narrower one first"),
+        ((12.0, 12.0), "the narrower one first"),
+        ((0.0, 12.0), "between 0 and 180"),
+        ((math.nan, 12.0), "between 0 and 180"),
+        ((10.0 / (1.05 * BEYOND), 12.0), "serve 10 to 40 deg"),
+        ((12.0, 60.0), "serve 10 to 40 deg"),
+    ],
+)
+def test_ranges_that_cannot_be_searched_are_refused(sky, fov_deg, words):
+    with pytest.raises(ConfigError, match=words):
+        Matcher(sky).identify(np.ones((5, 2)), fov_deg=fov_deg)
+
+
+def test_what_cannot_be_blind_says_so(sky, sky_of):
+    with pytest.raises(ConfigError, match="only 'triangle' can find it"):
+        Matcher(sky, "pyramid").identify(np.ones((5, 2)), fov_deg=RANGE_DEG)
+    plain = sky_of(sky.directions, CAMERA, boresights=10)
+    with pytest.raises(ProductError, match=r"set 'products.levels.enabled = true'"):
+        Matcher(plain).identify(np.ones((5, 2)), fov_deg=RANGE_DEG)
+
+
+def strangers(sky):
+    return np.setdiff1d(np.arange(len(sky.mag)), levels(sky)[1].rows)
+
+
+@pytest.mark.parametrize("name", ["stars_values", "j_values", "k_offsets"])
+def test_levels_that_contradict_themselves_are_damaged(sky, name):
+    product = sky.products["levels"]
+    damaged = product[name].copy()
+    # Row 1 is that of a star which is not of the level, or the end of the first list.
+    damaged[1] = damaged[1] + 1 if name == "k_offsets" else strangers(sky)[0]
+    arrays = ProductArrays({**product.arrays, name: damaged})
+    wrong = replace(sky, products={**sky.products, "levels": arrays})
+    with pytest.raises(ProductError, match="the database is damaged"):
+        levels(wrong)
+
+
+def test_a_database_with_no_level_in_the_product_is_damaged(sky):
+    arrays = {
+        name: values[:1] if name.endswith("_offsets") else values[:0]
+        for name, values in sky.products["levels"].arrays.items()
+    }
+    wrong = replace(sky, products={**sky.products, "levels": ProductArrays(arrays)})
+    with pytest.raises(ProductError, match="there are none; the database is damaged"):
+        levels(wrong)
+
+
+def test_the_same_steps_give_the_same_end(sky):
+    px, mag = np.random.default_rng(2).uniform(0, 768, (40, 2)), np.linspace(1.0, 5.0, 40)
+    matcher = Matcher(sky, engine="numpy", max_steps=2000)
+    first, second = (matcher.identify(px, magnitudes=mag, fov_deg=RANGE_DEG) for _ in range(2))
+    assert first.refusal == second.refusal
+    assert first.refusal.reason == "steps"
+
+
+RANGE_SPEC = """\
+name = "range"
+version = "1.0.0"
+epoch_jyear = 2026.0
+catalog.source = "sao"
+selection.faint_limit_mag = 6.4
+camera = { width_px = 512, height_px = 512, fov_x_deg = 30.0 }
+boresights.count = 600
+self_test = { frames = 5, min_identified = 0.5 }
+products.levels = { enabled = true, widest_fov_x_deg = 70.0 }
+products.pairs.enabled = false
+products.neighbours.enabled = false
+products.hausdorff_angular.enabled = false
+products.hausdorff_l2.enabled = false
+products.grid.enabled = false
+products.radial.enabled = false
+"""
+
+
+@pytest.fixture
+def built(starcat, sao_lines, tmp_path):
+    (tmp_path / "sao.dat").write_bytes(b"".join(sao_lines))
+    (tmp_path / "range.toml").write_text(RANGE_SPEC)
+    run = starcat(["build", tmp_path / "range.toml", "--input", f"sao={tmp_path / 'sao.dat'}",
+                   "-o", tmp_path / "dist"])  # fmt: skip
+    assert run.code == 0, run.err
+    return tmp_path / "dist" / "range-1.0.0"
+
+
+def test_an_artifact_of_a_range_is_asked_from_the_command_line(
+    starcat, built: Path, small_artifact: Path, tmp_path: Path
+) -> None:
+    check_artifact(built)
+    manifest = json.loads((built / "manifest.json").read_bytes())
+    assert manifest["products"]["levels"]["rows"] == 2
+    database = Matcher.open(built).database
+    camera = Camera(640, 480, fov_x_deg=55.0)
+    frame = next(simulate_frames(database.directions, camera, 1, Noise(0.2), 3, mag=database.mag))
+    text = "".join(
+        f"{x},{y},{mag}\n" for (x, y), mag in zip(frame.centroids_px, frame.mag, strict=True)
+    )
+    (tmp_path / "frame.csv").write_text("x_px,y_px,mag\n" + text)
+    ask = ["identify", built, tmp_path / "frame.csv", "--json", "--fov", "32:70"]
+    run = starcat([*ask, "--size", "640x480"])
+    [answer] = json.loads(run.out)
+    assert answer["status"] == "identified"
+    assert answer["focal_length_px"] == pytest.approx(camera.focal_length_px, rel=2e-3)
+    optics = Optics(zero_point_e=3e6)
+    drawn = render_image(frame.centroids_px, frame.mag, (640, 480), optics, 1)
+    write_image(tmp_path / "frame.png", drawn)
+    [answer] = json.loads(
+        starcat(["identify", built, tmp_path / "frame.png", "--json", "--fov", "32:70"]).out
+    )
+    assert answer["status"] == "identified"
+    for options, words in (
+        (["--fov-error", "2%"], "either --fov, a range of fields, or --fov-error"),
+        (["--size", "640"], "is not WIDTHxHEIGHT"),
+    ):
+        run = starcat([*ask, *options])
+        assert (run.code, words in run.err) == (2, True)
+    run = starcat(["identify", built, tmp_path / "frame.csv", "--size", "640x480"])
+    assert (run.code, "--size is the size of frames with --fov" in run.err) == (2, True)
+    run = starcat(["identify", built, tmp_path / "frame.png", "--fov", "32:70", "--size", "8x8"])
+    assert (run.code, "the image has 640 x 480 px" in run.err) == (2, True)
+    # An artifact without levels does not mention them, as before there was such a product.
+    plain = json.loads((small_artifact / "manifest.json").read_bytes())
+    assert "levels" not in plain["spec"]["products"]
+    assert "levels" in manifest["spec"]["products"]
+
+
+@pytest.mark.slow
+def test_init_writes_a_spec_for_a_range(starcat, tmp_path):
+    file = tmp_path / "range.toml"
+    run = starcat(["init", file, "--size", "1024x768", "--fov-range", "15:30", "--json"])
+    assert run.code == 0, run.err
+    spec = json.loads(run.out)["spec"]
+    assert spec["camera"]["fov_x_deg"] == 15.0
+    assert spec["products"]["levels"]["enabled"]
+    assert spec["products"]["levels"]["widest_fov_x_deg"] == 30.0
+    enabled = {name for name, product in spec["products"].items() if product["enabled"]}
+    assert enabled == {"triangles", "levels"}
+    for options, words in (
+        (["--fov-range", "30:15"], "is not above the camera's own field"),
+        (["--fov-range", "15:30", "--fov-x-deg", "15"], "either --fov-range or --fov-x-deg"),
+    ):
+        run = starcat(["init", tmp_path / "b.toml", "--size", "1024x768", *options])
+        assert (run.code, words in run.err) == (2, True)
