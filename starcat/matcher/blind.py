@@ -11,16 +11,16 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice, pairwise
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
+from starcat.matcher.asking import Asking
 from starcat.matcher.budget import Budget, BudgetSpentError
 from starcat.matcher.chance import MIN_STARS
-from starcat.matcher.database import Database
 from starcat.matcher.levels import Level, levels
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.table import METHODS
@@ -49,54 +49,6 @@ _OWN = 3
 BEYOND = 1.25
 """Factor by which the outer levels serve focal lengths beyond those that they are made for: a
 frame of other proportions than the camera's has another width for the same area."""
-
-
-class Asking(Protocol):
-    """What a `Matcher` states of a search."""
-
-    @property
-    def database(self) -> Database:
-        """The stars and the products."""
-
-    @property
-    def method(self) -> str:
-        """A key of `METHODS`."""
-
-    @property
-    def selection(self) -> TriangleOrder:
-        """Order and limits of triangles."""
-
-    @property
-    def max_batches(self) -> int:
-        """Batches of candidates of each level."""
-
-    @property
-    def tolerance_px(self) -> float:
-        """Largest error of a centroid."""
-
-    @property
-    def noise_px(self) -> float | None:
-        """Noise of a centroid, where it is stated."""
-
-    @property
-    def noise_mag(self) -> float | None:
-        """Noise of a magnitude, where it is stated."""
-
-    @property
-    def max_false_match_probability(self) -> float:
-        """Answers that chance would give more often are withheld."""
-
-    @property
-    def min_share(self) -> float:
-        """Least share of the frame to be explained."""
-
-    @property
-    def max_steps(self) -> float:
-        """Steps that a frame may take."""
-
-    @property
-    def time_limit_s(self) -> float:
-        """Seconds that a frame may take."""
 
 
 @dataclass(frozen=True)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from itertools import islice
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
+from starcat.matcher.asking import Asking
 from starcat.matcher.budget import Budget, BudgetSpentError
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.methods.table import METHODS
@@ -18,9 +19,6 @@ from starcat.matcher.prior import Prior, expected_near, search_near
 from starcat.matcher.refusal import Refusal
 from starcat.matcher.result import MatchResult, Origin, identified, unidentified
 from starcat.matcher.verification import Agreement, BestOf, verify
-
-if TYPE_CHECKING:
-    from starcat.matcher.matcher import Matcher
 
 Array = NDArray[np.float64]
 
@@ -31,13 +29,13 @@ Where more is allowed, a hundredth of it ends the search; else the best answer i
 """
 
 
-def certainty(matcher: Matcher) -> float:
+def certainty(matcher: Asking) -> float:
     """Return how low a false-match probability ends a search.
 
     Parameters
     ----------
-    matcher : Matcher
-        The matcher, whose limit an answer has to keep.
+    matcher : Asking
+        A `Matcher`, whose limit an answer has to keep.
 
     Returns
     -------
@@ -49,7 +47,7 @@ def certainty(matcher: Matcher) -> float:
 
 
 def searched(
-    matcher: Matcher,
+    matcher: Asking,
     frame: Array,
     camera: Camera,
     mag: Array | None,
@@ -60,8 +58,8 @@ def searched(
 
     Parameters
     ----------
-    matcher : Matcher
-        Database, method and limits.
+    matcher : Asking
+        A `Matcher`: database, method and limits.
     frame : ndarray of float64, shape (N, 2)
         Centroids, pixels.
     camera : Camera
@@ -113,7 +111,7 @@ def searched(
 
 
 def _best(
-    matcher: Matcher, observation: Observation, prior: Prior | None
+    matcher: Asking, observation: Observation, prior: Prior | None
 ) -> tuple[Agreement | None, Literal["time", "steps"] | None]:
     """Return the first agreement that is certain, or the best one, and what ended the search.
 

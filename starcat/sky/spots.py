@@ -16,9 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from starcat.geometry.attitude import matrix_from_quaternion, solve_wahba_svd
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
-from starcat.matcher.matcher import CERTAIN, TOLERANCE_PX
+from starcat.matcher.matcher import TOLERANCE_PX
 from starcat.matcher.observation import as_frame
 from starcat.matcher.result import MatchResult
+from starcat.matcher.searching import CERTAIN
 from starcat.sky.bodies import Bodies, bodies_seen
 from starcat.sky.observer import Observer
 

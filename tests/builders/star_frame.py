@@ -17,10 +17,11 @@ from starcat.geometry.attitude import (
 )
 from starcat.geometry.kvector import KVector
 from starcat.geometry.sphere import radec_from_directions, tangent_axes
-from starcat.matcher.matcher import CERTAIN, Matcher
+from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods import triangle
 from starcat.matcher.methods.triangle_order import select_triangles
 from starcat.matcher.observation import observe
+from starcat.matcher.searching import CERTAIN
 from starcat.simulation.selftest import HARD, answers_rightly
 from starcat.simulation.simulate import Frame, Noise, simulate_frame, simulate_frames
 from starcat.simulation.sky import Sky
