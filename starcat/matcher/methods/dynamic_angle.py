@@ -2,7 +2,8 @@
 
 The angle from one neighbour of a reference star to the next, and that neighbour's separation,
 lead to stars that have the same. With the two neighbours laid upon each other, the neighbours
-that agree in angle and separation are counted. Needs the product ``neighbours``.
+that agree in angle and separation are counted. Where no reference star leads to an answer, every
+pair of the frame is a base (`small_fields`). Needs the product ``neighbours``.
 """
 
 from __future__ import annotations
@@ -75,7 +76,8 @@ def candidates(
     Yields
     ------
     Candidates
-        Two stars each; the reference star nearest to the centre of the frame first.
+        Two stars each, the reference star nearest to the centre of the frame first; at the end
+        three each, of all pairs of the frame.
 
     References
     ----------
