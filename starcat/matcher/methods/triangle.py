@@ -19,7 +19,12 @@ from starcat.matcher.budget import LOOKUP
 from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder, select_triangles
-from starcat.matcher.methods.triangle_shape import are_similar, sides_by_length, similar_triangles
+from starcat.matcher.methods.triangle_shape import (
+    are_similar,
+    area_and_slopes,
+    sides_by_length,
+    similar_triangles,
+)
 from starcat.matcher.observation import Observation
 
 Array = NDArray[np.float64]
@@ -157,11 +162,8 @@ def features(
     area_rad2, area_error_rad2, circumradius_rad, circumradius_error_rad : float
         The errors are of first order and treat those of the three sides as independent.
     """
-    a2, b2, c2 = a * a, b * b, c * c
-    u, v, w = b2 + c2 - a2, a2 + c2 - b2, a2 + b2 - c2
-    area = 0.25 * math.sqrt(max(a2 * u + b2 * v + c2 * w, 1e-300))
+    area, slopes = area_and_slopes(a, b, c)
     radius = a * b * c / (4.0 * area)
-    slopes = a * u / (8.0 * area), b * v / (8.0 * area), c * w / (8.0 * area)
     area_error = tolerance_rad * math.hypot(*slopes)
     turns = (1.0 / side - slope / area for side, slope in zip((a, b, c), slopes, strict=True))
     return area, area_error, radius, tolerance_rad * radius * math.hypot(*turns)

@@ -135,6 +135,32 @@ def similar_triangles(
     return found
 
 
+def area_and_slopes(a: float, b: float, c: float) -> tuple[float, tuple[float, float, float]]:
+    """Return the area of a plane triangle, and its derivatives by the sides.
+
+    Parameters
+    ----------
+    a, b, c : float
+        Sides of a triangle that is not flat.
+
+    Returns
+    -------
+    area : float
+        In the square of their unit.
+    slopes : tuple of three float
+        In their unit.
+
+    Examples
+    --------
+    >>> area_and_slopes(3.0, 4.0, 5.0)
+    (6.0, (2.0, 1.5, 0.0))
+    """
+    a2, b2, c2 = a * a, b * b, c * c
+    u, v, w = b2 + c2 - a2, a2 + c2 - b2, a2 + b2 - c2
+    area = 0.25 * math.sqrt(max(a2 * u + b2 * v + c2 * w, 1e-300))
+    return area, (a * u / (8.0 * area), b * v / (8.0 * area), c * w / (8.0 * area))
+
+
 def scale_free(
     a: float, b: float, c: float, tolerance_rad: float
 ) -> tuple[float, float, float, float]:
@@ -158,11 +184,8 @@ def scale_free(
     >>> round(scale_free(1.0, 1.0, 1.0, 0.0)[0], 3)
     1.299
     """
-    a2, b2, c2 = a * a, b * b, c * c
-    u, v, w = b2 + c2 - a2, a2 + c2 - b2, a2 + b2 - c2
-    area = 0.25 * math.sqrt(max(a2 * u + b2 * v + c2 * w, 1e-300))
-    shape = 16.0 * area**3 / (a2 * b2 * c2)
-    slopes = a * u / (8.0 * area), b * v / (8.0 * area), c * w / (8.0 * area)
+    area, slopes = area_and_slopes(a, b, c)
+    shape = 16.0 * area**3 / (a * b * c) ** 2
     turns = (3.0 * s / area - 2.0 / side for side, s in zip((a, b, c), slopes, strict=True))
     part = tolerance_rad / min(a, b, c)
     shape_error = shape * (tolerance_rad * math.hypot(*turns) + 3.0 * part * part)
