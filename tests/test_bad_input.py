@@ -492,6 +492,34 @@ def _(place: Place) -> Call:
     return with_counterparts(place, '{ enabled = true, catalogs = ["hipparcos"] }')
 
 
+def with_motions(place: Place, catalogs: str) -> Call:
+    return place.build(
+        'catalog.source = "sao"', f'catalog = {{ source = "gaia", motions = {catalogs} }}'
+    )
+
+
+@case("motions of no catalog that has some", 2)
+def _(place: Place) -> Call:
+    return with_motions(place, '["2mass"]')
+
+
+@case("motions of one catalog twice", 2)
+def _(place: Place) -> Call:
+    return with_motions(place, '["tycho2", "tycho2"]')
+
+
+@case("motions of the stars' own catalog", 2)
+def _(place: Place) -> Call:
+    return place.build(
+        'catalog.source = "sao"', 'catalog = { source = "tycho2", motions = ["tycho2"] }'
+    )
+
+
+@case("catalog of motions missing", 3)
+def _(place: Place) -> Call:
+    return ["build", "--preset", "gaia-12deg-2026", "-o", place.out]
+
+
 def matched_with(place: Place, other: Path) -> Call:
     """Find the stars of a good artifact in a file."""
     return ["crossmatch", place.artifact / "stars.parquet", other, "-o", place.out / "x.parquet"]

@@ -219,9 +219,9 @@ def _source_facts(artifact: Artifact) -> dict[str, Any]:
     """Return digests and counts by a name that both sides share."""
     facts: dict[str, Any] = {}
     for source in artifact.manifest["sources"]:
-        # A catalog may be read twice: for amplitudes, and for counterparts.
+        # A catalog may be read again: for amplitudes, motions and counterparts.
         role = source["role"]
-        name = source["source"] + (f" {role}" if role == "crossmatch" else "")
+        name = source["source"] + (f" {role}" if role in ("crossmatch", "motions") else "")
         facts |= {f"{name} {key}": source[key] for key in ("rows_read", "kept")}
         facts |= {f"{name} rejected {key}": count for key, count in source["rejected"].items()}
         for file in source["files"]:

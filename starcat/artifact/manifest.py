@@ -24,6 +24,8 @@ if TYPE_CHECKING:  # reading a manifest needs none of these
 
 MANIFEST_NAME = "manifest.json"
 MANIFEST_VERSION = "1.1.0"
+MOTIONS_VERSION = "1.2.0"
+"""The version of manifests with motions of another catalog; all others are `MANIFEST_VERSION`."""
 
 DATABASE_NAME = "database.h5"
 
@@ -67,7 +69,7 @@ class SourceFacts:
     Attributes
     ----------
     source, role : str
-        Name of the data source; ``stars``, ``variability`` or ``crossmatch``.
+        Name of the data source; ``stars``, ``motions``, ``variability`` or ``crossmatch``.
     files : sequence of FileFacts
         Its input files.
     rows_read, kept : int
@@ -75,7 +77,9 @@ class SourceFacts:
     rejected : dict of str to int
         The others, by reason.
     joined : int, optional
-        Stars whose amplitude came from this source, or whose counterpart is in it.
+        Stars whose amplitude or motion came from this source, or whose counterpart is in it.
+    moved_arcsec : dict of str to float, optional
+        ``median`` and ``largest`` way of the stars whose motion came from this source.
     """
 
     source: str
@@ -85,6 +89,7 @@ class SourceFacts:
     kept: int
     rejected: dict[str, int]
     joined: int | None = None
+    moved_arcsec: dict[str, float] | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return the facts as the manifest holds them.
@@ -104,6 +109,8 @@ class SourceFacts:
         }
         if self.joined is not None:
             facts["joined"] = self.joined
+        if self.moved_arcsec is not None:
+            facts["moved_arcsec"] = self.moved_arcsec
         return facts
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from starcat.artifact.content import content_sha256
 from starcat.artifact.crossmatch_table import counterpart_problems
+from starcat.artifact.motion_table import motion_problems
 from starcat.errors import SchemaError
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.tables.schema import ProductSchema
@@ -232,6 +233,23 @@ def counterparts_are_those_of_the_stars(held: HeldProduct) -> Iterator[str]:
         yield from counterpart_problems(held.table, held.stars)
 
 
+def motions_are_those_of_the_stars(held: HeldProduct) -> Iterator[str]:
+    """Yield where what is said of motions contradicts itself or the stars.
+
+    Parameters
+    ----------
+    held : HeldProduct
+        The product; only motions says where they are from.
+
+    Yields
+    ------
+    str
+        The problem.
+    """
+    if held.schema.product == "motions" and held.stars is not None:
+        yield from motion_problems(held.table, held.stars)
+
+
 TABLE_CHECKS: tuple[Check, ...] = (
     content_is_the_manifests,
     rows_are_in_order,
@@ -243,5 +261,6 @@ REFERENCE_CHECKS: tuple[Check, ...] = (
     star_rows_exist,
     separations_are_those_of_the_stars,
     counterparts_are_those_of_the_stars,
+    motions_are_those_of_the_stars,
 )
 """The checks where the stars are known; each needs what the one before it found sound."""

@@ -25,6 +25,7 @@ from starcat.artifact.manifest import (
     manifest_digest,
     read_manifest,
 )
+from starcat.artifact.motion_table import motion_count_problems
 from starcat.artifact.reader import Artifact
 from starcat.artifact.table_checks import (
     REFERENCE_CHECKS,
@@ -332,6 +333,10 @@ def _count_problems(manifest: dict[str, Any], held: dict[str, HeldProduct]) -> I
                     f"{source['source']}: rejected {listed}, but the product rejected holds "
                     f"{held_rows}"
                 )
+        if source["role"] == "motions" and "motions" in held:
+            yield from motion_count_problems(held["motions"].table, source)
+        elif source["role"] == "motions" and "motions" not in products:
+            yield f"{source['source']}: motions are from it, but there is no product motions"
         if source["role"] == "crossmatch" and "crossmatch" in held:
             found = counterparts_of(held["crossmatch"].table, source["source"])
             if found != source["joined"]:

@@ -15,6 +15,7 @@ from starcat.artifact.manifest import (
     DATABASE_NAME,
     MANIFEST_NAME,
     MANIFEST_VERSION,
+    MOTIONS_VERSION,
     ProductFacts,
     SourceFacts,
     manifest_digest,
@@ -118,9 +119,10 @@ def write_manifest(
         The manifest.
     """
     files = sorted(path for path in folder.rglob("*") if path.is_file())
+    has_motions = any(source.role == "motions" for source in sources)
     manifest: dict[str, Any] = {
         "format": "starcat-artifact",
-        "manifest_version": MANIFEST_VERSION,
+        "manifest_version": MOTIONS_VERSION if has_motions else MANIFEST_VERSION,
         "name": spec["name"],
         "version": spec["version"],
         "frame": "ICRS",

@@ -37,6 +37,7 @@ from starcat.pipeline.facts import (
 from starcat.pipeline.guide_stars import select_stars
 from starcat.pipeline.judgement import advice_without_magnitudes, check_rates
 from starcat.pipeline.log import Stopwatch, write_build_log
+from starcat.pipeline.motions import join_motions, motion_notes, motion_product, motion_sources
 from starcat.pipeline.recipes import (
     RECIPES,
     Ingredients,
@@ -186,6 +187,8 @@ def _make(partial: Path, plan: _Plan, clock: Stopwatch, progress: Progress) -> B
     """Go through all stages up to the manifest, in a folder that has no name yet."""
     spec, inputs, workers = plan.spec, plan.inputs, plan.workers
     catalog, amplitudes = read_sources(spec, inputs, workers, progress)
+    motions = join_motions(catalog, spec, inputs, workers, progress)
+    catalog = motions.catalog
     stars, joined = _join_all(catalog.stars, amplitudes)
     clock.lap("read")
     selected, fields = select_stars(stars, spec)
@@ -195,6 +198,7 @@ def _make(partial: Path, plan: _Plan, clock: Stopwatch, progress: Progress) -> B
     check_memory(cost, spec, plan.max_memory_bytes)
     clock.lap("select")
     products = make_products(spec, catalog, selected, fields, progress)
+    products += motion_product(motions, selected.guide_stars)
     matched = match_catalogs(stars, selected, spec, inputs, workers, progress)
     products += matched.products
     clock.lap("products")
@@ -203,7 +207,8 @@ def _make(partial: Path, plan: _Plan, clock: Stopwatch, progress: Progress) -> B
     rates = run_self_test(partial, spec, progress)
     clock.lap("self-test")
     progress("report", 0, None)
-    sources = [*source_facts(catalog, selected, amplitudes, joined), *matched.sources]
+    star_source, *others = source_facts(catalog, selected, amplitudes, joined)
+    sources = [star_source, *motion_sources(motions, products), *others, *matched.sources]
     filters = filter_coverages(selected.steps, fields, spec)
     results = Results(spec, sources, products, facts, fields, filters, rates)
     report = report_build(partial, results)
@@ -212,6 +217,7 @@ def _make(partial: Path, plan: _Plan, clock: Stopwatch, progress: Progress) -> B
     told = dict.fromkeys(
         (
             *catalog.notes,
+            *motion_notes(spec, products),
             *matched.notes,
             holes_warning(report.gap),
             advice_without_magnitudes(rates, spec),
@@ -255,6 +261,7 @@ def read_sources(
         band=spec.catalog.band,
         epoch_jyear=spec.epoch_jyear,
         read_limit_mag=spec.catalog.read_limit_mag,
+        neighbours=not spec.catalog.motions,  # found where the stars will be
         workers=workers,
         progress=progress,
     )

@@ -175,7 +175,10 @@ def _source(source: Mapping[str, Any], reasons: Mapping[str, str]) -> str:
     rows = [("read", "", source["rows_read"]), ("kept", "", source["kept"])]
     rows += [(name, reasons[name], count) for name, count in source["rejected"].items()]
     if "joined" in source:
-        rows.append(("joined", "stars whose amplitude is from here", source["joined"]))
+        what = "motion" if source["role"] == "motions" else "amplitude"
+        rows.append(("joined", f"stars whose {what} is from here", source["joined"]))
+    for name, moved_arcsec in source.get("moved_arcsec", {}).items():
+        rows.append((f"{name} movement", "of these stars, arcsec", moved_arcsec))
     files = [(f["name"], f["bytes"], f["rows"], f["sha256"]) for f in source["files"]]
     name = f"{source['source']} ({source['role']})"
     return "\n".join(

@@ -34,6 +34,23 @@ class Catalog(Section):
         None,
         description="fainter records, and those without magnitude, are counted and left out",
     )
+    motions: tuple[Literal["hipparcos", "tycho2"], ...] = Field(
+        (),
+        strict=False,  # a list in TOML
+        description="catalogs that stars without a proper motion get one from, the first that has "
+        "one first; found as [products.crossmatch] says",
+        examples=[["tycho2"]],
+    )
+
+    @model_validator(mode="after")
+    def _motions_of_other_catalogs(self) -> Catalog:
+        if self.source in self.motions:
+            raise ValueError(
+                f"motions: {self.source} is the catalog of the stars themselves; name others"
+            )
+        if len(set(self.motions)) != len(self.motions):
+            raise ValueError(f"motions: a catalog is named twice: {', '.join(self.motions)}")
+        return self
 
 
 class Doubles(Section):
@@ -273,19 +290,22 @@ class BuildSpec(Section):
         Returns
         -------
         dict
-            All keys as JSON has them, but not those of ``products.levels`` where there are none:
-            artifacts are the same as before there was such a product.
+            All keys as JSON has them, but not those of ``products.levels`` and
+            ``catalog.motions`` where there are none: artifacts are the same as before there was
+            such a thing.
         """
         content = self.model_dump(mode="json")
         if self.products.levels == Levels():
             del content["products"]["levels"]
+        if not self.catalog.motions:
+            del content["catalog"]["motions"]
         return content
 
     @property
     def sources(self) -> tuple[str, ...]:
         """Names of all sources that the build reads, the stars' first, each once."""
         wanted = self.products.crossmatch
-        names = [self.catalog.source, *self.selection.variables.join]
+        names = [self.catalog.source, *self.catalog.motions, *self.selection.variables.join]
         return tuple(dict.fromkeys([*names, *(wanted.catalogs if wanted.enabled else ())]))
 
     def __repr__(self) -> str:

@@ -2,7 +2,7 @@
 
 Positions are ICRS at J2016. Stars that Gaia lacks carry minus their Hipparcos number. The two
 columns that the package calls proper motions hold the magnitudes BP and RP (docs/decisions.md), so
-no star has a proper motion, and all stay at J2016.
+no star has a proper motion, and all stay at J2016 unless a build joins motions of another catalog.
 """
 
 from __future__ import annotations

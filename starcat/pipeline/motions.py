@@ -1,0 +1,312 @@
+"""Proper motions for stars whose own catalog has none, from other catalogs.
+
+Each star is matched with the entries of a catalog by the cross-identification of the product
+``crossmatch``: an entry is moved by its own motion to the epoch of the star's position and
+compared there. The star keeps its position and gets the motion, which takes it to the epoch of
+the build.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from starcat.artifact.manifest import SourceFacts
+from starcat.artifact.motion_table import JOINED, NO_CANDIDATE, NO_MOTION, OWN_MOTION
+from starcat.artifact.writer import Product
+from starcat.catalog.fetching.locate import locate
+from starcat.catalog.ingest import Ingested, unmoved_stars
+from starcat.catalog.nearest import add_nearest_neighbours
+from starcat.catalog.proper_motion import Motion, propagate
+from starcat.catalog.quality import Quality
+from starcat.catalog.stars import directions_of, floats_of, move_to_epoch, with_columns
+from starcat.geometry.sphere import separation
+from starcat.pipeline.counterparts import match_tables
+from starcat.progress import Progress, no_progress
+from starcat.specs.build_spec import BuildSpec
+from starcat.store.reading import read_catalog
+from starcat.tables.schema import product_schema
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+OF_ENTRY = (
+    "catalog",
+    "counterpart_id",
+    "designation",
+    "separation_arcsec",
+    "delta_mag",
+    "n_candidates",
+    "probability",
+)
+"""Columns of the crossmatch product that the product ``motions`` has too."""
+
+
+@dataclass(frozen=True)
+class JoinedMotions:
+    """What became of the motions of a catalog's stars.
+
+    Attributes
+    ----------
+    catalog : Ingested
+        The catalog; its stars have their motions and are at the epoch of the build.
+    table : pyarrow.Table, optional
+        Rows of the schema ``motions`` for all its stars, in their order; None where the spec asks
+        for no motions.
+    sources : tuple of SourceFacts
+        The catalogs that motions were looked for in; ``joined`` counts all stars.
+    """
+
+    catalog: Ingested
+    table: pa.Table | None = None
+    sources: tuple[SourceFacts, ...] = ()
+
+
+def join_motions(
+    catalog: Ingested,
+    spec: BuildSpec,
+    inputs: Mapping[str, Sequence[Path]],
+    workers: int = 2,
+    progress: Progress = no_progress,
+) -> JoinedMotions:
+    """Give the stars that have no proper motion those of other catalogs.
+
+    Parameters
+    ----------
+    catalog : Ingested
+        A star catalog, as it was read for the build.
+    spec : BuildSpec
+        Its key ``catalog.motions``, its epoch, and the model of ``products.crossmatch``.
+    inputs : mapping of str to sequence of Path
+        Input files or folders by source; others are looked for (`locate`).
+    workers : int, default 2
+        Threads; the result is the same for any number.
+    progress : Progress
+        Called with (stage, done, total).
+
+    Returns
+    -------
+    JoinedMotions
+        The catalog as it was where the spec asks for no motions. A star with a motion of its own
+        keeps it; of several catalogs the first that has one of a star gives it.
+
+    Raises
+    ------
+    SourceError
+        If a catalog of motions is missing or damaged.
+    """
+    if not spec.catalog.motions:
+        return JoinedMotions(catalog)
+    wanted, stars = spec.products.crossmatch, catalog.stars
+    found = _Found.of(stars)
+    sources: list[SourceFacts] = []
+    told: list[str] = []
+    for name in spec.catalog.motions:
+        read = read_catalog(
+            name,
+            locate(name, inputs),
+            read_limit_mag=wanted.read_limit_mag,
+            neighbours=False,
+            workers=workers,
+            progress=progress,
+        )
+        progress("motions", 0, None)
+        matches, _ = match_tables(stars, read.stars, wanted)
+        found.note(matches)
+        sources.append(_source_facts(read))
+        told += read.notes
+        del read  # a whole catalog: two of them need not fit into memory
+    moved = _with_motions(stars, found, spec.epoch_jyear)
+    table = found.table(stars, moved)
+    # What reading said of stars that stay behind is no longer so.
+    stale = unmoved_stars(catalog.source, stars, spec.epoch_jyear)
+    notes = (*(note for note in catalog.notes if note not in stale), *told)
+    moved = add_nearest_neighbours(moved, workers)
+    return JoinedMotions(replace(catalog, stars=moved, notes=notes), table, tuple(sources))
+
+
+def motion_product(joined: JoinedMotions, guide_stars: pa.Table) -> tuple[Product, ...]:
+    """Return where the motions of guide stars are from, as a product.
+
+    Parameters
+    ----------
+    joined : JoinedMotions
+        What `join_motions` returned.
+    guide_stars : pyarrow.Table
+        The guide stars, by star_id: some of its stars.
+
+    Returns
+    -------
+    tuple of Product
+        The product ``motions``; none where the spec asks for no motions.
+    """
+    if joined.table is None:
+        return ()
+    number = joined.catalog.stars["star_id"].to_numpy()
+    rows = np.searchsorted(number, guide_stars["star_id"].to_numpy())
+    table = joined.table.take(pa.array(rows)).combine_chunks()
+    own = pa.array(np.arange(len(guide_stars), dtype=np.int32))
+    table = table.set_column(0, table.schema.field(0), own)
+    return (Product("motions", table, in_database=False),)
+
+
+def motion_sources(joined: JoinedMotions, products: Sequence[Product]) -> list[SourceFacts]:
+    """Return what the manifest says of the catalogs of motions.
+
+    Parameters
+    ----------
+    joined : JoinedMotions
+        What `join_motions` returned.
+    products : sequence of Product
+        The products of the build; ``motions`` is among them where there are such catalogs.
+
+    Returns
+    -------
+    list of SourceFacts
+        With the number of guide stars whose motion is from each, and how far those moved.
+    """
+    facts = []
+    for source in joined.sources:
+        table = next(product.table for product in products if product.name == "motions")
+        own = pc.and_(pc.equal(table["outcome"], JOINED), pc.equal(table["catalog"], source.source))
+        way = floats_of(table.filter(own), "moved_arcsec")
+        moved = None
+        if len(way):
+            largest, median = float(way.max()), float(np.median(way))
+            moved = {"median": round(median, 6), "largest": round(largest, 6)}
+        facts.append(replace(source, joined=len(way), moved_arcsec=moved))
+    return facts
+
+
+def motion_notes(spec: BuildSpec, products: Sequence[Product]) -> tuple[str, ...]:
+    """Return a note where guide stars stay at the epoch of their catalog.
+
+    Parameters
+    ----------
+    spec : BuildSpec
+        The build.
+    products : sequence of Product
+        The products of the build.
+
+    Returns
+    -------
+    tuple of str
+        How many stay, for which reasons; empty where all have a motion, or none was asked for.
+    """
+    for product in products:
+        if product.name != "motions":
+            continue
+        counts = {
+            entry["values"]: entry["counts"]
+            for entry in pc.value_counts(product.table["outcome"]).to_pylist()
+            if entry["values"] not in (JOINED, OWN_MOTION)
+        }
+        if counts:
+            reasons = ", ".join(f"{name} {counts[name]:,}" for name in sorted(counts))
+            return (
+                f"{spec.catalog.source}: {sum(counts.values()):,} of {len(product.table):,} guide "
+                f"stars have no motion in {', '.join(spec.catalog.motions)} and are not moved to "
+                f"J{spec.epoch_jyear:g} ({reasons}); the product motions lists them",
+            )
+    return ()
+
+
+@dataclass
+class _Found:
+    """The entry that each star has so far, its motion and what is said of it.
+
+    ``rows`` are rows of all matches so far, -1 where a star has none.
+    """
+
+    outcome: NDArray[np.object_]
+    epoch_jyear: Array
+    pm_ra: Array
+    pm_dec: Array
+    rows: NDArray[np.int64]
+    matches: list[pa.Table]
+
+    @classmethod
+    def of(cls, stars: pa.Table) -> _Found:
+        """Return what is known before any catalog has been read."""
+        pm_ra, pm_dec = (floats_of(stars, f"pm_{way}_mas_yr") for way in ("ra_cosdec", "dec"))
+        own = ~(np.isnan(pm_ra) | np.isnan(pm_dec))
+        outcome = np.where(own, OWN_MOTION, NO_CANDIDATE).astype(object)
+        rows = np.full(len(stars), -1, dtype=np.int64)
+        return cls(outcome, floats_of(stars, "epoch_jyear"), pm_ra, pm_dec, rows, [])
+
+    def note(self, matches: pa.Table) -> None:
+        """Take the motions that a catalog has, and its verdict on stars that none had so far."""
+        best = matches.filter(pc.equal(matches["rank"], 1))
+        start = sum(map(len, self.matches))
+        self.matches.append(best)
+        star = best["star"].to_numpy()
+        motion = Motion(
+            *(floats_of(best, name) for name in ("ra_deg", "dec_deg")),
+            *(floats_of(best, f"pm_{way}_mas_yr") for way in ("ra_cosdec", "dec")),
+        )
+        # The motion at the epoch of the star's position, as its straight line has it there.
+        motion = propagate(motion, self.epoch_jyear[star] - floats_of(best, "epoch_jyear"))
+        known = ~(np.isnan(motion.pm_ra_cosdec_mas_yr) | np.isnan(motion.pm_dec_mas_yr))
+        outcome = best["verdict"].to_numpy(zero_copy_only=False).astype(object)
+        named = (outcome == "unique") | (outcome == "best")
+        outcome[named] = np.where(known[named], JOINED, NO_MOTION)
+        before = self.outcome[star]
+        better = (outcome == JOINED) & (before != JOINED) & (before != OWN_MOTION)
+        chosen = better | (before == NO_CANDIDATE)
+        self.outcome[star[chosen]] = outcome[chosen]
+        self.rows[star[chosen]] = start + np.flatnonzero(chosen)
+        self.pm_ra[star[better]] = motion.pm_ra_cosdec_mas_yr[better]
+        self.pm_dec[star[better]] = motion.pm_dec_mas_yr[better]
+
+    def table(self, stars: pa.Table, moved: pa.Table) -> pa.Table:
+        """Return what was found for stars and how far each moved, as the product has it."""
+        schema = product_schema("motions").arrow_schema
+        entries = pa.concat_tables([table.select(OF_ENTRY) for table in self.matches])
+        entries = entries.take(pa.array(self.rows, mask=self.rows < 0))
+        way = np.degrees(separation(directions_of(stars), directions_of(moved))) * 3600.0
+        columns = {name: entries[name] for name in OF_ENTRY}
+        columns |= {
+            "star": pa.array(np.arange(len(stars), dtype=np.int32)),
+            "outcome": pa.array(self.outcome, pa.string()),
+            "n_candidates": pc.fill_null(entries["n_candidates"], 0),
+            "from_jyear": pa.array(self.epoch_jyear),
+            "moved_arcsec": pa.array(way, mask=self.outcome != JOINED),
+        }
+        arrays = [columns[field.name].cast(field.type) for field in schema]
+        return pa.Table.from_arrays(arrays, schema=schema)
+
+
+def _with_motions(stars: pa.Table, found: _Found, epoch_jyear: float) -> pa.Table:
+    """Return stars with the motions that were found for them, moved to an epoch."""
+    rows = np.flatnonzero(found.outcome == JOINED)
+    flags = stars["quality_flags"].to_numpy()[rows] & ~np.int32(Quality.NO_PROPER_MOTION)
+    moved = move_to_epoch(
+        {
+            "ra_deg": floats_of(stars, "ra_deg")[rows],
+            "dec_deg": floats_of(stars, "dec_deg")[rows],
+            "epoch_jyear": found.epoch_jyear[rows],
+            "pm_ra_cosdec_mas_yr": found.pm_ra[rows],
+            "pm_dec_mas_yr": found.pm_dec[rows],
+            "quality_flags": flags,
+        },
+        epoch_jyear,
+    )
+    columns = {}
+    for name, values in moved.items():
+        before = stars[name].to_numpy() if name == "quality_flags" else floats_of(stars, name)
+        columns[name] = before.copy()
+        columns[name][rows] = values
+    return with_columns(stars, columns)
+
+
+def _source_facts(read: Ingested) -> SourceFacts:
+    """Return what the manifest says of a catalog of motions, but for what came of it."""
+    return SourceFacts(
+        read.source, "motions", read.files, read.rows_read, len(read.stars), read.rejected_by_reason
+    )

@@ -1,0 +1,453 @@
+"""Proper motions that a build takes from another catalog: which stars, from where, how far."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+import json
+import shutil
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pytest
+from archives import file_header
+from astropy import units
+from astropy.coordinates import Distance, SkyCoord
+from astropy.time import Time
+from jsonschema import Draft202012Validator
+
+from starcat.artifact.manifest import MANIFEST_VERSION, MOTIONS_VERSION, manifest_digest
+from starcat.artifact.motion_table import OUTCOMES, motion_problems
+from starcat.artifact.reader import Artifact, open_artifact
+from starcat.artifact.verify import verify_artifact
+from starcat.catalog.archives.gaia import embedded_sky
+from starcat.catalog.ingest import Ingested, ingest
+from starcat.catalog.quality import Quality
+from starcat.catalog.source import data_source
+from starcat.catalog.stars import floats_of, with_columns
+from starcat.pipeline.build import Built, build
+from starcat.pipeline.motions import JoinedMotions, join_motions, motion_product
+from starcat.pipeline.rebuild import rebuild
+from starcat.resources import resource_folder
+from starcat.specs.build_spec import BuildSpec
+from starcat.specs.reading import preset, spec_from_dict
+from starcat.storage.digests import file_sha256, json_bytes
+from starcat.store.reading import read_catalog
+
+FAINT_LIMIT_MAG = 6.3
+FAST_MAS_YR = 500.0
+
+SPEC = """\
+name = "moved"
+version = "1.0.0"
+epoch_jyear = 2026.0
+catalog = { source = "gaia", motions = ["tycho2", "hipparcos"] }
+selection.faint_limit_mag = 5.0
+camera = { width_px = 512, height_px = 512, fov_x_deg = 40.0 }
+boresights.count = 200
+self_test = { frames = 5, min_identified = 0.8 }
+"""
+
+
+def spec_of(**changes: object) -> BuildSpec:
+    content = tomllib.loads(SPEC)
+    content["catalog"] |= {"motions": changes.pop("motions", ["tycho2", "hipparcos"])}
+    return spec_from_dict(content | changes, "moved.toml")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The bright stars of the embedded sky, in a file of its own layout."""
+    layout = data_source("gaia").files[0]
+    kinds = np.dtype([(column.name, column.format) for column in layout.columns])
+    sky = np.frombuffer(embedded_sky().read_bytes(), kinds, offset=layout.header_bytes)
+    bright = sky[sky["mag_g"] <= FAINT_LIMIT_MAG]
+    folder = tmp_path_factory.mktemp("sky")
+    header = file_header(layout, len(bright))
+    (folder / "gaia_merged.bin").write_bytes(header + bright.tobytes())
+    return folder
+
+
+@pytest.fixture(scope="module")
+def inputs(folder: Path, catalogs: Path) -> dict[str, list[Path]]:
+    return {
+        "gaia": [folder / "gaia_merged.bin"],
+        "tycho2": [catalogs / "tyc2.dat.gz"],
+        "hipparcos": [catalogs / "hip_main.dat.gz"],
+    }
+
+
+@pytest.fixture(scope="module")
+def sky(inputs: dict[str, list[Path]]) -> Ingested:
+    """What a build reads of the embedded sky: no star moves."""
+    return read_catalog("gaia", inputs["gaia"], epoch_jyear=2026.0, neighbours=False)
+
+
+@pytest.fixture(scope="module")
+def built(inputs: dict[str, list[Path]], tmp_path_factory: pytest.TempPathFactory) -> Built:
+    return build(spec_of(), inputs, tmp_path_factory.mktemp("dist"))
+
+
+@pytest.fixture(scope="module")
+def artifact(built: Built) -> Artifact:
+    return open_artifact(built.folder)
+
+
+def rows_of(table: pa.Table, star_id: pa.ChunkedArray) -> pa.Table:
+    """Rows of a star table by star_id, in the order asked for."""
+    place = {number: row for row, number in enumerate(table["star_id"].to_pylist())}
+    return table.take([place[number] for number in star_id.to_pylist()])
+
+
+def coordinates(stars: pa.Table, motions: SkyCoord | None = None) -> SkyCoord:
+    """Stars for astropy, at 10 pc, where light travels as if the sky were flat."""
+    pm_ra, pm_dec = (
+        floats_of(stars, f"pm_{name}_mas_yr") * units.mas / units.yr
+        for name in ("ra_cosdec", "dec")
+    )
+    return SkyCoord(
+        floats_of(stars, "ra_deg") * units.deg,
+        floats_of(stars, "dec_deg") * units.deg,
+        distance=Distance(np.full(len(stars), 10.0) * units.pc),
+        pm_ra_cosdec=pm_ra if motions is None else motions.pm_ra_cosdec,
+        pm_dec=pm_dec if motions is None else motions.pm_dec,
+        radial_velocity=np.zeros(len(stars)) * units.km / units.s,
+        obstime=Time(floats_of(stars, "epoch_jyear"), format="jyear"),
+    )
+
+
+def at(stars: SkyCoord, epoch_jyear: float) -> SkyCoord:
+    return stars.apply_space_motion(new_obstime=Time(epoch_jyear, format="jyear"))
+
+
+def joined(artifact: Artifact) -> tuple[pa.Table, pa.Table]:
+    """The guide stars that have a motion of another catalog, and what is said of each."""
+    table, stars = artifact.table("motions"), artifact.table("stars")
+    chosen = pc.equal(table["outcome"], "joined")
+    return stars.filter(chosen), table.filter(chosen)
+
+
+def entries(table: pa.Table, inputs: dict[str, list[Path]]) -> pa.Table:
+    """The entries of the catalogs that the motions are of, by the order of the table."""
+    read = {
+        name: ingest(name, inputs[name], neighbours=False).stars for name in ("tycho2", "hipparcos")
+    }
+    place = {
+        (name, number): (name, row)
+        for name, stars in read.items()
+        for row, number in enumerate(stars["star_id"].to_pylist())
+    }
+    named = zip(table["catalog"].to_pylist(), table["counterpart_id"].to_pylist(), strict=True)
+    found = [place[key] for key in named]
+    return pa.concat_tables([read[name].slice(row, 1) for name, row in found])
+
+
+# Where the stars are -------------------------------------------------------------------------
+
+
+def test_stars_are_where_astropy_takes_them(artifact, inputs, sky):
+    stars, table = joined(artifact)
+    assert len(stars) > 1_500
+    assert set(stars["epoch_jyear"].to_pylist()) == {2026.0}
+    before = rows_of(sky.stars, stars["star_id"])
+    assert set(before["epoch_jyear"].to_pylist()) == {2016.0}
+    # The motions that the archives print for J2000 and J1991.25, as they are in 2016: that of
+    # 61 Cygni has turned by 0.02 deg, which is 22 mas in ten years.
+    then = at(coordinates(entries(table, inputs)), 2016.0)
+    there = at(coordinates(before, then), 2026.0)
+    off = there.separation(coordinates(stars)).to_value(units.mas)
+    assert off.max() < 1.0
+    way = coordinates(before, then).separation(coordinates(stars)).to_value(units.arcsec)
+    assert way == pytest.approx(floats_of(table, "moved_arcsec"), abs=1e-6)
+    assert way.max() > 9.0
+
+
+def test_fast_stars_are_where_hipparcos_has_them(artifact, inputs, excerpts):
+    """Stars with a motion of Tycho-2 against Hipparcos, 35 years after its epoch."""
+    stars, table = joined(artifact)
+    hipparcos = ingest("hipparcos", inputs["hipparcos"], neighbours=False).stars
+    now = at(coordinates(hipparcos), 2026.0)
+    fast = np.flatnonzero(
+        (floats_of(table, "moved_arcsec") > 10.0 * FAST_MAS_YR / 1000.0)
+        & (np.array(table["catalog"].to_pylist()) == "tycho2")
+    )
+    assert len(fast) > 20
+    _, off, _ = coordinates(stars.take(pa.array(fast))).match_to_catalog_sky(now)
+    # They were 5 to 47 arcsec off. What is left are orbits of double stars.
+    assert np.median(off.arcsec) < 0.1
+    assert off.arcsec.max() < 2.0
+
+
+def test_stars_without_a_counterpart_stay_where_they_are(artifact, sky):
+    table, stars = artifact.table("motions"), artifact.table("stars")
+    moves = pc.equal(table["outcome"], "joined").to_numpy()
+    assert 0 < (~moves).sum() < 0.1 * len(stars)
+    before = rows_of(sky.stars, stars["star_id"])
+    for name in ("ra_deg", "dec_deg", "x", "y", "z"):
+        assert stars[name].to_numpy()[~moves].tobytes() == before[name].to_numpy()[~moves].tobytes()
+    assert set(stars["epoch_jyear"].to_numpy()[~moves]) == {2016.0}
+    flags = stars["quality_flags"].to_numpy() & int(Quality.NO_PROPER_MOTION)
+    assert (flags > 0).tolist() == (~moves).tolist()
+    # Nearest neighbours are those at the places where the stars now are.
+    assert stars["nearest_separation_arcsec"].null_count == 0
+
+
+# What is said of them ------------------------------------------------------------------------
+
+
+def test_every_guide_star_is_listed_once(artifact, built):
+    table, stars = artifact.table("motions"), artifact.table("stars")
+    assert table["star"].to_pylist() == list(range(len(stars)))
+    outcomes = table["outcome"].to_pylist()
+    assert set(outcomes) <= set(OUTCOMES)
+    stay = len(stars) - outcomes.count("joined")
+    told = [text for text in built.warnings if "the product motions lists them" in text]
+    assert len(told) == 1
+    assert told[0].startswith(f"gaia: {stay:,} of {len(stars):,} guide stars have no motion in ")
+    assert f"no_candidate {outcomes.count('no_candidate'):,}" in told[0]
+    # What a build without motions says, that all stars stay at J2016, is not so here.
+    assert not any("have no proper motion and stay" in text for text in built.warnings)
+    assert any("suppl_1.dat is not among the inputs" in text for text in built.warnings)
+
+
+def test_the_manifest_says_what_came_from_where(artifact, inputs):
+    manifest = artifact.manifest
+    schema = (resource_folder("schemas") / f"manifest-{MOTIONS_VERSION}.json").read_text()
+    Draft202012Validator(json.loads(schema)).validate(manifest)
+    assert [(s["source"], s["role"]) for s in manifest["sources"]] == [
+        ("gaia", "stars"),
+        ("tycho2", "motions"),
+        ("hipparcos", "motions"),
+    ]
+    _, table = joined(artifact)
+    for source in manifest["sources"][1:]:
+        path = inputs[source["source"]][0]
+        assert [file["sha256"] for file in source["files"]] == [file_sha256(path)]
+        way = floats_of(table.filter(pc.equal(table["catalog"], source["source"])), "moved_arcsec")
+        assert source["joined"] == len(way)
+        if len(way):
+            expected = {"median": np.median(way), "largest": way.max()}
+            assert source["moved_arcsec"] == pytest.approx(expected, abs=1e-6)
+    assert manifest["sources"][1]["joined"] > 1_000
+    report = json.loads((artifact.folder / "report" / "report.json").read_text())
+    assert report["sources"] == manifest["sources"]
+    page = (artifact.folder / "report" / "index.html").read_text()
+    assert "stars whose motion is from here" in page
+
+
+def test_sql_explains_a_star(artifact, starcat):
+    query = (
+        "SELECT s.designation, outcome, m.catalog, m.designation AS entry, moved_arcsec "
+        "FROM motions AS m JOIN (SELECT *, row_number() OVER () - 1 AS row FROM stars) AS s "
+        "ON s.row = m.star WHERE outcome = 'joined' ORDER BY moved_arcsec DESC LIMIT 1"
+    )
+    run = starcat(["sql", artifact.folder, query, "--format", "csv"])
+    assert run.code == 0, run.err
+    row = next(csv.DictReader(io.StringIO(run.out)))
+    stars, table = joined(artifact)
+    fastest = int(np.nanargmax(floats_of(table, "moved_arcsec")))
+    assert row["designation"] == stars["designation"][fastest].as_py()
+    assert (row["outcome"], row["entry"]) == ("joined", table["designation"][fastest].as_py())
+
+
+@pytest.mark.slow
+def test_the_artifact_is_sound_and_rebuilds(built, inputs, tmp_path):
+    assert verify_artifact(built.folder).findings == ()
+    assert rebuild(built.folder, inputs, tmp_path).is_identical
+
+
+def test_a_damaged_table_is_told(artifact):
+    table, stars = artifact.table("motions"), artifact.table("stars")
+    assert list(motion_problems(table, stars)) == []
+    way = floats_of(table, "moved_arcsec")
+    row = int(np.nanargmax(way))
+    way[row] += 1e-4
+    problems = list(motion_problems(with_columns(table, {"moved_arcsec": way}), stars))
+    assert problems == [f"moved_arcsec of row {row} is not the way that its star has gone"]
+    words = table["outcome"].to_pylist()
+    words[row] = "guessed"
+    damaged = with_columns(
+        table, {"outcome": pa.array(words), "moved_arcsec": table["moved_arcsec"]}
+    )
+    assert any(
+        "outcome guessed; expected one of" in text for text in motion_problems(damaged, stars)
+    )
+    words[row] = "ambiguous"
+    damaged = with_columns(table, {"outcome": pa.array(words)})
+    assert any("but the star has a motion" in text for text in motion_problems(damaged, stars))
+    assert any("each once" in text for text in motion_problems(table.slice(1), stars))
+
+
+@pytest.mark.parametrize("damage", ["count", "product"])
+def test_a_manifest_that_says_otherwise_is_told(damage, built, tmp_path):
+    copy = Path(shutil.copytree(built.folder, tmp_path / "a", copy_function=shutil.copyfile))
+    manifest = json.loads((copy / "manifest.json").read_bytes())
+    count = manifest["sources"][1]["joined"]
+    if damage == "count":
+        manifest["sources"][1]["joined"] += 1
+        expected = f"{count + 1} stars have their motion from it, but the product motions holds"
+    else:
+        del manifest["products"]["motions"], manifest["files"]["motions.parquet"]
+        (copy / "motions.parquet").unlink()
+        expected = "tycho2: motions are from it, but there is no product motions"
+    manifest["manifest_sha256"] = manifest_digest(manifest)
+    (copy / "manifest.json").write_bytes(json_bytes(manifest))
+    found = [str(finding) for finding in verify_artifact(copy).findings]
+    assert any(expected in text for text in found), found
+
+
+# Which entry is which star -------------------------------------------------------------------
+
+
+def motions_with(
+    lines: list[bytes], sky: Ingested, folder: Path, **changes: object
+) -> JoinedMotions:
+    """The motions of the sky's stars in a Tycho-2 of some records."""
+    (folder / "tyc2.dat").write_bytes(b"".join(lines))
+    spec = spec_of(motions=["tycho2"], **changes)
+    return join_motions(sky, spec, {"tycho2": [folder / "tyc2.dat"]})
+
+
+def outcome_of(found: JoinedMotions, star_id: int) -> dict[str, object]:
+    rows = np.flatnonzero(found.catalog.stars["star_id"].to_numpy() == star_id)
+    assert found.table is not None
+    (row,) = found.table.take(pa.array(rows)).to_pylist()
+    return row
+
+
+def number_of(record: bytes) -> tuple[int, ...]:
+    """The three parts of a record's TYC number."""
+    return tuple(int(record[first:last]) for first, last in ((0, 4), (5, 10), (11, 12)))
+
+
+def number_in(designation: str) -> tuple[int, ...]:
+    return tuple(map(int, designation.removeprefix("TYC ").split("-")))
+
+
+@pytest.fixture(scope="module")
+def tycho2(catalogs: Path) -> list[bytes]:
+    return gzip.decompress((catalogs / "tyc2.dat.gz").read_bytes()).splitlines(keepends=True)
+
+
+def test_two_entries_that_fit_as_well_give_no_motion(tycho2, sky, artifact, tmp_path):
+    stars, table = joined(artifact)
+    alone = np.flatnonzero(
+        (table["n_candidates"].to_numpy() == 1)
+        & (np.array(table["catalog"].to_pylist()) == "tycho2")
+    )
+    twice, gone = (int(row) for row in alone[:2])
+    begins = [number_in(table["designation"][row].as_py()) for row in (twice, gone)]
+    lines = []
+    for line in tycho2:
+        if number_of(line) != begins[1]:
+            lines.append(line)
+        if number_of(line) == begins[0]:
+            lines.append(line[:11] + b"3" + line[12:])
+    found = motions_with(lines, sky, tmp_path)
+    ambiguous = outcome_of(found, stars["star_id"][twice].as_py())
+    assert (ambiguous["outcome"], ambiguous["n_candidates"]) == ("ambiguous", 2)
+    assert ambiguous["catalog"] == "tycho2"
+    lost = outcome_of(found, stars["star_id"][gone].as_py())
+    assert (lost["outcome"], lost["n_candidates"]) == ("no_candidate", 0)
+    assert [lost[name] for name in ("catalog", "counterpart_id", "moved_arcsec")] == [None] * 3
+    for star_id in stars["star_id"].take([twice, gone]).to_pylist():
+        moved = found.catalog.stars.filter(pc.equal(found.catalog.stars["star_id"], star_id))
+        assert moved["epoch_jyear"].to_pylist() == [2016.0]
+        assert moved["pm_dec_mas_yr"].null_count == 1
+    # The other stars do not mind.
+    others = np.setdiff1d(np.arange(len(stars)), [twice, gone])[:50]
+    for row in others[np.array(table["catalog"].to_pylist())[others] == "tycho2"].tolist():
+        assert outcome_of(found, stars["star_id"][row].as_py())["outcome"] == "joined"
+
+
+def test_an_entry_without_motion_gives_none(tycho2, sky, artifact, tmp_path):
+    """A record of Tycho-2 that has only its observed position (X)."""
+    stars, table = joined(artifact)
+    of_tycho2 = np.flatnonzero(np.array(table["catalog"].to_pylist()) == "tycho2")
+    slow = int(of_tycho2[np.argmin(floats_of(table, "moved_arcsec")[of_tycho2])])
+    begin = number_in(table["designation"][slow].as_py())
+    lines = list(tycho2)
+    row = next(n for n, line in enumerate(lines) if number_of(line) == begin)
+    blank = bytearray(lines[row])
+    # The observed position is the mean one, a few hundredths of an arcsec away.
+    blank[152:164], blank[165:177] = blank[15:27], blank[28:40]
+    blank[13:14] = b"X"
+    for first, last in ((15, 27), (28, 40), (41, 48), (49, 56)):
+        blank[first:last] = b" " * (last - first)
+    lines[row] = bytes(blank)
+    found = outcome_of(motions_with(lines, sky, tmp_path), stars["star_id"][slow].as_py())
+    assert (found["outcome"], found["moved_arcsec"]) == ("no_motion", None)
+
+
+def test_a_star_with_a_motion_keeps_it(sky, inputs, tmp_path):
+    own = replace(
+        sky,
+        stars=with_columns(
+            sky.stars,
+            {
+                "pm_ra_cosdec_mas_yr": np.full(len(sky.stars), 12.5),
+                "pm_dec_mas_yr": np.full(len(sky.stars), -3.0),
+            },
+        ),
+    )
+    found = join_motions(own, spec_of(), inputs)
+    assert found.table is not None
+    assert set(found.table["outcome"].to_pylist()) == {"own_motion"}
+    for name in ("ra_deg", "dec_deg", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr", "epoch_jyear"):
+        assert found.catalog.stars[name].equals(own.stars[name])
+
+
+def test_threads_do_not_matter(sky, inputs):
+    one, two = (join_motions(sky, spec_of(), inputs, workers) for workers in (1, 2))
+    assert one.table is not None
+    assert one.table.equals(two.table)
+    assert one.catalog.stars.equals(two.catalog.stars)
+
+
+# Asking for it -------------------------------------------------------------------------------
+
+
+def test_without_the_key_nothing_is_said_of_motions(sky, small_artifact):
+    spec = preset("gaia-12deg")
+    assert spec.catalog.motions == ()
+    # Bytes of manifests and databases without it are those of earlier versions.
+    assert "motions" not in spec.recorded()["catalog"]
+    assert preset("gaia-12deg-2026").recorded()["catalog"]["motions"] == ["tycho2"]
+    found = join_motions(sky, spec, {})
+    assert found.catalog is sky
+    assert (found.sources, motion_product(found, sky.stars)) == ((), ())
+    assert open_artifact(small_artifact).manifest["manifest_version"] == MANIFEST_VERSION
+
+
+def test_the_preset_for_2026_is_the_default_one_moved():
+    moved, plain = preset("gaia-12deg-2026"), preset("gaia-12deg")
+    assert (moved.epoch_jyear, moved.catalog.motions) == (2026.0, ("tycho2",))
+    assert moved.sources == ("gaia", "tycho2")
+    assert "Tycho-2" in moved.description
+    for section in ("selection", "camera", "boresights", "products", "self_test"):
+        assert getattr(moved, section) == getattr(plain, section)
+
+
+def test_a_build_without_the_catalog_says_how_to_get_it(starcat, tmp_path):
+    run = starcat(["build", "--preset", "gaia-12deg-2026", "-o", tmp_path / "dist"])
+    assert run.code == 3
+    assert "--input tycho2=PATH" in run.err
+    assert "starcat fetch tycho2" in run.err
+    assert list((tmp_path / "dist").iterdir()) == []
+
+
+@pytest.mark.slow
+def test_the_command_prints_what_came_from_where(starcat, inputs, tmp_path):
+    (tmp_path / "moved.toml").write_text(SPEC.replace(', "hipparcos"', ""))
+    given = [f"{name}={inputs[name][0]}" for name in ("gaia", "tycho2")]
+    arguments = [word for text in given for word in ("--input", text)]
+    run = starcat(["build", tmp_path / "moved.toml", *arguments, "-o", tmp_path / "dist"])
+    assert run.code == 0, run.err
+    assert "guide stars whose motion is from here" in run.out
+    assert "largest movement of these, arcsec" in run.out
+    assert "the product motions lists them" in " ".join(run.err.split())
