@@ -27,6 +27,7 @@ from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.refusal import ADVICE, WORDS, Refusal
 from starcat.matcher.result import MatchResult
+from starcat.matcher.searching import searched
 from starcat.matcher.stars import MatchedStars, attitude_covariance
 from starcat.simulation.simulate import Frame, Noise, simulate_frames
 
@@ -349,20 +350,19 @@ def test_too_few_spots_are_the_reason(sky, engine):
 
 @needs_c
 def test_the_library_s_no_is_explained_when_somebody_asks(sky, monkeypatch):
-    searched = []
-    search = Matcher._identify
+    searches = []
     monkeypatch.setattr(
-        Matcher, "_identify", lambda self, *frame: searched.append(1) or search(self, *frame)
+        "starcat.matcher.matcher.searched", lambda *asked: searches.append(1) or searched(*asked)
     )
     px = np.random.default_rng(3).random((8, 2)) * 1024.0
     found = Matcher(sky, engine="c").identify(px)
     assert (found.status, found.why is None) == ("no_match", False)
     assert repr(found) == "<MatchResult no_match: 8 spots>"
-    assert not searched
+    assert not searches
     why = found.refusal
     assert why == Matcher(sky, engine="numpy").identify(px).refusal
     assert why is found.refusal is not None
-    assert len(searched) == 2  # this matcher's, once, and that of numpy
+    assert len(searches) == 2  # this matcher's, once, and that of numpy
     assert repr(found) == f"<MatchResult no_match: 8 spots, {why.reason}>"
     assert why.advice.split(",")[0] in found._repr_html_()
 

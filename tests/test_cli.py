@@ -230,7 +230,9 @@ def test_build_prints_what_it_made(
     run = starcat(arguments)
     assert run.code == 0
     artifact = tmp_path / "dist" / "small-1.0.0"
-    assert run.err == f"written: {artifact}\nreport: {artifact / 'report' / 'index.html'}\n"
+    estimate, _, rest = run.err.partition("\n")
+    assert estimate.startswith("estimate: ")
+    assert rest == f"written: {artifact}\nreport: {artifact / 'report' / 'index.html'}\n"
     assert (artifact / "report" / "index.html").is_file()
     assert fits(run.out)
     for words in ("read", "kept", "rejected: too_faint", "fields below 4", "pairs-1.0.0", "clean"):

@@ -20,6 +20,7 @@ PUBLIC = [
     "Matcher",
     "Observer",
     "StarcatError",
+    "Tracker",
     "__version__",
     "build",
     "calibrate",

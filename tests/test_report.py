@@ -434,7 +434,9 @@ def test_holes_go_to_stderr(
     assert run.code == 0
     assert json.loads(run.out)["coverage"]["tiling"]["holes"] is True
     (warning,) = json.loads(run.out)["warnings"]
-    assert run.err == f"warning: {warning}\n"
+    estimate, _, rest = run.err.partition("\n")
+    assert estimate.startswith("estimate: ")
+    assert rest == f"warning: {warning}\n"
     run = starcat([*arguments, "-o", tmp_path])
     assert run.err.startswith("warning: boresights.count = 20 leaves holes")
     run = starcat(["coverage", tmp_path / "small-1.0.0", "--json"])

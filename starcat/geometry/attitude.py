@@ -96,7 +96,8 @@ def turn_between(q_from: Sequence[float], q_to: Sequence[float]) -> Turn:
 
     Examples
     --------
-    >>> turn_between((0.0, 0.0, 0.0, 1.0), (0.0, 0.0, math.sin(0.1), math.cos(0.1)))
+    >>> x, y, z = turn_between((0.0, 0.0, 0.0, 1.0), (0.0, 0.0, math.sin(0.1), math.cos(0.1)))
+    >>> x, y, round(z, 9)
     (0.0, 0.0, 0.2)
     """
     x, y, z, w = _quaternion_product((-q_from[0], -q_from[1], -q_from[2], q_from[3]), q_to)

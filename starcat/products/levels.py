@@ -83,7 +83,7 @@ def level_fields(
     --------
     >>> fields = level_fields(NominalField(10.0, 7.5), 30.0, 1.5)
     >>> [round(field.fov_x_deg, 2) for field in fields]
-    [14.48, 20.9]
+    [14.48, 20.91]
     """
     across, down = (
         math.tan(math.radians(0.5 * angle)) for angle in (narrowest.fov_x_deg, narrowest.fov_y_deg)
