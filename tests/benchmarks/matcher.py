@@ -36,8 +36,9 @@ import peers
 from synthetic import catalogs_folder
 
 from starcat.geometry.attitude import matrix_from_quaternion, quaternion_from_matrix
+from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database, open_database
-from starcat.matcher.matcher import MIN_STARS, Matcher
+from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
 from starcat.pipeline.build import build
 from starcat.simulation.simulate import Frame, Noise, simulate_frames
