@@ -239,7 +239,7 @@ def test_build_prints_what_it_made(
         assert words in run.out
     again = starcat([*arguments, "--json"])
     made = json.loads(again.out)
-    assert again.err == ""
+    assert again.err == f"{estimate}\n"
     assert made["outcome"] == "unchanged"
     assert list(made) == [
         "artifact", "report", "outcome", "filters", "coverage", "self_test", "warnings", "times_s",

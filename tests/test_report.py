@@ -438,7 +438,7 @@ def test_holes_go_to_stderr(
     assert estimate.startswith("estimate: ")
     assert rest == f"warning: {warning}\n"
     run = starcat([*arguments, "-o", tmp_path])
-    assert run.err.startswith("warning: boresights.count = 20 leaves holes")
+    assert "\nwarning: boresights.count = 20 leaves holes" in run.err
     run = starcat(["coverage", tmp_path / "small-1.0.0", "--json"])
     assert json.loads(run.out)["tiling"]["holes"] is True
     assert "leaves holes" in run.err
