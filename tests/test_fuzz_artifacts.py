@@ -234,6 +234,16 @@ def restore(artifact: Path, before: bytes) -> None:
     seal(artifact)
 
 
+def test_a_name_that_is_no_text_is_told(copy: Path) -> None:
+    text = h5py.string_dtype("utf-8")
+    before = spoil_database(copy, lambda file: file.attrs.create("name", b"sm\xff", dtype=text))
+    try:
+        with pytest.raises(ProductError, match="not a readable starcat database"):
+            open_database(copy)
+    finally:
+        restore(copy, before)
+
+
 def put(product: str, name: str, structure: str, other: Path) -> Callable[[h5py.File], object]:
     def change(file: h5py.File) -> None:
         group = file[product] if name else file["/"]

@@ -237,9 +237,12 @@ def _read(file: h5py.File, mapped: mmap.mmap, path: Path, products: tuple[str, .
     _check_version(str(file.attrs["layout_version"]), READABLE_LAYOUT, "database", path)
     stars = _product(file, mapped, "stars", path)
     camera = json.loads(file.attrs["camera"])
+    name = f"{file.attrs['name']}-{file.attrs['version']}"
+    # Bytes that are no text are damage, which is told here and not where the name is used.
+    name.encode()
     count = len(stars["star_id"])
     return Database(
-        name=f"{file.attrs['name']}-{file.attrs['version']}",
+        name=name,
         camera=Camera(
             _whole(camera["width_px"]),
             _whole(camera["height_px"]),
