@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import matrix_from_quaternion
 from starcat.geometry.camera import Camera
+from starcat.matcher.asking import SCALE_FREE
 from starcat.matcher.centroids import (
     MeasuredFrame,
     read_frames,
     write_centroids,
 )
 from starcat.matcher.database import Database
-from starcat.matcher.matcher import SCALE_FREE, Matcher
+from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.matcher.tracking import Tracker
 from starcat.simulation.simulate import Frame

@@ -4,8 +4,20 @@ from __future__ import annotations
 
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.errors import ConfigError
+from starcat.geometry.camera import Camera
+from starcat.matcher.budget import Budget
 from starcat.matcher.database import Database
 from starcat.matcher.methods.triangle_order import TriangleOrder
+from starcat.matcher.observation import Observation, observe
+
+Array = NDArray[np.float64]
+
+SCALE_FREE = ("triangle",)
+"""Methods that find the focal length with the attitude."""
 
 
 class Asking(Protocol):
@@ -54,3 +66,64 @@ class Asking(Protocol):
     @property
     def time_limit_s(self) -> float:
         """Seconds that a frame may take."""
+
+
+def check_scale_free(asking: Asking) -> None:
+    """Check that a method can do without the focal length.
+
+    Parameters
+    ----------
+    asking : Asking
+        A `Matcher`.
+
+    Raises
+    ------
+    ConfigError
+        If its method needs the focal length.
+    """
+    if asking.method not in SCALE_FREE:
+        text = f"method {asking.method!r} needs the focal length; only 'triangle' can find it"
+        raise ConfigError(text, key="method", value=asking.method)
+
+
+def as_asked(
+    asking: Asking,
+    centroids_px: Array,
+    camera: Camera,
+    mag: Array | None,
+    fov_error: float = 0.0,
+    budget: Budget | None = None,
+) -> Observation:
+    """Return a frame with all that a matcher states of it.
+
+    Parameters
+    ----------
+    asking : Asking
+        A `Matcher`, whose tolerance, noises and limits hold.
+    centroids_px : ndarray of float64, shape (N, 2)
+        Pixels.
+    camera : Camera
+        The camera.
+    mag : ndarray of float64, shape (N,), or None
+        Magnitudes.
+    fov_error : float
+        Largest relative error of the focal length.
+    budget : Budget, optional
+        What several searches share; by default this frame has one of its own.
+
+    Returns
+    -------
+    Observation
+        Ready to be searched.
+    """
+    return observe(
+        centroids_px,
+        camera,
+        asking.tolerance_px,
+        mag,
+        noise_px=asking.noise_px,
+        noise_mag=asking.noise_mag,
+        fov_error=fov_error,
+        min_share=asking.min_share,
+        budget=budget or Budget(asking.max_steps, asking.time_limit_s),
+    )

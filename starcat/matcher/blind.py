@@ -18,17 +18,17 @@ from numpy.typing import NDArray
 
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
-from starcat.matcher.asking import Asking
+from starcat.matcher.asking import Asking, as_asked, check_scale_free
 from starcat.matcher.budget import Budget, BudgetSpentError
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.levels import Level, levels
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.table import METHODS
 from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder
-from starcat.matcher.observation import WIDEST_FOV_ERROR, Observation, observe
+from starcat.matcher.observation import WIDEST_FOV_ERROR, Observation
 from starcat.matcher.pose import first_poses, pose_at
-from starcat.matcher.refusal import Refusal
 from starcat.matcher.result import MatchResult, identified, unidentified
+from starcat.matcher.searching import certainty, refusal_of
 from starcat.matcher.verification import AT_ONCE, Agreement, BestOf, agree, agreeing_centroids
 
 Array = NDArray[np.float64]
@@ -151,7 +151,6 @@ def identify_blind(
     camera: Camera,
     mag: Array | None,
     fov_deg: tuple[float, float],
-    certain: float,
 ) -> MatchResult:
     """Identify a frame of a camera of which only a range of fields of view is known.
 
@@ -167,8 +166,6 @@ def identify_blind(
         Magnitudes. Without them, frames of many more stars than a level's are hard to identify.
     fov_deg : pair of float
         Narrowest and widest field across the width, degrees.
-    certain : float
-        A false-match probability as low as this ends the search.
 
     Returns
     -------
@@ -196,7 +193,7 @@ def identify_blind(
     parts = _checked_parts(matcher, camera, fov_deg)
     budget = Budget(matcher.max_steps, matcher.time_limit_s)
     searches = [
-        _begun(part, matcher, camera, centroids_px, mag, budget, certain / len(parts))
+        _begun(part, matcher, camera, centroids_px, mag, budget, certainty(matcher) / len(parts))
         for part in parts
     ]
     whole = searches[0].whole
@@ -205,16 +202,14 @@ def identify_blind(
     limit = _run(searches, matcher)
     done = [search for search in searches if search.best.found is not None]
     if not done:
-        return unidentified("no_match", whole, Refusal(limit or "no_candidate"))
+        return unidentified("no_match", whole, refusal_of(None, limit))
     first = done[0]
     for other in done[1:]:
         if other.best.found is not None and other.best.found.is_better_than(first.best.found):
             first = other
     found = _of_the_artifact(first, len(parts))
     if found.false_match_probability > matcher.max_false_match_probability:
-        reason = limit or found.withheld or "chance"
-        refusal = Refusal(reason, found.n_matched, found.chance, found.share)
-        return unidentified("no_match", whole, refusal)
+        return unidentified("no_match", whole, refusal_of(found, limit))
     return identified(found, first.whole, matcher.database.star_id)
 
 
@@ -223,12 +218,7 @@ def _checked_parts(matcher: Asking, camera: Camera, fov_deg: tuple[float, float]
         raise ConfigError(
             "an onboard image serves one field of view; open the artifact that it is of", key="fov"
         )
-    if matcher.method != "triangle":
-        raise ConfigError(
-            f"method {matcher.method!r} needs the focal length; only 'triangle' can find it",
-            key="method",
-            value=matcher.method,
-        )
+    check_scale_free(matcher)
     return parts_of_range(levels(matcher.database), camera, fov_deg)
 
 
@@ -242,17 +232,9 @@ def _begun(
     certain: float,
 ) -> _Search:
     """Return the search of one part before its first candidate."""
-    whole = observe(
-        centroids_px,
-        Camera(camera.width_px, camera.height_px, part.focal_length_px),
-        matcher.tolerance_px,
-        mag,
-        noise_px=matcher.noise_px,
-        noise_mag=matcher.noise_mag,
-        fov_error=min(part.fov_error, WIDEST_FOV_ERROR),
-        min_share=matcher.min_share,
-        budget=budget,
-    )
+    eye = Camera(camera.width_px, camera.height_px, part.focal_length_px)
+    error = min(part.fov_error, WIDEST_FOV_ERROR)
+    whole = as_asked(matcher, centroids_px, eye, mag, error, budget)
     used = whole
     if whole.mag is not None and len(whole) > MOST_CENTROIDS:
         used = replace(
@@ -316,9 +298,7 @@ def _verify(candidates: Candidates, search: _Search) -> None:
     for row in order[count[order] >= _standing_out(count)].tolist():
         batch, place = divmod(row, AT_ONCE)
         pose = pose_at(matrices[batch][place], float(factors[batch][place]), frame)
-        found = agree(pose, frame, database, search.best.certain)
-        if found.is_better_than(search.best.found):
-            search.best.found = found
+        search.best.offer(agree(pose, frame, database, search.best.certain))
         if search.best.is_certain:
             return
 

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import checked_number
+from starcat.matcher.asking import check_scale_free
 from starcat.matcher.blind import identify_blind
 from starcat.matcher.database import Database, open_database, open_image, products_in
 from starcat.matcher.fast import FastMatcher, Limits, fast_matcher, is_compiled
@@ -32,7 +33,7 @@ from starcat.matcher.observation import MIN_SHARE, WIDEST_FOV_ERROR, as_frame
 from starcat.matcher.prior import Prior, expected_near, prior_of
 from starcat.matcher.refusal import Refusal
 from starcat.matcher.result import MatchResult
-from starcat.matcher.searching import CERTAIN, certainty, searched
+from starcat.matcher.searching import CERTAIN, searched
 from starcat.matcher.stars import Asked
 from starcat.onboard.layout import FEATURES
 from starcat.onboard.reading import is_image
@@ -50,9 +51,6 @@ A centroid farther than `REACH` times as many from its star, 4.5, is one of 25,0
 Array = NDArray[np.float64]
 
 Engine = Literal["auto", "c", "numpy"]
-
-SCALE_FREE = ("triangle",)
-"""Methods that find the focal length with the attitude."""
 
 WIDE_PX = 4.0
 """With a wider tolerance, ``auto`` is ``numpy``, which tries smaller reaches too."""
@@ -302,7 +300,7 @@ class Matcher:
         frame, mag = as_frame(centroids_px, magnitudes)
         near = prior_of(prior, prior_error_deg)
         if fov_deg is not None:
-            blind = partial(identify_blind, fov_deg=fov_deg, certain=certainty(self))
+            blind = partial(identify_blind, fov_deg=fov_deg)
             return self._timed(frame, camera, mag, search=blind)
         if fov_error:
             return self._timed(frame, camera, mag, self._checked_fov_error(fov_error), near)
@@ -408,9 +406,7 @@ class Matcher:
         if self.database.image is not None:
             text = "an onboard image needs the focal length; open the artifact that it is of"
             raise ConfigError(text, key="fov_error", value=fov_error)
-        if self.method not in SCALE_FREE:
-            text = f"method {self.method!r} needs the focal length; only 'triangle' can find it"
-            raise ConfigError(text, key="method", value=self.method)
+        check_scale_free(self)
         if not 0.0 < fov_error <= WIDEST_FOV_ERROR:
             text = f"fov_error is {fov_error}; expected 0 to {WIDEST_FOV_ERROR:g}"
             raise ConfigError(text, key="fov_error", value=fov_error)

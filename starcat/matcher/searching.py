@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
-from starcat.matcher.asking import Asking
-from starcat.matcher.budget import Budget, BudgetSpentError
+from starcat.matcher.asking import Asking, as_asked
+from starcat.matcher.budget import BudgetSpentError
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.methods.table import METHODS
-from starcat.matcher.observation import Observation, observe
+from starcat.matcher.observation import Observation
 from starcat.matcher.prior import Prior, expected_near, search_near
 from starcat.matcher.refusal import Refusal
 from starcat.matcher.result import MatchResult, Origin, identified, unidentified
@@ -86,23 +86,13 @@ def searched(
             f"a frame of {len(frame)} centroids and this camera are beyond the C library, and "
             "an onboard image holds nothing for numpy; open the artifact that it is of"
         )
-    observation = observe(
-        frame,
-        camera,
-        matcher.tolerance_px,
-        mag,
-        noise_px=matcher.noise_px,
-        noise_mag=matcher.noise_mag,
-        fov_error=fov_error,
-        min_share=matcher.min_share,
-        budget=Budget(matcher.max_steps, matcher.time_limit_s),
-    )
+    observation = as_asked(matcher, frame, camera, mag, fov_error)
     origin: Origin = "lost_in_space" if prior is None else "tracking"
     if len(observation) < MIN_STARS:
         return unidentified("too_few_stars", observation, origin=origin)
     found, limit = _best(matcher, observation, prior)
     if found is None or found.false_match_probability > matcher.max_false_match_probability:
-        why = _refusal(found, limit, prior)
+        why = refusal_of(found, limit, prior)
         return unidentified("no_match", observation, why, origin=origin)
     answer = identified(found, observation, matcher.database.star_id, origin)
     if prior is None:
@@ -135,10 +125,27 @@ def _best(
     return best.found, None
 
 
-def _refusal(
-    found: Agreement | None, limit: Literal["time", "steps"] | None, prior: Prior | None
+def refusal_of(
+    found: Agreement | None,
+    limit: Literal["time", "steps"] | None,
+    prior: Prior | None = None,
 ) -> Refusal:
-    """Return why the best agreement, if there is one, is no answer."""
+    """Return why the best agreement, if there is one, is no answer.
+
+    Parameters
+    ----------
+    found : Agreement or None
+        The best agreement.
+    limit : {"time", "steps"}, optional
+        What ended the search before it had come to its end.
+    prior : Prior, optional
+        Where the frame was expected.
+
+    Returns
+    -------
+    Refusal
+        The limit, or why the agreement is withheld.
+    """
     if found is None or (prior is not None and found.chance >= 1.0):
         return Refusal(limit or ("no_candidate" if prior is None else "prior"))
     return Refusal(limit or found.withheld or "chance", found.n_matched, found.chance, found.share)

@@ -146,6 +146,17 @@ class BestOf:
         """Whether the search is over."""
         return self.found is not None and self.found.false_match_probability <= self.certain
 
+    def offer(self, found: Agreement) -> None:
+        """Keep an agreement if it is better than the best one so far.
+
+        Parameters
+        ----------
+        found : Agreement
+            Another one.
+        """
+        if found.is_better_than(self.found):
+            self.found = found
+
 
 def verify(
     candidates: Candidates, observation: Observation, database: Database, best: BestOf
@@ -171,9 +182,7 @@ def verify(
     for first in range(0, len(candidates), AT_ONCE):
         part = candidates[first : first + AT_ONCE]
         for pose in _worth_trying(part, observation, database):
-            found = agree(pose, observation, database, best.certain)
-            if found.is_better_than(best.found):
-                best.found = found
+            best.offer(agree(pose, observation, database, best.certain))
             if best.is_certain:
                 return
 

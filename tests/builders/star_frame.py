@@ -19,6 +19,7 @@ from starcat.geometry.kvector import KVector
 from starcat.geometry.sphere import radec_from_directions, tangent_axes
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods import triangle
+from starcat.matcher.methods.pairs import side_tolerance_rad
 from starcat.matcher.methods.triangle_order import select_triangles
 from starcat.matcher.observation import observe
 from starcat.matcher.searching import CERTAIN
@@ -69,7 +70,7 @@ def _triangle_rows(shot: Shot) -> tuple[int, list[tuple[str, object]]]:
     rank = int(np.flatnonzero((chosen == polaris).any(axis=1))[0])
     i, j, k = (int(n) for n in chosen[rank])
     sides = seen.separation_rad[[j, i, i], [k, k, j]]
-    tolerance_rad = triangle.SIDE_TOLERANCE * seen.tolerance_rad
+    tolerance_rad = side_tolerance_rad(seen)
     area, area_error, radius, radius_error = triangle.features(*sides.tolist(), tolerance_rad)
     product = matcher.database.products["triangles"]
     line = product.numbers["kvector_intercept"], product.numbers["kvector_slope"]

@@ -19,6 +19,7 @@ from starcat.matcher.budget import LOOKUP
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database
 from starcat.matcher.methods.candidates import Candidates
+from starcat.matcher.methods.pairs import side_tolerance_rad
 from starcat.matcher.observation import Observation
 from starcat.matcher.ways import compatible_pairs
 
@@ -43,9 +44,6 @@ MOST_STARS = 1500
 USED_AGAIN = 0.3
 """What the area of a triangle counts, once for every triangle before that it shares a centroid
 with."""
-
-SIDE_TOLERANCE = 1.5
-"""Largest error of a side, in units of the largest error of a centroid."""
 
 
 def candidates(
@@ -77,7 +75,7 @@ def candidates(
     may_be = predicted @ stars.T >= math.cos(min(math.pi, reach_rad))
     if observation.mag is not None and observation.noise_mag is not None:
         may_be &= compatible_pairs(observation.mag, database.mag[near], observation.noise_mag)
-    tolerance_rad = SIDE_TOLERANCE * observation.tolerance_rad
+    tolerance_rad = side_tolerance_rad(observation)
     centroid, star = may_be.nonzero()
     if len(centroid) <= MOST_PAIRS:
         observation.budget.spend(len(centroid))

@@ -18,6 +18,7 @@ from starcat.geometry.kvector import KVector
 from starcat.matcher.budget import LOOKUP
 from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.methods.candidates import Candidates
+from starcat.matcher.methods.pairs import side_tolerance_rad
 from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder, select_triangles
 from starcat.matcher.methods.triangle_shape import (
     are_similar,
@@ -40,9 +41,6 @@ into the order of the observed ones."""
 
 ROUNDING_RAD = 1e-7
 """More than the sides of all triangles lose where they are kept as 32 bits, radians."""
-
-SIDE_TOLERANCE = 1.5
-"""Largest error of a side, in units of the largest error of a centroid."""
 
 _ORDERS = np.array(list(permutations(range(3))), dtype=np.intp)
 
@@ -92,7 +90,7 @@ def _look_up(
     i, j, k = triangles.T
     apart = observation.separation_rad
     sides = np.stack([apart[j, k], apart[i, k], apart[i, j]], axis=-1)
-    tolerance_rad = SIDE_TOLERANCE * observation.tolerance_rad
+    tolerance_rad = side_tolerance_rad(observation)
     if observation.fov_error:
         found = similar_triangles(sides, tolerance_rad, observation, database)
     else:
