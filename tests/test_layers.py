@@ -27,6 +27,7 @@ ROOMS = rooms_of_the_house()
 
 SINGLE_MODULES = {
     "ground": ["errors", "progress", "resources", "version"],
+    "client": ["client"],
     "entry": ["", "cli", "__main__"],  # "" is starcat itself
 }
 
