@@ -7,6 +7,7 @@ from contextlib import asynccontextmanager
 
 from fastapi import APIRouter, FastAPI
 
+from starcat.service import pages
 from starcat.service.problems import REFUSALS, add_problem_handlers
 from starcat.service.service import Service, open_service
 from starcat.service.settings import Settings
@@ -17,7 +18,7 @@ API = "/api/v1"
 RESOURCES: tuple[APIRouter, ...] = ()
 """Routers of the REST interface, under `API`."""
 
-OTHERS: tuple[APIRouter, ...] = ()
+OTHERS: tuple[APIRouter, ...] = (*pages.ROUTERS,)
 """Routers of everything else: pages, the registry, TAP, cone searches, health."""
 
 
