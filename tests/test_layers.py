@@ -166,7 +166,7 @@ def test_what_the_matcher_needs_needs_little(module):
 
 ROOM_BY_ROOM = """
 import os, sys
-import astropy.table, duckdb, fastapi, matplotlib.pyplot, pyarrow.dataset, rich, scipy.spatial, typer
+import astropy.table, duckdb, fastapi, matplotlib.pyplot, pyarrow.dataset, scipy.spatial, typer
 failed = []
 for room, *names in {rooms}:
     if (child := os.fork()) == 0:
