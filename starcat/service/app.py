@@ -7,6 +7,7 @@ from contextlib import asynccontextmanager
 
 from fastapi import APIRouter, FastAPI
 
+from starcat.service.api import databases, registry, releases
 from starcat.service.problems import REFUSALS, add_problem_handlers
 from starcat.service.service import Service, open_service
 from starcat.service.settings import Settings
@@ -14,10 +15,10 @@ from starcat.version import __version__
 
 API = "/api/v1"
 
-RESOURCES: tuple[APIRouter, ...] = ()
+RESOURCES: tuple[APIRouter, ...] = (databases.router, releases.router)
 """Routers of the REST interface, under `API`."""
 
-OTHERS: tuple[APIRouter, ...] = ()
+OTHERS: tuple[APIRouter, ...] = (registry.router,)
 """Routers of everything else: pages, the registry, TAP, cone searches, health."""
 
 
@@ -59,4 +60,5 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     try:
         yield
     finally:
+        service.sessions.close()
         service.records.close()
