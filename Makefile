@@ -8,7 +8,8 @@ READY := $(VENV)/.ready
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
-.PHONY: help install check format test test-all test-changed demo bench reproduction docs pictures golden release clean
+SERVED := $(VENV)/.served
+.PHONY: help serve install check format test test-all test-changed demo bench reproduction docs pictures golden release clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -19,6 +20,11 @@ $(RUNS): pyproject.toml
 	@$(PYTHON) -m venv $(VENV)
 	@$(PIP) --editable '.[images]'
 	@touch $(RUNS)
+
+$(SERVED): $(RUNS)
+	@echo "installing what the service needs into $(VENV) (30 MB)"
+	@$(PIP) --editable '.[service]'
+	@touch $(SERVED)
 
 $(READY): $(RUNS)
 	@echo "installing the tools of the tests into $(VENV) (another 300 MB; a minute)"
@@ -55,6 +61,9 @@ demo: $(RUNS) ## build a database from the embedded sky, check it, identify simu
 	$(BIN)/starcat simulate dist/gaia-12deg-1.0.0 --output dist/frame.csv --seed 7
 	$(BIN)/starcat identify dist/gaia-12deg-1.0.0 dist/frame.csv
 	$(BIN)/starcat selftest dist/gaia-12deg-1.0.0 --frames 500
+
+serve: $(SERVED) ## run the service at http://127.0.0.1:8000 with the embedded sky
+	$(BIN)/starcat serve --root dist/service
 
 bench: $(READY) ## time and memory beside bare parsers and other star trackers, in one run
 	$(BIN)/python tests/benchmarks/ingest.py

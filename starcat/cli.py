@@ -26,6 +26,7 @@ from starcat.commands import (
     matching,
     querying,
     releasing,
+    serving,
     specs,
 )
 from starcat.terminal.failures import failure_of
@@ -62,7 +63,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["--help", "-h"]},
 )
-PARTS = (catalogs, specs, artifacts, querying, exchanging, releasing, matching, evaluating)
+PARTS = (catalogs, specs, artifacts, querying, exchanging, releasing, matching, evaluating, serving)
 """In the order of --help."""
 
 for part in PARTS:

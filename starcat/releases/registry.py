@@ -86,7 +86,7 @@ class FolderRegistry:
 
         Parameters
         ----------
-        X        progress : Progress
+        progress : Progress
                 Called with ("pull", bytes there are, bytes in all).
 
         Raises
@@ -157,7 +157,7 @@ class HttpRegistry:
 
         Parameters
         ----------
-        X        progress : Progress
+        progress : Progress
                 Called with (file name, bytes there are, bytes in all).
 
         Raises

@@ -1,0 +1,1 @@
+"""The service: databases built, queried and shipped from a browser, TOPCAT or a script."""

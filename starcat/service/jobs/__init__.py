@@ -1,0 +1,1 @@
+"""Long work: what was asked for, who does it, and what became of it."""

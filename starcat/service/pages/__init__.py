@@ -1,0 +1,1 @@
+"""What a browser shows: pages made on the server, and the small scripts that they use."""

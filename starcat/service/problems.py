@@ -1,0 +1,198 @@
+"""Errors as problem details (RFC 9457): the words and the code of the command line."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse, Response
+from pydantic import BaseModel, Field
+from starlette.exceptions import HTTPException
+
+from starcat.errors import (
+    BuildError,
+    CalibrationError,
+    ConfigError,
+    OutputError,
+    ProductError,
+    QueryError,
+    QueryLimitError,
+    SourceError,
+    SourceMissing,
+    StarcatError,
+    TargetMissing,
+)
+from starcat.terminal.failures import DEFECT, failure_of, shown
+
+MEDIA_TYPE = "application/problem+json"
+
+STATUS: tuple[tuple[type[Exception], int], ...] = (
+    (TargetMissing, 404),
+    (QueryLimitError, 422),
+    (QueryError, 400),
+    (ConfigError, 422),
+    (SourceMissing, 404),
+    (SourceError, 422),
+    (OutputError, 409),
+    (ProductError, 422),
+    (BuildError, 422),
+    (CalibrationError, 422),
+    (StarcatError, 400),
+)
+"""The status of each of starcat's errors; the first that fits."""
+
+_logger = logging.getLogger(__name__)
+
+
+class ProblemDetails(BaseModel):
+    """What is sent when a request cannot be answered."""
+
+    type: str = Field("about:blank", description="Kind of the problem, as RFC 9457 says.")
+    title: str = Field(description="Words of the status.")
+    status: int = Field(description="Status of the answer.")
+    detail: str = Field(description="What was found, what was expected, what to do next.")
+    code: int = Field(1, description="Exit code that the command line gives for it.")
+    kind: str | None = Field(None, description="Class of the error.")
+    hint: str | None = Field(None, description="The part of the detail that says what to do.")
+    key: str | None = Field(None, description="Key of the spec, or parameter, that is wrong.")
+
+
+class Problem(Exception):  # noqa: N818 - the name is that of RFC 9457
+    """What the service refuses by itself.
+
+    Parameters
+    ----------
+    status : int
+        Status of the answer.
+    detail : str
+        What was found, what was expected, what to do next.
+    headers : mapping of str to str, optional
+        Of the answer.
+    key : str, optional
+        The parameter that is wrong.
+    """
+
+    def __init__(
+        self,
+        status: int,
+        detail: str,
+        *,
+        headers: Mapping[str, str] | None = None,
+        key: str | None = None,
+    ) -> None:
+        super().__init__(detail)
+        self.status = status
+        self.detail = detail
+        self.headers = dict(headers or {})
+        self.key = key
+
+
+def problem_of(error: Exception) -> ProblemDetails:
+    """Return what to say of an exception.
+
+    Parameters
+    ----------
+    error : Exception
+        Whatever a handler raised.
+
+    Returns
+    -------
+    ProblemDetails
+        Of a defect no more than that it is one: the log of the server has the rest.
+    """
+    if isinstance(error, Problem):
+        title = HTTPStatus(error.status).phrase
+        return ProblemDetails(title=title, status=error.status, detail=error.detail, key=error.key)
+    status = next((number for kind, number in STATUS if isinstance(error, kind)), 500)
+    title = HTTPStatus(status).phrase
+    if status == 500:
+        detail = "this is a defect of starcat; the log of the server says more"
+        return ProblemDetails(title=title, status=500, detail=detail, code=DEFECT)
+    failure = failure_of(error, "starcat serve")
+    key = getattr(error, "key", None)
+    return ProblemDetails(
+        title=title,
+        status=status,
+        detail=failure.message,
+        code=failure.code,
+        kind=failure.kind,
+        hint=failure.hint,
+        key=str(key) if key else None,
+    )
+
+
+def problem_response(problem: ProblemDetails, headers: Mapping[str, str] | None = None) -> Response:
+    """Return the answer that tells a problem.
+
+    Parameters
+    ----------
+    problem : ProblemDetails
+        What is wrong.
+    headers : mapping of str to str, optional
+        Of the answer.
+
+    Returns
+    -------
+    Response
+        Of type ``application/problem+json``.
+    """
+    content = problem.model_dump(exclude_none=True)
+    return JSONResponse(content, problem.status, dict(headers or {}), MEDIA_TYPE)
+
+
+def add_problem_handlers(app: FastAPI) -> None:
+    """Make an application tell all of its errors as problem details.
+
+    Parameters
+    ----------
+    app : FastAPI
+        The application.
+    """
+
+    @app.exception_handler(StarcatError)
+    @app.exception_handler(Problem)
+    def refuse(request: Request, error: Exception) -> Response:
+        return problem_response(problem_of(error), getattr(error, "headers", None))
+
+    @app.exception_handler(RequestValidationError)
+    def refuse_parameters(request: Request, error: RequestValidationError) -> Response:
+        first: dict[str, Any] = dict(error.errors()[0])
+        key = ".".join(str(step) for step in first["loc"][1:])
+        where = f"{first['loc'][0]} {key}".strip()
+        detail = shown(f"{where}: {first['msg']}; /api/docs says what is expected", 500)
+        problem = ProblemDetails(
+            title="Unprocessable Content", status=422, detail=detail, code=2, key=key or None
+        )
+        return problem_response(problem)
+
+    @app.exception_handler(HTTPException)
+    def refuse_http(request: Request, error: HTTPException) -> Response:
+        title = HTTPStatus(error.status_code).phrase
+        detail = shown(f"{error.detail}", 500)
+        problem = ProblemDetails(title=title, status=error.status_code, detail=detail)
+        return problem_response(problem, error.headers)
+
+    @app.exception_handler(Exception)
+    def tell_defect(request: Request, error: Exception) -> Response:
+        _logger.exception("a defect", exc_info=error)
+        return problem_response(problem_of(error))
+
+
+REFUSALS: dict[int | str, dict[str, Any]] = {
+    status: {"model": ProblemDetails, "content": {MEDIA_TYPE: {}}, "description": text}
+    for status, text in (
+        (400, "The request cannot be understood."),
+        (401, "A token is needed."),
+        (403, "The token has not the role that is needed."),
+        (404, "There is no such thing."),
+        (409, "It contradicts what is there."),
+        (413, "Too large."),
+        (422, "Something in the request is wrong."),
+        (429, "Too many requests; ``Retry-After`` says when to ask again."),
+    )
+}
+"""For ``responses=`` of routers: how they refuse."""

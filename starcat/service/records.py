@@ -1,0 +1,140 @@
+"""What the service remembers, in one SQLite file: jobs, tokens, and what was published."""
+
+from __future__ import annotations
+
+import sqlite3
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from starcat.errors import SchemaVersionError
+
+MIGRATIONS: tuple[str, ...] = (
+    """
+    CREATE TABLE jobs (
+        id TEXT PRIMARY KEY,
+        kind TEXT NOT NULL,
+        key TEXT NOT NULL,
+        owner TEXT NOT NULL,
+        title TEXT NOT NULL,
+        state TEXT NOT NULL,
+        request TEXT NOT NULL,
+        created_s REAL NOT NULL,
+        started_s REAL,
+        ended_s REAL,
+        attempt INTEGER NOT NULL DEFAULT 0,
+        wants_end INTEGER NOT NULL DEFAULT 0,
+        stage TEXT,
+        done INTEGER,
+        total INTEGER,
+        error TEXT,
+        result TEXT
+    );
+    CREATE INDEX jobs_by_key ON jobs (key);
+    CREATE INDEX jobs_by_owner ON jobs (owner, state);
+    CREATE TABLE job_events (
+        job TEXT NOT NULL REFERENCES jobs (id) ON DELETE CASCADE,
+        number INTEGER NOT NULL,
+        at_s REAL NOT NULL,
+        kind TEXT NOT NULL,
+        data TEXT NOT NULL,
+        PRIMARY KEY (job, number)
+    );
+    CREATE TABLE tokens (
+        id TEXT PRIMARY KEY,
+        name TEXT NOT NULL,
+        role TEXT NOT NULL,
+        digest TEXT NOT NULL UNIQUE,
+        created_s REAL NOT NULL,
+        expires_s REAL,
+        revoked_s REAL
+    );
+    """,
+)
+"""Statements that bring the file from each version to the next; one that is out never changes."""
+
+WAIT_S = 20.0
+"""Seconds that a writer waits for another."""
+
+
+class Records:
+    """The SQLite file, opened once by each thread.
+
+    Parameters
+    ----------
+    path : Path
+        The file; made and brought to the newest version if need be.
+
+    Raises
+    ------
+    SchemaVersionError
+        If a newer starcat has written it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._of_thread = threading.local()
+        self._migrate()
+
+    @contextmanager
+    def reading(self) -> Iterator[sqlite3.Connection]:
+        """Give the connection of this thread, to read.
+
+        Yields
+        ------
+        sqlite3.Connection
+            Rows are `sqlite3.Row`.
+        """
+        yield self._connection()
+
+    @contextmanager
+    def writing(self) -> Iterator[sqlite3.Connection]:
+        """Give the connection of this thread within a transaction that nobody else writes in.
+
+        Yields
+        ------
+        sqlite3.Connection
+            What was done is on disk when the context ends, or not at all where it raises.
+        """
+        connection = self._connection()
+        connection.execute("BEGIN IMMEDIATE")
+        try:
+            yield connection
+        except BaseException:
+            connection.execute("ROLLBACK")
+            raise
+        connection.execute("COMMIT")
+
+    def close(self) -> None:
+        """Close the connection of this thread."""
+        connection = getattr(self._of_thread, "connection", None)
+        if connection is not None:
+            connection.close()
+            self._of_thread.connection = None
+
+    def _connection(self) -> sqlite3.Connection:
+        connection: sqlite3.Connection | None = getattr(self._of_thread, "connection", None)
+        if connection is None:
+            connection = sqlite3.connect(self.path, timeout=WAIT_S, isolation_level=None)
+            connection.row_factory = sqlite3.Row
+            connection.execute("PRAGMA journal_mode = WAL")
+            connection.execute("PRAGMA synchronous = FULL")
+            connection.execute("PRAGMA foreign_keys = ON")
+            self._of_thread.connection = connection
+        return connection
+
+    def _migrate(self) -> None:
+        with self.writing() as connection:
+            [found] = connection.execute("PRAGMA user_version").fetchone()
+            if found > len(MIGRATIONS):
+                raise SchemaVersionError(
+                    f"{self.path}: records version {found}; this starcat writes "
+                    f"{len(MIGRATIONS)}. Install a newer starcat",
+                    found=str(found),
+                    expected=str(len(MIGRATIONS)),
+                )
+            for version in range(found, len(MIGRATIONS)):
+                for statement in MIGRATIONS[version].split(";"):
+                    connection.execute(statement)
+                connection.execute(f"PRAGMA user_version = {version + 1}")

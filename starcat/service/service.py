@@ -1,0 +1,74 @@
+"""The one object that handlers reach everything through."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from fastapi import Depends, Request
+
+from starcat.service.jobs.job import JobStore
+from starcat.service.places import Places
+from starcat.service.records import Records
+from starcat.service.settings import Settings
+from starcat.service.shelf import Shelf
+
+
+@dataclass(frozen=True)
+class Service:
+    """What a running service is made of.
+
+    Attributes
+    ----------
+    settings : Settings
+        What the operator set.
+    places : Places
+        What lies where.
+    records : Records
+        What is remembered.
+    shelf : Shelf
+        The databases there are.
+    jobs : JobStore
+        The jobs there are.
+    """
+
+    settings: Settings
+    places: Places
+    records: Records
+    shelf: Shelf
+    jobs: JobStore
+
+
+def open_service(settings: Settings) -> Service:
+    """Open a service: its folders and its records.
+
+    Parameters
+    ----------
+    settings : Settings
+        What the operator set.
+
+    Returns
+    -------
+    Service
+        Nothing runs yet.
+
+    Raises
+    ------
+    OutputError
+        If the root cannot be written to.
+    SchemaVersionError
+        If a newer starcat has written it.
+    """
+    places = Places(settings.root)
+    places.make()
+    records = Records(places.records)
+    return Service(settings, places, records, Shelf(places), JobStore(records))
+
+
+def service_of(request: Request) -> Service:
+    """Return the service that a request came to."""
+    service: Service = request.app.state.service
+    return service
+
+
+TheService = Annotated[Service, Depends(service_of)]

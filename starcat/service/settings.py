@@ -1,0 +1,121 @@
+"""What an operator may set: ``service.toml`` under the root, and options of the command."""
+
+from __future__ import annotations
+
+import ipaddress
+import tomllib
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from starcat.errors import ConfigError, suggest
+
+FILE_NAME = "service.toml"
+
+RoleName = Literal["none", "reader", "builder", "publisher"]
+
+
+class Settings(BaseModel):
+    """Everything that an operator may set.
+
+    Attributes are described where they are defined, for the page of documentation.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    root: Path = Field(description="Folder with all that the service keeps.")
+    host: str = Field("127.0.0.1", description="Address to listen at.")
+    port: int = Field(8000, ge=0, le=65535, description="Port; 0 for any that is free.")
+    public_url: str | None = Field(
+        None, description="Address that others see, where a proxy stands before the service."
+    )
+    anonymous: RoleName | None = Field(
+        None,
+        description="What somebody without a token may do; by default read on a loopback address, "
+        "nothing on any other.",
+    )
+    workers: int = Field(1, ge=0, le=64, description="Jobs that run at the same time here.")
+    queue_url: str | None = Field(
+        None, description="redis://HOST:PORT/N, for workers on several machines; else a file."
+    )
+    scheduler: str | None = Field(
+        None, description="tcp://HOST:PORT of a Dask cluster for ingests."
+    )
+    job_time_s: float = Field(3600.0, gt=0, description="Seconds that a job may take.")
+    job_memory_gib: float = Field(4.0, gt=0, description="Memory that a job may take, GiB.")
+    jobs_waiting: int = Field(20, ge=1, description="Jobs that one user may have waiting.")
+    disk_gib: float = Field(20.0, gt=0, description="Disk that one user's databases may take, GiB.")
+    free_gib: float = Field(1.0, ge=0, description="Disk that is left free: below, no job begins.")
+    query_time_s: float = Field(60.0, gt=0, description="Seconds that a query may take.")
+    query_memory_gib: float = Field(1.0, gt=0, description="Memory that a query may take, GiB.")
+    queries: int = Field(2, ge=1, le=64, description="Queries that run at the same time.")
+    max_rows: int = Field(10_000_000, ge=1, description="Rows of an answer at most.")
+    upload_mib: float = Field(64.0, gt=0, description="Size of an upload at most, MiB.")
+    upload_time_s: float = Field(60.0, gt=0, description="Seconds that an upload may take.")
+    requests_per_minute: int = Field(
+        6000, ge=1, description="Requests of one address or token in a minute."
+    )
+    keep_jobs_days: float = Field(90.0, gt=0, description="Days that ended jobs are kept.")
+    keep_results_days: float = Field(7.0, gt=0, description="Days that results of TAP are kept.")
+    shutdown_s: float = Field(
+        20.0, ge=0, description="Seconds that jobs have to end when the service stops."
+    )
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether only this machine can reach the service."""
+        if self.host == "localhost":
+            return True
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return False
+
+    @property
+    def anonymous_role(self) -> RoleName:
+        """What somebody without a token may do."""
+        return self.anonymous or ("reader" if self.is_loopback else "none")
+
+
+def read_settings(root: Path, **options: object) -> Settings:
+    """Read the settings of a service.
+
+    Parameters
+    ----------
+    root : Path
+        Its folder; ``service.toml`` in it is optional.
+    **options
+        What takes the place of the file's values; None says nothing.
+
+    Returns
+    -------
+    Settings
+        Checked.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read, or a value is unknown or out of range.
+    """
+    path = root / FILE_NAME
+    content: dict[str, object] = {}
+    if path.exists():
+        try:
+            content = tomllib.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"{path}: not a readable TOML file: {error}") from error
+    content |= {name: value for name, value in options.items() if value is not None}
+    try:
+        return Settings.model_validate({**content, "root": root.resolve()})
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False)[0]
+        key = ".".join(str(step) for step in first["loc"])
+        known = ", ".join(Settings.model_fields)
+        hint = f"{suggest(key, Settings.model_fields)}known: {known}"
+        advice = f"; {hint}" if first["type"] == "extra_forbidden" else ""
+        raise ConfigError(
+            f"{path}: {key}: {first['msg']} (found {str(first['input'])[:80]!r}){advice}",
+            key=key,
+            value=first["input"],
+        ) from None

@@ -1,0 +1,114 @@
+"""The databases that a service has: built ones, each under the id that its content gives it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
+from starcat.errors import ProductError, TargetMissing
+from starcat.service.places import DATABASE_ID, Places
+
+
+@dataclass(frozen=True)
+class Database:
+    """A built database.
+
+    Attributes
+    ----------
+    id : str
+        Sixteen hexadecimal digits: the beginning of the digest of what it was made from.
+    folder : Path
+        Its artifact, ``<name>-<version>``.
+    manifest : dict
+        The manifest of that.
+    """
+
+    id: str
+    folder: Path
+    manifest: dict[str, Any]
+
+    @property
+    def name(self) -> str:
+        """Name of the artifact."""
+        return str(self.manifest["name"])
+
+    @property
+    def version(self) -> str:
+        """Version of the artifact."""
+        return str(self.manifest["version"])
+
+    @property
+    def title(self) -> str:
+        """Name and version, as the folder has them."""
+        return f"{self.name}-{self.version}"
+
+
+class Shelf:
+    """All databases there are.
+
+    Parameters
+    ----------
+    places : Places
+        Where they lie.
+    """
+
+    def __init__(self, places: Places) -> None:
+        self._places = places
+        self._known: dict[Path, tuple[int, Database]] = {}
+
+    def databases(self) -> list[Database]:
+        """Return all databases.
+
+        Returns
+        -------
+        list of Database
+            By name, then by version, then by id. A folder without a readable manifest is none.
+        """
+        found = []
+        for path in self._places.databases.glob(f"*/*/{MANIFEST_NAME}"):
+            if not DATABASE_ID.fullmatch(path.parents[1].name):
+                continue
+            try:
+                found.append(self._at(path))
+            except (ProductError, OSError):
+                continue
+        return sorted(found, key=lambda one: (one.name, _numbers(one.version), one.id))
+
+    def database(self, database_id: str) -> Database:
+        """Return a database.
+
+        Parameters
+        ----------
+        database_id : str
+            Its id.
+
+        Returns
+        -------
+        Database
+            With its manifest read.
+
+        Raises
+        ------
+        TargetMissing
+            If there is none.
+        """
+        for path in self._places.database(database_id).glob(f"*/{MANIFEST_NAME}"):
+            return self._at(path)
+        raise TargetMissing(
+            f"no database has the id {database_id!r}; the list of them tells theirs"
+        )
+
+    def _at(self, path: Path) -> Database:
+        changed_ns = path.stat().st_mtime_ns
+        known = self._known.get(path)
+        if known is None or known[0] != changed_ns:
+            folder = path.parent
+            known = changed_ns, Database(folder.parent.name, folder, read_manifest(folder))
+            self._known[path] = known
+        return known[1]
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    return tuple(map(int, version.split(".")))
