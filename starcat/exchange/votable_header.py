@@ -162,7 +162,7 @@ def _field(column: VotableColumn) -> str:
         "arraysize": "*" if column.is_text or column.is_list else None,
         "unit": column.unit,
         "ucd": column.facts.get("ucd"),
-        "xtype": "timestamp" if column.is_time else None,
+        "xtype": column.xtype,
         "ref": _ICRS if column.is_place else None,
     }
     said = " ".join(f"{key}={_attribute(text)}" for key, text in known.items() if text is not None)
