@@ -51,6 +51,14 @@ MIGRATIONS: tuple[str, ...] = (
         revoked_s REAL
     );
     """,
+    """
+    CREATE TABLE sessions (
+        digest TEXT PRIMARY KEY,
+        token TEXT NOT NULL REFERENCES tokens (id),
+        created_s REAL NOT NULL,
+        expires_s REAL NOT NULL
+    );
+    """,
 )
 """Statements that bring the file from each version to the next; one that is out never changes."""
 
