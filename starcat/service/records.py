@@ -50,8 +50,6 @@ MIGRATIONS: tuple[str, ...] = (
         expires_s REAL,
         revoked_s REAL
     );
-    """,
-    """
     CREATE TABLE sessions (
         digest TEXT PRIMARY KEY,
         token TEXT NOT NULL REFERENCES tokens (id),
