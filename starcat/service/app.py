@@ -9,6 +9,7 @@ from contextlib import asynccontextmanager, suppress
 from fastapi import APIRouter, FastAPI
 from starlette.middleware import Middleware
 
+from starcat.service import pages
 from starcat.service.guard import health, signing
 from starcat.service.guard.bodies import Bodies
 from starcat.service.guard.headers import SafeHeaders
@@ -31,7 +32,7 @@ API = "/api/v1"
 RESOURCES: tuple[APIRouter, ...] = ()
 """Routers of the REST interface, under `API`."""
 
-OTHERS: tuple[APIRouter, ...] = (health.router, signing.router)
+OTHERS: tuple[APIRouter, ...] = (health.router, signing.router, *pages.ROUTERS)
 """Routers of everything else: pages, the registry, TAP, cone searches, health."""
 
 
