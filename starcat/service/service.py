@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import threading
+from dataclasses import dataclass, field
 from typing import Annotated
 
 from fastapi import Depends, Request
 
 from starcat.service.jobs.job import JobStore
+from starcat.service.jobs.queue import JobQueue, open_queue
 from starcat.service.places import Places
 from starcat.service.records import Records
 from starcat.service.settings import Settings
@@ -30,6 +32,10 @@ class Service:
         The databases there are.
     jobs : JobStore
         The jobs there are.
+    queue : JobQueue
+        What tells the workers that a job waits.
+    stopping : threading.Event
+        Set when the service is about to stop: what lasts, such as a stream of events, ends.
     """
 
     settings: Settings
@@ -37,6 +43,8 @@ class Service:
     records: Records
     shelf: Shelf
     jobs: JobStore
+    queue: JobQueue
+    stopping: threading.Event = field(default_factory=threading.Event)
 
 
 def open_service(settings: Settings) -> Service:
@@ -62,7 +70,8 @@ def open_service(settings: Settings) -> Service:
     places = Places(settings.root)
     places.make()
     records = Records(places.records)
-    return Service(settings, places, records, Shelf(places), JobStore(records))
+    queue = open_queue(settings, places)
+    return Service(settings, places, records, Shelf(places), JobStore(records), queue)
 
 
 def service_of(request: Request) -> Service:
