@@ -17,7 +17,13 @@ from starcat.pipeline.stars_read import StarsRead, read_stars, what_is_read
 from starcat.specs.build_spec import BuildSpec
 from starcat.service.access import Builder, Reader, Role, principal_of
 from starcat.service.jobs.submission import submit_build
-from starcat.service.pages.draft import TEXT, Draft, draft_of_form, draft_of_preset
+from starcat.service.pages.draft import (
+    TEXT,
+    Draft,
+    draft_of_content,
+    draft_of_form,
+    without_defaults,
+)
 from starcat.service.pages.preview import MOST_MAPPED, Preview, preview_of, tiling_content
 from starcat.service.pages.rendering import (
     ENVIRONMENT,
@@ -61,10 +67,21 @@ def new_page(
     request: Request,
     service: TheService,
     _: Reader,
-    chosen: Annotated[str, Query(alias="preset")] = "gaia-12deg",
+    chosen: Annotated[str | None, Query(alias="preset")] = None,
+    job: Annotated[str | None, Query()] = None,
+    database: Annotated[str | None, Query()] = None,
 ) -> Response:
-    """Show the form with a preset."""
-    return _page(request, service, draft_of_preset(chosen), chosen)
+    """Show the form with a preset, or with the spec of a job or of a database."""
+    if job is not None:
+        spec = service.jobs.get(job).request.get("spec")
+    elif database is not None:
+        spec = service.shelf.database(database).manifest["spec"]
+    else:
+        chosen = chosen or preset_names()[0]
+        spec = preset(chosen).recorded()
+    if spec is None:
+        raise Problem(404, f"job {job} builds nothing; choose one that does")
+    return _page(request, service, draft_of_content(without_defaults(spec)), chosen or "")
 
 
 @router.post("/new")
