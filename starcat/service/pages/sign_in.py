@@ -63,5 +63,5 @@ def own_path(address: str) -> str:
     >>> [own_path(one) for one in ("/jobs?state=done", "//elsewhere.example", "https://x.example")]
     ['/jobs?state=done', '/', '/']
     """
-    is_own = address.startswith("/") and not address.startswith(("//", "/\\"))
+    is_own = address.startswith("/") and not address.startswith("//") and "\\" not in address
     return address if is_own and address.isprintable() else "/"
