@@ -12,7 +12,7 @@ from starcat.artifact.reader import Artifact
 from starcat.errors import TargetMissing
 from starcat.matcher.methods.table import METHODS
 from starcat.service.access import Reader
-from starcat.service.pages import coverage_map as sky
+from starcat.service.pages import sky
 from starcat.service.pages.facts import (
     MANIFEST_DIGEST,
     database_row,

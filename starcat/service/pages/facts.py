@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -71,7 +72,7 @@ class Product:
     Attributes
     ----------
     name, schema, description, parquet : str
-        Its name, the version of its schema, what a row is, its file.
+        Its name, the version of its schema, what a row is and what else is stored, its file.
     rows, bytes : int
         Records, and the size of the Parquet file.
     in_database : bool
@@ -88,6 +89,11 @@ class Product:
     bytes: int
     in_database: bool
     columns: list[tuple[str, str, str, str]]
+
+    @property
+    def summary(self) -> str:
+        """What a row is."""
+        return re.split(r"[.:;] ", self.description)[0].rstrip(".")
 
 
 def database_rows(service: Service) -> list[Row]:
