@@ -7,7 +7,7 @@ from contextlib import asynccontextmanager
 
 from fastapi import APIRouter, FastAPI
 
-from starcat.service.api import databases, registry, releases
+from starcat.service.api import databases, identify, registry, releases, sql
 from starcat.service.problems import REFUSALS, add_problem_handlers
 from starcat.service.service import Service, open_service
 from starcat.service.settings import Settings
@@ -15,7 +15,7 @@ from starcat.version import __version__
 
 API = "/api/v1"
 
-RESOURCES: tuple[APIRouter, ...] = (databases.router, releases.router)
+RESOURCES: tuple[APIRouter, ...] = (databases.router, releases.router, identify.router, sql.router)
 """Routers of the REST interface, under `API`."""
 
 OTHERS: tuple[APIRouter, ...] = (registry.router,)
@@ -61,4 +61,5 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         yield
     finally:
         service.sessions.close()
+        service.confined.close()
         service.records.close()

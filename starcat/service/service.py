@@ -7,6 +7,7 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
+from starcat.service.confined import Confined
 from starcat.service.jobs.job import JobStore
 from starcat.service.places import Places
 from starcat.service.records import Records
@@ -33,6 +34,8 @@ class Service:
         The jobs there are.
     sessions : Sessions
         Open query sessions.
+    confined : Confined
+        Processes that read uploads and make files.
     """
 
     settings: Settings
@@ -41,6 +44,7 @@ class Service:
     shelf: Shelf
     jobs: JobStore
     sessions: Sessions
+    confined: Confined
 
 
 def open_service(settings: Settings) -> Service:
@@ -66,7 +70,15 @@ def open_service(settings: Settings) -> Service:
     places = Places(settings.root)
     places.make()
     records = Records(places.records)
-    return Service(settings, places, records, Shelf(places), JobStore(records), Sessions(settings))
+    return Service(
+        settings=settings,
+        places=places,
+        records=records,
+        shelf=Shelf(places),
+        jobs=JobStore(records),
+        sessions=Sessions(settings),
+        confined=Confined(settings, places.scratch),
+    )
 
 
 def service_of(request: Request) -> Service:
