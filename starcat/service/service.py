@@ -8,6 +8,7 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
+from starcat.service.confined import Confined
 from starcat.service.jobs.job import JobStore
 from starcat.service.jobs.queue import JobQueue, open_queue
 from starcat.service.places import Places
@@ -33,8 +34,14 @@ class Service:
         The databases there are.
     jobs : JobStore
         The jobs there are.
-    queue, sessions = open_queue(settings, places), Sessions(settings)
-    return Service(settings, places, records, Shelf(places), JobStore(records), sessions, queue)
+    sessions : Sessions
+        Open query sessions.
+    queue : JobQueue
+        What waits for workers.
+    confined : Confined
+        Processes that read uploads and make files.
+    stopping : threading.Event
+        Set when the service stops.
     """
 
     settings: Settings
@@ -44,6 +51,7 @@ class Service:
     jobs: JobStore
     sessions: Sessions
     queue: JobQueue
+    confined: Confined
     stopping: threading.Event = field(default_factory=threading.Event)
 
 
@@ -70,8 +78,16 @@ def open_service(settings: Settings) -> Service:
     places = Places(settings.root)
     places.make()
     records = Records(places.records)
-    queue, sessions = open_queue(settings, places), Sessions(settings)
-    return Service(settings, places, records, Shelf(places), JobStore(records), sessions, queue)
+    return Service(
+        settings=settings,
+        places=places,
+        records=records,
+        shelf=Shelf(places),
+        jobs=JobStore(records),
+        sessions=Sessions(settings),
+        queue=open_queue(settings, places),
+        confined=Confined(settings, places.scratch),
+    )
 
 
 def service_of(request: Request) -> Service:
