@@ -49,9 +49,7 @@ def list_of_databases(request: Request, service: TheService, _: Reader) -> Respo
 
 
 @router.get("/databases/{database_id}")
-def one_database(
-    request: Request, service: TheService, _: Reader, database_id: str
-) -> Response:
+def one_database(request: Request, service: TheService, _: Reader, database_id: str) -> Response:
     """Show what is known of a database."""
     database = service.shelf.database(database_id)
     manifest = database.manifest
