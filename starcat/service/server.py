@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import sys
-from types import FrameType
+from socket import socket
 
 import uvicorn
-from fastapi import FastAPI
 
 from starcat.errors import ConfigError
 from starcat.service.access import Role
@@ -14,6 +13,7 @@ from starcat.service.app import make_app
 from starcat.service.guard.logs import log_settings
 from starcat.service.guard.shape import MOST_HEADER_BYTES, MOST_TARGET_BYTES
 from starcat.service.guard.tokens import TokenStore
+from starcat.service.service import Service
 from starcat.service.settings import Settings
 
 CONNECTIONS = 1_000
@@ -50,30 +50,30 @@ def run_server(settings: Settings) -> None:
         h11_max_incomplete_event_size=MOST_HEADER_BYTES + MOST_TARGET_BYTES,
         timeout_graceful_shutdown=round(settings.shutdown_s),
     )
-    _Server(config, app, settings).run()
+    _Server(config, app.state.service).run()
 
 
 class _Server(uvicorn.Server):
     """Says where it is, and ends streams of events when it is told to stop."""
 
-    def __init__(self, config: uvicorn.Config, app: FastAPI, settings: Settings) -> None:
+    def __init__(self, config: uvicorn.Config, service: Service) -> None:
         super().__init__(config)
-        self._app = app
-        self._settings = settings
+        self._service = service
 
-    async def startup(self, sockets: list[object] | None = None) -> None:  # type: ignore[override]
+    async def startup(self, sockets: list[socket] | None = None) -> None:
         """Begin to listen."""
-        await super().startup(sockets)  # type: ignore[arg-type]
+        await super().startup(sockets)
         if self.started:
             port = self.servers[0].sockets[0].getsockname()[1]
-            host = f"[{self._settings.host}]" if ":" in self._settings.host else self._settings.host
-            address = self._settings.public_url or f"http://{host}:{port}"
-            _say(f"starcat serves {self._settings.root} at {address.rstrip('/')}/")
+            settings = self._service.settings
+            host = f"[{settings.host}]" if ":" in settings.host else settings.host
+            address = settings.public_url or f"http://{host}:{port}"
+            _say(f"starcat serves {settings.root} at {address.rstrip('/')}/")
 
-    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Begin to stop."""
-        self._app.state.stopping.stop()
-        super().handle_exit(sig, frame)
+    async def shutdown(self, sockets: list[socket] | None = None) -> None:
+        """Stop: streams of events end at once, other requests within the time that they have."""
+        self._service.stopping.set()
+        await super().shutdown(sockets)
 
 
 def _see_to_tokens(tokens: TokenStore, settings: Settings) -> None:
