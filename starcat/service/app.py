@@ -10,6 +10,7 @@ from fastapi import APIRouter, FastAPI
 from starlette.middleware import Middleware
 
 from starcat.service import pages
+from starcat.service.api import databases, registry, releases
 from starcat.service.guard import health, signing
 from starcat.service.guard.bodies import Bodies
 from starcat.service.guard.headers import SafeHeaders
@@ -28,10 +29,18 @@ from starcat.version import __version__
 
 API = "/api/v1"
 
-RESOURCES: tuple[APIRouter, ...] = ()
+RESOURCES: tuple[APIRouter, ...] = (
+    databases.router,
+    releases.router,
+)
 """Routers of the REST interface, under `API`."""
 
-OTHERS: tuple[APIRouter, ...] = (health.router, signing.router, *pages.ROUTERS)
+OTHERS: tuple[APIRouter, ...] = (
+    registry.router,
+    health.router,
+    signing.router,
+    *pages.ROUTERS,
+)
 """Routers of everything else: pages, the registry, TAP, cone searches, health."""
 
 
@@ -89,4 +98,5 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         removing.cancel()
         with suppress(asyncio.CancelledError):
             await removing
+        service.sessions.close()
         service.records.close()
