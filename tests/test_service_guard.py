@@ -254,7 +254,7 @@ def test_the_server_does_not_begin_where_others_could_not_get_in(
 ) -> None:
     settings = read_settings(tmp_path / "root", **options)
     with pytest.raises(ConfigError, match="make one first: starcat token create NAME"):
-        run_server(settings)
+        run_server(settings, print)
 
 
 def test_requests_of_one_address_or_token_are_limited(client: Make) -> None:
