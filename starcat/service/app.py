@@ -59,4 +59,5 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     try:
         yield
     finally:
+        service.sessions.close()
         service.records.close()

@@ -10,6 +10,7 @@ from fastapi import Depends, Request
 from starcat.service.jobs.job import JobStore
 from starcat.service.places import Places
 from starcat.service.records import Records
+from starcat.service.sessions import Sessions
 from starcat.service.settings import Settings
 from starcat.service.shelf import Shelf
 
@@ -30,6 +31,8 @@ class Service:
         The databases there are.
     jobs : JobStore
         The jobs there are.
+    sessions : Sessions
+        Open query sessions.
     """
 
     settings: Settings
@@ -37,6 +40,7 @@ class Service:
     records: Records
     shelf: Shelf
     jobs: JobStore
+    sessions: Sessions
 
 
 def open_service(settings: Settings) -> Service:
@@ -62,7 +66,7 @@ def open_service(settings: Settings) -> Service:
     places = Places(settings.root)
     places.make()
     records = Records(places.records)
-    return Service(settings, places, records, Shelf(places), JobStore(records))
+    return Service(settings, places, records, Shelf(places), JobStore(records), Sessions(settings))
 
 
 def service_of(request: Request) -> Service:
