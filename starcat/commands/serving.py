@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -61,11 +60,10 @@ def serve(
     from starcat.service.settings import read_settings
 
     def announce(address: str) -> None:
-        from starcat.terminal.console import print_json, say
+        from starcat.terminal.console import print_json_line, say
 
         if json:
-            print_json({"address": address, "root": str(root)})
-            sys.stdout.flush()
+            print_json_line({"address": address, "root": str(root)})
         else:
             say(f"starcat serves {root} at {address}")
 

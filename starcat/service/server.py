@@ -14,6 +14,7 @@ from starcat.errors import ConfigError, reason
 from starcat.service.access import Role
 from starcat.service.app import make_app
 from starcat.service.guard.logs import log_settings
+from starcat.service.guard.patience import Patience
 from starcat.service.guard.shape import MOST_HEADER_BYTES, MOST_TARGET_BYTES
 from starcat.service.guard.tokens import TokenStore
 from starcat.service.service import Service
@@ -50,6 +51,7 @@ def run_server(settings: Settings, announce: Announce) -> None:
     listening = _listen(settings)
     config = uvicorn.Config(
         app,
+        http=Patience,
         log_config=log_settings(),
         access_log=False,
         server_header=False,

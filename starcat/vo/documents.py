@@ -174,7 +174,9 @@ def availability(up_since: datetime) -> bytes:
     bytes
         A document of VOSI.
     """
-    return _document(Availability(available=True, up_since=UTCTimestamp.fromisoformat(_utc(up_since))))
+    return _document(
+        Availability(available=True, up_since=UTCTimestamp.fromisoformat(_utc(up_since)))
+    )
 
 
 def tableset(tables: Tables, with_columns: bool = True) -> bytes:

@@ -251,7 +251,9 @@ def _inline(value: Any) -> str:
     if isinstance(value, list):
         return f"[{', '.join(map(_inline, value))}]"
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{_key(name)} = {_inline(one)}" for name, one in value.items()) + "}"
+        return (
+            "{" + ", ".join(f"{_key(name)} = {_inline(one)}" for name, one in value.items()) + "}"
+        )
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     return toml_value(value) if isinstance(value, bool | int | float | str) else f"{value}"
