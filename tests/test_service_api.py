@@ -32,7 +32,9 @@ def root(tmp_path: Path, small_artifact: Path) -> Path:
 
 @pytest.fixture
 def client(root: Path) -> Iterator[TestClient]:
-    with TestClient(make_app(Settings(root=root, anonymous="publisher"))) as client:
+    with TestClient(
+        make_app(Settings(root=root, anonymous="publisher")), base_url="http://127.0.0.1:8000"
+    ) as client:
         yield client
 
 
