@@ -33,8 +33,6 @@ class Service:
         The databases there are.
     jobs : JobStore
         The jobs there are.
-    queue, sessions = open_queue(settings, places), Sessions(settings)
-    return Service(settings, places, records, Shelf(places), JobStore(records), sessions, queue)
     """
 
     settings: Settings
