@@ -220,17 +220,13 @@ def _identify(
     artifact = service.shelf.database(database).folder
     with scratch_folder(service.places) as folder:
         _keep(asked, folder)
-        limit_s = service.settings.query_time_s
-        options = asked.options.model_copy(
-            update={"time_limit_s": min(asked.options.time_limit_s or limit_s, limit_s)}
-        )
         found = service.confined.call(
             "identify",
             {
                 "folder": str(folder),
                 "file": asked.name,
                 "artifact": str(artifact),
-                "options": options.model_dump(),
+                "options": asked.options.model_dump(),
                 "picture": kind,
             },
         )
