@@ -10,7 +10,7 @@ from fastapi import APIRouter, FastAPI
 from starlette.middleware import Middleware
 
 from starcat.service import pages
-from starcat.service.api import databases, registry, releases
+from starcat.service.api import databases, identify, registry, releases, sql
 from starcat.service.guard import health, signing
 from starcat.service.guard.bodies import Bodies
 from starcat.service.guard.headers import SafeHeaders
@@ -32,6 +32,8 @@ API = "/api/v1"
 RESOURCES: tuple[APIRouter, ...] = (
     databases.router,
     releases.router,
+    identify.router,
+    sql.router,
 )
 """Routers of the REST interface, under `API`."""
 
@@ -99,4 +101,5 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         with suppress(asyncio.CancelledError):
             await removing
         service.sessions.close()
+        service.confined.close()
         service.records.close()

@@ -8,6 +8,7 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
+from starcat.service.confined import Confined
 from starcat.service.jobs.job import JobStore
 from starcat.service.jobs.queue import JobQueue, open_queue
 from starcat.service.places import Places
@@ -33,6 +34,10 @@ class Service:
         The databases there are.
     jobs : JobStore
         The jobs there are.
+    sessions : Sessions
+        Open query sessions.
+    confined : Confined
+        Processes that read uploads and make files.
     """
 
     settings: Settings
@@ -41,6 +46,7 @@ class Service:
     shelf: Shelf
     jobs: JobStore
     sessions: Sessions
+    confined: Confined
     queue: JobQueue
     stopping: threading.Event = field(default_factory=threading.Event)
 
@@ -68,8 +74,16 @@ def open_service(settings: Settings) -> Service:
     places = Places(settings.root)
     places.make()
     records = Records(places.records)
-    queue, sessions = open_queue(settings, places), Sessions(settings)
-    return Service(settings, places, records, Shelf(places), JobStore(records), sessions, queue)
+    return Service(
+        settings=settings,
+        places=places,
+        records=records,
+        shelf=Shelf(places),
+        jobs=JobStore(records),
+        sessions=Sessions(settings),
+        confined=Confined(settings, places.scratch),
+        queue=open_queue(settings, places),
+    )
 
 
 def service_of(request: Request) -> Service:
