@@ -21,7 +21,6 @@ from starcat.service.guard.origin import Origin
 from starcat.service.guard.request_id import RequestId
 from starcat.service.guard.retention import keep_removing
 from starcat.service.guard.shape import Shape
-from starcat.service.guard.streams import Stopping, Streams
 from starcat.service.guard.who import Who
 from starcat.service.problems import REFUSALS, add_problem_handlers
 from starcat.service.service import Service, open_service
@@ -61,7 +60,7 @@ def make_app(settings: Settings) -> FastAPI:
         With the service as ``app.state.service``. Its workers run while its lifespan lasts.
     """
     service = open_service(settings)
-    metrics, identities, stopping = Metrics(service), Identities(service), Stopping()
+    metrics, identities = Metrics(service), Identities(service)
     app = FastAPI(
         title="starcat",
         version=__version__,
@@ -79,12 +78,10 @@ def make_app(settings: Settings) -> FastAPI:
             Middleware(Origin, settings=settings),
             Middleware(Who, settings=settings, identities=identities),
             Middleware(Bodies, settings=settings),
-            Middleware(Streams, stopping=stopping),
             Middleware(Defects),
         ],
     )
-    app.state.service, app.state.metrics = service, metrics
-    app.state.identities, app.state.stopping = identities, stopping
+    app.state.service, app.state.metrics, app.state.identities = service, metrics, identities
     add_problem_handlers(app)
     for router in RESOURCES:
         app.include_router(router, prefix=API, responses=REFUSALS)

@@ -36,12 +36,8 @@ class Service:
         The jobs there are.
     sessions : Sessions
         Open query sessions.
-    queue : JobQueue
-        What waits for workers.
     confined : Confined
         Processes that read uploads and make files.
-    stopping : threading.Event
-        Set when the service stops.
     """
 
     settings: Settings
@@ -50,8 +46,8 @@ class Service:
     shelf: Shelf
     jobs: JobStore
     sessions: Sessions
-    queue: JobQueue
     confined: Confined
+    queue: JobQueue
     stopping: threading.Event = field(default_factory=threading.Event)
 
 
@@ -85,8 +81,8 @@ def open_service(settings: Settings) -> Service:
         shelf=Shelf(places),
         jobs=JobStore(records),
         sessions=Sessions(settings),
-        queue=open_queue(settings, places),
         confined=Confined(settings, places.scratch),
+        queue=open_queue(settings, places),
     )
 
 
