@@ -22,6 +22,7 @@ from starcat.service.guard.request_id import RequestId
 from starcat.service.guard.retention import keep_removing
 from starcat.service.guard.shape import Shape
 from starcat.service.guard.who import Who
+from starcat.service.pages.rendering import add_missing_page
 from starcat.service.problems import REFUSALS, add_problem_handlers
 from starcat.service.service import Service, open_service
 from starcat.service.settings import Settings
@@ -83,6 +84,7 @@ def make_app(settings: Settings) -> FastAPI:
     )
     app.state.service, app.state.metrics, app.state.identities = service, metrics, identities
     add_problem_handlers(app)
+    add_missing_page(app)
     for router in RESOURCES:
         app.include_router(router, prefix=API, responses=REFUSALS)
     for router in OTHERS:

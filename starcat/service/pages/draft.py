@@ -116,6 +116,7 @@ class Draft:
         inside = [name for name in self.values if key and name.startswith(f"{key}.")]
         words = str(self.error).removeprefix(f"{ORIGIN}: ")
         told = [name for name in inside if name.rpartition(".")[2] in words]
+        told.sort(key=lambda name: words.index(name.rpartition(".")[2]))
         return {(named or told or [TEXT])[0]: words}
 
 
@@ -197,7 +198,7 @@ def plain_toml(content: Mapping[str, Any]) -> str:
     Returns
     -------
     str
-        The values of a table before the tables in it; empty tables are left out.
+        The values of a table before the tables in it.
 
     Examples
     --------
@@ -213,7 +214,7 @@ def plain_toml(content: Mapping[str, Any]) -> str:
 def _tables(content: Mapping[str, Any], path: tuple[str, ...]) -> list[str]:
     lines = [f"{_key(k)} = {_inline(v)}\n" for k, v in content.items() if not isinstance(v, dict)]
     parts = []
-    if lines:
+    if lines or (path and not content):
         head = f"[{'.'.join(map(_key, path))}]\n" if path else ""
         parts.append(head + "".join(lines))
     for name, value in content.items():
@@ -368,6 +369,8 @@ def _at(content: Mapping[str, Any], path: str) -> Any:
 
 
 def _put(content: dict[str, Any], path: str, value: Any) -> None:
+    if value is None and _at(content, path) is None:
+        return
     *tables, name = path.split(".")
     for table in tables:
         content = content.setdefault(table, {})
