@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
+from anyio import to_thread
 from fastapi import APIRouter, FastAPI
 
+from starcat.service.api import jobs
+from starcat.service.jobs.pool import WorkerPool
 from starcat.service.problems import REFUSALS, add_problem_handlers
 from starcat.service.service import Service, open_service
 from starcat.service.settings import Settings
@@ -14,7 +17,7 @@ from starcat.version import __version__
 
 API = "/api/v1"
 
-RESOURCES: tuple[APIRouter, ...] = ()
+RESOURCES: tuple[APIRouter, ...] = (jobs.router,)
 """Routers of the REST interface, under `API`."""
 
 OTHERS: tuple[APIRouter, ...] = ()
@@ -32,7 +35,8 @@ def make_app(settings: Settings) -> FastAPI:
     Returns
     -------
     FastAPI
-        With the service as ``app.state.service``. Its workers run while its lifespan lasts.
+        With the service as ``app.state.service`` and its workers as ``app.state.workers``, which
+        run while its lifespan lasts.
     """
     service = open_service(settings)
     app = FastAPI(
@@ -45,6 +49,7 @@ def make_app(settings: Settings) -> FastAPI:
         redoc_url=None,
     )
     app.state.service = service
+    app.state.workers = WorkerPool(service)
     add_problem_handlers(app)
     for router in RESOURCES:
         app.include_router(router, prefix=API, responses=REFUSALS)
@@ -56,7 +61,12 @@ def make_app(settings: Settings) -> FastAPI:
 @asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     service: Service = app.state.service
+    pool: WorkerPool = app.state.workers
+    await to_thread.run_sync(pool.start)
     try:
         yield
     finally:
+        service.stopping.set()
+        await to_thread.run_sync(pool.stop)
+        service.queue.close()
         service.records.close()

@@ -1,11 +1,52 @@
-"""The web server."""
+"""The web server: one for each root, and what happens when it is to stop."""
 
 from __future__ import annotations
 
-import uvicorn
+import shutil
+from types import FrameType
 
+import uvicorn
+from fastapi import FastAPI
+
+from starcat.errors import ConfigError, OutputError, reason
 from starcat.service.app import make_app
+from starcat.service.jobs.pool import WorkerPool
+from starcat.service.places import Places
+from starcat.service.service import Service
 from starcat.service.settings import Settings
+from starcat.storage.atomic import make_folder
+from starcat.storage.locks import locked
+
+
+class Server(uvicorn.Server):
+    """A web server that has jobs end as soon as it is told to stop.
+
+    Parameters
+    ----------
+    config : uvicorn.Config
+        Of the server.
+    app : FastAPI
+        The application, as `make_app` makes it.
+    """
+
+    def __init__(self, config: uvicorn.Config, app: FastAPI) -> None:
+        super().__init__(config)
+        self._service: Service = app.state.service
+        self._workers: WorkerPool = app.state.workers
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Begin to stop: requests, streams of events and jobs end at the same time.
+
+        Parameters
+        ----------
+        sig : int
+            The signal.
+        frame : FrameType, optional
+            Where it arrived.
+        """
+        self._service.stopping.set()
+        self._workers.begin_stop()
+        super().handle_exit(sig, frame)
 
 
 def run_server(settings: Settings) -> None:
@@ -15,10 +56,39 @@ def run_server(settings: Settings) -> None:
     ----------
     settings : Settings
         What the operator set.
+
+    Raises
+    ------
+    ConfigError
+        If another server runs with the same root.
+    OutputError
+        If the root cannot be written to.
     """
-    uvicorn.run(
-        make_app(settings),
+    places = Places(settings.root)
+    try:
+        make_folder(places.root)
+        with locked(places.lock, wait=False):
+            _serve(settings, places)
+    except BlockingIOError:
+        raise ConfigError(
+            f"another server runs with --root {places.root}; stop it, or choose another root",
+            key="root",
+            value=str(places.root),
+        ) from None
+    except OSError as error:
+        raise OutputError(
+            f"{places.root}: cannot be used ({reason(error)}); choose another --root",
+            path=places.root,
+        ) from error
+
+
+def _serve(settings: Settings, places: Places) -> None:
+    shutil.rmtree(places.scratch, ignore_errors=True)
+    app = make_app(settings)
+    config = uvicorn.Config(
+        app,
         host=settings.host,
         port=settings.port,
         timeout_graceful_shutdown=round(settings.shutdown_s),
     )
+    Server(config, app).run()
