@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import signal
+from signal import SIGINT, SIGTERM
 from types import FrameType
 
 import uvicorn
@@ -91,4 +93,14 @@ def _serve(settings: Settings, places: Places) -> None:
         port=settings.port,
         timeout_graceful_shutdown=round(settings.shutdown_s),
     )
-    Server(config, app).run()
+    # uvicorn raises the signal that ended it once more when it has ended, for whoever is outside.
+    before = {number: signal.signal(number, _is_heard) for number in (SIGINT, SIGTERM)}
+    try:
+        Server(config, app).run()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _is_heard(number: int, frame: FrameType | None) -> None:
+    """Do nothing more about a signal: the server has ended because of it."""
