@@ -37,6 +37,7 @@ from starcat.service.problems import Problem, problem_of
 from starcat.service.service import Service, TheService
 from starcat.specs.reading import preset, preset_names
 
+
 @lru_cache(maxsize=2)
 def _read(key: str, spec_json: str) -> StarsRead:
     return read_stars(BuildSpec.model_validate_json(spec_json), {})
@@ -130,9 +131,7 @@ def tiling(count: Annotated[int, Query(ge=1, le=MOST_MAPPED)], _: Reader) -> Res
     return JSONResponse(tiling_content(count), headers={"Cache-Control": "private, max-age=86400"})
 
 
-def _preview(
-    service: Service, draft: Draft
-) -> tuple[Preview | None, str | None]:
+def _preview(service: Service, draft: Draft) -> tuple[Preview | None, str | None]:
     if draft.spec is None:
         return None, None
     try:
