@@ -136,7 +136,10 @@ def test_a_page_has_no_address_elsewhere_and_its_links_lead_somewhere(pages, cli
             assert not found.startswith("//"), (address, found)
             path = found.partition("#")[0]
             is_ours = path and path not in others and not path.startswith(("/databases/", "/api/"))
-            is_preset = path.startswith("/new?preset=") and path[12:] not in ("gaia-12deg", "sao-6deg")
+            is_preset = path.startswith("/new?preset=") and path[12:] not in (
+                "gaia-12deg",
+                "sao-6deg",
+            )
             if is_ours and not path.endswith(("/cancel", "/retry", "/preview", "/tiling")):
                 if is_preset:  # whose catalogs take seconds to be read
                     assert path[12:] in preset_names()

@@ -132,9 +132,11 @@ async function ask() {
     summary.textContent = `No estimate: ${error.message}`;
   }
   result.setAttribute("aria-busy", "false");
+  form.dataset.state = "settled";
 }
 
 form.addEventListener("input", (event) => {
+  form.dataset.state = "changed";
   clearTimeout(waiting);
   const range = ranges.find((one) => one.dataset.of === event.target.id);
   if (range) follow(range);
