@@ -74,9 +74,8 @@ class Choice:
     def nbytes(self) -> int:
         """Memory that it takes."""
         tables = (self.selected.guide_stars, self.selected.rejected)
-        arrays = (self.fields.boresights, self.fields.offsets, self.fields.star_index)
         steps = (step.directions for step in self.selected.steps)
-        return int(sum(each.nbytes for each in (*tables, *arrays, *steps)))
+        return int(self.fields.nbytes + sum(each.nbytes for each in (*tables, *steps)))
 
 
 def choose_stars(read: StarsRead, spec: BuildSpec) -> Choice:

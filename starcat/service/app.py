@@ -10,7 +10,7 @@ from fastapi import APIRouter, FastAPI
 from starlette.middleware import Middleware
 
 from starcat.service import pages
-from starcat.service.api import databases, registry, releases
+from starcat.service.api import catalogs, databases, registry, releases, specs
 from starcat.service.guard import health, signing
 from starcat.service.guard.bodies import Bodies
 from starcat.service.guard.headers import SafeHeaders
@@ -31,6 +31,8 @@ from starcat.version import __version__
 API = "/api/v1"
 
 RESOURCES: tuple[APIRouter, ...] = (
+    specs.router,
+    catalogs.router,
     databases.router,
     releases.router,
 )
@@ -101,5 +103,6 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         removing.cancel()
         with suppress(asyncio.CancelledError):
             await removing
+        service.catalogs.close()
         service.sessions.close()
         service.records.close()

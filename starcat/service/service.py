@@ -8,6 +8,7 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
+from starcat.service.catalogs import Catalogs
 from starcat.service.jobs.job import JobStore
 from starcat.service.jobs.queue import JobQueue, open_queue
 from starcat.service.places import Places
@@ -15,6 +16,11 @@ from starcat.service.records import Records
 from starcat.service.sessions import Sessions
 from starcat.service.settings import Settings
 from starcat.service.shelf import Shelf
+
+READ = "read"
+"""Folder, among the catalogs, of what estimates start from."""
+
+GIB = 2**30
 
 
 @dataclass(frozen=True)
@@ -33,6 +39,14 @@ class Service:
         The databases there are.
     jobs : JobStore
         The jobs there are.
+    sessions : Sessions
+        Processes of their own, for what takes long or may take too much.
+    queue : JobQueue
+        Where jobs wait.
+    catalogs : Catalogs
+        The catalogs there are, and estimates from them.
+    stopping : threading.Event
+        Set when the service is about to end.
     """
 
     settings: Settings
@@ -42,6 +56,7 @@ class Service:
     jobs: JobStore
     sessions: Sessions
     queue: JobQueue
+    catalogs: Catalogs
     stopping: threading.Event = field(default_factory=threading.Event)
 
 
@@ -69,7 +84,17 @@ def open_service(settings: Settings) -> Service:
     places.make()
     records = Records(places.records)
     queue, sessions = open_queue(settings, places), Sessions(settings)
-    return Service(settings, places, records, Shelf(places), JobStore(records), sessions, queue)
+    most = round(settings.job_memory_gib * GIB)
+    return Service(
+        settings,
+        places,
+        records,
+        Shelf(places),
+        JobStore(records),
+        sessions,
+        queue,
+        Catalogs(places.catalogs / READ, most),
+    )
 
 
 def service_of(request: Request) -> Service:
