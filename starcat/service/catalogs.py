@@ -19,12 +19,15 @@ from starcat.catalog.fetching.locate import locate
 from starcat.catalog.source import DataSource, data_source
 from starcat.errors import SourceMissing
 from starcat.pipeline.estimate import Choice, Estimate, choose_stars, estimate
+from starcat.pipeline.guide_stars import MOST_FIELD_STARS
 from starcat.pipeline.stars_read import StarsRead, read_stars, what_is_read
+from starcat.pipeline.starter import Starter, starter_spec
 from starcat.service.jobs.keys import source_files
 from starcat.service.kept import Kept
 from starcat.service.problems import Problem
 from starcat.service.star_cache import CatalogRead, StarCache
-from starcat.specs.build_spec import BuildSpec
+from starcat.specs.build_spec import BuildSpec, CameraSpec
+from starcat.specs.reading import preset, preset_names
 from starcat.storage.digests import json_bytes
 from starcat.version import __version__
 
@@ -135,11 +138,49 @@ class Catalogs:
         if found is not None:
             return found
         read = self.read(spec, key)
-        with self.turn():
+        with self._turn():
             choice = self._choice(read, key, spec)
             found = estimate(read, choice, spec, self._max_memory_bytes)
         self._estimates.put(whole, found, found.fields.nbytes)
         return found
+
+    def starter(
+        self,
+        name: str,
+        camera: CameraSpec,
+        faint_limit_mag: float | None = None,
+        widest_fov_x_deg: float | None = None,
+    ) -> Starter:
+        """Return a first spec for a camera, from the embedded sky.
+
+        Parameters
+        ----------
+        name, camera, faint_limit_mag, widest_fov_x_deg
+            As `starcat.pipeline.starter.starter_spec` takes them.
+
+        Returns
+        -------
+        Starter
+            The spec, and what it gives.
+
+        Raises
+        ------
+        ConfigError, BuildError
+            If the camera or the limit is out of range.
+        Problem
+            With status 503, while the sky is being read, or too many ask.
+        """
+        # The default preset reads what a first spec is made from.
+        sky = self.read(preset(preset_names()[0])).stars
+        with self._turn():
+            return starter_spec(
+                name,
+                camera,
+                faint_limit_mag,
+                widest_fov_x_deg=widest_fov_x_deg,
+                sky=sky,
+                most_field_stars=MOST_FIELD_STARS,
+            )
 
     def read(self, spec: BuildSpec, key: str | None = None) -> StarsRead:
         """Return the catalogs of a spec; read them where that was not done yet.
@@ -214,19 +255,7 @@ class Catalogs:
         return found
 
     @contextmanager
-    def turn(self) -> Iterator[None]:
-        """Wait for a turn to compute: so many as `AT_ONCE` do so at the same time.
-
-        Yields
-        ------
-        None
-            To the work.
-
-        Raises
-        ------
-        Problem
-            With status 503, if that takes longer than a request waits.
-        """
+    def _turn(self) -> Iterator[None]:
         if not self._turns.acquire(timeout=self._wait_s):
             raise _busy("too many estimates are being made", 1)
         try:

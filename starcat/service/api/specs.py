@@ -6,7 +6,6 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Response
 
-from starcat.pipeline.starter import starter_spec
 from starcat.service.access import Reader
 from starcat.service.api.coverage_map import CoverageMap, coverage_answer, coverage_svg
 from starcat.service.api.spec_bodies import SPEC_BODY, SpecOfRequest
@@ -114,11 +113,7 @@ def coverage_picture(spec: SpecOfRequest, service: TheService, reader: Reader) -
 @router.post("/starter", summary="A first spec for a camera", responses=BUSY)
 def starter(wanted: StarterRequest, service: TheService, reader: Reader) -> StarterAnswer:
     """Return a spec for a camera, as 'starcat init' writes it, from the embedded sky."""
-    with service.catalogs.turn():
-        found = starter_spec(
-            wanted.name,
-            wanted.camera,
-            wanted.faint_limit_mag,
-            widest_fov_x_deg=wanted.widest_fov_x_deg,
-        )
+    found = service.catalogs.starter(
+        wanted.name, wanted.camera, wanted.faint_limit_mag, wanted.widest_fov_x_deg
+    )
     return starter_answer(found)
