@@ -11,7 +11,16 @@ from fastapi import APIRouter, FastAPI
 from starlette.middleware import Middleware
 
 from starcat.service import pages
-from starcat.service.api import databases, identify, jobs, registry, releases, sql
+from starcat.service.api import (
+    catalogs,
+    databases,
+    identify,
+    jobs,
+    registry,
+    releases,
+    specs,
+    sql,
+)
 from starcat.service.guard import health, signing
 from starcat.service.guard.bodies import Bodies
 from starcat.service.guard.headers import SafeHeaders
@@ -34,6 +43,8 @@ API = "/api/v1"
 
 RESOURCES: tuple[APIRouter, ...] = (
     jobs.router,
+    specs.router,
+    catalogs.router,
     databases.router,
     releases.router,
     identify.router,
@@ -111,6 +122,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         with suppress(asyncio.CancelledError):
             await removing
         await to_thread.run_sync(pool.stop)
+        service.catalogs.close()
         service.sessions.close()
         service.confined.close()
         service.queue.close()

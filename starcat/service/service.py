@@ -8,6 +8,7 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
+from starcat.service.catalogs import Catalogs
 from starcat.service.confined import Confined
 from starcat.service.jobs.job import JobStore
 from starcat.service.jobs.queue import JobQueue, open_queue
@@ -16,6 +17,11 @@ from starcat.service.records import Records
 from starcat.service.sessions import Sessions
 from starcat.service.settings import Settings
 from starcat.service.shelf import Shelf
+
+READ = "read"
+"""Folder, among the catalogs, of what estimates start from."""
+
+GIB = 2**30
 
 
 @dataclass(frozen=True)
@@ -35,9 +41,15 @@ class Service:
     jobs : JobStore
         The jobs there are.
     sessions : Sessions
-        Open query sessions.
+        Processes of their own, for what takes long or may take too much.
     confined : Confined
         Processes that read uploads and make files.
+    queue : JobQueue
+        Where jobs wait.
+    catalogs : Catalogs
+        The catalogs there are, and estimates from them.
+    stopping : threading.Event
+        Set when the service is about to end.
     """
 
     settings: Settings
@@ -48,6 +60,7 @@ class Service:
     sessions: Sessions
     confined: Confined
     queue: JobQueue
+    catalogs: Catalogs
     stopping: threading.Event = field(default_factory=threading.Event)
 
 
@@ -74,6 +87,7 @@ def open_service(settings: Settings) -> Service:
     places = Places(settings.root)
     places.make()
     records = Records(places.records)
+    most = round(settings.job_memory_gib * GIB)
     return Service(
         settings=settings,
         places=places,
@@ -83,6 +97,7 @@ def open_service(settings: Settings) -> Service:
         sessions=Sessions(settings),
         confined=Confined(settings, places.scratch),
         queue=open_queue(settings, places),
+        catalogs=Catalogs(places.catalogs / READ, most),
     )
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -17,7 +16,7 @@ from starcat.catalog.source import data_source, source_names
 from starcat.errors import ConfigError, StarcatError
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.keys import REQUIRED, SpecKey, spec_sections
-from starcat.specs.reading import spec_from_dict
+from starcat.specs.reading import content_of_toml, spec_from_dict
 from starcat.specs.spec_toml import toml_value
 
 ORIGIN = "spec"
@@ -27,9 +26,6 @@ TEXT = "toml"
 BEFORE = "toml-before"
 LENS = "lens"
 ENABLED = "enabled"
-
-MOST_CHARACTERS = 100_000
-"""A longer text is not read; every key of a spec with its explanation takes 12,000."""
 
 FIELDS = (
     "name",
@@ -135,12 +131,9 @@ def draft_of_text(text: str) -> Draft:
     """
     text = text.replace("\r\n", "\n")
     try:
-        if len(text) > MOST_CHARACTERS:
-            raise ValueError(f"{len(text):,} characters; at most {MOST_CHARACTERS:,} are read")
-        return _checked(tomllib.loads(text), text)
-    except (ValueError, RecursionError) as error:
-        wrong = ConfigError(f"{ORIGIN}: not a readable TOML file: {error}", key=TEXT)
-        return _draft({}, text, None, wrong)
+        return _checked(content_of_toml(text, ORIGIN), text)
+    except ConfigError as error:
+        return _draft({}, text, None, ConfigError(str(error), key=TEXT))
 
 
 def draft_of_form(form: Mapping[str, str]) -> Draft:
@@ -163,12 +156,12 @@ def draft_of_form(form: Mapping[str, str]) -> Draft:
     known = draft_of_text(before)
     if known.error is not None and known.error.key == TEXT:
         return known
-    content = tomllib.loads(before)
+    content = content_of_toml(before, ORIGIN)
     try:
         _fill(content, form)
     except ConfigError as error:
         return _draft(content, before, None, error)
-    return known if content == tomllib.loads(before) else draft_of_content(content)
+    return known if content == content_of_toml(before, ORIGIN) else draft_of_content(content)
 
 
 def draft_of_content(content: Mapping[str, Any]) -> Draft:

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import json
-from functools import lru_cache
 from typing import Annotated, Any
 
 from fastapi import Depends, Query, Request
 from fastapi.responses import JSONResponse, RedirectResponse, Response
 
-from starcat.catalog.fetching.locate import locate
-from starcat.catalog.source import data_source, source_names
-from starcat.errors import SourceError, StarcatError
-from starcat.pipeline.estimate import Estimate, choose_stars, estimate
-from starcat.pipeline.stars_read import StarsRead, read_stars, what_is_read
+from starcat.errors import StarcatError
 from starcat.service.access import Reader, Role, principal_of
 from starcat.service.jobs.submission import submit_build
 from starcat.service.pages.draft import (
@@ -34,19 +28,7 @@ from starcat.service.pages.rendering import (
 )
 from starcat.service.problems import Problem, problem_of
 from starcat.service.service import Service, TheService
-from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset, preset_names
-
-
-@lru_cache(maxsize=2)
-def _read(key: str, spec_json: str) -> StarsRead:
-    return read_stars(BuildSpec.model_validate_json(spec_json), {})
-
-
-def estimate_of(service: Service, spec: BuildSpec) -> Estimate:
-    read = _read(json.dumps(what_is_read(spec)), spec.model_dump_json())
-    return estimate(read, choose_stars(read, spec), spec)
-
 
 MOST_FIELDS = 100
 """Fields of a form; this one has 30."""
@@ -135,7 +117,7 @@ def _preview(service: Service, draft: Draft) -> tuple[Preview | None, str | None
     if draft.spec is None:
         return None, None
     try:
-        return preview_of(estimate_of(service, draft.spec)), None
+        return preview_of(service.catalogs.estimate(draft.spec)), None
     except (StarcatError, Problem) as error:
         return None, problem_of(error).detail
 
@@ -161,7 +143,7 @@ def _page(
         summary=summary(seen),
         presets=[(name, preset(name).description) for name in preset_names()],
         chosen=chosen,
-        sources=_sources(),
+        sources=_sources(service),
         may_build=principal_of(request).role >= Role.BUILDER,
         text_error=draft.errors.get(TEXT),
     )
@@ -180,15 +162,12 @@ def summary(seen: Preview | None) -> str:
     )
 
 
-def _sources() -> list[tuple[str, str]]:
+def _sources(service: Service) -> list[tuple[str, str]]:
     """Return the star catalogs there are, those whose files are here first."""
-    here, missing = [], []
-    for name in source_names():
-        if data_source(name).kind != "stars":
-            continue
-        try:
-            locate(name, {})
-            here.append((name, f"{name} – {data_source(name).identifier}"))
-        except SourceError:
-            missing.append((name, f"{name} – files not here"))
-    return here + missing
+    return [
+        (
+            one.source.name,
+            f"{one.source.name} – {one.source.identifier if one.is_here else 'its files are not here'}",
+        )
+        for one in service.catalogs.offered()
+    ]
