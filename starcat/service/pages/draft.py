@@ -159,6 +159,7 @@ def draft_of_form(form: Mapping[str, str]) -> Draft:
     content = content_of_toml(before, ORIGIN)
     try:
         _fill(content, form)
+        _prune(content)
     except ConfigError as error:
         return _draft(content, before, None, error)
     return known if content == content_of_toml(before, ORIGIN) else draft_of_content(content)
@@ -229,7 +230,14 @@ def _inline(value: Any) -> str:
         )
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
+    if _is_huge(value):
+        return hex(value)
     return toml_value(value) if isinstance(value, bool | int | float | str) else f"{value}"
+
+
+def _is_huge(value: Any) -> bool:
+    """Return whether a number has more digits than Python writes; none is in any range."""
+    return isinstance(value, int) and value.bit_length() > 1000
 
 
 def without_defaults(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -294,6 +302,8 @@ def _shown(key: str, content: Mapping[str, Any]) -> str:
         value = "" if default is REQUIRED or default is None else default
     if key == "selection.bright_limit_mag" and value == _KEYS[key].default:
         return ""  # No star is that bright: there is no limit.
+    if _is_huge(value):
+        return hex(value)[:40]
     return f"{value:.12g}" if isinstance(value, float) else str(value)
 
 
@@ -376,3 +386,12 @@ def _put(content: dict[str, Any], path: str, value: Any) -> None:
         content.pop(name, None)
     else:
         content[name] = value
+
+
+def _prune(content: dict[str, Any]) -> None:
+    """Remove tables inside others that have become empty; those at the top are needed."""
+    for value in content.values():
+        if isinstance(value, dict):
+            _prune(value)
+            for name in [key for key, inner in value.items() if inner == {}]:
+                del value[name]

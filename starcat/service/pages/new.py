@@ -26,7 +26,7 @@ from starcat.service.pages.rendering import (
     render,
     size_text,
 )
-from starcat.service.problems import Problem, problem_of
+from starcat.service.problems import Problem, ProblemDetails, problem_of
 from starcat.service.service import Service, TheService
 from starcat.specs.reading import preset, preset_names
 
@@ -92,7 +92,9 @@ def preview(request: Request, service: TheService, form: Form, _: Reader) -> Res
     """Tell a script what the form has become, and what that would give."""
     draft = draft_of_form(form)
     seen, error = _preview(service, draft)
-    part = ENVIRONMENT.get_template("new_result.html").render(preview=seen, problem=error)
+    part = ENVIRONMENT.get_template("new_result.html").render(
+        preview=seen, problem=error and error.detail
+    )
     content: dict[str, Any] = {
         "toml": draft.text,
         "values": draft.values,
@@ -102,6 +104,7 @@ def preview(request: Request, service: TheService, form: Form, _: Reader) -> Res
         "errors": draft.errors,
         "result": part,
         "summary": summary(seen),
+        "is_busy": error is not None and error.status == 503,
         "stars": [] if seen is None else seen.estimate.fields.count.tolist(),
     }
     return JSONResponse(content, headers={"Cache-Control": "no-store"})
@@ -113,13 +116,13 @@ def tiling(count: Annotated[int, Query(ge=1, le=MOST_MAPPED)], _: Reader) -> Res
     return JSONResponse(tiling_content(count), headers={"Cache-Control": "private, max-age=86400"})
 
 
-def _preview(service: Service, draft: Draft) -> tuple[Preview | None, str | None]:
+def _preview(service: Service, draft: Draft) -> tuple[Preview | None, ProblemDetails | None]:
     if draft.spec is None:
         return None, None
     try:
         return preview_of(service.catalogs.estimate(draft.spec)), None
     except (StarcatError, Problem) as error:
-        return None, problem_of(error).detail
+        return None, problem_of(error)
 
 
 def _page(
@@ -138,7 +141,7 @@ def _page(
         status=status,
         draft=draft,
         preview=seen,
-        problem=error,
+        problem=error and error.detail,
         refused=problem and problem.detail,
         summary=summary(seen),
         presets=[(name, preset(name).description) for name in preset_names()],
@@ -164,10 +167,8 @@ def summary(seen: Preview | None) -> str:
 
 def _sources(service: Service) -> list[tuple[str, str]]:
     """Return the star catalogs there are, those whose files are here first."""
-    return [
-        (
-            one.source.name,
-            f"{one.source.name} – {one.source.identifier if one.is_here else 'its files are not here'}",
-        )
-        for one in service.catalogs.offered()
-    ]
+    found = []
+    for one in service.catalogs.offered():
+        told = one.source.identifier if one.is_here else "its files are not here"
+        found.append((one.source.name, f"{one.source.name} – {told}"))
+    return found
