@@ -92,9 +92,7 @@ def preview(request: Request, service: TheService, form: Form, _: Reader) -> Res
     """Tell a script what the form has become, and what that would give."""
     draft = draft_of_form(form)
     seen, error = _preview(service, draft)
-    part = ENVIRONMENT.get_template("new_result.html").render(
-        preview=seen, problem=error and error.detail
-    )
+    told = {"problem": error and error.detail, "errors": draft.errors}
     content: dict[str, Any] = {
         "toml": draft.text,
         "values": draft.values,
@@ -102,7 +100,8 @@ def preview(request: Request, service: TheService, form: Form, _: Reader) -> Res
         "products": draft.products,
         "bands": draft.bands,
         "errors": draft.errors,
-        "result": part,
+        "wrong": ENVIRONMENT.get_template("new_wrong.html").render(told),
+        "result": ENVIRONMENT.get_template("new_result.html").render(preview=seen),
         "summary": summary(seen),
         "is_busy": error is not None and error.status == 503,
         "stars": [] if seen is None else seen.estimate.fields.count.tolist(),
@@ -142,6 +141,7 @@ def _page(
         draft=draft,
         preview=seen,
         problem=error and error.detail,
+        errors=draft.errors,
         refused=problem and problem.detail,
         summary=summary(seen),
         presets=[(name, preset(name).description) for name in preset_names()],
@@ -155,7 +155,7 @@ def _page(
 def summary(seen: Preview | None) -> str:
     """Return what a spec would give in one line."""
     if seen is None:
-        return "No estimate: see what is wrong above."
+        return "No estimate: something in the spec is not right yet."
     found = seen.estimate
     stars = found.coverage.stars
     return (
