@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import threading
+from dataclasses import dataclass, field
 from typing import Annotated
 
 from fastapi import Depends, Request
 
 from starcat.service.confined import Confined
 from starcat.service.jobs.job import JobStore
+from starcat.service.jobs.queue import JobQueue, open_queue
 from starcat.service.places import Places
 from starcat.service.records import Records
 from starcat.service.sessions import Sessions
@@ -45,6 +47,8 @@ class Service:
     jobs: JobStore
     sessions: Sessions
     confined: Confined
+    queue: JobQueue
+    stopping: threading.Event = field(default_factory=threading.Event)
 
 
 def open_service(settings: Settings) -> Service:
@@ -78,6 +82,7 @@ def open_service(settings: Settings) -> Service:
         jobs=JobStore(records),
         sessions=Sessions(settings),
         confined=Confined(settings, places.scratch),
+        queue=open_queue(settings, places),
     )
 
 
