@@ -192,13 +192,14 @@ def _make(partial: Path, plan: _Plan, clock: Stopwatch, progress: Progress) -> B
     stars, joined = _join_all(catalog.stars, amplitudes)
     clock.lap("read")
     selected, fields = select_stars(stars, spec)
-    cost = estimate_cost(catalog, selected, fields, spec)
+    moved = motion_product(motions, selected.guide_stars)
+    cost = estimate_cost(catalog, selected, fields, spec, moved)
     if plan.announce is not None:
         plan.announce(cost)
     check_memory(cost, spec, plan.max_memory_bytes)
     clock.lap("select")
     products = make_products(spec, catalog, selected, fields, progress)
-    products += motion_product(motions, selected.guide_stars)
+    products += moved
     matched = match_catalogs(stars, selected, spec, inputs, workers, progress)
     products += matched.products
     clock.lap("products")

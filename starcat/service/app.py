@@ -2,11 +2,27 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 
 from fastapi import APIRouter, FastAPI
+from starlette.middleware import Middleware
 
+from starcat.service import pages
+from starcat.service.api import databases, registry, releases
+from starcat.service.guard import health, signing
+from starcat.service.guard.bodies import Bodies
+from starcat.service.guard.headers import SafeHeaders
+from starcat.service.guard.identities import Identities
+from starcat.service.guard.logs import Defects, RequestLog
+from starcat.service.guard.metrics import Counted, Metrics
+from starcat.service.guard.origin import Origin
+from starcat.service.guard.request_id import RequestId
+from starcat.service.guard.retention import keep_removing
+from starcat.service.guard.shape import Shape
+from starcat.service.guard.streams import Stopping, Streams
+from starcat.service.guard.who import Who
 from starcat.service.problems import REFUSALS, add_problem_handlers
 from starcat.service.service import Service, open_service
 from starcat.service.settings import Settings
@@ -14,10 +30,18 @@ from starcat.version import __version__
 
 API = "/api/v1"
 
-RESOURCES: tuple[APIRouter, ...] = ()
+RESOURCES: tuple[APIRouter, ...] = (
+    databases.router,
+    releases.router,
+)
 """Routers of the REST interface, under `API`."""
 
-OTHERS: tuple[APIRouter, ...] = ()
+OTHERS: tuple[APIRouter, ...] = (
+    registry.router,
+    health.router,
+    signing.router,
+    *pages.ROUTERS,
+)
 """Routers of everything else: pages, the registry, TAP, cone searches, health."""
 
 
@@ -35,6 +59,7 @@ def make_app(settings: Settings) -> FastAPI:
         With the service as ``app.state.service``. Its workers run while its lifespan lasts.
     """
     service = open_service(settings)
+    metrics, identities, stopping = Metrics(service), Identities(service), Stopping()
     app = FastAPI(
         title="starcat",
         version=__version__,
@@ -43,8 +68,21 @@ def make_app(settings: Settings) -> FastAPI:
         openapi_url="/api/openapi.json",
         docs_url=None,
         redoc_url=None,
+        middleware=[  # what a request passes, from the outside to the inside
+            Middleware(RequestId),
+            Middleware(RequestLog),
+            Middleware(Counted, metrics=metrics),
+            Middleware(SafeHeaders, settings=settings),
+            Middleware(Shape),
+            Middleware(Origin, settings=settings),
+            Middleware(Who, settings=settings, identities=identities),
+            Middleware(Bodies, settings=settings),
+            Middleware(Streams, stopping=stopping),
+            Middleware(Defects),
+        ],
     )
-    app.state.service = service
+    app.state.service, app.state.metrics = service, metrics
+    app.state.identities, app.state.stopping = identities, stopping
     add_problem_handlers(app)
     for router in RESOURCES:
         app.include_router(router, prefix=API, responses=REFUSALS)
@@ -56,7 +94,12 @@ def make_app(settings: Settings) -> FastAPI:
 @asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     service: Service = app.state.service
+    removing = asyncio.create_task(keep_removing(service))
     try:
         yield
     finally:
+        removing.cancel()
+        with suppress(asyncio.CancelledError):
+            await removing
+        service.sessions.close()
         service.records.close()

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import threading
+from dataclasses import dataclass, field
 from typing import Annotated
 
 from fastapi import Depends, Request
 
 from starcat.service.jobs.job import JobStore
+from starcat.service.jobs.queue import JobQueue, open_queue
 from starcat.service.places import Places
 from starcat.service.records import Records
+from starcat.service.sessions import Sessions
 from starcat.service.settings import Settings
 from starcat.service.shelf import Shelf
 
@@ -30,6 +33,8 @@ class Service:
         The databases there are.
     jobs : JobStore
         The jobs there are.
+    queue, sessions = open_queue(settings, places), Sessions(settings)
+    return Service(settings, places, records, Shelf(places), JobStore(records), sessions, queue)
     """
 
     settings: Settings
@@ -37,6 +42,9 @@ class Service:
     records: Records
     shelf: Shelf
     jobs: JobStore
+    sessions: Sessions
+    queue: JobQueue
+    stopping: threading.Event = field(default_factory=threading.Event)
 
 
 def open_service(settings: Settings) -> Service:
@@ -62,7 +70,8 @@ def open_service(settings: Settings) -> Service:
     places = Places(settings.root)
     places.make()
     records = Records(places.records)
-    return Service(settings, places, records, Shelf(places), JobStore(records))
+    queue, sessions = open_queue(settings, places), Sessions(settings)
+    return Service(settings, places, records, Shelf(places), JobStore(records), sessions, queue)
 
 
 def service_of(request: Request) -> Service:
