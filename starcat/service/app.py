@@ -27,6 +27,7 @@ from starcat.service.jobs.pool import WorkerPool
 from starcat.service.problems import REFUSALS, add_problem_handlers
 from starcat.service.service import Service, open_service
 from starcat.service.settings import Settings
+from starcat.service.vo import cone_search
 from starcat.version import __version__
 
 API = "/api/v1"
@@ -44,6 +45,7 @@ OTHERS: tuple[APIRouter, ...] = (
     registry.router,
     health.router,
     signing.router,
+    cone_search.router,
     *pages.ROUTERS,
 )
 """Routers of everything else: pages, the registry, TAP, cone searches, health."""
