@@ -10,6 +10,7 @@ from fastapi import APIRouter, FastAPI
 from starcat.service.problems import REFUSALS, add_problem_handlers
 from starcat.service.service import Service, open_service
 from starcat.service.settings import Settings
+from starcat.service.vo import tap, tap_jobs
 from starcat.version import __version__
 
 API = "/api/v1"
@@ -17,7 +18,7 @@ API = "/api/v1"
 RESOURCES: tuple[APIRouter, ...] = ()
 """Routers of the REST interface, under `API`."""
 
-OTHERS: tuple[APIRouter, ...] = ()
+OTHERS: tuple[APIRouter, ...] = (tap.router, tap_jobs.router)
 """Routers of everything else: pages, the registry, TAP, cone searches, health."""
 
 
@@ -56,8 +57,10 @@ def make_app(settings: Settings) -> FastAPI:
 @asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     service: Service = app.state.service
+    service.tap.runner.start()
     try:
         yield
     finally:
+        service.tap.close()
         service.sessions.close()
         service.records.close()

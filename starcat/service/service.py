@@ -13,6 +13,7 @@ from starcat.service.records import Records
 from starcat.service.sessions import Sessions
 from starcat.service.settings import Settings
 from starcat.service.shelf import Shelf
+from starcat.service.vo.tap_service import Tap
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,8 @@ class Service:
         The jobs there are.
     sessions : Sessions
         Open query sessions.
+    tap : Tap
+        What TAP needs.
     """
 
     settings: Settings
@@ -41,6 +44,7 @@ class Service:
     shelf: Shelf
     jobs: JobStore
     sessions: Sessions
+    tap: Tap
 
 
 def open_service(settings: Settings) -> Service:
@@ -66,7 +70,9 @@ def open_service(settings: Settings) -> Service:
     places = Places(settings.root)
     places.make()
     records = Records(places.records)
-    return Service(settings, places, records, Shelf(places), JobStore(records), Sessions(settings))
+    shelf, sessions = Shelf(places), Sessions(settings)
+    tap = Tap(settings, places, records, shelf, sessions)
+    return Service(settings, places, records, shelf, JobStore(records), sessions, tap)
 
 
 def service_of(request: Request) -> Service:

@@ -297,7 +297,9 @@ class _Translator:
             )
         return shapes
 
-    def _centred(self, part: exp.Anonymous, name: str, count: int) -> tuple[Point, *tuple[str, ...]]:
+    def _centred(
+        self, part: exp.Anonymous, name: str, count: int
+    ) -> tuple[Point, *tuple[str, ...]]:
         """Return the middle of a shape, given as a place or as two numbers, and its sizes."""
         arguments = self._without_frame(part)
         first = self._shapes.get(id(arguments[0])) if arguments else None

@@ -221,11 +221,9 @@ class Names:
             child, parent = parent, parent.parent
         return None
 
-    def _projected(
-        self, query: exp.Select, part: exp.Expr, number: int
-    ) -> list[Column] | None:
+    def _projected(self, query: exp.Select, part: exp.Expr, number: int) -> list[Column] | None:
         """Return the columns that one part of a SELECT list gives."""
-        if isinstance(part, exp.Star) or isinstance(part, exp.Column) and part.name == "*":
+        if isinstance(part, exp.Star) or (isinstance(part, exp.Column) and part.name == "*"):
             joins = query.args.get("joins", ())
             if any(join.args.get("using") or join.args.get("method") for join in joins):
                 return None
@@ -273,5 +271,3 @@ def default_name(value: exp.Expr, number: int) -> str:
     if isinstance(value, exp.Anonymous):
         return f"{value.name.lower()}_{number}"
     return f"col_{number}"
-
-

@@ -173,7 +173,9 @@ def intersects(one: Shape, other: Shape) -> str:
     if isinstance(one, Circle) and isinstance(other, Circle):
         return f"({_apart(one.centre, other.centre)} <= {one.radius} + {other.radius})"
     if isinstance(one, Circle) and isinstance(other, Polygon):
-        near = " OR ".join(f"{_from_side(one.centre, a, b)} <= {one.radius}" for a, b in other.sides)
+        near = " OR ".join(
+            f"{_from_side(one.centre, a, b)} <= {one.radius}" for a, b in other.sides
+        )
         return f"({_in_polygon(one.centre, other)} OR {near})"
     if isinstance(one, Polygon) and isinstance(other, Polygon):
         inside = [_in_polygon(one.corners[0], other), _in_polygon(other.corners[0], one)]
@@ -302,7 +304,9 @@ def _from_side(place: Point, a: Point, b: Point) -> str:
     p, u, v = place.vector, a.vector, b.vector
     normal = _cross(u, v)
     height = f"degrees({_text(_arctan(_dot(p, normal), _root(_dot(_cross(p, normal), _cross(p, normal)))))})"
-    beside = f"{_text(_dot(p, _cross(normal, u)))} >= 0 AND {_text(_dot(p, _cross(v, normal)))} >= 0"
+    beside = (
+        f"{_text(_dot(p, _cross(normal, u)))} >= 0 AND {_text(_dot(p, _cross(v, normal)))} >= 0"
+    )
     ends = f"least({_apart(place, a)}, {_apart(place, b)})"
     return f"(CASE WHEN {beside} THEN abs({height}) ELSE {ends} END)"
 

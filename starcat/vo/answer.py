@@ -58,7 +58,9 @@ def ask(
         for k, ((_, kind), column) in enumerate(zip(found, columns, strict=True), start=1)
     )
     limit = "" if max_rows is None else f" LIMIT {max_rows + 1}"
-    with session.ask(f"SELECT {chosen} FROM ({asked.sql}) AS found{limit}", progress=progress) as it:
+    with session.ask(
+        f"SELECT {chosen} FROM ({asked.sql}) AS found{limit}", progress=progress
+    ) as it:
         batches = it.batches()
     schema = pa.schema(
         field.with_metadata(column.facts)

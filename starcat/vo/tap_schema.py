@@ -180,7 +180,9 @@ def write_tap_schema(tables: Tables, folder: Path) -> None:
 
     folder.mkdir(parents=True, exist_ok=True)
     for name, rows in _rows(tables).items():
-        write_parquet(pa.Table.from_pylist(rows, schema=_arrow_schema(name)), folder / f"{name}.parquet")
+        write_parquet(
+            pa.Table.from_pylist(rows, schema=_arrow_schema(name)), folder / f"{name}.parquet"
+        )
 
 
 def _arrow_schema(name: str) -> pa.Schema:
@@ -237,4 +239,3 @@ def _column_rows(table: Table) -> list[dict[str, object]]:
         }
         for place, column in enumerate(table.columns)
     ]
-
