@@ -28,7 +28,6 @@ from starcat.service.problems import REFUSALS, add_problem_handlers
 from starcat.service.service import Service, open_service
 from starcat.service.settings import Settings
 from starcat.service.vo import cone_search
-from starcat.service.vo import tap, tap_jobs
 from starcat.version import __version__
 
 API = "/api/v1"
@@ -103,6 +102,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     service: Service = app.state.service
     pool: WorkerPool = app.state.workers
     await to_thread.run_sync(pool.start)
+    service.tap.runner.start()
     removing = asyncio.create_task(keep_removing(service))
     try:
         yield
@@ -113,7 +113,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
             await removing
         await to_thread.run_sync(pool.stop)
         service.queue.close()
-    app.state.workers = WorkerPool(service)
+        service.tap.close()
         service.sessions.close()
         service.confined.close()
         service.records.close()

@@ -37,10 +37,14 @@ class Service:
         The jobs there are.
     sessions : Sessions
         Open query sessions.
+    queue : JobQueue
+        What waits for workers.
     confined : Confined
         Processes that read uploads and make files.
     tap : Tap
         What TAP needs.
+    stopping : threading.Event
+        Set when the service stops.
     """
 
     settings: Settings
