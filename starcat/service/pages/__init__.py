@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from fastapi import APIRouter
 
-from starcat.service.pages import databases, jobs, new, sign_in, static_files
+from starcat.service.pages import (
+    console,
+    databases,
+    identify,
+    jobs,
+    new,
+    sign_in,
+    static_files,
+)
 
 ROUTERS: tuple[APIRouter, ...] = (
     static_files.router,
@@ -12,5 +20,7 @@ ROUTERS: tuple[APIRouter, ...] = (
     new.router,
     jobs.router,
     databases.router,
+    console.router,
+    identify.router,
 )
 """Routers of the page, in the order in which they are asked."""
