@@ -1,24 +1,31 @@
-"""The web server."""
+"""The web server: one for each root, and what happens when it is to stop."""
 
 from __future__ import annotations
 
+import shutil
 import signal
 import socket
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FrameType
 
 import uvicorn
+from fastapi import FastAPI
 
-from starcat.errors import ConfigError, reason
+from starcat.errors import ConfigError, OutputError, reason
 from starcat.service.access import Role
 from starcat.service.app import make_app
 from starcat.service.guard.logs import log_settings
 from starcat.service.guard.patience import Patience
 from starcat.service.guard.shape import MOST_HEADER_BYTES, MOST_TARGET_BYTES
 from starcat.service.guard.tokens import TokenStore
+from starcat.service.jobs.pool import WorkerPool
+from starcat.service.places import Places
 from starcat.service.service import Service
 from starcat.service.settings import Settings
+from starcat.storage.atomic import make_folder
+from starcat.storage.locks import locked
 
 CONNECTIONS = 1_000
 """Connections at the same time; of more, the server says that it is busy."""
@@ -43,9 +50,31 @@ def run_server(settings: Settings, announce: Announce) -> None:
     Raises
     ------
     ConfigError
-        If others than this machine are to reach it and nobody has a token, or if the port is
-        taken.
+        If others than this machine are to reach it and nobody has a token, if the port is taken,
+        or if another server runs with the same root.
+    OutputError
+        If the root cannot be written to.
     """
+    places = Places(settings.root)
+    try:
+        make_folder(places.root)
+        with locked(places.lock, wait=False):
+            _serve(settings, places, announce)
+    except BlockingIOError:
+        raise ConfigError(
+            f"another server runs with --root {places.root}; stop it, or choose another root",
+            key="root",
+            value=str(places.root),
+        ) from None
+    except OSError as error:
+        raise OutputError(
+            f"{places.root}: cannot be used ({reason(error)}); choose another --root",
+            path=places.root,
+        ) from error
+
+
+def _serve(settings: Settings, places: Places, announce: Announce) -> None:
+    shutil.rmtree(places.scratch, ignore_errors=True)
     app = make_app(settings)
     _see_to_tokens(app.state.identities.tokens, settings)
     listening = _listen(settings)
@@ -61,15 +90,16 @@ def run_server(settings: Settings, announce: Announce) -> None:
         timeout_graceful_shutdown=round(settings.shutdown_s),
     )
     with _signals_end_nothing_else():
-        _Server(config, app.state.service, announce).run([listening])
+        _Server(config, app, announce).run([listening])
 
 
 class _Server(uvicorn.Server):
-    """Says where it is, and that it is about to stop, so that streams of events end."""
+    """Says where it is, and has jobs and streams of events end as soon as it is told to stop."""
 
-    def __init__(self, config: uvicorn.Config, service: Service, announce: Announce) -> None:
+    def __init__(self, config: uvicorn.Config, app: FastAPI, announce: Announce) -> None:
         super().__init__(config)
-        self._service = service
+        self._service: Service = app.state.service
+        self._workers: WorkerPool = app.state.workers
         self._announce = announce
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -78,10 +108,11 @@ class _Server(uvicorn.Server):
         if self.started and sockets:
             self._announce(_address(self._service.settings, sockets[0].getsockname()[1]))
 
-    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Stop: streams of events end at once, other requests within the time that they have."""
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Begin to stop: requests, streams of events and jobs end at the same time."""
         self._service.stopping.set()
-        await super().shutdown(sockets)
+        self._workers.begin_stop()
+        super().handle_exit(sig, frame)
 
 
 def _address(settings: Settings, port: int) -> str:
