@@ -80,7 +80,7 @@ def _column(column: NumpyColumn) -> Any:
         values = np.empty(len(column.is_null), dtype=np.object_)
         values[:] = column.lists()
     said = {
-        "unit": unit_text(column, "generic"),
+        "unit": unit_text(column.name, facts.get("unit"), "generic"),
         "description": facts.get("description"),
         "meta": {"ucd": facts["ucd"]} if "ucd" in facts else None,
     }

@@ -113,7 +113,7 @@ def _column(column: NumpyColumn, descriptor: str) -> Any:
     else:
         array, null = _with_null(column)
         code = _CODES[array.dtype.str[1:]]
-    unit = unit_text(column, "fits")
+    unit = unit_text(column.name, column.facts.get("unit"), "fits")
     return fits.Column(name=column.name, format=code, array=array, null=null, unit=unit)
 
 

@@ -1,6 +1,6 @@
 """Tables in the formats that other tools read: one table in, one file out.
 
-CSV, JSON and Parquet are written batch by batch; VOTable, FITS, ECSV and npz hold the table in
+CSV, JSON, Parquet and VOTable are written batch by batch; FITS, ECSV and npz hold the table in
 memory. Units, meanings and UCDs come from the field metadata of the table. The same table gives
 the same bytes.
 """
@@ -174,15 +174,15 @@ def _write(batches: pa.RecordBatchReader, path: Path, file_format: str, label: L
         return rows
     if file_format == "parquet":
         return write_parquet_stream(batches, path)
+    if file_format == "votable":
+        return write_votable(batches, path, label)
     return _write_table(batches.read_all(), path, file_format, label)
 
 
 def _write_table(table: pa.Table, path: Path, file_format: str, label: Label) -> int:
-    columns = numpy_columns(table, signed=file_format in ("votable", "fits"))
-    check_names(columns, file_format)
-    if file_format == "votable":
-        write_votable(columns, len(table), path, label)
-    elif file_format == "fits":
+    columns = numpy_columns(table, signed=file_format == "fits")
+    check_names(table.column_names, file_format)
+    if file_format == "fits":
         write_fits(columns, len(table), path, label)
     elif file_format == "ecsv":
         write_ecsv(columns, path, label)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -88,13 +89,13 @@ def numpy_columns(table: pa.Table, *, signed: bool) -> list[NumpyColumn]:
     ]
 
 
-def check_names(columns: list[NumpyColumn], file_format: str) -> None:
+def check_names(names: Iterable[str], file_format: str) -> None:
     """Refuse a column without a name, which these formats have no place for.
 
     Parameters
     ----------
-    columns : list of NumpyColumn
-        The table.
+    names : iterable of str
+        Names of the columns.
     file_format : str
         For the message.
 
@@ -103,12 +104,12 @@ def check_names(columns: list[NumpyColumn], file_format: str) -> None:
     SchemaError
         If a name is empty.
     """
-    for number, column in enumerate(columns, start=1):
-        if not column.name:
+    for number, name in enumerate(names, start=1):
+        if not name:
             raise SchemaError(
                 f"column {number} has an empty name, which {file_format} cannot hold; give it "
                 "one with AS",
-                field=column.name,
+                field=name,
             )
 
 
@@ -137,22 +138,68 @@ def _numpy_column(field: pa.Field, values: pa.Array, *, signed: bool) -> NumpyCo
     is_null = values.is_null().to_numpy(zero_copy_only=False)
     offsets = None
     if is_list(values.type) and is_number(values.type.value_type):
-        lengths = pc.fill_null(values.value_lengths(), 0).to_numpy(zero_copy_only=False)
-        offsets = np.concatenate(([0], np.cumsum(lengths, dtype=np.int64)))
-        values = values.flatten()
-        if values.null_count and pa.types.is_integer(values.type):
-            raise SchemaError(
-                f"column {field.name!r}: a list of integers has a missing item, which only CSV, "
-                "JSON and Parquet can hold; cast the items to DOUBLE",
-                field=field.name,
-                found=str(field.type),
-            )
-    plain = _plain_values(field.name, values, signed=signed)
+        offsets, values = list_items(field.name, values)
+    plain = plain_values(field.name, values, signed=signed)
     return NumpyColumn(field.name, _to_numpy(plain), is_null, offsets, field_facts(field))
 
 
-def _plain_values(name: str, values: pa.Array, *, signed: bool) -> pa.Array:
-    """Return values as numbers, truth values or texts."""
+def list_items(name: str, values: pa.Array) -> tuple[NDArray[np.int64], pa.Array]:
+    """Return where the list of each row begins and ends, and the items of all rows.
+
+    Parameters
+    ----------
+    name : str
+        Name of the column, for the message.
+    values : pyarrow.ListArray
+        Lists of numbers; null counts as an empty one.
+
+    Returns
+    -------
+    offsets : ndarray of int64, shape (N + 1,)
+        Places in the items.
+    items : pyarrow.Array
+        One row's items after the other.
+
+    Raises
+    ------
+    SchemaError
+        If an integer is missing.
+    """
+    lengths = pc.fill_null(values.value_lengths(), 0).to_numpy(zero_copy_only=False)
+    offsets = np.concatenate(([0], np.cumsum(lengths, dtype=np.int64)))
+    items = values.flatten()
+    if items.null_count and pa.types.is_integer(items.type):
+        raise SchemaError(
+            f"column {name!r}: a list of integers has a missing item, which only CSV, "
+            "JSON and Parquet can hold; cast the items to DOUBLE",
+            field=name,
+            found=str(values.type),
+        )
+    return offsets, items
+
+
+def plain_values(name: str, values: pa.Array, *, signed: bool) -> pa.Array:
+    """Return values as numbers, truth values or texts.
+
+    Parameters
+    ----------
+    name : str
+        Name of the column, for the message.
+    values : pyarrow.Array
+        Values of a plain type, no lists of numbers.
+    signed : bool
+        Whether to widen integers to those that FITS and VOTable have.
+
+    Returns
+    -------
+    pyarrow.Array
+        Null stays null.
+
+    Raises
+    ------
+    SchemaError
+        If a value does not fit.
+    """
     kind = values.type
     if pa.types.is_decimal(kind):
         return _narrowed(name, values, pa.float64() if kind.scale else pa.int64())

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from starcat.errors import SchemaError
-from starcat.exchange.numpy_columns import NumpyColumn
 
 
-def unit_text(column: NumpyColumn, standard: str) -> str | None:
+def unit_text(name: str, unit: str | None, standard: str) -> str | None:
     """Return the unit of a column in the spelling of a standard.
 
     Parameters
     ----------
-    column : NumpyColumn
-        With its unit among the facts.
+    name : str
+        Name of the column, for the message.
+    unit : str, optional
+        Its unit as our schemas write it.
     standard : {"fits", "vounit", "generic"}
         A unit format of `astropy.units`.
 
@@ -26,17 +27,16 @@ def unit_text(column: NumpyColumn, standard: str) -> str | None:
     SchemaError
         If the standard does not know the unit.
     """
+    if not unit:
+        return None
     from astropy import units
 
-    text = column.facts.get("unit")
-    if not text:
-        return None
     try:
-        return str(units.Unit(text).to_string(standard))
+        return str(units.Unit(unit).to_string(standard))
     except (ValueError, TypeError) as error:
         raise SchemaError(
-            f"column {column.name!r}: unit {text!r} is not one that {standard} knows; "
+            f"column {name!r}: unit {unit!r} is not one that {standard} knows; "
             "mend the unit, or export to CSV or JSON",
-            field=column.name,
-            found=text,
+            field=name,
+            found=unit,
         ) from error

@@ -166,13 +166,18 @@ class Engine:
             If it takes longer, or more memory and disk, than it may.
         """
         with self._asking:
-            if self._process.poll() is not None:
+            if not self.is_running:
                 self.close()
                 self._process = self._started()
                 if self._views is not None:
                     self._answered("open", (self._views,), Allowance(OPENING_S, OPENING_S))
             time_s = allowance or Allowance(OPENING_S, OPENING_S)
             return self._answered(name, arguments, time_s, progress)
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the process is there; after a limit, or a failure of DuckDB, it is not."""
+        return self._process.poll() is None
 
     def close(self) -> None:
         """End the process."""

@@ -29,6 +29,9 @@ from starcat.query.targets import Target, View, open_targets
 MAX_COLUMNS = 100_000
 """How many columns a DESCRIBE tells of at most."""
 
+MAX_CHECKED = 200
+"""Queries that are remembered as checked; those that were asked longest ago are forgotten."""
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -71,6 +74,11 @@ class Session:
         """The views of all targets."""
         return tuple(view for target in self.targets for view in target.views)
 
+    @property
+    def is_running(self) -> bool:
+        """Whether its process is there; after a limit, or a failure of DuckDB, it is not."""
+        return self._engine.is_running
+
     def statements(self, text: str) -> list[str]:
         """Return the queries of a text.
 
@@ -105,9 +113,13 @@ class Session:
         QueryError
             If none may.
         """
-        if text not in self._checked:
-            [self._checked[text]] = self._engine.ask("check", text, allowance=self._allowance())
-        return self._checked[text]
+        known = self._checked.pop(text, None)
+        if known is None:
+            [known] = self._engine.ask("check", text, allowance=self._allowance())
+        self._checked[text] = known
+        if len(self._checked) > MAX_CHECKED:
+            del self._checked[next(iter(self._checked))]
+        return known
 
     @contextmanager
     def ask(

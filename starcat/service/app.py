@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 
 from anyio import to_thread
 from fastapi import APIRouter, FastAPI
+from starlette.middleware import Middleware
 
-from starcat.service.api import jobs
+from starcat.service import pages
+from starcat.service.api import databases, jobs, registry, releases
+from starcat.service.guard import health, signing
+from starcat.service.guard.bodies import Bodies
+from starcat.service.guard.headers import SafeHeaders
+from starcat.service.guard.identities import Identities
+from starcat.service.guard.logs import Defects, RequestLog
+from starcat.service.guard.metrics import Counted, Metrics
+from starcat.service.guard.origin import Origin
+from starcat.service.guard.request_id import RequestId
+from starcat.service.guard.retention import keep_removing
+from starcat.service.guard.shape import Shape
+from starcat.service.guard.who import Who
 from starcat.service.jobs.pool import WorkerPool
 from starcat.service.problems import REFUSALS, add_problem_handlers
 from starcat.service.service import Service, open_service
@@ -17,10 +31,19 @@ from starcat.version import __version__
 
 API = "/api/v1"
 
-RESOURCES: tuple[APIRouter, ...] = (jobs.router,)
+RESOURCES: tuple[APIRouter, ...] = (
+    jobs.router,
+    databases.router,
+    releases.router,
+)
 """Routers of the REST interface, under `API`."""
 
-OTHERS: tuple[APIRouter, ...] = ()
+OTHERS: tuple[APIRouter, ...] = (
+    registry.router,
+    health.router,
+    signing.router,
+    *pages.ROUTERS,
+)
 """Routers of everything else: pages, the registry, TAP, cone searches, health."""
 
 
@@ -39,6 +62,7 @@ def make_app(settings: Settings) -> FastAPI:
         run while its lifespan lasts.
     """
     service = open_service(settings)
+    metrics, identities = Metrics(service), Identities(service)
     app = FastAPI(
         title="starcat",
         version=__version__,
@@ -47,8 +71,19 @@ def make_app(settings: Settings) -> FastAPI:
         openapi_url="/api/openapi.json",
         docs_url=None,
         redoc_url=None,
+        middleware=[  # what a request passes, from the outside to the inside
+            Middleware(RequestId),
+            Middleware(RequestLog),
+            Middleware(Counted, metrics=metrics),
+            Middleware(SafeHeaders, settings=settings),
+            Middleware(Shape),
+            Middleware(Origin, settings=settings),
+            Middleware(Who, settings=settings, identities=identities),
+            Middleware(Bodies, settings=settings),
+            Middleware(Defects),
+        ],
     )
-    app.state.service = service
+    app.state.service, app.state.metrics, app.state.identities = service, metrics, identities
     app.state.workers = WorkerPool(service)
     add_problem_handlers(app)
     for router in RESOURCES:
@@ -61,12 +96,17 @@ def make_app(settings: Settings) -> FastAPI:
 @asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     service: Service = app.state.service
-    pool: WorkerPool = app.state.workers
-    await to_thread.run_sync(pool.start)
+    workers: WorkerPool = app.state.workers
+    await to_thread.run_sync(workers.start)
+    removing = asyncio.create_task(keep_removing(service))
     try:
         yield
     finally:
+        removing.cancel()
+        with suppress(asyncio.CancelledError):
+            await removing
         service.stopping.set()
-        await to_thread.run_sync(pool.stop)
+        await to_thread.run_sync(workers.stop)
+        service.sessions.close()
         service.queue.close()
         service.records.close()

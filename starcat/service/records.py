@@ -10,6 +10,18 @@ from pathlib import Path
 
 from starcat.errors import SchemaVersionError
 
+PUBLICATIONS = """
+    CREATE TABLE publications (
+        name TEXT NOT NULL,
+        version TEXT NOT NULL,
+        database TEXT NOT NULL,
+        note TEXT NOT NULL,
+        owner TEXT NOT NULL,
+        published_s REAL NOT NULL,
+        PRIMARY KEY (name, version)
+    )
+"""
+
 MIGRATIONS: tuple[str, ...] = (
     """
     CREATE TABLE jobs (
@@ -58,7 +70,14 @@ MIGRATIONS: tuple[str, ...] = (
         expires_s REAL,
         revoked_s REAL
     );
+    CREATE TABLE sessions (
+        digest TEXT PRIMARY KEY,
+        token TEXT NOT NULL REFERENCES tokens (id),
+        created_s REAL NOT NULL,
+        expires_s REAL NOT NULL
+    );
     """,
+    PUBLICATIONS,
 )
 """Statements that bring the file from each version to the next; one that is out never changes."""
 

@@ -12,6 +12,7 @@ from starcat.service.jobs.job import JobStore
 from starcat.service.jobs.queue import JobQueue, open_queue
 from starcat.service.places import Places
 from starcat.service.records import Records
+from starcat.service.sessions import Sessions
 from starcat.service.settings import Settings
 from starcat.service.shelf import Shelf
 
@@ -32,10 +33,6 @@ class Service:
         The databases there are.
     jobs : JobStore
         The jobs there are.
-    queue : JobQueue
-        What tells the workers that a job waits.
-    stopping : threading.Event
-        Set when the service is about to stop: what lasts, such as a stream of events, ends.
     """
 
     settings: Settings
@@ -43,6 +40,7 @@ class Service:
     records: Records
     shelf: Shelf
     jobs: JobStore
+    sessions: Sessions
     queue: JobQueue
     stopping: threading.Event = field(default_factory=threading.Event)
 
@@ -70,8 +68,8 @@ def open_service(settings: Settings) -> Service:
     places = Places(settings.root)
     places.make()
     records = Records(places.records)
-    queue = open_queue(settings, places)
-    return Service(settings, places, records, Shelf(places), JobStore(records), queue)
+    queue, sessions = open_queue(settings, places), Sessions(settings)
+    return Service(settings, places, records, Shelf(places), JobStore(records), sessions, queue)
 
 
 def service_of(request: Request) -> Service:

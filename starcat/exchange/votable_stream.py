@@ -1,0 +1,265 @@
+"""Tables as VOTable 1.4, batch by batch: what a service sends, and what files are made of.
+
+Two threads make batches into bytes, which are given in order; never more than a few batches are
+held. With a status, as services have it, the document says at its end that rows were left out or
+that reading failed; without one, what fails is raised.
+"""
+
+from __future__ import annotations
+
+from binascii import b2a_base64
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from itertools import chain, islice
+from typing import Literal
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from starcat.errors import StarcatError
+from starcat.exchange.column_types import plain_batch, plain_schema
+from starcat.exchange.first_rows import FirstRows
+from starcat.exchange.label import UNLABELLED, Label
+from starcat.exchange.votable_binary2 import Binary2
+from starcat.exchange.votable_columns import VotableColumn, cells_of, votable_columns
+from starcat.exchange.votable_header import foot, has_places, head, info
+from starcat.exchange.votable_text import Tabledata
+
+Serialization = Literal["binary2", "tabledata"]
+
+_EPOCH = "epoch_jyear"
+_STEP_ROWS = 1 << 14
+_STEP_BYTES = 8 << 20
+_THREADS = 2
+_BASE64_BYTES = 3
+"""What base64 makes four letters of; only the end of a stream may be shorter."""
+
+
+def votable_chunks(
+    batches: pa.RecordBatchReader,
+    *,
+    serialization: Serialization = "binary2",
+    label: Label = UNLABELLED,
+    maxrec: int | None = None,
+    infos: Mapping[str, str] | None = None,
+) -> Iterator[bytes]:
+    """Yield a table as a VOTable with a status, as services answer.
+
+    Parameters
+    ----------
+    batches : pyarrow.RecordBatchReader
+        The table; ``unit``, ``description`` and ``ucd`` in its field metadata are passed on.
+    serialization : {"binary2", "tabledata"}
+        How rows are written.
+    label : Label
+        The table's name; its artifact and version become ``INFO`` elements.
+    maxrec : int, optional
+        The largest number of rows to give; all by default. One row more has to be among the
+        batches for it to be known that rows were left out. With 0 nothing is read.
+    infos : mapping of str to str, optional
+        Names and values of more ``INFO`` elements.
+
+    Yields
+    ------
+    bytes
+        UTF-8, all that stands before the rows first.
+
+    Raises
+    ------
+    SchemaError
+        If a column cannot be said in a VOTable.
+
+    Notes
+    -----
+    What goes wrong with the first rows is raised before anything is given. What goes wrong later
+    ends the document with ``QUERY_STATUS`` ``ERROR``.
+
+    References
+    ----------
+    DALI 1.1, section 4.4.
+    """
+    schema = plain_schema(batches.schema)
+    columns = votable_columns(schema)
+    cut = FirstRows(batches, maxrec)
+    read = iter(cut)
+    epoch = ""
+    if has_epoch(schema, columns):
+        begun = list(islice(read, 2))
+        read = chain(begun, read)
+        # The document begins before the rest is known, so it says the epoch of short tables only.
+        epoch = epoch_attribute(epochs_of(begun)) if len(begun) < 2 else ""
+    told = {"QUERY_STATUS": "OK", **(infos or {})}
+    rows = row_chunks(read, schema, columns, serialization)
+    first = next(rows, b"")
+    yield head(columns, serialization, label, told, epoch).encode()
+    yield first
+    last = []
+    try:
+        yield from rows
+        if cut.were_more:
+            last = [info("QUERY_STATUS", "OVERFLOW")]
+    except StarcatError as error:
+        last = [info("QUERY_STATUS", "ERROR", text=str(error))]
+    except (OSError, pa.ArrowException):
+        last = [info("QUERY_STATUS", "ERROR", text="the rest of the rows cannot be read")]
+    yield foot(serialization, last).encode()
+
+
+def row_chunks(
+    batches: Iterable[pa.RecordBatch],
+    schema: pa.Schema,
+    columns: Sequence[VotableColumn],
+    serialization: Serialization,
+) -> Iterator[bytes]:
+    """Yield what stands between the head and the foot of a VOTable.
+
+    Parameters
+    ----------
+    batches : iterable of pyarrow.RecordBatch
+        The rows.
+    schema : pyarrow.Schema
+        Their schema as `plain_schema` returned it.
+    columns : sequence of VotableColumn
+        The columns of that schema.
+    serialization : {"binary2", "tabledata"}
+        How rows are written.
+
+    Yields
+    ------
+    bytes
+        UTF-8.
+
+    Raises
+    ------
+    SchemaError
+        If a value cannot be said in a VOTable.
+
+    Notes
+    -----
+    What goes wrong with reading the batches is raised as it comes, after the rows before it were
+    given.
+    """
+    writer = Binary2(columns) if serialization == "binary2" else Tabledata(columns)
+    encode = partial(_encoded, schema=schema, columns=columns, rows=writer.rows)
+    texts = _in_order(encode, _steps(batches))
+    if serialization == "tabledata":
+        yield from texts
+        return
+    left = b""
+    failure = None
+    try:
+        for content in texts:
+            content = left + content
+            whole = len(content) - len(content) % _BASE64_BYTES
+            left = content[whole:]
+            yield b2a_base64(memoryview(content)[:whole])
+    except Exception as error:
+        failure = error
+    yield b2a_base64(left)
+    if failure is not None:
+        raise failure
+
+
+def has_epoch(schema: pa.Schema, columns: Sequence[VotableColumn]) -> bool:
+    """Return whether a table has coordinates and says of which epoch they are.
+
+    Parameters
+    ----------
+    schema : pyarrow.Schema
+        As `plain_schema` returned it.
+    columns : sequence of VotableColumn
+        The columns of that schema.
+
+    Returns
+    -------
+    bool
+        True where there is a column of epochs.
+    """
+    place = schema.get_field_index(_EPOCH)
+    return place >= 0 and pa.types.is_floating(schema.field(place).type) and has_places(columns)
+
+
+def epochs_of(batches: Iterable[pa.RecordBatch]) -> set[float]:
+    """Return the epochs of the positions of batches.
+
+    Parameters
+    ----------
+    batches : iterable of pyarrow.RecordBatch
+        With a column of epochs.
+
+    Returns
+    -------
+    set of float
+        Julian years, at most two of each batch: more than one means that there is no common one.
+    """
+    found: set[float] = set()
+    for batch in batches:
+        extremes = pc.min_max(batch.column(_EPOCH)).as_py()
+        found |= {epoch for epoch in extremes.values() if epoch is not None}
+    return found
+
+
+def epoch_attribute(epochs: set[float]) -> str:
+    """Return the attribute of the coordinate system with the epoch.
+
+    Parameters
+    ----------
+    epochs : set of float
+        The epochs of the positions, Julian years.
+
+    Returns
+    -------
+    str
+        Such as `` epoch="J2026"``; empty where the positions have no epoch in common.
+    """
+    if len(epochs) != 1:
+        return ""
+    [epoch] = epochs
+    return f' epoch="J{str(epoch).removesuffix(".0")}"'
+
+
+def _steps(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
+    """Yield the rows in steps whose text fits into memory, however large the batches are."""
+    for batch in batches:
+        per_row = max(1, batch.nbytes // max(1, batch.num_rows))
+        rows = min(_STEP_ROWS, max(1, _STEP_BYTES // per_row))
+        for start in range(0, batch.num_rows, rows):
+            yield batch.slice(start, rows)
+
+
+def _encoded(
+    batch: pa.RecordBatch,
+    *,
+    schema: pa.Schema,
+    columns: Sequence[VotableColumn],
+    rows: Callable[..., bytes],
+) -> bytes:
+    plain = plain_batch(batch, schema)
+    cells = [cells_of(column, values) for column, values in zip(columns, plain, strict=True)]
+    return rows(cells, plain.num_rows) if columns else b""
+
+
+def _in_order(
+    encode: Callable[[pa.RecordBatch], bytes], steps: Iterator[pa.RecordBatch]
+) -> Iterator[bytes]:
+    """Yield what some threads make of the steps, in the order of the steps."""
+    failure = None
+    with ThreadPoolExecutor(_THREADS) as pool:
+        waiting: deque[Future[bytes]] = deque()
+        while True:
+            try:
+                step = next(steps, None)
+            except Exception as error:
+                failure = error
+                step = None
+            if step is None:
+                break
+            waiting.append(pool.submit(encode, step))
+            if len(waiting) > _THREADS:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    if failure is not None:
+        raise failure

@@ -1,0 +1,215 @@
+"""Open query sessions, which are kept for the next question about the same targets.
+
+Each is a process of its own with the guard of `starcat.query`. So many as the operator says answer
+at the same time; a few more wait, for whoever asks about the same targets next.
+"""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import ParamSpec, TypeVar
+
+import anyio
+from anyio import CapacityLimiter, to_thread
+
+from starcat.errors import QueryError
+from starcat.query.session import Limits, Session, open_session
+from starcat.service.problems import Problem
+from starcat.service.settings import Settings
+
+WAIT_S = 10.0
+"""Seconds that a question waits for others to be answered."""
+
+IDLE = 4
+"""Sessions that are kept while nobody asks; those that were asked longest ago are closed first."""
+
+DISK_GB = 4.0
+"""Gigabytes of disk that a query may take for what does not fit into its memory."""
+
+GIB_IN_GB = 2**30 / 1e9
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+Key = tuple[tuple[str, int, int], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Open:
+    """A session that is open, and what closes it."""
+
+    key: Key
+    session: Session
+    closing: ExitStack
+
+
+class Sessions:
+    """A bounded number of open sessions; any thread may ask for one.
+
+    Parameters
+    ----------
+    settings : Settings
+        How many answer at the same time, and what each query may take.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        memory_gb = settings.query_memory_gib * GIB_IN_GB
+        self._limits = Limits(settings.query_time_s, memory_gb, DISK_GB)
+        self._places = threading.BoundedSemaphore(settings.queries)
+        self._lock = threading.Lock()
+        self._idle: list[_Open] = []
+        self._threads = CapacityLimiter(settings.queries)
+        self._is_closed = False
+        weakref.finalize(self, _close, self._idle)
+
+    @contextmanager
+    def session(
+        self, targets: Sequence[str | Path], time_s: float | None = None
+    ) -> Iterator[Session]:
+        """Give a session about some targets, which nobody else uses meanwhile.
+
+        Parameters
+        ----------
+        targets : sequence of str or Path
+            Folders and files of the service's own; never what a request says.
+        time_s : float, optional
+            Seconds that a query may take; by default what the operator set.
+
+        Yields
+        ------
+        Session
+            It is kept for the next question about the same targets, unless its process was ended.
+
+        Raises
+        ------
+        Problem
+            With status 503, if others take too long.
+        QueryError, ProductError, SourceError
+            If a target cannot be read, and whatever is raised within the context.
+        """
+        if not self._places.acquire(timeout=WAIT_S):
+            raise _busy()
+        try:
+            key = tuple(map(_identity, targets))
+            one = self._taken(key) or self._opened(key)
+            limits = replace(self._limits, time_s=time_s or self._limits.time_s)
+            is_kept = False
+            try:
+                yield replace(one.session, limits=limits)
+                is_kept = True
+            except QueryError:
+                is_kept = True
+                raise
+            finally:
+                self._give_back(one, is_kept and one.session.is_running)
+        finally:
+            self._places.release()
+
+    async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Call a function that asks a session, in a thread that only queries use.
+
+        Handlers that only read have the other threads for themselves.
+
+        Parameters
+        ----------
+        function : callable
+            What asks; it uses `session`.
+        *args, **kwargs
+            Its arguments.
+
+        Returns
+        -------
+        object
+            What the function returns.
+
+        Raises
+        ------
+        Problem
+            With status 503, if others take too long.
+        """
+        place = object()
+        with anyio.move_on_after(WAIT_S) as waiting:
+            await self._threads.acquire_on_behalf_of(place)
+        if waiting.cancelled_caught:
+            raise _busy()
+        try:
+            # The place is taken already: this limiter keeps nobody waiting.
+            return await to_thread.run_sync(
+                partial(function, *args, **kwargs), limiter=CapacityLimiter(1)
+            )
+        finally:
+            self._threads.release_on_behalf_of(place)
+
+    def forget(self, target: str | Path) -> None:
+        """Close the sessions about a target that is to be removed and that nobody uses.
+
+        Parameters
+        ----------
+        target : str or Path
+            As `session` was given it.
+        """
+        name = str(target)
+        with self._lock:
+            gone = [one for one in self._idle if name in [text for text, *_ in one.key]]
+            self._idle[:] = [one for one in self._idle if one not in gone]
+        _close(gone)
+
+    def close(self) -> None:
+        """Close all sessions; one that is in use is closed as soon as it is given back."""
+        with self._lock:
+            self._is_closed = True
+            gone = self._idle[:]
+            self._idle.clear()
+        _close(gone)
+
+    def _taken(self, key: Key) -> _Open | None:
+        """Return the session about some targets that was used last, if one is idle."""
+        with self._lock:
+            found = next((one for one in reversed(self._idle) if one.key == key), None)
+            if found is not None:
+                self._idle.remove(found)
+        return found
+
+    def _opened(self, key: Key) -> _Open:
+        with ExitStack() as stack:
+            names = [text for text, *_ in key]
+            session = stack.enter_context(open_session(names, self._limits))
+            return _Open(key, session, stack.pop_all())
+
+    def _give_back(self, one: _Open, is_kept: bool) -> None:
+        gone = [] if is_kept else [one]
+        with self._lock:
+            if is_kept:
+                self._idle.append(one)
+            most = 0 if self._is_closed else IDLE
+            while len(self._idle) > most:
+                gone.append(self._idle.pop(0))
+        _close(gone)
+
+
+def _identity(target: str | Path) -> tuple[str, int, int]:
+    """Return what tells a target from another that takes its place."""
+    try:
+        found = Path(target).stat()
+    except OSError:
+        return str(target), 0, 0
+    return str(target), found.st_ino, found.st_mtime_ns
+
+
+def _close(sessions: list[_Open]) -> None:
+    for one in sessions:
+        one.closing.close()
+
+
+def _busy() -> Problem:
+    return Problem(
+        503,
+        f"all queries that may run at the same time were busy for {WAIT_S:g} s; ask again later",
+        headers={"Retry-After": f"{WAIT_S:.0f}"},
+    )
