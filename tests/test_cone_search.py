@@ -200,7 +200,7 @@ def test_the_document_is_of_the_artifact(client: TestClient) -> None:
         ({"VERB": "4"}, 400, "VERB is '4'; give a whole number from 1 to 3"),
         ({"MAXREC": "-1"}, 400, "MAXREC is '-1'; give a whole number from 0"),
         ({"MAXREC": "9" * 30}, 400, "MAXREC is "),
-        ({"RESPONSEFORMAT": "<script>"}, 400, "the format '<script>' is unknown"),
+        ({"RESPONSEFORMAT": "<script>"}, 400, "RESPONSEFORMAT '<script>' is not known"),
         ({"ra": "1"}, 400, "RA is given twice"),
     ],
 )
@@ -253,7 +253,7 @@ def test_who_may_not_read_gets_nothing(root: Path) -> None:
 def test_parameters_as_they_are_checked() -> None:
     asked = cone_request([("ra", "1.5"), ("Dec", "-2"), ("SR", "1e-3"), ("UNKNOWN", "x")])
     assert (asked.ra_deg, asked.dec_deg, asked.radius_deg) == (1.5, -2.0, 0.001)
-    assert (asked.verbosity, asked.maxrec, asked.form.name) == (2, None, "tabledata")
+    assert (asked.verbosity, asked.maxrec, asked.form.name) == (2, None, "votable/td")
     edge = cone_request([("RA", "360"), ("DEC", "-90"), ("SR", "180"), ("VERB", "")])
     assert isinstance(edge, ConeRequest)
     with pytest.raises(ConfigError, match="RA is"):

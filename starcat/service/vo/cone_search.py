@@ -24,7 +24,7 @@ from starcat.vo.cone import (
     star_view,
     with_ucds,
 )
-from starcat.vo.results import result
+from starcat.vo.results import result_chunks
 
 router = APIRouter(prefix="/scs", tags=["cone search"])
 
@@ -80,9 +80,7 @@ async def search(catalog: str, request: Request, service: TheService, reader: Re
         told = problem_of(error)
         headers = error.headers if isinstance(error, Problem) else {}
         return Response(cone_error(told.detail), _status(error), {**headers, **_VOTABLE})
-    if asked.form.media_type == "text/xml":
-        return StreamingResponse(_chunks(found), headers=_VOTABLE)
-    return StreamingResponse(_chunks(found), media_type=asked.form.media_type)
+    return StreamingResponse(_chunks(found), headers={"Content-Type": asked.media_type})
 
 
 def target_of(service: Service, name: str) -> tuple[Path, Label]:
@@ -130,11 +128,12 @@ def _answer(service: Service, name: str, asked: ConeRequest) -> SpooledTemporary
         view = star_view(session)
         with session.ask(cone_query(view, asked, maxrec)) as running:
             rows = with_ucds(running.batches(), view)
-            found = result(rows, asked.form, service.places.scratch, label=label, maxrec=maxrec)
+            scratch = service.places.scratch
+            chunks = result_chunks(rows, asked.form, scratch, label=label, maxrec=maxrec)
             held: SpooledTemporaryFile[bytes]
-            held = SpooledTemporaryFile(_HELD_BYTES, dir=str(service.places.scratch))  # noqa: SIM115
+            held = SpooledTemporaryFile(_HELD_BYTES, dir=str(scratch))  # noqa: SIM115
             try:
-                held.writelines(found.chunks)
+                held.writelines(chunks)
             except BaseException:
                 held.close()
                 raise
