@@ -51,6 +51,9 @@ def root(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Path
     kept = root / "catalogs" / "bright"
     kept.mkdir(parents=True)
     shutil.copyfile(small_artifact / "stars.parquet", kept / "stars.parquet")
+    shutil.copyfile(small_artifact / "stars.parquet", kept.with_name("faint.parquet"))
+    shutil.copyfile(small_artifact / "stars.parquet", kept.with_name(f"sao-{'0a' * 8}.parquet"))
+    (root / "catalogs" / "unfinished").mkdir()
     return root
 
 
@@ -104,7 +107,10 @@ def test_a_search_finds_what_brute_force_finds(
         assert sorted(found["mag"].tolist()) == sorted(stars["mag"].tolist())
 
 
-@pytest.mark.parametrize("catalog", [DATABASE, "small", "small-1.0.0", "bright"])
+@pytest.mark.parametrize(
+    "catalog",
+    [DATABASE, "small", "small-1.0.0", "bright", "faint", "sao", f"sao-{'0a' * 8}.parquet"],
+)
 def test_a_catalog_has_several_names(
     client: TestClient, stars: dict[str, np.ndarray], catalog: str
 ) -> None:
@@ -234,13 +240,22 @@ def test_what_is_missing_is_told(client: TestClient, missing: str) -> None:
 
 @pytest.mark.parametrize(
     "catalog",
-    ["nothing", "0" * 16, "..%2f..%2fetc%2fpasswd", "bright%00", "records.sqlite", "x" * 300],
+    [
+        "nothing",
+        "unfinished",
+        "sa",
+        "0" * 16,
+        "..%2f..%2fetc%2fpasswd",
+        "bright%00",
+        "records.sqlite",
+        "x" * 300,
+    ],
 )
 def test_a_catalog_that_is_not_there(client: TestClient, catalog: str) -> None:
     answer = ask(client, catalog)
     assert answer.status_code in (400, 404)
     assert b"root:" not in answer.content
-    if catalog in ("nothing", "0" * 16):
+    if catalog in ("nothing", "unfinished", "sa", "0" * 16):
         check_error(answer.content, "no database and no catalog is called")
 
 
