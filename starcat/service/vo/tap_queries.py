@@ -9,17 +9,20 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from starcat.errors import ConfigError
+from starcat.exchange.label import Label
 from starcat.progress import Progress, no_progress
 from starcat.service.places import Places
 from starcat.service.sessions import Sessions
-from starcat.service.vo.tap_answers import chunks
 from starcat.service.vo.tap_tables import TapTables
 from starcat.vo.adql import translate
 from starcat.vo.answer import ask
 from starcat.vo.parameters import Question, Upload
+from starcat.vo.results import result_chunks
 from starcat.vo.tables import Schema
 from starcat.vo.tap_schema import UPLOADS
 from starcat.vo.uploads import read_upload
+
+_LABEL = Label("result")
 
 
 class TapQueries:
@@ -85,7 +88,8 @@ class TapQueries:
             translated = translate(asked.query, tables)
             with self._sessions.session(targets, time_s) as session:
                 batches = ask(session, translated, asked.max_rows, progress)
-                yield from chunks(batches, asked.form, asked.max_rows, self._places.scratch)
+                scratch, most = self._places.scratch, asked.max_rows
+                yield from result_chunks(batches, asked.form, scratch, label=_LABEL, maxrec=most)
 
     @contextmanager
     def _uploaded(
