@@ -13,9 +13,10 @@ from xml.parsers import expat
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from starcat.errors import ConfigError, quoted
-from starcat.tables.parquet import write_parquet
+from starcat.query.names import identifier
 from starcat.vo.tables import Column, Table
 from starcat.vo.tap_schema import UPLOADS
 
@@ -67,10 +68,12 @@ def read_upload(path: Path, name: str, folder: Path) -> Table:
     arrays, columns = [], []
     for field, column in zip(table.fields, _columns(table), strict=True):
         values = _arrow(column, field.name, name)
+        if field.xtype == "timestamp":
+            values = _times(values)
         kind = values.type
         is_list = pa.types.is_list(kind)
-        datatype = _NAMES[kind.value_type if is_list else kind]
-        size = "*" if is_list or datatype == "unicodeChar" else ""
+        datatype = _NAMES.get(kind.value_type if is_list else kind, "char")
+        size = "*" if is_list or datatype in ("char", "unicodeChar") else ""
         arrays.append(values)
         told = " ".join(str(field.description or "").split())
         unit = str(field.unit) if field.unit is not None else ""
@@ -79,8 +82,8 @@ def read_upload(path: Path, name: str, folder: Path) -> Table:
         )
     _check_names([column.name for column in columns], name)
     names = [column.name for column in columns]
-    write_parquet(pa.table(arrays, names=names), folder / f"{name}.parquet")
-    return Table(UPLOADS, name, tuple(columns), f"The uploaded table {name}")
+    pq.write_table(pa.table(arrays, names=names), folder / f"{name}.parquet")
+    return Table(UPLOADS, name, tuple(columns), f"The uploaded table {name}", view=identifier(name))
 
 
 def _parsed(path: Path, name: str) -> Any:
@@ -127,6 +130,14 @@ def _arrow(values: Any, field: str, name: str) -> pa.Array:
         return pa.array([one.tolist() for one in lists], pa.list_(_item(item)))
     found = pa.array(np.ascontiguousarray(data.astype(data.dtype.newbyteorder("="))), mask=mask)
     return found.cast(_item(found.type))
+
+
+def _times(values: pa.Array) -> pa.Array:
+    """Return texts as times, if they are."""
+    try:
+        return values.cast(pa.timestamp("us"))
+    except pa.ArrowInvalid:
+        return values
 
 
 def _item(kind: pa.DataType) -> pa.DataType:

@@ -96,7 +96,7 @@ class TapQueries:
             yield None, None
             return
         for one in uploads:
-            if one.part not in files:
+            if one.part and one.part not in files:
                 raise ConfigError(
                     f"UPLOAD of {one.table}: the request has no file {one.part!r}; send it as a "
                     "part of multipart/form-data with that name",
@@ -106,7 +106,9 @@ class TapQueries:
         try:
             folder = top / UPLOADS
             folder.mkdir()
-            tables = tuple(read_upload(files[one.part], one.table, folder) for one in uploads)
+            tables = tuple(
+                read_upload(files[one.part or one.job_id], one.table, folder) for one in uploads
+            )
             yield folder, Schema(UPLOADS, "Tables that came with the query", tables)
         finally:
             shutil.rmtree(top, ignore_errors=True)
