@@ -335,6 +335,7 @@ def lowest_bounds(
     )
 
 
+@pytest.mark.slow
 def test_as_many_random_frames_agree_as_the_bound_says(random_directions):
     # Eight stars a frame. All frames of four centroids, all assignments: no search that could
     # miss some, and no sum over other numbers of stars: the bound is the expected number.

@@ -113,6 +113,7 @@ def sky_of() -> Any:
     return make
 
 
+@pytest.mark.slow
 def test_the_memory_of_a_build_is_estimated(starcat, tmp_path):
     """In a process of its own, whose peak is that of one build."""
     import subprocess

@@ -242,6 +242,7 @@ def test_a_store_and_a_file(a: str, b: str, catalogs_made: Path, tmp_path: Path)
     assert [path.name for path in sorted(tmp_path.iterdir())] == ["whole.parquet", "x.parquet"]
 
 
+@pytest.mark.slow
 def test_the_command_takes_stores(catalogs_made: Path, tmp_path: Path, starcat: Callable[..., Any]):
     stores = (catalogs_made / "sao", catalogs_made / "hipparcos")
     output = tmp_path / "x.parquet"

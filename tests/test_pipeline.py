@@ -229,7 +229,7 @@ def test_a_changed_byte_is_found(small_artifact: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(small_artifact, tmp_path / "copy", copy_function=shutil.copyfile))
     for name in check_artifact(folder).manifest["files"]:
         whole = (folder / name).read_bytes()
-        for place in random.Random(name).sample(range(len(whole)), 3):
+        for place in random.Random(name).sample(range(len(whole)), 1):
             data = bytearray(whole)
             data[place] ^= 1
             (folder / name).write_bytes(data)

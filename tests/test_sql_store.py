@@ -218,6 +218,7 @@ def test_cones_within_other_queries(session, sky):
 # What is read ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_cone_reads_the_partitions_that_it_crosses_and_their_neighbours(session, sky):
     order = 7
     small = np.arange(12 * 4**order)

@@ -159,6 +159,7 @@ def test_an_unfinished_run_is_not_overwritten(damaged, tmp_path):
         make(copies, store, resume=True, max_partition_rows=2_000)
 
 
+@pytest.mark.slow
 def test_a_store_is_replaced_only_when_asked(parts, whole, tmp_path):
     store = tmp_path / "store"
     make(parts, store)

@@ -1,4 +1,4 @@
-"""Tables as CSV and JSON text, batch by batch.
+"""Tables as CSV, TSV and JSON text, batch by batch.
 
 CSV: nothing for null, ``""`` for an empty text (for both where there is one column only),
 ``nan`` and ``inf`` for numbers that are none, lists and records as JSON in the cell. JSON: an
@@ -20,6 +20,7 @@ import pyarrow.csv as pcsv
 from starcat.exchange.column_types import is_list, plain_batch, plain_schema, time_texts
 
 _STEP_ROWS = 1 << 14
+_BREAKS = "[\\t\\r\\n]"
 
 
 def csv_chunks(batches: pa.RecordBatchReader) -> Iterator[tuple[bytes, int]]:
@@ -44,6 +45,44 @@ def csv_chunks(batches: pa.RecordBatchReader) -> Iterator[tuple[bytes, int]]:
     yield _csv(schema.empty_table().to_batches(), schema, header=True), 0
     for batch in _small_batches(batches, schema):
         yield _csv([batch], schema, header=False), batch.num_rows
+
+
+def tsv_chunks(batches: pa.RecordBatchReader) -> Iterator[tuple[bytes, int]]:
+    """Yield a table as text with tabs between the cells and nothing quoted.
+
+    Parameters
+    ----------
+    batches : pyarrow.RecordBatchReader
+        The table.
+
+    Yields
+    ------
+    tuple of (bytes, int)
+        UTF-8 text, the names first, and how many rows it holds. Null and an empty text are both
+        an empty cell; a tab or the end of a line in a text becomes a blank.
+
+    Raises
+    ------
+    SchemaError
+        If a column has no place in a file.
+    """
+    schema = plain_schema(batches.schema)
+    names = pc.replace_substring_regex(pa.array(schema.names, pa.string()), _BREAKS, " ")
+    yield ("\t".join(names.to_pylist()) + "\n").encode(), 0
+    for batch in _small_batches(batches, schema):
+        cells = [_cells(column).cast(pa.string()) for column in batch.columns]
+        texts = [
+            pc.replace_substring_regex(text, _BREAKS, " ")
+            if pa.types.is_string(field.type)
+            or is_list(field.type)
+            or pa.types.is_struct(field.type)
+            else text
+            for field, text in zip(schema, cells, strict=True)
+        ]
+        rows = pc.binary_join_element_wise(
+            *texts, "\t", null_handling="replace", null_replacement=""
+        )
+        yield ("\n".join(rows.to_pylist()) + "\n").encode(), batch.num_rows
 
 
 def json_chunks(batches: pa.RecordBatchReader) -> Iterator[tuple[bytes, int]]:

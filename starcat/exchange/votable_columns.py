@@ -44,8 +44,9 @@ class VotableColumn:
         Type of its values, or of the items of its lists.
     is_list : bool
         Whether its rows are lists of numbers.
-    is_time : bool
-        Whether its values are dates or times with a date, which become ISO 8601 text.
+    xtype : str, optional
+        What DALI calls values of that kind. Dates, and times with a date, are ``timestamp`` and
+        become ISO 8601 text; the metadata of a field may name another.
     facts : dict of str to str
         ``unit``, ``description`` and ``ucd`` where the column has them.
     """
@@ -53,7 +54,7 @@ class VotableColumn:
     name: str
     kind: pa.DataType
     is_list: bool
-    is_time: bool
+    xtype: str | None
     facts: dict[str, str]
 
     @property
@@ -64,7 +65,9 @@ class VotableColumn:
     @property
     def datatype(self) -> str:
         """VOTable's word for the type: ``char`` where texts are sure to be ASCII."""
-        return "char" if self.is_time else _DATATYPES[self.kind]
+        if self.is_text and self.xtype == "timestamp":
+            return "char"
+        return _DATATYPES[self.kind]
 
     @property
     def is_place(self) -> bool:
@@ -235,12 +238,14 @@ def said_in_xml(text: str) -> str:
 def _votable_column(field: pa.Field) -> VotableColumn:
     check_xml(field.name, [field.name])
     kind = field.type
-    is_time = pa.types.is_timestamp(kind) or pa.types.is_date(kind)
+    xtype = (field.metadata or {}).get(b"xtype", b"").decode() or None
+    if pa.types.is_timestamp(kind) or pa.types.is_date(kind):
+        xtype = "timestamp"
     has_lists = is_list(kind) and is_number(kind.value_type)
     if has_lists:
         kind = kind.value_type
     plain = plain_values(field.name, pa.array([], kind), signed=True).type
-    return VotableColumn(field.name, plain, has_lists, bool(is_time), field_facts(field))
+    return VotableColumn(field.name, plain, has_lists, xtype, field_facts(field))
 
 
 def _check_text(name: str, values: pa.Array) -> None:

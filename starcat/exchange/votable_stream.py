@@ -20,6 +20,7 @@ import pyarrow.compute as pc
 
 from starcat.errors import StarcatError
 from starcat.exchange.column_types import plain_batch, plain_schema
+from starcat.exchange.first_rows import FirstRows
 from starcat.exchange.label import UNLABELLED, Label
 from starcat.exchange.votable_binary2 import Binary2
 from starcat.exchange.votable_columns import VotableColumn, cells_of, votable_columns
@@ -81,8 +82,8 @@ def votable_chunks(
     """
     schema = plain_schema(batches.schema)
     columns = votable_columns(schema)
-    cut = _Cut(maxrec)
-    read = cut.batches(batches)
+    cut = FirstRows(batches, maxrec)
+    read = iter(cut)
     epoch = ""
     if has_epoch(schema, columns):
         begun = list(islice(read, 2))
@@ -97,7 +98,7 @@ def votable_chunks(
     last = []
     try:
         yield from rows
-        if cut.is_over:
+        if cut.were_more:
             last = [info("QUERY_STATUS", "OVERFLOW")]
     except StarcatError as error:
         last = [info("QUERY_STATUS", "ERROR", text=str(error))]
@@ -156,7 +157,8 @@ def row_chunks(
             yield b2a_base64(memoryview(content)[:whole])
     except Exception as error:
         failure = error
-    yield b2a_base64(left)
+    if left:
+        yield b2a_base64(left)
     if failure is not None:
         raise failure
 
@@ -217,27 +219,6 @@ def epoch_attribute(epochs: set[float]) -> str:
         return ""
     [epoch] = epochs
     return f' epoch="J{str(epoch).removesuffix(".0")}"'
-
-
-class _Cut:
-    """The first rows of a table, and whether there were more."""
-
-    def __init__(self, maxrec: int | None) -> None:
-        self._left = maxrec
-        self.is_over = maxrec == 0
-
-    def batches(self, batches: Iterable[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
-        """Yield no more rows than are asked for."""
-        if self.is_over:
-            return
-        for batch in batches:
-            if self._left is not None and batch.num_rows > self._left:
-                self.is_over = True
-                yield batch.slice(0, self._left)
-                return
-            if self._left is not None:
-                self._left -= batch.num_rows
-            yield batch
 
 
 def _steps(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:

@@ -189,16 +189,17 @@ def _make(partial: Path, plan: _Plan, clock: Stopwatch, progress: Progress) -> B
     catalog, amplitudes = read_sources(spec, inputs, workers, progress)
     motions = join_motions(catalog, spec, inputs, workers, progress)
     catalog = motions.catalog
-    stars, joined = _join_all(catalog.stars, amplitudes)
+    stars, joined = join_all(catalog.stars, amplitudes)
     clock.lap("read")
     selected, fields = select_stars(stars, spec)
-    cost = estimate_cost(catalog, selected, fields, spec)
+    moved = motion_product(motions, selected.guide_stars)
+    cost = estimate_cost(catalog, selected, fields, spec, moved)
     if plan.announce is not None:
         plan.announce(cost)
     check_memory(cost, spec, plan.max_memory_bytes)
     clock.lap("select")
     products = make_products(spec, catalog, selected, fields, progress)
-    products += motion_product(motions, selected.guide_stars)
+    products += moved
     matched = match_catalogs(stars, selected, spec, inputs, workers, progress)
     products += matched.products
     clock.lap("products")
@@ -293,9 +294,25 @@ def check_inputs(spec: BuildSpec, inputs: Inputs) -> None:
             )
 
 
-def _join_all(
+def join_all(
     stars: pa.Table, amplitudes: Sequence[AmplitudeTable]
 ) -> tuple[pa.Table, dict[str, int]]:
+    """Join amplitudes to a star table.
+
+    Parameters
+    ----------
+    stars : pyarrow.Table
+        Star table (schema ``stars``).
+    amplitudes : sequence of AmplitudeTable
+        In the order of the spec.
+
+    Returns
+    -------
+    stars : pyarrow.Table
+        The same rows.
+    joined : dict of str to int
+        Stars whose amplitude came from each.
+    """
     joined: dict[str, int] = {}
     for table in amplitudes:
         stars, joined[table.source] = join_amplitudes(stars, table)

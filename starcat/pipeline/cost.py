@@ -1,40 +1,39 @@
-"""What a build will cost, before it makes anything: rows, memory and time from counts of stars.
+"""What a build will cost, before it makes anything: rows, files, memory and time.
 
-The counts of pairs and neighbours are those around some of the stars, and the triangles that
-several fields share are found from some of the triangles. Nothing here depends on the machine but
-the memory that it has left. Times are those of a processor of 2020 that does nothing else.
+Rows are those of `starcat.pipeline.counts`, files those of `starcat.pipeline.sizes`. Nothing here
+depends on the machine but the memory that it has left. Times are those of a processor of 2020 that
+does nothing else.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import lru_cache
-from itertools import combinations
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
-import numpy as np
-from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.spatial import cKDTree
+import pyarrow as pa
+import pyarrow.compute as pc
 
+from starcat.artifact.writer import Product
 from starcat.catalog.ingest import Ingested
 from starcat.catalog.selection import Selected
-from starcat.catalog.stars import directions_of
+from starcat.catalog.stars import directions_of, floats_of
 from starcat.errors import BuildError
-from starcat.geometry.sphere import chord_from_separation
+from starcat.pipeline.counts import Extent, LevelExtent, count_levels, count_products
 from starcat.pipeline.log import available_memory_bytes
-from starcat.pipeline.recipes import RECIPES, Ingredients
+from starcat.pipeline.recipes import Ingredients, boresight_product
+from starcat.pipeline.sizes import (
+    counterparts_bytes,
+    database_bytes,
+    other_bytes,
+    product_files,
+    table_bytes,
+)
 from starcat.products.boresights import FieldStars
 from starcat.specs.build_spec import BuildSpec
 
-Array = NDArray[np.float64]
-
-SAMPLE = 2000
-"""Stars around which neighbours are counted, and triangles whose fields are."""
-
-GOLDEN_RATIO = 0.5 * (1.0 + 5.0**0.5)
-
 GIB = 2**30
+
+MB = 1e6
 
 
 @dataclass(frozen=True)
@@ -64,8 +63,10 @@ ROWS: Mapping[str, Row] = {
     "hausdorff_l2": Row(24.0, 60.0, 1.2),
     "grid": Row(16.0, 60.0, 1.2),
     "radial": Row(12.0, 60.0, 1.2),
+    "levels": Row(24.0, 60.0, 0.6),
 }
-"""Measured with numpy 2 on products of 0.5 to 6 million rows."""
+"""Measured with numpy 2 on products of 0.5 to 6 million rows: of patterns a neighbour is one, of
+levels a triangle."""
 
 RECORD = Row(0.0, 32.0, 0.15)
 """A triangle of one field, before those that several fields have are made one."""
@@ -104,6 +105,9 @@ class Cost:
         Most memory that the build will hold.
     seconds : float
         Time from here on.
+    files : mapping of str to int
+        Bytes of each file as it will be written; those of the folder ``report`` and of the
+        manifest together as ``report``.
     """
 
     stars: int
@@ -112,20 +116,59 @@ class Cost:
     bytes: Mapping[str, int]
     memory_bytes: int
     seconds: float
+    files: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def in_words(self) -> str:
         """One line for people."""
         named = [f"{_rounded(count)} {name}" for name, count in self.rows.items()]
+        written = f"{sum(self.files.values()) / MB:,.1f} MB of files, " if self.files else ""
         return (
             f"estimate: {self.stars:,} guide stars in {self.fields:,} fields; "
-            f"{', '.join(named) or 'no products'}; {self.memory_bytes / GIB:.1f} GiB of memory, "
-            f"{max(1, round(self.seconds)):,} s"
+            f"{', '.join(named) or 'no products'}; {written}{self.memory_bytes / GIB:.1f} GiB of "
+            f"memory, {max(1, round(self.seconds)):,} s"
         )
 
 
+@dataclass(frozen=True)
+class Made:
+    """What is there when a build is estimated: some products, and guide stars for the others.
+
+    Attributes
+    ----------
+    guide_stars : pyarrow.Table
+        As the schema ``stars`` has them.
+    fields : FieldStars
+        Their tiling.
+    spec : BuildSpec
+        Which products, and their parameters.
+    rejected_bytes : int
+        Size of the file of rejected records.
+    others : sequence of Product
+        Products that are there too, such as ``motions``.
+    base_bytes : float
+        Memory that is taken already.
+    """
+
+    guide_stars: pa.Table
+    fields: FieldStars
+    spec: BuildSpec
+    rejected_bytes: int
+    others: Sequence[Product] = ()
+    base_bytes: float = 0.0
+
+    @property
+    def ingredients(self) -> Ingredients:
+        """What products are made from."""
+        return Ingredients(directions_of(self.guide_stars), self.fields, self.spec)
+
+
 def estimate_cost(
-    catalog: Ingested, selected: Selected, fields: FieldStars, spec: BuildSpec
+    catalog: Ingested,
+    selected: Selected,
+    fields: FieldStars,
+    spec: BuildSpec,
+    others: Sequence[Product] = (),
 ) -> Cost:
     """Estimate what the products of a build will cost.
 
@@ -139,19 +182,77 @@ def estimate_cost(
         The tiling of the guide stars.
     spec : BuildSpec
         Which products, and their parameters.
+    others : sequence of Product
+        Products that are there already, such as ``motions``.
 
     Returns
     -------
     Cost
         The same for the same input, on every machine.
     """
-    given = Ingredients(directions_of(selected.guide_stars), fields, spec)
-    base = BASE_BYTES + CATALOG_FACTOR * (catalog.stars.nbytes + catalog.rejected.nbytes)
-    return product_cost(given, base)
+    rejected = pa.concat_tables([catalog.rejected, selected.rejected])
+    base = base_memory(catalog.stars.nbytes + catalog.rejected.nbytes)
+    made = Made(
+        selected.guide_stars, fields, spec, table_bytes(rejected), others=others, base_bytes=base
+    )
+    return whole_cost(made)
+
+
+def base_memory(catalog_bytes: float) -> float:
+    """Return the memory that is taken when the guide stars are selected.
+
+    Parameters
+    ----------
+    catalog_bytes : float
+        Of the tables of the catalog.
+
+    Returns
+    -------
+    float
+        Bytes, those of the program included.
+    """
+    return BASE_BYTES + CATALOG_FACTOR * catalog_bytes
+
+
+def whole_cost(made: Made) -> Cost:
+    """Estimate what a build will cost, its files included.
+
+    Parameters
+    ----------
+    made : Made
+        What is there.
+
+    Returns
+    -------
+    Cost
+        The same for the same input, on every machine.
+    """
+    spec, stars = made.spec, made.guide_stars
+    extents, levels = count_products(made.ingredients), None
+    if spec.products.levels.enabled:
+        levels = count_levels(directions_of(stars), floats_of(stars, "mag"), spec)
+    cost = _cost(made.ingredients, extents, levels, made.base_bytes)
+    boresights = boresight_product(made.fields, spec.boresights.brightest).table
+    longest = pc.max(pc.binary_length(stars["designation"])).as_py() or 1
+    listed = pc.sum(pc.list_value_length(boresights["brightest"])).as_py() or 0
+    stored = {"boresights": Extent(float(len(boresights)), float(listed)), **extents}
+    tables = {"stars": table_bytes(stars), "boresights": table_bytes(boresights)}
+    tables |= product_files(extents, levels, len(stars), spec)
+    tables |= {product.name: table_bytes(product.table) for product in made.others}
+    tables["rejected"] = made.rejected_bytes
+    rows = dict(cost.rows)
+    wanted = spec.products.crossmatch
+    if wanted.enabled:
+        rows["crossmatch"] = len(stars) * len(wanted.catalogs)
+        tables["crossmatch"] = counterparts_bytes(rows["crossmatch"])
+    files = {f"{name}.parquet": count for name, count in tables.items()}
+    files["database.h5"] = database_bytes(stored, levels, len(stars), spec, longest)
+    files["report"] = other_bytes(len(boresights))
+    return replace(cost, rows=rows, files=files)
 
 
 def product_cost(given: Ingredients, base_bytes: float) -> Cost:
-    """Estimate what products will cost.
+    """Estimate what products that are made from guide stars alone will cost.
 
     Parameters
     ----------
@@ -163,36 +264,42 @@ def product_cost(given: Ingredients, base_bytes: float) -> Cost:
     Returns
     -------
     Cost
-        The same for the same input, on every machine.
+        Without files; the same for the same input, on every machine.
     """
+    return _cost(given, count_products(given), None, base_bytes)
+
+
+def _cost(
+    given: Ingredients,
+    extents: Mapping[str, Extent],
+    levels: LevelExtent | None,
+    base_bytes: float,
+) -> Cost:
+    """Return what products of known size cost in memory and time."""
     spec, fields = given.spec, given.fields
-    wanted = [name for name in RECIPES if getattr(spec.products, name).enabled]
-    radii = {name: _reach_rad(name, given) for name in wanted if name != "triangles"}
-    counts = _neighbours_within(given.directions, sorted(set(radii.values())))
-    rows = {name: float(len(given.directions) * counts[radius]) for name, radius in radii.items()}
-    if "pairs" in rows:
-        rows["pairs"] *= 0.5
-    records = 0.0
-    if "triangles" in wanted:
-        records, distinct = _triangles(fields, len(given.directions), spec.boresights.brightest)
-        rows["triangles"] = distinct
-    parts = [(ROWS[name], rows[name]) for name in wanted]
+    rows = {name: extent.rows for name, extent in extents.items()}
+    work = {name: extent.reached for name, extent in extents.items()}
+    records = sum(extent.records for extent in extents.values())
+    if levels is not None:
+        rows["levels"], work["levels"] = float(levels.levels), levels.triangles
+        records += levels.records
+    parts = [(ROWS[name], count) for name, count in work.items()]
     parts += [
         (FIELD, float(len(fields.count))),
         (FIELD_STAR, float(len(fields.star_index))),
         (RECORD, records),
     ]
-    held = {name: rows[name] * ROWS[name].held_bytes for name in wanted}
+    held = {name: count * ROWS[name].held_bytes for name, count in work.items()}
     working = max((row.working_bytes * count for row, count in parts), default=0.0)
     memory = base_bytes + working + sum(row.held_bytes * count for row, count in parts)
     seconds = 1e-6 * sum(row.micros * count for row, count in parts)
     seconds += BASE_SECONDS + 3.0 * FRAME_SECONDS * spec.self_test.frames
-    saved = {name: held[name] + rows[name] * ROWS[name].working_bytes for name in wanted}
+    saved = {name: held[name] + work[name] * ROWS[name].working_bytes for name in work}
     return Cost(
         len(given.directions),
         len(fields.count),
-        {name: round(rows[name]) for name in wanted},
-        {name: round(saved[name]) for name in wanted},
+        {name: round(count) for name, count in rows.items()},
+        {name: round(count) for name, count in saved.items()},
         round(memory),
         seconds,
     )
@@ -229,65 +336,6 @@ def check_memory(cost: Cost, spec: BuildSpec, max_memory_bytes: int | None = Non
         f"more than {whose}, {limit / GIB:.1f} GiB; {key} saves most, and fewer stars "
         "(selection.max_stars_per_field, a brighter faint_limit_mag) save some of everything"
     )
-
-
-def _reach_rad(name: str, given: Ingredients) -> float:
-    """Return how far apart two stars of a row of a product may be."""
-    wanted = getattr(given.spec.products, name)
-    if name == "pairs":
-        if wanted.max_separation_deg is None:
-            return given.spec.camera.camera().diagonal_rad
-        return float(np.radians(wanted.max_separation_deg))
-    return given.radius_rad(wanted.radius_deg, 4.0 / 3.0 if name == "hausdorff_angular" else 1.0)
-
-
-def _neighbours_within(directions: Array, radii_rad: list[float]) -> dict[float, float]:
-    """Return the mean number of neighbours of a star within each radius, of some of the stars."""
-    step = -(-len(directions) // SAMPLE)
-    some, tree = directions[::step], cKDTree(directions)
-    return {
-        radius: float(
-            np.mean(tree.query_ball_point(some, _chord(radius), return_length=True) - 1.0)
-        )
-        for radius in radii_rad
-    }
-
-
-def _chord(radius_rad: float) -> float:
-    return float(chord_from_separation(min(radius_rad, np.pi)))
-
-
-def _triangles(fields: FieldStars, stars: int, brightest: int) -> tuple[float, float]:
-    """Return the triangles of all fields, and about how many of them are distinct.
-
-    A triangle that t fields have is counted t times; so the distinct ones are as many as all times
-    the mean of 1 / t.
-    """
-    offsets, star = fields.brightest(brightest)
-    size = np.diff(offsets)
-    each = size * (size - 1) * (size - 2) // 6
-    records = int(each.sum())
-    if not records:
-        return 0.0, 0.0
-    held = np.ones(len(star), dtype=np.int32)
-    of_field = csr_array((held, star, offsets), shape=(len(size), stars))
-    of_star = of_field.T.tocsr()
-    # Multiples of the golden ratio are spread evenly, and never in step with the fields.
-    chosen = (np.arange(min(records, SAMPLE)) * GOLDEN_RATIO % 1.0 * records).astype(np.int64)
-    ends = np.cumsum(each)
-    field = np.searchsorted(ends, chosen, side="right")
-    within = chosen - (ends[field] - each[field])
-    members = np.array(
-        [_triples(int(size[f]))[int(n)] for f, n in zip(field, within, strict=True)], dtype=np.int64
-    )
-    i, j, k = star[offsets[field][:, None] + members].T
-    shared = of_star[i].multiply(of_star[j]).multiply(of_star[k]).sum(axis=1)
-    return float(records), float(records * np.mean(1.0 / np.asarray(shared).ravel()))
-
-
-@lru_cache
-def _triples(size: int) -> list[tuple[int, ...]]:
-    return list(combinations(range(size), 3))
 
 
 def _rounded(count: int) -> str:

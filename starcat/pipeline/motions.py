@@ -148,12 +148,32 @@ def motion_product(joined: JoinedMotions, guide_stars: pa.Table) -> tuple[Produc
     """
     if joined.table is None:
         return ()
-    number = joined.catalog.stars["star_id"].to_numpy()
+    return (motions_of(joined.catalog.stars, joined.table, guide_stars),)
+
+
+def motions_of(stars: pa.Table, motions: pa.Table, guide_stars: pa.Table) -> Product:
+    """Return the rows of guide stars in a table of motions.
+
+    Parameters
+    ----------
+    stars : pyarrow.Table
+        Star table, by star_id.
+    motions : pyarrow.Table
+        Rows of the schema ``motions``, one for each of its stars.
+    guide_stars : pyarrow.Table
+        Some of its stars, by star_id.
+
+    Returns
+    -------
+    Product
+        The product ``motions``.
+    """
+    number = stars["star_id"].to_numpy()
     rows = np.searchsorted(number, guide_stars["star_id"].to_numpy())
-    table = joined.table.take(pa.array(rows)).combine_chunks()
+    table = motions.take(pa.array(rows)).combine_chunks()
     own = pa.array(np.arange(len(guide_stars), dtype=np.int32))
     table = table.set_column(0, table.schema.field(0), own)
-    return (Product("motions", table, in_database=False),)
+    return Product("motions", table, in_database=False)
 
 
 def motion_sources(joined: JoinedMotions, products: Sequence[Product]) -> list[SourceFacts]:

@@ -22,8 +22,9 @@ from starcat.catalog.selection import reject_dense, select_guide_stars
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.errors import OutputError
 from starcat.geometry.camera import Camera
-from starcat.pipeline.cost import BASE_BYTES, CATALOG_FACTOR, Cost, product_cost
+from starcat.pipeline.cost import Cost, Made, base_memory, product_cost, whole_cost
 from starcat.pipeline.recipes import RECIPES, Ingredients, field_size, tile_guide_stars
+from starcat.pipeline.sizes import table_bytes
 from starcat.products.boresights import tile_sphere
 from starcat.products.coverage import Spread, field_coverage, summarise_coverage
 from starcat.progress import Progress, no_progress
@@ -267,9 +268,10 @@ def _affordable(sky: pa.Table, spec: BuildSpec) -> tuple[BuildSpec, LimitRow, Co
     selected = select_guide_stars(sky, spec.selection)
     fields = tile_guide_stars(selected.guide_stars, spec)
     _, brightest = fields.brightest(STARS_A_FIELD)
-    guide_stars = reject_dense(selected, brightest).guide_stars
+    selected = reject_dense(selected, brightest)
+    guide_stars = selected.guide_stars
     fields = tile_guide_stars(guide_stars, spec)
-    base = BASE_BYTES + CATALOG_FACTOR * sky.nbytes
+    base = base_memory(sky.nbytes)
     directions = directions_of(guide_stars)
     cost = product_cost(Ingredients(directions, fields, spec), base)
     while cost.memory_bytes > MEMORY_BYTES or cost.seconds > SECONDS:
@@ -281,6 +283,8 @@ def _affordable(sky: pa.Table, spec: BuildSpec) -> tuple[BuildSpec, LimitRow, Co
         content["products"][costly]["enabled"] = False
         spec = BuildSpec.model_validate(content)
         cost = product_cost(Ingredients(directions, fields, spec), base)
+    rejected = table_bytes(selected.rejected)
+    cost = whole_cost(Made(guide_stars, fields, spec, rejected, base_bytes=base))
     stars = summarise_coverage(field_coverage(fields, BRIGHTEST)).stars
     return spec, LimitRow(spec.selection.faint_limit_mag, len(guide_stars), stars), cost
 

@@ -118,8 +118,7 @@ def stars_in_fields(
         Stars by field, brightest first.
     """
     half_x, half_y = np.radians(0.5 * size.fov_x_deg), np.radians(0.5 * size.fov_y_deg)
-    corner = np.arctan(np.hypot(np.tan(half_x), np.tan(half_y)))
-    radius = float(min(half_x, half_y) if field == "circular" else corner)
+    radius = reach_rad(size, field)
     if not len(directions):
         none = np.zeros(len(boresights) + 1, dtype=np.int64)
         return FieldStars(boresights, none, np.empty(0, dtype=np.int32))
@@ -133,10 +132,34 @@ def stars_in_fields(
     else:
         inside = _in_frame(boresights, tile, directions[star], np.tan(half_x), np.tan(half_y))
     tile, star = tile[inside], star[inside]
-    order = np.lexsort((star, mag[star], tile))
+    # Field and rank in one number, as sorting numbers is several times faster.
+    by_brightness = np.argsort(mag, kind="stable")
+    rank = np.empty(len(mag), dtype=np.int64)
+    rank[by_brightness] = np.arange(len(mag))
+    key = np.sort(tile.astype(np.int64) * len(mag) + rank[star])
     count = np.bincount(tile, minlength=len(boresights))
     offsets = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
-    return FieldStars(boresights, offsets, star[order].astype(np.int32))
+    return FieldStars(boresights, offsets, by_brightness[key % len(mag)].astype(np.int32))
+
+
+def reach_rad(size: FieldSize, field: Literal["rectangular", "circular"]) -> float:
+    """Return how far from its boresight a field reaches.
+
+    Parameters
+    ----------
+    size : FieldSize
+        How large the field is.
+    field : {"rectangular", "circular"}
+        As for `stars_in_fields`.
+
+    Returns
+    -------
+    float
+        Radians: to a corner of the frame, or the radius of the circle.
+    """
+    half_x, half_y = np.radians(0.5 * size.fov_x_deg), np.radians(0.5 * size.fov_y_deg)
+    corner = np.arctan(np.hypot(np.tan(half_x), np.tan(half_y)))
+    return float(min(half_x, half_y) if field == "circular" else corner)
 
 
 def _in_frame(

@@ -8,13 +8,13 @@ between the two: the wider the field, the brighter and the fewer the stars.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.products.boresights import FieldSize, NominalField, tile_sphere
+from starcat.products.boresights import FieldSize, FieldStars, NominalField, tile_sphere
 from starcat.products.index import Index, Ragged
 from starcat.products.triangles import distinct_triangles
 
@@ -137,15 +137,11 @@ def find_levels(
         Each level is thinned from the one before, so that its stars are among those of all
         narrower ones.
     """
-    rows = np.arange(len(directions), dtype=np.int32)
     stars, triangles = [], []
-    for field in fields:
-        count = max(FEWEST_BORESIGHTS, round(boresights * _shrink(narrowest, field)))
-        tiled = tile_sphere(count, directions[rows], mag[rows], field)
-        found, _ = distinct_triangles(tiled, len(rows), brightest)
-        triangles.append(rows[found])
-        rows = rows[np.unique(tiled.brightest(stars_per_field)[1])]
-        stars.append(rows)
+    for level in thin_levels(directions, mag, narrowest, fields, boresights, stars_per_field):
+        found, _ = distinct_triangles(level.tiled, len(level.before), brightest)
+        triangles.append(level.before[found])
+        stars.append(level.rows)
     i, j, k = (_ragged([found[:, n] for found in triangles]) for n in range(3))
     return Levels(
         np.arange(1, len(fields) + 1, dtype=np.int32),
@@ -157,6 +153,72 @@ def find_levels(
         k,
         Index(),
     )
+
+
+@dataclass(frozen=True)
+class Level:
+    """The stars of a level.
+
+    Attributes
+    ----------
+    before : ndarray of int32, shape (M,)
+        Rows of the star table that the level is chosen from.
+    tiled : FieldStars
+        These in the fields of the level; its star numbers are places in ``before``.
+    rows : ndarray of int32, shape (K,)
+        Rows of the star table that are left, ascending.
+    """
+
+    before: Rows
+    tiled: FieldStars
+    rows: Rows
+
+
+def thin_levels(
+    directions: Array,
+    mag: Array,
+    narrowest: FieldSize,
+    fields: Sequence[FieldSize],
+    boresights: int,
+    stars_per_field: int,
+) -> Iterator[Level]:
+    """Thin stars to those of each level.
+
+    Parameters
+    ----------
+    directions, mag, narrowest, fields, boresights, stars_per_field
+        As for `find_levels`.
+
+    Yields
+    ------
+    Level
+        The narrowest first, each from the stars of the one before.
+    """
+    rows = np.arange(len(directions), dtype=np.int32)
+    for field in fields:
+        count = boresights_of_level(boresights, narrowest, field)
+        tiled = tile_sphere(count, directions[rows], mag[rows], field)
+        left = rows[np.unique(tiled.brightest(stars_per_field)[1])]
+        yield Level(rows, tiled, left)
+        rows = left
+
+
+def boresights_of_level(boresights: int, narrowest: FieldSize, field: FieldSize) -> int:
+    """Return how many boresights tile the sphere for a level.
+
+    Parameters
+    ----------
+    boresights : int
+        Points for the camera's own field.
+    narrowest, field : FieldSize
+        That field, and the level's.
+
+    Returns
+    -------
+    int
+        `FEWEST_BORESIGHTS` at the least.
+    """
+    return max(FEWEST_BORESIGHTS, round(boresights * _shrink(narrowest, field)))
 
 
 def _shrink(narrow: FieldSize, wide: FieldSize) -> float:

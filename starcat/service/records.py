@@ -10,6 +10,18 @@ from pathlib import Path
 
 from starcat.errors import SchemaVersionError
 
+PUBLICATIONS = """
+    CREATE TABLE publications (
+        name TEXT NOT NULL,
+        version TEXT NOT NULL,
+        database TEXT NOT NULL,
+        note TEXT NOT NULL,
+        owner TEXT NOT NULL,
+        published_s REAL NOT NULL,
+        PRIMARY KEY (name, version)
+    )
+"""
+
 MIGRATIONS: tuple[str, ...] = (
     """
     CREATE TABLE jobs (
@@ -24,6 +36,7 @@ MIGRATIONS: tuple[str, ...] = (
         started_s REAL,
         ended_s REAL,
         attempt INTEGER NOT NULL DEFAULT 0,
+        interrupted INTEGER NOT NULL DEFAULT 0,
         wants_end INTEGER NOT NULL DEFAULT 0,
         stage TEXT,
         done INTEGER,
@@ -33,6 +46,7 @@ MIGRATIONS: tuple[str, ...] = (
     );
     CREATE INDEX jobs_by_key ON jobs (key);
     CREATE INDEX jobs_by_owner ON jobs (owner, state);
+    CREATE INDEX jobs_by_state ON jobs (state, created_s);
     CREATE TABLE job_events (
         job TEXT NOT NULL REFERENCES jobs (id) ON DELETE CASCADE,
         number INTEGER NOT NULL,
@@ -40,6 +54,12 @@ MIGRATIONS: tuple[str, ...] = (
         kind TEXT NOT NULL,
         data TEXT NOT NULL,
         PRIMARY KEY (job, number)
+    );
+    CREATE TABLE file_digests (
+        path TEXT PRIMARY KEY,
+        size_bytes INTEGER NOT NULL,
+        changed_ns INTEGER NOT NULL,
+        sha256 TEXT NOT NULL
     );
     CREATE TABLE tokens (
         id TEXT PRIMARY KEY,
@@ -50,7 +70,14 @@ MIGRATIONS: tuple[str, ...] = (
         expires_s REAL,
         revoked_s REAL
     );
+    CREATE TABLE sessions (
+        digest TEXT PRIMARY KEY,
+        token TEXT NOT NULL REFERENCES tokens (id),
+        created_s REAL NOT NULL,
+        expires_s REAL NOT NULL
+    );
     """,
+    PUBLICATIONS,
     """
     CREATE TABLE tap_jobs (
         id TEXT PRIMARY KEY,

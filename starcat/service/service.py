@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import threading
+from dataclasses import dataclass, field
 from typing import Annotated
 
 from fastapi import Depends, Request
 
+from starcat.service.confined import Confined
 from starcat.service.jobs.job import JobStore
+from starcat.service.jobs.queue import JobQueue, open_queue
 from starcat.service.places import Places
 from starcat.service.records import Records
 from starcat.service.sessions import Sessions
@@ -34,8 +37,14 @@ class Service:
         The jobs there are.
     sessions : Sessions
         Open query sessions.
+    queue : JobQueue
+        What waits for workers.
+    confined : Confined
+        Processes that read uploads and make files.
     tap : Tap
         What TAP needs.
+    stopping : threading.Event
+        Set when the service stops.
     """
 
     settings: Settings
@@ -44,7 +53,10 @@ class Service:
     shelf: Shelf
     jobs: JobStore
     sessions: Sessions
+    confined: Confined
     tap: Tap
+    queue: JobQueue
+    stopping: threading.Event = field(default_factory=threading.Event)
 
 
 def open_service(settings: Settings) -> Service:
@@ -71,8 +83,17 @@ def open_service(settings: Settings) -> Service:
     places.make()
     records = Records(places.records)
     shelf, sessions = Shelf(places), Sessions(settings)
-    tap = Tap(settings, places, records, shelf, sessions)
-    return Service(settings, places, records, shelf, JobStore(records), sessions, tap)
+    return Service(
+        settings=settings,
+        places=places,
+        records=records,
+        shelf=shelf,
+        jobs=JobStore(records),
+        sessions=sessions,
+        confined=Confined(settings, places.scratch),
+        tap=Tap(settings, places, records, shelf, sessions),
+        queue=open_queue(settings, places),
+    )
 
 
 def service_of(request: Request) -> Service:

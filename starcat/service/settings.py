@@ -28,12 +28,15 @@ class Settings(BaseModel):
     host: str = Field("127.0.0.1", description="Address to listen at.")
     port: int = Field(8000, ge=0, le=65535, description="Port; 0 for any that is free.")
     public_url: str | None = Field(
-        None, description="Address that others see, where a proxy stands before the service."
+        None,
+        pattern=r"^https?://[^/?#@\s]+/?$",
+        description="Address that others see, where a proxy stands before the service: "
+        "https://HOST[:PORT].",
     )
     anonymous: RoleName | None = Field(
         None,
-        description="What somebody without a token may do; by default read on a loopback address, "
-        "nothing on any other.",
+        description="What somebody without a token may do; by default read on a loopback address "
+        "without a public_url, nothing on any other.",
     )
     workers: int = Field(1, ge=0, le=64, description="Jobs that run at the same time here.")
     queue_url: str | None = Field(
@@ -58,6 +61,7 @@ class Settings(BaseModel):
     )
     keep_jobs_days: float = Field(90.0, gt=0, description="Days that ended jobs are kept.")
     keep_results_days: float = Field(7.0, gt=0, description="Days that results of TAP are kept.")
+    session_hours: float = Field(12.0, gt=0, description="Hours that a sign-in lasts.")
     shutdown_s: float = Field(
         20.0, ge=0, description="Seconds that jobs have to end when the service stops."
     )
@@ -73,9 +77,19 @@ class Settings(BaseModel):
             return False
 
     @property
+    def is_private(self) -> bool:
+        """Whether only this machine is meant to reach it: no proxy stands before it either."""
+        return self.is_loopback and self.public_url is None
+
+    @property
+    def is_secure(self) -> bool:
+        """Whether people reach it by https."""
+        return self.public_url is not None and self.public_url.lower().startswith("https:")
+
+    @property
     def anonymous_role(self) -> RoleName:
         """What somebody without a token may do."""
-        return self.anonymous or ("reader" if self.is_loopback else "none")
+        return self.anonymous or ("reader" if self.is_private else "none")
 
 
 def read_settings(root: Path, **options: object) -> Settings:

@@ -61,8 +61,27 @@ def _write_group(writer: pq.ParquetWriter, rows: pa.Table) -> None:
     writer.write_table(rows.combine_chunks(), row_group_size=ROW_GROUP_ROWS)
 
 
+def parquet_bytes(table: pa.Table) -> int:
+    """Return how large the file of a table will be.
+
+    Parameters
+    ----------
+    table : pyarrow.Table
+        As for `write_parquet`.
+
+    Returns
+    -------
+    int
+        Bytes, to the last one: they are counted and thrown away.
+    """
+    counted = pa.MockOutputStream()
+    with _writer(table, counted) as writer:
+        writer.write_table(table.replace_schema_metadata(None), row_group_size=ROW_GROUP_ROWS)
+    return int(counted.size())
+
+
 @contextmanager
-def _writer(table: pa.Table, path: Path) -> Iterator[pq.ParquetWriter]:
+def _writer(table: pa.Table, path: Path | pa.NativeFile) -> Iterator[pq.ParquetWriter]:
     """Open a file for the rows of a table, and describe its columns in the footer."""
     floating = [field.name for field in table.schema if pa.types.is_floating(field.type)]
     # Names differ in every row: a dictionary of them would be the column again.

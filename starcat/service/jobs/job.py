@@ -130,14 +130,8 @@ class JobStore:
         Job
             Queued.
         """
-        job_id = secrets.token_hex(16)
         with self._records.writing() as connection:
-            connection.execute(
-                "INSERT INTO jobs (id, kind, key, owner, title, state, request, created_s) "
-                "VALUES (?, ?, ?, ?, ?, 'queued', ?, ?)",
-                (job_id, kind, key, owner, title, json.dumps(request), time.time()),
-            )
-            add_event(connection, job_id, "state", {"state": "queued"})
+            job_id = insert_job(connection, kind, request, key=key, title=title, owner=owner)
         return self.get(job_id)
 
     def get(self, job_id: str) -> Job:
@@ -165,27 +159,58 @@ class JobStore:
             raise TargetMissing(f"no job has the id {job_id!r}; the list of them tells theirs")
         return job_of(row)
 
-    def all(self, *, state: State | None = None, most: int = 100) -> list[Job]:
+    def all(
+        self,
+        *,
+        state: State | None = None,
+        kind: Kind | None = None,
+        owner: str | None = None,
+        most: int = 100,
+        skip: int = 0,
+    ) -> list[Job]:
         """Return the jobs, the newest first.
 
         Parameters
         ----------
-        state : str, optional
-            Only those in it.
+        state, kind, owner : str, optional
+            Only those that are so.
         most : int, default 100
             So many at most.
+        skip : int, default 0
+            So many of the newest are left out.
 
         Returns
         -------
         list of Job
             As they are now.
         """
-        where, values = ("WHERE state = ?", [state]) if state else ("", [])
+        where, values = _where(state=state, kind=kind, owner=owner)
         with self._records.reading() as connection:
             rows = connection.execute(
-                f"SELECT * FROM jobs {where} ORDER BY created_s DESC, id LIMIT ?", (*values, most)
+                f"SELECT * FROM jobs {where} ORDER BY created_s DESC, id LIMIT ? OFFSET ?",
+                (*values, most, skip),
             ).fetchall()
         return [job_of(row) for row in rows]
+
+    def count(
+        self, *, state: State | None = None, kind: Kind | None = None, owner: str | None = None
+    ) -> int:
+        """Return how many jobs there are.
+
+        Parameters
+        ----------
+        state, kind, owner : str, optional
+            Only those that are so.
+
+        Returns
+        -------
+        int
+            However many `all` would return.
+        """
+        where, values = _where(state=state, kind=kind, owner=owner)
+        with self._records.reading() as connection:
+            [found] = connection.execute(f"SELECT count(*) FROM jobs {where}", values).fetchone()
+        return int(found)
 
     def events(self, job_id: str, after: int = 0) -> list[Event]:
         """Return what happened to a job.
@@ -210,6 +235,45 @@ class JobStore:
         return [
             Event(row["number"], row["at_s"], row["kind"], json.loads(row["data"])) for row in rows
         ]
+
+
+def _where(**wanted: str | None) -> tuple[str, list[str]]:
+    given = {name: value for name, value in wanted.items() if value is not None}
+    conditions = " AND ".join(f"{name} = ?" for name in given)
+    return (f"WHERE {conditions}" if given else ""), list(given.values())
+
+
+def insert_job(
+    connection: sqlite3.Connection,
+    kind: Kind,
+    request: Mapping[str, Any],
+    *,
+    key: str,
+    title: str,
+    owner: str,
+) -> str:
+    """Remember a new job within a transaction.
+
+    Parameters
+    ----------
+    connection : sqlite3.Connection
+        Within a transaction.
+    kind, request, key, title, owner
+        As `JobStore.add` has them.
+
+    Returns
+    -------
+    str
+        Its id.
+    """
+    job_id = secrets.token_hex(16)
+    connection.execute(
+        "INSERT INTO jobs (id, kind, key, owner, title, state, request, created_s) "
+        "VALUES (?, ?, ?, ?, ?, 'queued', ?, ?)",
+        (job_id, kind, key, owner, title, json.dumps(request), time.time()),
+    )
+    add_event(connection, job_id, "state", {"state": "queued"})
+    return job_id
 
 
 def add_event(

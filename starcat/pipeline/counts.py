@@ -1,0 +1,265 @@
+"""How many rows the products of a build will have, counted around some of the stars.
+
+Neighbours are counted, not found, and the triangles that several fields share are known from some
+of the triangles; so this takes a moment where making the products takes minutes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+
+from starcat.geometry.sphere import chord_from_separation
+from starcat.pipeline.recipes import RECIPES, Ingredients, field_size
+from starcat.products.boresights import FieldStars
+from starcat.products.levels import level_fields, thin_levels
+from starcat.specs.build_spec import BuildSpec
+
+Array = NDArray[np.float64]
+Counts = NDArray[np.int64]
+
+SAMPLE = 2000
+"""Stars around which neighbours are counted, and triangles whose fields are."""
+
+MOST_IN_TREE = 500_000
+"""Of more stars than these, only some are searched for neighbours; so many lose little."""
+
+QUANTILES = 64
+"""Numbers of neighbours that stand for those of all stars, where a pattern's cells are counted."""
+
+GOLDEN_RATIO = 0.5 * (1.0 + 5.0**0.5)
+
+
+@dataclass(frozen=True)
+class Extent:
+    """How large a product will be.
+
+    Attributes
+    ----------
+    rows : float
+        Rows of its table.
+    values : float
+        Entries of its lists, all rows together; 0 where it has none.
+    reached : float
+        Neighbours that are gone through to make it; its rows where these are what it lists.
+    records : float
+        Triangles over all fields, repeats included; 0 for other products.
+    """
+
+    rows: float
+    values: float = 0.0
+    reached: float = 0.0
+    records: float = 0.0
+
+
+def count_products(given: Ingredients) -> dict[str, Extent]:
+    """Count the rows of the products that are made from guide stars alone.
+
+    Parameters
+    ----------
+    given : Ingredients
+        Guide stars, tiling and spec.
+
+    Returns
+    -------
+    dict of str to Extent
+        By product, of those that the spec enables, in the order of the database.
+    """
+    spec, stars = given.spec, len(given.directions)
+    wanted = [name for name in RECIPES if getattr(spec.products, name).enabled]
+    reach = {name: _reach_rad(name, given) for name in wanted if name != "triangles"}
+    inner = {name: _inner_rad(name, spec) for name in reach}
+    near = _neighbours_within(given.directions, {*reach.values(), *inner.values()})
+    found: dict[str, Extent] = {}
+    for name in wanted:
+        if name == "triangles":
+            records, distinct = count_triangles(given.fields, stars, spec.boresights.brightest)
+            found[name] = Extent(distinct, reached=distinct, records=records)
+            continue
+        around = near[reach[name]] - (near[inner[name]] if inner[name] > 0.0 else 0.0)
+        reached = float(stars * near[reach[name]].mean())
+        if name == "grid":
+            side = spec.products.grid.cells_per_side
+            cells = float(_distinct(around, np.full(1, 4.0 / (np.pi * side**2))) * stars)
+            found[name] = Extent(float(stars * (around > 0.0).mean()), cells, reached)
+        elif name == "radial":
+            rings = spec.products.radial.rings
+            share = (2.0 * np.arange(rings) + 1.0) / rings**2
+            found[name] = Extent(float(stars), float(_distinct(around, share) * stars), reached)
+        else:
+            both_ways = 0.5 if name == "pairs" else 1.0
+            rows = float(both_ways * stars * around.mean())
+            found[name] = Extent(rows, reached=both_ways * reached)
+    return found
+
+
+@dataclass(frozen=True)
+class LevelExtent:
+    """How large the product ``levels`` will be.
+
+    Attributes
+    ----------
+    levels : int
+        Its rows.
+    stars : int
+        Stars of all levels.
+    triangles : float
+        Triangles of all levels.
+    records : float
+        The same over all fields, repeats included.
+    """
+
+    levels: int
+    stars: int
+    triangles: float
+    records: float
+
+
+def count_levels(directions: Array, mag: Array, spec: BuildSpec) -> LevelExtent:
+    """Count the stars and the triangles of a range of fields.
+
+    Parameters
+    ----------
+    directions : ndarray of float64, shape (N, 3)
+        Guide stars, ICRS.
+    mag : ndarray of float64, shape (N,)
+        Their magnitudes.
+    spec : BuildSpec
+        Its ``products.levels`` and ``boresights``.
+
+    Returns
+    -------
+    LevelExtent
+        The stars to the last one, the triangles by estimate.
+    """
+    wanted, own = spec.products.levels, field_size(spec)
+    fields = level_fields(own, wanted.widest_fov_x_deg, wanted.max_ratio)
+    stars, triangles, records = 0, 0.0, 0.0
+    for level in thin_levels(
+        directions, mag, own, fields, spec.boresights.count, wanted.stars_per_field
+    ):
+        all_of_them, distinct = count_triangles(
+            level.tiled, len(level.before), spec.boresights.brightest
+        )
+        stars, triangles = stars + len(level.rows), triangles + distinct
+        records += all_of_them
+    return LevelExtent(len(fields), stars, triangles, records)
+
+
+def _reach_rad(name: str, given: Ingredients) -> float:
+    """Return how far apart two stars of a row of a product may be."""
+    wanted = getattr(given.spec.products, name)
+    if name == "pairs":
+        if wanted.max_separation_deg is None:
+            return given.spec.camera.camera().diagonal_rad
+        return float(np.radians(wanted.max_separation_deg))
+    return given.radius_rad(wanted.radius_deg, 4.0 / 3.0 if name == "hausdorff_angular" else 1.0)
+
+
+def _inner_rad(name: str, spec: BuildSpec) -> float:
+    """Return how far apart two stars of a row of a product have to be."""
+    products = spec.products
+    nearest_deg = {"pairs": products.pairs.min_separation_deg, "grid": products.grid.buffer_deg}
+    return float(np.radians(nearest_deg.get(name, 0.0)))
+
+
+def _neighbours_within(directions: Array, radii_rad: set[float]) -> Mapping[float, Array]:
+    """Return the number of neighbours within each radius of some of the stars."""
+    some = directions[:: -(-len(directions) // SAMPLE)]
+    thinning = -(-len(directions) // MOST_IN_TREE)
+    tree = cKDTree(directions[::thinning])
+    # Every star finds itself, in a tree of all of them.
+    return {
+        radius: np.maximum(
+            thinning * tree.query_ball_point(some, _chord(radius), return_length=True) - 1.0, 0.0
+        )
+        for radius in radii_rad
+    }
+
+
+def _chord(radius_rad: float) -> float:
+    return float(chord_from_separation(min(radius_rad, np.pi)))
+
+
+def _distinct(around: Array, share: Array) -> float:
+    """Return how many cells the neighbours of a star occupy in the mean.
+
+    ``share`` is the part of all neighbours that is in each cell; one number stands for as many
+    equal cells as make a whole.
+    """
+    middle = (np.arange(QUANTILES) + 0.5) / QUANTILES
+    count = np.quantile(around, middle)[:, None]
+    weight = np.round(1.0 / share) if len(share) == 1 else 1.0
+    with np.errstate(divide="ignore"):
+        occupied = -np.expm1(count * np.log1p(-np.minimum(share, 1.0)))
+    return float((weight * np.where(count > 0.0, occupied, 0.0)).sum(axis=1).mean())
+
+
+def count_triangles(fields: FieldStars, stars: int, brightest: int) -> tuple[float, float]:
+    """Return the triangles of all fields, and about how many of them are distinct.
+
+    Parameters
+    ----------
+    fields : FieldStars
+        The tiling.
+    stars : int
+        Rows of the star table.
+    brightest : int
+        Stars of a field that make its triangles.
+
+    Returns
+    -------
+    records, distinct : float
+        A triangle that t fields have is counted t times; so the distinct ones are as many as all
+        times the mean of 1 / t.
+    """
+    offsets, star = fields.brightest(brightest)
+    size = np.diff(offsets)
+    each = size * (size - 1) * (size - 2) // 6
+    records = int(each.sum())
+    if not records:
+        return 0.0, 0.0
+    held = np.ones(len(star), dtype=np.int32)
+    of_field = csr_array((held, star, offsets), shape=(len(size), stars))
+    of_star = of_field.T.tocsr()
+    # Multiples of the golden ratio are spread evenly, and never in step with the fields.
+    chosen = (np.arange(min(records, SAMPLE)) * GOLDEN_RATIO % 1.0 * records).astype(np.int64)
+    ends = np.cumsum(each)
+    field = np.searchsorted(ends, chosen, side="right")
+    members = triple_of_rank(chosen - (ends[field] - each[field]))
+    i, j, k = star[offsets[field][:, None] + members].T
+    shared = of_star[i].multiply(of_star[j]).multiply(of_star[k]).sum(axis=1)
+    return float(records), float(records * np.mean(1.0 / np.asarray(shared).ravel()))
+
+
+def triple_of_rank(rank: Counts) -> Counts:
+    """Return three numbers for each rank, each three of them once.
+
+    Parameters
+    ----------
+    rank : ndarray of int64, shape (M,)
+        0 or more.
+
+    Returns
+    -------
+    ndarray of int64, shape (M, 3)
+        Ascending in a row; the ranks below n (n - 1) (n - 2) / 6 have those below n.
+
+    Examples
+    --------
+    >>> triple_of_rank(np.array([0, 1, 3, 4]))
+    array([[0, 1, 2],
+           [0, 1, 3],
+           [1, 2, 3],
+           [0, 1, 4]])
+    """
+    n = np.arange(2 + int(np.ceil((6.0 * (1.0 + rank.max(initial=0))) ** (1.0 / 3.0))) + 1)
+    k = np.searchsorted(n * (n - 1) * (n - 2) // 6, rank, side="right") - 1
+    rest = rank - k * (k - 1) * (k - 2) // 6
+    j = np.searchsorted(n * (n - 1) // 2, rest, side="right") - 1
+    return np.stack([rest - j * (j - 1) // 2, j, k], axis=-1)

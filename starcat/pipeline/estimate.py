@@ -1,0 +1,334 @@
+"""What a spec will give, without building it: guide stars, fields, files, time and memory.
+
+The stars are those of the build, chosen by the same functions from the same tables. What takes
+long is reading the catalogs; it depends on a few keys of the spec only, and its result can be kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+
+import numpy as np
+import pyarrow as pa
+
+from starcat.artifact.writer import Product
+from starcat.catalog.ingest import count_by_reason
+from starcat.catalog.selection import Selected
+from starcat.catalog.verdict import Reason
+from starcat.errors import BuildError
+from starcat.geometry.sphere import saff_kuijlaars
+from starcat.pipeline.build import Inputs
+from starcat.pipeline.cost import Cost, Made, base_memory, check_memory, whole_cost
+from starcat.pipeline.guide_stars import (
+    FIRST_LOOK,
+    MIN_GUIDE_STARS,
+    check_fields,
+    field_share,
+    thinned_stars,
+)
+from starcat.pipeline.motions import motions_of
+from starcat.pipeline.recipes import field_size, tile_guide_stars
+from starcat.pipeline.sizes import table_bytes
+from starcat.pipeline.stars_read import StarsRead, read_stars
+from starcat.products.boresights import FieldStars
+from starcat.products.coverage import (
+    CoverageSummary,
+    TilingGap,
+    field_coverage,
+    summarise_coverage,
+    tiling_gap,
+)
+from starcat.products.levels import boresights_of_level, level_fields
+from starcat.progress import Progress, no_progress
+from starcat.report.coverage_report import holes_warning
+from starcat.specs.build_spec import BuildSpec, Selection
+
+MOST_FIELD_STARS = 4_000_000
+"""Stars of all fields of a tiling that an estimate goes through at the most, and of all levels."""
+
+MOST_FOR_GAPS = 50_000
+"""Of more boresights than these the widest gap is not looked for."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The guide stars of a spec and their fields.
+
+    Attributes
+    ----------
+    selected : Selected
+        Guide stars, and of the others those that were bright enough to be looked at.
+    fields : FieldStars
+        The tiling of the guide stars.
+    rejected : dict of str to int
+        All records that are no guide stars, by reason.
+    """
+
+    selected: Selected
+    fields: FieldStars
+    rejected: Mapping[str, int]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that it takes."""
+        tables = (self.selected.guide_stars, self.selected.rejected)
+        arrays = (self.fields.boresights, self.fields.offsets, self.fields.star_index)
+        steps = (step.directions for step in self.selected.steps)
+        return int(sum(each.nbytes for each in (*tables, *arrays, *steps)))
+
+
+def choose_stars(read: StarsRead, spec: BuildSpec) -> Choice:
+    """Choose the guide stars of a spec, as its build does.
+
+    Parameters
+    ----------
+    read : StarsRead
+        The catalogs of the spec.
+    spec : BuildSpec
+        Limits, rules and the tiling.
+
+    Returns
+    -------
+    Choice
+        The same guide stars as in the build, to the last bit; a field may have too few of them.
+
+    Raises
+    ------
+    BuildError
+        If too few stars are left, or the tiling is larger than an estimate goes through.
+    """
+    order, mag = read.by_brightness
+    bright = np.sort(order[: np.searchsorted(mag, _faintest(spec.selection), side="right")])
+    stars = read.stars.take(pa.array(bright)).combine_chunks()
+    most = spec.selection.max_stars_per_field
+    _check_tiling(len(stars), spec, most)
+    selected = thinned_stars(stars, spec)
+    _check_tiling(len(selected.guide_stars), spec, None)
+    _check_levels(len(selected.guide_stars), spec)
+    fields = tile_guide_stars(selected.guide_stars, spec)
+    blank = len(mag) - int(np.searchsorted(mag, np.inf))
+    found = dict.fromkeys((reason.name for reason in Reason), 0)
+    for counts in (
+        read.rejected,
+        count_by_reason(selected.rejected),
+        {
+            Reason.no_magnitude.name: blank,
+            Reason.too_faint.name: len(mag) - len(bright) - blank,
+        },
+    ):
+        for name, count in counts.items():
+            found[name] += count
+    return Choice(selected, fields, {name: count for name, count in found.items() if count})
+
+
+def _faintest(selection: Selection) -> float:
+    """Return the magnitude beyond which a star is too faint, and nobody's companion."""
+    companions = selection.doubles.companion_limit_mag
+    return max(selection.faint_limit_mag, -np.inf if companions is None else companions)
+
+
+def _check_tiling(stars: int, spec: BuildSpec, most: int | None) -> None:
+    """Check that the fields of a tiling have not more stars than an estimate goes through."""
+    in_field = stars * field_share(spec)
+    if most is not None:
+        in_field = min(in_field, FIRST_LOOK * most)
+    found = spec.boresights.count * in_field
+    if found > MOST_FIELD_STARS:
+        raise BuildError(
+            f"{spec.name}: the {spec.boresights.count:,} fields of the tiling have about "
+            f"{found:,.0f} stars in all, more than the {MOST_FIELD_STARS:,} that an estimate goes "
+            "through; a smaller boresights.count, or fewer stars "
+            "(selection.max_stars_per_field, a brighter faint_limit_mag), and it is there"
+        )
+
+
+def _check_levels(stars: int, spec: BuildSpec) -> None:
+    """Check the same of the levels of a range of fields, each with as many stars as it may have."""
+    wanted, own = spec.products.levels, field_size(spec)
+    if not wanted.enabled:
+        return
+    found, boresights, left = 0.0, 0, float(stars)
+    for level in level_fields(own, wanted.widest_fov_x_deg, wanted.max_ratio):
+        count = boresights_of_level(spec.boresights.count, own, level)
+        found += count * left * level.fov_x_deg * level.fov_y_deg / 41_253.0 * 1.6
+        left = min(left, float(count * wanted.stars_per_field))
+        boresights += count
+    if max(found, boresights) > MOST_FIELD_STARS:
+        raise BuildError(
+            f"{spec.name}: the {boresights:,} fields of all levels may have {found:,.0f} stars, "
+            f"more than the {MOST_FIELD_STARS:,} that an estimate goes through; a smaller "
+            "boresights.count or products.levels.stars_per_field, or a larger "
+            "products.levels.max_ratio, and it is there"
+        )
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a spec will give.
+
+    Attributes
+    ----------
+    spec : BuildSpec
+        The spec.
+    cost : Cost
+        Rows, files, memory, and the time after reading.
+    read_seconds : float
+        Time to read the catalogs.
+    fields : FieldStars
+        The tiling of the guide stars.
+    coverage : CoverageSummary
+        How stars are spread over the fields.
+    enough_share, full_share : float
+        Shares of the fields with at least `MIN_GUIDE_STARS` stars, and with as many as the list
+        of a field is long.
+    filters : tuple of (str, int)
+        The stars that each filter leaves.
+    rejected : mapping of str to int
+        All other records, by reason.
+    refusals : tuple of str
+        Why the build will be refused; empty where it will not.
+    warnings : tuple of str
+        What is worth a second look.
+    """
+
+    spec: BuildSpec
+    cost: Cost
+    read_seconds: float
+    fields: FieldStars
+    coverage: CoverageSummary
+    enough_share: float
+    full_share: float
+    filters: tuple[tuple[str, int], ...]
+    rejected: Mapping[str, int]
+    refusals: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def build_seconds(self) -> float:
+        """Time of the whole build."""
+        return self.cost.seconds + self.read_seconds
+
+    @property
+    def total_bytes(self) -> int:
+        """Size of the artifact."""
+        return sum(self.cost.files.values())
+
+
+def estimate(
+    read: StarsRead, choice: Choice, spec: BuildSpec, max_memory_bytes: int | None = None
+) -> Estimate:
+    """Estimate what a spec will give.
+
+    Parameters
+    ----------
+    read : StarsRead
+        The catalogs of the spec.
+    choice : Choice
+        Its guide stars.
+    spec : BuildSpec
+        The spec.
+    max_memory_bytes : int, optional
+        What a build may take; by default what this machine has left.
+
+    Returns
+    -------
+    Estimate
+        The same for the same input, but for what ``refusals`` says of memory.
+    """
+    guide_stars, fields = choice.selected.guide_stars, choice.fields
+    made = Made(
+        guide_stars,
+        fields,
+        spec,
+        _rejected_bytes(read, choice),
+        _motion_product(read, guide_stars),
+        base_memory(read.held_bytes),
+    )
+    cost = whole_cost(made)
+    refusals = []
+    for check in (
+        partial(check_fields, fields, spec),
+        partial(check_memory, cost, spec, max_memory_bytes),
+    ):
+        try:
+            check()
+        except BuildError as error:
+            refusals.append(str(error))
+    count = fields.count
+    gap = _gap(spec)
+    return Estimate(
+        spec,
+        cost,
+        read.seconds,
+        fields,
+        summarise_coverage(field_coverage(fields, spec.boresights.brightest)),
+        float((count >= MIN_GUIDE_STARS).mean()),
+        float((count >= spec.boresights.brightest).mean()),
+        tuple((step.name, len(step.directions)) for step in choice.selected.steps),
+        choice.rejected,
+        tuple(refusals),
+        (*read.notes, *filter(None, [None if gap is None else holes_warning(gap)])),
+    )
+
+
+def _rejected_bytes(read: StarsRead, choice: Choice) -> int:
+    """Return the size of the file of rejected records, of which only some are at hand."""
+    seen = choice.selected.rejected
+    unseen = len(read.stars) - len(choice.selected.guide_stars) - len(seen)
+    more = unseen * read.faint_bytes + read.rejected_rows * read.rejected_bytes
+    return round(table_bytes(seen) + more)
+
+
+def _motion_product(read: StarsRead, guide_stars: pa.Table) -> Sequence[Product]:
+    if read.motions is None:
+        return ()
+    return (motions_of(read.stars, read.motions, guide_stars),)
+
+
+def _gap(spec: BuildSpec) -> TilingGap | None:
+    """Return the widest gap of a tiling that is not too large to look for it."""
+    if spec.boresights.count > MOST_FOR_GAPS:
+        return None
+    size = field_size(spec)
+    radius = 0.5 * float(np.radians(min(size.fov_x_deg, size.fov_y_deg)))
+    return replace(_widest_gap(spec.boresights.count), tile_radius_rad=radius)
+
+
+@lru_cache
+def _widest_gap(boresights: int) -> TilingGap:
+    return tiling_gap(saff_kuijlaars(boresights), 0.0)
+
+
+def estimate_spec(
+    spec: BuildSpec,
+    inputs: Inputs,
+    workers: int = 2,
+    progress: Progress = no_progress,
+) -> Estimate:
+    """Read the catalogs of a spec and estimate what it will give.
+
+    Parameters
+    ----------
+    spec : BuildSpec
+        The spec.
+    inputs : mapping of str to sequence of Path
+        Inputs, as `starcat.pipeline.build.build` takes them.
+    workers : int, default 2
+        Threads; the result is the same for any number.
+    progress : Progress
+        Passed on.
+
+    Returns
+    -------
+    Estimate
+        What its build will give.
+
+    Raises
+    ------
+    ConfigError, SourceError, BuildError
+        If the spec or an input cannot be used, too few stars are left, or the tiling is too large.
+    """
+    read = read_stars(spec, inputs, workers, progress)
+    return estimate(read, choose_stars(read, spec), spec)

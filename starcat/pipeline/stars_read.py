@@ -1,0 +1,165 @@
+"""The catalogs of a spec, read as its build reads them, to be kept for many estimates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from starcat.catalog.blocks import reject_rows
+from starcat.catalog.stars import floats_of
+from starcat.catalog.verdict import Reason
+from starcat.pipeline.build import Inputs, join_all, read_sources
+from starcat.pipeline.motions import join_motions
+from starcat.pipeline.sizes import table_bytes
+from starcat.progress import Progress, no_progress
+from starcat.specs.build_spec import BuildSpec
+
+SECONDS_PER_RECORD = 4.5e-6
+"""Time to read a record of a catalog and to place it."""
+
+SAMPLE_ROWS = 8192
+"""Rejected records whose size is measured."""
+
+
+@dataclass(frozen=True)
+class StarsRead:
+    """The catalogs of a spec, read: what every estimate with the same ones starts from.
+
+    Attributes
+    ----------
+    stars : pyarrow.Table
+        Star table (schema ``stars``) with motions and amplitudes joined, by star_id.
+    motions : pyarrow.Table, optional
+        Where the motions are from (schema ``motions``), a row a star.
+    rejected : dict of str to int
+        Records that reading rejected, by reason.
+    rejected_rows : int
+        Those of them that the product ``rejected`` lists.
+    rejected_bytes, faint_bytes : float
+        Bytes that one of them takes in its file, and one that the selection finds too faint.
+    held_bytes : int
+        Memory that the tables of the catalog take.
+    records : int
+        Records in all files of the star catalog.
+    notes : tuple of str
+        What a user should know of the inputs.
+    """
+
+    stars: pa.Table
+    motions: pa.Table | None
+    rejected: Mapping[str, int]
+    rejected_rows: int
+    rejected_bytes: float
+    faint_bytes: float
+    held_bytes: int
+    records: int
+    notes: tuple[str, ...]
+
+    @cached_property
+    def by_brightness(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Rows in order of magnitude, those without one at the end, and the magnitudes."""
+        mag = floats_of(self.stars, "mag")
+        order = np.argsort(mag, kind="stable")
+        return order, mag[order]
+
+    @property
+    def magnitudes(self) -> tuple[float, float] | None:
+        """The brightest and the faintest magnitude; None where no star has one."""
+        mag = self.by_brightness[1]
+        known = int(np.searchsorted(mag, np.inf))
+        return (float(mag[0]), float(mag[known - 1])) if known else None
+
+    @property
+    def seconds(self) -> float:
+        """Time that reading takes: by estimate, the same on every machine."""
+        return SECONDS_PER_RECORD * self.records
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that it takes."""
+        motions = 0 if self.motions is None else self.motions.nbytes
+        return int(self.stars.nbytes + motions + 16 * len(self.stars))
+
+
+def read_stars(
+    spec: BuildSpec,
+    inputs: Inputs,
+    workers: int = 2,
+    progress: Progress = no_progress,
+) -> StarsRead:
+    """Read the catalogs of a spec, as its build does.
+
+    Parameters
+    ----------
+    spec : BuildSpec
+        Which sources, and the epoch.
+    inputs : mapping of str to sequence of Path
+        Inputs, as `starcat.pipeline.build.build` takes them.
+    workers : int, default 2
+        Threads; the result is the same for any number.
+    progress : Progress
+        Passed on.
+
+    Returns
+    -------
+    StarsRead
+        Which depends on no more of the spec than `what_is_read` has.
+
+    Raises
+    ------
+    ConfigError, SourceError
+        If the spec or an input cannot be used.
+    """
+    catalog, amplitudes = read_sources(spec, inputs, workers, progress)
+    joined = join_motions(catalog, spec, inputs, workers, progress)
+    stars, _ = join_all(joined.catalog.stars, amplitudes)
+    catalog = joined.catalog
+    middle = stars.slice(max(0, (len(stars) - SAMPLE_ROWS) // 2), SAMPLE_ROWS)
+    faint = reject_rows(middle, pa.repeat(Reason.too_faint.name, len(middle)))
+    return StarsRead(
+        stars.combine_chunks(),
+        joined.table,
+        catalog.rejected_by_reason,
+        len(catalog.rejected),
+        _bytes_of_a_row(catalog.rejected.slice(0, SAMPLE_ROWS)),
+        _bytes_of_a_row(faint),
+        catalog.stars.nbytes + catalog.rejected.nbytes,
+        catalog.rows_read,
+        catalog.notes,
+    )
+
+
+def what_is_read(spec: BuildSpec) -> dict[str, Any]:
+    """Return all of a spec that reading its catalogs depends on.
+
+    Parameters
+    ----------
+    spec : BuildSpec
+        Any.
+
+    Returns
+    -------
+    dict
+        As JSON has it.
+    """
+    content = spec.model_dump(mode="json")
+    wanted = {
+        "catalog": content["catalog"],
+        "epoch_jyear": content["epoch_jyear"],
+        "join": content["selection"]["variables"]["join"],
+    }
+    if spec.catalog.motions:
+        model = content["products"]["crossmatch"]
+        wanted["model"] = {key: model[key] for key in model if key not in ("enabled", "catalogs")}
+    return wanted
+
+
+def _bytes_of_a_row(table: pa.Table) -> float:
+    empty = table_bytes(table.slice(0, 0))
+    return (table_bytes(table) - empty) / max(1, len(table))

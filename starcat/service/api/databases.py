@@ -1,0 +1,215 @@
+"""Databases: what there is, what they hold, their files."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Query, Request
+from fastapi.responses import JSONResponse, Response, StreamingResponse
+
+from starcat.artifact.manifest import MANIFEST_NAME
+from starcat.errors import TargetMissing
+from starcat.releases.tree import Blob, files_of
+from starcat.service.access import Publisher, Reader
+from starcat.service.api.database_models import (
+    CoverageAnswer,
+    DatabaseFacts,
+    DatabaseFile,
+    Databases,
+    facts_of,
+)
+from starcat.service.archive import archive_bytes, archive_chunks
+from starcat.service.file_answers import REVALIDATED, file_answer, has_already, type_of
+from starcat.service.problems import Problem
+from starcat.service.removal import remove_database
+from starcat.service.service import Service, TheService
+from starcat.service.shelf import Database
+from starcat.storage.digests import file_sha256
+
+router = APIRouter(prefix="/databases", tags=["databases"])
+
+DatabaseId = Annotated[
+    str, Path(description="Sixteen hexadecimal digits.", examples=["0123456789abcdef"])
+]
+
+REPORT, COVERAGE, FIELDS = "report/report.json", "report/coverage.json", "report/coverage.csv"
+
+FILE: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"application/octet-stream": {}}, "description": "The file."},
+    206: {"description": "The range that was asked for."},
+    304: {"description": "The same as you have (``If-None-Match``)."},
+    416: {"description": "The range lies outside of the file."},
+}
+SAME: dict[int | str, dict[str, Any]] = {304: FILE[304]}
+
+
+@router.get("", summary="All databases")
+def all_databases(service: TheService, reader: Reader) -> Databases:
+    """Return what databases there are, by name and version."""
+    return Databases(databases=[facts_of(one) for one in service.shelf.databases()])
+
+
+@router.get("/{database}", summary="One database")
+def one_database(database: DatabaseId, service: TheService, reader: Reader) -> DatabaseFacts:
+    """Return what a database was made from, and what it holds."""
+    return facts_of(service.shelf.database(database))
+
+
+@router.get("/{database}/manifest", summary="Manifest", responses=SAME)
+def manifest(
+    database: DatabaseId, request: Request, service: TheService, reader: Reader
+) -> Response:
+    """Return the manifest as its file has it; its SHA-256 is the ETag."""
+    path = service.shelf.database(database).folder / MANIFEST_NAME
+    return file_answer(
+        *(request, path, file_sha256(path)), file_name=MANIFEST_NAME, cache=REVALIDATED
+    )
+
+
+@router.get("/{database}/report", summary="Report", responses=SAME)
+def report(database: DatabaseId, request: Request, service: TheService, reader: Reader) -> Response:
+    """Return the report of the build: counts, coverage, magnitudes, rates of the self-test."""
+    return _file(service, database, REPORT, request, REVALIDATED)
+
+
+@router.get("/{database}/coverage", summary="Coverage", response_model=CoverageAnswer)
+def coverage(
+    database: DatabaseId, request: Request, service: TheService, reader: Reader
+) -> Response:
+    """Return stars, pairs and triangles by field, and their summary."""
+    found = service.shelf.database(database)
+    digest = _listed(found, FIELDS).sha256
+    headers = {"ETag": f'"{digest}"', "Cache-Control": REVALIDATED}
+    if has_already(request, digest):
+        return Response(status_code=304, headers=headers)
+    summary = json.loads((found.folder / COVERAGE).read_bytes())
+    names, *lines = (found.folder / FIELDS).read_text("ascii").splitlines()
+    columns = zip(*(map(json.loads, line.split(",")) for line in lines), strict=True)
+    fields = dict(zip(names.split(","), columns, strict=True))
+    return JSONResponse({"summary": summary, "fields": fields}, headers=headers)
+
+
+@router.get("/{database}/diff/{other}", summary="Difference of two databases")
+async def difference(
+    database: DatabaseId,
+    other: DatabaseId,
+    service: TheService,
+    reader: Reader,
+    most: Annotated[
+        int, Query(ge=0, le=10_000, description="Stars of each kind to list at most.")
+    ] = 1000,
+) -> dict[str, Any]:
+    """Return what differs: spec, sources, software, stars and why, products.
+
+    ``counts`` says how many stars came, went and moved, however many are listed.
+    """
+    return await service.sessions.run(_difference, service, database, other, most)
+
+
+def _difference(service: Service, one: str, other: str, most: int) -> dict[str, Any]:
+    from starcat.artifact.diff import diff_artifacts
+    from starcat.artifact.reader import open_artifact
+
+    a, b = (open_artifact(service.shelf.database(name).folder) for name in (one, other))
+    content = diff_artifacts(a, b).as_dict()
+    stars = ("came", "went", "moved")
+    counts = {name: len(content[name]) for name in stars}
+    return {**content, **{name: content[name][:most] for name in stars}, "counts": counts}
+
+
+@router.get("/{database}/files", summary="Files")
+def files(database: DatabaseId, service: TheService, reader: Reader) -> list[DatabaseFile]:
+    """Return the files of a database with sizes and digests, the manifest first."""
+    found = service.shelf.database(database)
+    return [
+        DatabaseFile(path=name, content_type=type_of(name), **blob.model_dump())
+        for name, blob in listed_files(found).items()
+    ]
+
+
+@router.get("/{database}/files/{path:path}", summary="A file", responses=FILE)
+def file(
+    database: DatabaseId,
+    path: Annotated[str, Path(examples=["stars.parquet"])],
+    request: Request,
+    service: TheService,
+    reader: Reader,
+) -> Response:
+    """Return a file that the manifest lists, or a range of it; its SHA-256 is the ETag."""
+    return _file(service, database, path, request)
+
+
+router.head("/{database}/files/{path:path}", include_in_schema=False)(file)
+
+
+@router.get(
+    "/{database}/archive",
+    summary="All files in one",
+    response_class=StreamingResponse,
+    responses={200: {"content": {"application/x-tar": {}}, "description": "A tar archive."}},
+)
+def archive(database: DatabaseId, service: TheService, reader: Reader) -> StreamingResponse:
+    """Return the folder of a database as a tar archive, the same bytes each time."""
+    found = service.shelf.database(database)
+    contents = listed_files(found)
+    return StreamingResponse(
+        archive_chunks(found.folder, contents),
+        media_type="application/x-tar",
+        headers={
+            "Content-Length": str(archive_bytes(found.folder.name, contents)),
+            "Content-Disposition": f'attachment; filename="{found.title}.tar"',
+        },
+    )
+
+
+@router.delete("/{database}", status_code=204, summary="Remove a database")
+def remove(database: DatabaseId, service: TheService, publisher: Publisher) -> None:
+    """Remove a database from the shelf; what was published of it stays published."""
+    remove_database(service, database)
+
+
+def listed_files(database: Database) -> dict[str, Blob]:
+    """Return the files of a database.
+
+    Parameters
+    ----------
+    database : Database
+        The database.
+
+    Returns
+    -------
+    dict of str to Blob
+        By path within its folder, none of which leads out of it; the manifest first.
+
+    Raises
+    ------
+    ProductError
+        If the manifest lists what is no plain path.
+    """
+    path = database.folder / MANIFEST_NAME
+    itself = Blob(sha256=file_sha256(path), bytes=path.stat().st_size)
+    return {MANIFEST_NAME: itself, **files_of(database.manifest, database.title)}
+
+
+def _listed(database: Database, name: str) -> Blob:
+    """Return what the manifest says of a file."""
+    found = listed_files(database).get(name)
+    if found is None:
+        raise TargetMissing(
+            f"{database.title} has no file {name[:80]!r}; "
+            f"/api/v1/databases/{database.id}/files lists what it has"
+        )
+    return found
+
+
+def _file(
+    service: Service, database: str, name: str, request: Request, cache: str | None = None
+) -> Response:
+    found = service.shelf.database(database)
+    blob = _listed(found, name)
+    path = found.folder / name
+    if path.is_symlink() or not path.resolve().is_relative_to(found.folder.resolve()):
+        raise Problem(404, f"{found.title} has no file {name[:80]!r}")
+    options = {} if cache is None else {"cache": cache}
+    return file_answer(request, path, blob.sha256, file_name=path.name, **options)

@@ -1,0 +1,152 @@
+"""Releases: what was published, and publishing."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Path, Response
+from pydantic import BaseModel, ConfigDict, Field
+
+from starcat.errors import TargetMissing
+from starcat.releases.publishing import publish_artifact, recorded
+from starcat.releases.tree import Listed
+from starcat.service.access import Publisher, Reader
+from starcat.service.publications import Publication, Publications
+from starcat.service.service import Service, TheService
+
+router = APIRouter(prefix="/releases", tags=["releases"])
+
+MAX_NOTE = 4000
+
+
+class ReleaseFacts(BaseModel):
+    """A release."""
+
+    name: str = Field(examples=["gaia-12deg"])
+    version: str = Field(examples=["1.0.0"])
+    title: str = Field(examples=["gaia-12deg-1.0.0"])
+    manifest_sha256: str = Field(description="Digest of the file ``manifest.json``.")
+    files: int = Field(description="How many files it has.")
+    bytes: int = Field(description="Their sizes together.")
+    database: str | None = Field(None, description="Id of the database that it was.")
+    note: str | None = Field(None, description="What was said about it.")
+    owner: str | None = Field(None, description="Who published it.")
+    published_s: float | None = Field(None, description="When; seconds since 1970.")
+    pull: str = Field(
+        description="What to run to get it, with the address of the service before the path.",
+        examples=["starcat pull gaia-12deg@1.0.0 --registry http://127.0.0.1:8000/registry"],
+    )
+
+
+class Releases(BaseModel):
+    """All releases."""
+
+    releases: list[ReleaseFacts]
+
+
+class ToPublish(BaseModel):
+    """What is to be published."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [{"database": "0123456789abcdef", "note": "For the flight of June."}]
+        },
+    )
+
+    database: str = Field(description="Id of the database.")
+    note: str = Field("", max_length=MAX_NOTE, description="What is to be known about it.")
+
+
+class PublishedRelease(ReleaseFacts):
+    """What became of a publication."""
+
+    outcome: Literal["published", "unchanged"] = Field(
+        description="``unchanged`` where it was there with the same content."
+    )
+    new_blobs: int = Field(description="Content that the registry did not have.")
+    new_bytes: int = Field(description="Its size.")
+
+
+@router.get("", summary="All releases")
+def all_releases(service: TheService, reader: Reader) -> Releases:
+    """Return all releases, by name and then by version."""
+    known = Publications(service.records).all()
+    return Releases(releases=[_facts(service, one, known) for one in _listed(service)])
+
+
+@router.get("/{name}/{version}", summary="One release")
+def one_release(
+    name: Annotated[str, Path(examples=["gaia-12deg"])],
+    version: Annotated[str, Path(examples=["1.0.0"])],
+    service: TheService,
+    reader: Reader,
+) -> ReleaseFacts:
+    """Return what is known of a release."""
+    for one in _listed(service):
+        if (one.name, one.version) == (name, version):
+            return _facts(service, one, Publications(service.records).all())
+    raise TargetMissing(
+        f"no release {name[:80]!r} {version[:80]!r}; /api/v1/releases lists what there is"
+    )
+
+
+@router.post(
+    "",
+    summary="Publish a database",
+    status_code=201,
+    responses={200: {"model": PublishedRelease, "description": "It was there already."}},
+)
+def publish(
+    wanted: ToPublish, response: Response, service: TheService, publisher: Publisher
+) -> PublishedRelease:
+    """Check a database and put it into the registry, where it will never change.
+
+    The same again is answered with 200; a version that is there with another content is refused
+    with 409.
+    """
+    answer = _publish(service, wanted, publisher.name)
+    response.status_code = 201 if answer.outcome == "published" else 200
+    return answer
+
+
+def _publish(service: Service, wanted: ToPublish, owner: str) -> PublishedRelease:
+    database = service.shelf.database(wanted.database)
+    published = publish_artifact(database.folder, str(service.places.registry))
+    publications = Publications(service.records)
+    publications.add(published, database.id, wanted.note, owner)
+    facts = _facts(service, published.release, publications.all())
+    return PublishedRelease(
+        **facts.model_dump(),
+        outcome=published.outcome,
+        new_blobs=published.new_blobs,
+        new_bytes=published.new_bytes,
+    )
+
+
+def _listed(service: Service) -> list[Listed]:
+    """Return the releases by their own files: one that was just published is among them."""
+    root = service.places.registry
+    return recorded(root) if root.is_dir() else []
+
+
+def _facts(
+    service: Service, release: Listed, known: dict[tuple[str, str], Publication]
+) -> ReleaseFacts:
+    told = known.get((release.name, release.version))
+    settings = service.settings
+    address = settings.public_url or f"http://{settings.host}:{settings.port}"
+    return ReleaseFacts(
+        name=release.name,
+        version=release.version,
+        title=release.title,
+        manifest_sha256=release.manifest.sha256,
+        files=release.files,
+        bytes=release.bytes,
+        database=told.database if told else None,
+        note=told.note if told else None,
+        owner=told.owner if told else None,
+        published_s=told.published_s if told else None,
+        pull=f"starcat pull {release.name}@{release.version} --registry "
+        f"{address.rstrip('/')}/registry",
+    )

@@ -1,0 +1,166 @@
+"""Files as answers: with their digest as ETag, and a range of them where one is asked for.
+
+Starlette sends the bytes. What a request asks for is decided here: a range that cannot be
+understood, or several at once, is the whole file, as RFC 9110 has it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+
+from fastapi import Request
+from fastapi.responses import FileResponse, Response
+from starlette.types import Receive, Scope, Send
+
+from starcat.errors import TargetMissing
+from starcat.service.problems import Problem
+
+IMMUTABLE = "private, max-age=31536000, immutable"
+"""What lies under its digest never changes."""
+
+REVALIDATED = "private, no-cache"
+"""What may change is asked for anew each time, and not sent again where it did not."""
+
+TYPES = {
+    ".parquet": "application/vnd.apache.parquet",
+    ".h5": "application/x-hdf5",
+    ".json": "application/json",
+    ".csv": "text/csv; charset=utf-8",
+    ".html": "text/html; charset=utf-8",
+    ".svg": "image/svg+xml",
+    ".png": "image/png",
+    ".fits": "application/fits",
+    ".vot": "application/x-votable+xml",
+    ".ecsv": "text/plain; charset=utf-8",
+    ".toml": "application/toml",
+}
+"""Content types by suffix; all else are bytes."""
+
+_RANGE = re.compile(r"\s*bytes\s*=\s*([0-9]{0,18})-([0-9]{0,18})\s*", re.IGNORECASE | re.ASCII)
+
+
+class _Part(FileResponse):
+    """A file of which a range is sent only where this module allowed one."""
+
+    may_be_part = False
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the file."""
+        if not self.may_be_part:
+            headers = [(name, value) for name, value in scope["headers"] if name != b"range"]
+            scope = {**scope, "headers": headers}
+        await super().__call__(scope, receive, send)
+
+
+def file_answer(
+    request: Request,
+    path: Path,
+    sha256: str,
+    *,
+    file_name: str,
+    cache: str = IMMUTABLE,
+    content_type: str | None = None,
+) -> Response:
+    """Answer with a file.
+
+    Parameters
+    ----------
+    request : Request
+        With what it says of ranges and of what it has already.
+    path : Path
+        The file; checked by who calls, never what a request says.
+    sha256 : str
+        Digest of the content, which is its ETag.
+    file_name : str
+        What it is saved as.
+    cache : str
+        ``Cache-Control``.
+    content_type : str, optional
+        By default what the suffix says.
+
+    Returns
+    -------
+    Response
+        200, 206 or 304.
+
+    Raises
+    ------
+    TargetMissing
+        If the file is not there.
+    Problem
+        With status 416, if the range lies outside of the file.
+    """
+    try:
+        found = path.stat()
+    except OSError:
+        raise TargetMissing(f"{file_name} is not there any more; look at the list again") from None
+    headers = {"ETag": f'"{sha256}"', "Cache-Control": cache}
+    if has_already(request, sha256):
+        return Response(status_code=304, headers=headers)
+    kind = content_type or type_of(file_name)
+    answer = _Part(path, headers=headers, media_type=kind, filename=file_name, stat_result=found)
+    answer.may_be_part = _wants_part(request, found.st_size, answer.headers)
+    return answer
+
+
+def has_already(request: Request, sha256: str) -> bool:
+    """Return whether who asks has the same content already.
+
+    Parameters
+    ----------
+    request : Request
+        With ``If-None-Match``, or without.
+    sha256 : str
+        Digest of the content.
+
+    Returns
+    -------
+    bool
+        Whether 304 is the answer.
+    """
+    given = request.headers.get("if-none-match", "")
+    tags = [tag.strip().removeprefix("W/") for tag in given.split(",")]
+    return "*" in tags or f'"{sha256}"' in tags
+
+
+def type_of(file_name: str) -> str:
+    """Return the content type of a file.
+
+    Parameters
+    ----------
+    file_name : str
+        With its suffix.
+
+    Returns
+    -------
+    str
+        Bytes where the suffix is unknown.
+
+    Examples
+    --------
+    >>> type_of("stars.parquet")
+    'application/vnd.apache.parquet'
+    """
+    return TYPES.get(PurePosixPath(file_name).suffix.lower(), "application/octet-stream")
+
+
+def _wants_part(request: Request, size: int, headers: Mapping[str, str]) -> bool:
+    """Return whether a range is to be sent; refuse one that lies outside of the file."""
+    found = _RANGE.fullmatch(request.headers.get("range", ""))
+    if request.method != "GET" or found is None or found[1] == found[2] == "":
+        return False
+    known = request.headers.get("if-range")
+    if known is not None and known not in (headers["etag"], headers["last-modified"]):
+        return False
+    start = int(found[1]) if found[1] else max(size - int(found[2]), 0)
+    if found[1] and found[2] and int(found[2]) < start:
+        return False
+    if start >= size:
+        raise Problem(
+            416,
+            f"the range begins at byte {start:,}, and the file has {size:,}; ask for less",
+            headers={"Content-Range": f"bytes */{size}"},
+        )
+    return True

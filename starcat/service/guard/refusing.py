@@ -1,0 +1,35 @@
+"""How a guard refuses a request before any handler sees it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from starlette.requests import HTTPConnection
+from starlette.types import Receive, Scope, Send
+
+from starcat.service.problems import Problem, problem_of, problem_response
+
+
+async def refuse(scope: Scope, receive: Receive, send: Send, problem: Problem) -> None:
+    """Answer a request with what is wrong with it.
+
+    Parameters
+    ----------
+    scope, receive, send
+        Of the request.
+    problem : Problem
+        What is wrong.
+    """
+    await problem_response(problem_of(problem), problem.headers)(scope, receive, send)
+
+
+def later(wait_s: float) -> Mapping[str, str]:
+    """Return the header that says after how many seconds to ask again, at least one."""
+    return {"Retry-After": str(max(1, math.ceil(wait_s)))}
+
+
+def address_of(scope: Scope) -> str:
+    """Return the address that a request came from, as far as the server knows it."""
+    client = HTTPConnection(scope).client
+    return client.host if client is not None else "unknown"

@@ -1,0 +1,225 @@
+"""Tokens: who may do what, until when. Their text is shown once and kept only as a digest.
+
+A token is 256 random bits, so its SHA-256 digest cannot be turned back by trying: a slow hash, as
+passwords need it, would protect nothing more and cost a tenth of a second of each first request.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import secrets
+import sqlite3
+import time
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+from starcat.errors import ConfigError, TargetMissing
+from starcat.service.access import Role
+from starcat.service.records import Records
+
+PREFIX = "starcat_"
+"""Beginning of every token, for people and for scanners of leaked secrets."""
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
+RESERVED = ("anonymous",)
+DAY_S = 86_400.0
+
+
+@dataclass(frozen=True)
+class Token:
+    """What is remembered of a token.
+
+    Attributes
+    ----------
+    id : str
+        Eight hexadecimal digits.
+    name : str
+        Of who has it.
+    role : Role
+        What they may do.
+    created_s, expires_s, revoked_s : float
+        Seconds since 1970; the last two None where it does not expire, or was not revoked.
+    """
+
+    id: str
+    name: str
+    role: Role
+    created_s: float
+    expires_s: float | None
+    revoked_s: float | None
+
+    def state(self, now_s: float) -> str:
+        """Return whether it is ``valid``, ``expired`` or ``revoked`` at a time."""
+        if self.revoked_s is not None:
+            return "revoked"
+        return "expired" if self.expires_s is not None and self.expires_s <= now_s else "valid"
+
+    def as_dict(self) -> dict[str, str | None]:
+        """Return what is printed of it, with times as ISO 8601 has them."""
+        return {
+            "id": self.id,
+            "name": self.name,
+            "role": self.role.name.lower(),
+            "state": self.state(time.time()),
+            "created": _date(self.created_s),
+            "expires": _date(self.expires_s),
+            "revoked": _date(self.revoked_s),
+        }
+
+
+class TokenStore:
+    """The tokens of a service.
+
+    Parameters
+    ----------
+    records : Records
+        Where they are kept.
+    """
+
+    def __init__(self, records: Records) -> None:
+        self._records = records
+
+    def create(self, name: str, role: Role, expires_days: float | None = None) -> tuple[Token, str]:
+        """Make a token.
+
+        Parameters
+        ----------
+        name : str
+            Of who gets it: letters, digits and ``._@-``.
+        role : Role
+            What they may do.
+        expires_days : float, optional
+            Days that it is valid; without, until it is revoked.
+
+        Returns
+        -------
+        Token
+            What is remembered.
+        str
+            The token itself, which nobody can find out again.
+
+        Raises
+        ------
+        ConfigError
+            If the name is of another form, or that of a valid token.
+        """
+        if not NAME.fullmatch(name) or name in RESERVED:
+            raise ConfigError(
+                f"{name[:80]!r} cannot be the name of a token; expected 1 to 64 letters, digits "
+                "and '.', '_', '@', '-', not 'anonymous'. Choose another",
+                key="name",
+                value=name,
+            )
+        text = PREFIX + secrets.token_urlsafe(32)
+        now_s = time.time()
+        expires_s = None if expires_days is None else now_s + expires_days * DAY_S
+        with self._records.writing() as connection:
+            same = connection.execute("SELECT * FROM tokens WHERE name = ?", (name,)).fetchall()
+            if any(token_of(row).state(now_s) == "valid" for row in same):
+                raise ConfigError(
+                    f"there is a valid token with the name {name!r}; choose another name, or "
+                    f"revoke that one first: starcat token revoke {name}",
+                    key="name",
+                    value=name,
+                )
+            token = Token(secrets.token_hex(4), name, role, now_s, expires_s, None)
+            connection.execute(
+                "INSERT INTO tokens (id, name, role, digest, created_s, expires_s) "
+                "VALUES (?, ?, ?, ?, ?, ?)",
+                (token.id, name, role.name.lower(), digest_of(text), now_s, expires_s),
+            )
+        return token, text
+
+    def all(self) -> list[Token]:
+        """Return all tokens, the oldest first, those that are no longer valid among them."""
+        with self._records.reading() as connection:
+            rows = connection.execute("SELECT * FROM tokens ORDER BY created_s, id").fetchall()
+        return [token_of(row) for row in rows]
+
+    def has_valid(self) -> bool:
+        """Return whether anybody has a token that is valid now."""
+        now_s = time.time()
+        return any(token.state(now_s) == "valid" for token in self.all())
+
+    def revoke(self, name: str) -> list[Token]:
+        """Make the valid tokens of a name, or the one of an id, worth nothing from now on.
+
+        Parameters
+        ----------
+        name : str
+            Name or id.
+
+        Returns
+        -------
+        list of Token
+            Those that were revoked.
+
+        Raises
+        ------
+        TargetMissing
+            If there is none that is valid.
+        """
+        now_s = time.time()
+        found = [
+            token
+            for token in self.all()
+            if name in (token.name, token.id) and token.state(now_s) == "valid"
+        ]
+        if not found:
+            raise TargetMissing(
+                f"no valid token has the name or id {name[:80]!r}; 'starcat token list' tells them"
+            )
+        with self._records.writing() as connection:
+            for token in found:
+                connection.execute(
+                    "UPDATE tokens SET revoked_s = ? WHERE id = ?", (now_s, token.id)
+                )
+                connection.execute("DELETE FROM sessions WHERE token = ?", (token.id,))
+        return found
+
+    def find(self, text: str) -> Token | None:
+        """Return the token of a text.
+
+        Parameters
+        ----------
+        text : str
+            As a request has it.
+
+        Returns
+        -------
+        Token or None
+            None where there is no valid one. What the index of digests takes to look one up
+            tells nothing of a token: nobody can choose the digest of what they guess.
+        """
+        if not text.startswith(PREFIX):
+            return None
+        with self._records.reading() as connection:
+            row = connection.execute(
+                "SELECT * FROM tokens WHERE digest = ?", (digest_of(text),)
+            ).fetchone()
+        token = None if row is None else token_of(row)
+        return token if token is not None and token.state(time.time()) == "valid" else None
+
+
+def digest_of(secret: str) -> str:
+    """Return what is kept of a secret: its SHA-256 digest in hexadecimal digits."""
+    return hashlib.sha256(secret.encode()).hexdigest()
+
+
+def token_of(row: sqlite3.Row) -> Token:
+    """Return the token of a row of the records."""
+    return Token(
+        row["id"],
+        row["name"],
+        Role.named(row["role"]),
+        row["created_s"],
+        row["expires_s"],
+        row["revoked_s"],
+    )
+
+
+def _date(at_s: float | None) -> str | None:
+    if at_s is None:
+        return None
+    return datetime.fromtimestamp(at_s, UTC).isoformat(timespec="seconds")

@@ -1,0 +1,238 @@
+"""Pages out of templates, and errors as pages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine
+from datetime import UTC, datetime
+from typing import Any
+from urllib.parse import quote
+
+from fastapi import APIRouter, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from fastapi.routing import APIRoute
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from starlette.exceptions import HTTPException
+
+from starcat.errors import StarcatError
+from starcat.service.access import principal_of
+from starcat.service.pages.static_files import static_address
+from starcat.service.problems import Problem, ProblemDetails, problem_of
+from starcat.terminal.failures import shown
+from starcat.version import __version__
+
+NAVIGATION = (
+    ("/new", "New database"),
+    ("/jobs", "Jobs"),
+    ("/databases", "Databases"),
+    ("/identify", "Identify"),
+    ("/releases", "Releases"),
+)
+"""Address and name of what the head of every page leads to."""
+
+
+def count_text(value: float | None) -> str:
+    """Return a count with a thin space between thousands, such as ``4 999``.
+
+    Parameters
+    ----------
+    value : float or None
+        A whole number.
+
+    Returns
+    -------
+    str
+        A dash where there is none.
+
+    Examples
+    --------
+    >>> count_text(4999) == "4\N{NARROW NO-BREAK SPACE}999", count_text(None)
+    (True, '–')
+    """
+    return "–" if value is None else f"{round(value):,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+
+
+def size_text(value: float | None) -> str:
+    """Return a size with its unit, such as ``4.2 MB``.
+
+    Parameters
+    ----------
+    value : float or None
+        Bytes.
+
+    Returns
+    -------
+    str
+        Powers of 1000, two digits at least.
+
+    Examples
+    --------
+    >>> [size_text(number).replace("\N{NO-BREAK SPACE}", " ") for number in (999, 1000, 4.2e6)]
+    ['999 B', '1.0 kB', '4.2 MB']
+    """
+    if value is None:
+        return "–"
+    number, unit = float(value), "B"
+    for larger in ("kB", "MB", "GB", "TB"):
+        if number < 999.5:
+            break
+        number, unit = number / 1000.0, larger
+    digits = 1 if unit != "B" and number < 99.95 else 0
+    return f"{number:.{digits}f}\N{NO-BREAK SPACE}{unit}"
+
+
+def duration_text(value: float | None) -> str:
+    """Return a duration, such as ``4.2 s`` or ``3 min 20 s``.
+
+    Parameters
+    ----------
+    value : float or None
+        Seconds.
+
+    Returns
+    -------
+    str
+        A dash where there is none.
+
+    Examples
+    --------
+    >>> [duration_text(s).replace("\N{NO-BREAK SPACE}", " ") for s in (0.04, 4.21, 200, 7260)]
+    ['0.04 s', '4.2 s', '3 min 20 s', '2 h 1 min']
+    """
+    if value is None:
+        return "–"
+    if value < 59.5:
+        digits = 2 if value < 0.995 else (1 if value < 9.95 else 0)
+        text = f"{value:.{digits}f} s"
+    elif value < 3570.0:
+        text = "{} min {} s".format(*divmod(round(value), 60))
+    else:
+        text = "{} h {} min".format(*divmod(round(value / 60.0), 60))
+    return text.replace(" ", "\N{NO-BREAK SPACE}")
+
+
+def time_text(value: float | None) -> str:
+    """Return a moment as ``2026-11-22 14:05:09``, UTC.
+
+    Parameters
+    ----------
+    value : float or None
+        Seconds since 1970.
+
+    Returns
+    -------
+    str
+        A dash where there is none.
+    """
+    return "–" if value is None else f"{datetime.fromtimestamp(value, UTC):%Y-%m-%d %H:%M:%S}"
+
+
+def moment_text(value: float) -> str:
+    """Return a moment as ``2026-11-22T14:05:09Z``, for the attribute ``datetime``."""
+    return f"{datetime.fromtimestamp(value, UTC):%Y-%m-%dT%H:%M:%SZ}"
+
+
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("starcat.service.pages"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {
+        "count": count_text,
+        "size": size_text,
+        "duration": duration_text,
+        "time": time_text,
+        "moment": moment_text,
+    }
+    environment.globals |= {
+        "static": static_address,
+        "navigation": NAVIGATION,
+        "starcat_version": __version__,
+    }
+    return environment
+
+
+ENVIRONMENT = _environment()
+
+
+def render(request: Request, template: str, *, status: int = 200, **content: Any) -> HTMLResponse:
+    """Return a page.
+
+    Parameters
+    ----------
+    request : Request
+        Whose principal and path the head of the page shows.
+    template : str
+        Name of the template.
+    status : int, default 200
+        Of the answer.
+    **content
+        What the template needs beside them.
+
+    Returns
+    -------
+    HTMLResponse
+        Never kept by a browser: what it shows changes.
+    """
+    page = ENVIRONMENT.get_template(template).render(
+        principal=principal_of(request), path=request.url.path, **content
+    )
+    return HTMLResponse(page, status, {"Cache-Control": "no-store"})
+
+
+class _PageRoute(APIRoute):
+    """A route whose errors are pages, in the words that the REST interface has for them."""
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        handler = super().get_route_handler()
+
+        async def handle(request: Request) -> Response:
+            try:
+                return await handler(request)
+            except (StarcatError, Problem) as error:
+                return error_page(request, problem_of(error))
+            except RequestValidationError as error:
+                first = error.errors()[0]
+                where = ".".join(str(step) for step in first["loc"])
+                problem = Problem(422, shown(f"{where}: {first['msg']}", 500))
+                return error_page(request, problem_of(problem))
+            except HTTPException as error:
+                problem = Problem(error.status_code, shown(str(error.detail), 500))
+                return error_page(request, problem_of(problem))
+
+        return handle
+
+
+def page_router() -> APIRouter:
+    """Return a router for pages: not in the schema, and its errors are pages.
+
+    Returns
+    -------
+    APIRouter
+        Without a route.
+    """
+    return APIRouter(route_class=_PageRoute, include_in_schema=False)
+
+
+def error_page(request: Request, problem: ProblemDetails) -> Response:
+    """Return the page of an error; who only has to sign in is led there.
+
+    Parameters
+    ----------
+    request : Request
+        What could not be answered.
+    problem : ProblemDetails
+        Why.
+
+    Returns
+    -------
+    Response
+        With the status of the problem.
+    """
+    if problem.status == 401 and request.method == "GET":
+        asked = request.url.path + (f"?{request.url.query}" if request.url.query else "")
+        return RedirectResponse(f"/sign-in?next={quote(asked, safe='')}", 303)
+    return render(request, "error.html", status=problem.status, problem=problem)

@@ -1,0 +1,75 @@
+// What every page has: the theme, and buttons that copy.
+
+const THEMES = { system: "as the system", light: "light", dark: "dark" };
+
+function theme() {
+  return document.documentElement.dataset.theme ?? "system";
+}
+
+function setTheme(name) {
+  if (name === "system") delete document.documentElement.dataset.theme;
+  else document.documentElement.dataset.theme = name;
+  try {
+    if (name === "system") localStorage.removeItem("theme");
+    else localStorage.setItem("theme", name);
+  } catch {
+    // It lasts as long as the page.
+  }
+}
+
+function startTheme() {
+  const button = document.getElementById("theme");
+  const told = document.getElementById("theme-name");
+  const tell = () => {
+    told.textContent = THEMES[theme()];
+    button.title = `Theme: ${THEMES[theme()]}`;
+  };
+  button.hidden = false;
+  tell();
+  button.addEventListener("click", () => {
+    const names = Object.keys(THEMES);
+    setTheme(names[(names.indexOf(theme()) + 1) % names.length]);
+    tell();
+  });
+}
+
+// Text goes to the clipboard; a page that is not served safely has none, there it is selected.
+export async function copy(text, element) {
+  try {
+    await navigator.clipboard.writeText(text);
+    return "Copied";
+  } catch {
+    if (element.select) element.select();
+    else getSelection().selectAllChildren(element);
+    return "Selected";
+  }
+}
+
+function startCopying() {
+  for (const button of document.querySelectorAll("button[data-copies]")) {
+    button.hidden = false;
+    const before = button.innerHTML;
+    button.addEventListener("click", async () => {
+      const source = document.getElementById(button.dataset.copies);
+      button.textContent = await copy(source.value ?? source.textContent, source);
+      announce(button.textContent);
+      setTimeout(() => { button.innerHTML = before; }, 1600);
+    });
+  }
+}
+
+// Said to who listens to the page instead of looking at it.
+export function announce(text) {
+  let region = document.getElementById("announcement");
+  if (!region) {
+    region = document.createElement("p");
+    region.id = "announcement";
+    region.className = "unseen";
+    region.setAttribute("role", "status");
+    document.body.append(region);
+  }
+  region.textContent = text;
+}
+
+startTheme();
+startCopying();

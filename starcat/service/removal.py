@@ -1,0 +1,47 @@
+"""Taking a database from the shelf."""
+
+from __future__ import annotations
+
+import secrets
+import shutil
+
+from starcat.service.jobs.job import State
+from starcat.service.places import DATABASE_ID, checked
+from starcat.service.problems import Problem
+from starcat.service.service import Service
+
+ACTIVE: tuple[State, ...] = ("queued", "running")
+ALL_JOBS = 1 << 31
+
+
+def remove_database(service: Service, database_id: str) -> None:
+    """Remove a database; what was published of it stays in the registry.
+
+    Parameters
+    ----------
+    service : Service
+        The service.
+    database_id : str
+        Sixteen hexadecimal digits.
+
+    Raises
+    ------
+    TargetMissing
+        If there is none.
+    Problem
+        With status 409, if a job that has not ended makes it or uses it.
+    """
+    database = service.shelf.database(checked(database_id, DATABASE_ID, "database"))
+    for state in ACTIVE:
+        for job in service.jobs.all(state=state, most=ALL_JOBS):
+            if job.key.startswith(database_id) or database_id in str(job.request):
+                raise Problem(
+                    409,
+                    f"the job {job.id} ({job.title}), which is {job.state}, uses {database.title}; "
+                    "cancel it, or wait until it has ended",
+                )
+    # It is gone in one step; then its files are.
+    gone = service.places.scratch / f"removed-{secrets.token_hex(8)}"
+    service.places.database(database_id).rename(gone)
+    service.sessions.forget(database.folder)
+    shutil.rmtree(gone, ignore_errors=True)
