@@ -65,7 +65,7 @@ class Confined:
 
         Parameters
         ----------
-        task : {"identify", "convert"}
+        task : {"identify", "convert", "upload"}
             What.
         arguments : mapping
             As JSON has them.

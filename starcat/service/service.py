@@ -83,6 +83,7 @@ def open_service(settings: Settings) -> Service:
     places.make()
     records = Records(places.records)
     shelf, sessions = Shelf(places), Sessions(settings)
+    confined = Confined(settings, places.scratch)
     return Service(
         settings=settings,
         places=places,
@@ -90,8 +91,8 @@ def open_service(settings: Settings) -> Service:
         shelf=shelf,
         jobs=JobStore(records),
         sessions=sessions,
-        confined=Confined(settings, places.scratch),
-        tap=Tap(settings, places, records, shelf, sessions),
+        confined=confined,
+        tap=Tap(settings, places, records, shelf, sessions, confined),
         queue=open_queue(settings, places),
     )
 

@@ -6,7 +6,7 @@ or take more memory than the size of the file explains.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
@@ -84,6 +84,28 @@ def read_upload(path: Path, name: str, folder: Path) -> Table:
     names = [column.name for column in columns]
     pq.write_table(pa.table(arrays, names=names), folder / f"{name}.parquet")
     return Table(UPLOADS, name, tuple(columns), f"The uploaded table {name}", view=identifier(name))
+
+
+def upload_facts(path: str, name: str, folder: str) -> dict[str, Any]:
+    """Write an uploaded table as `read_upload` does, where values have to be those of JSON.
+
+    Parameters
+    ----------
+    path, name, folder : str
+        As for `read_upload`.
+
+    Returns
+    -------
+    dict
+        The table as `table_of_facts` takes it.
+    """
+    return asdict(read_upload(Path(path), name, Path(folder)))
+
+
+def table_of_facts(facts: dict[str, Any]) -> Table:
+    """Return the table that `upload_facts` described."""
+    columns = tuple(Column(**column) for column in facts["columns"])
+    return Table(**{**facts, "columns": columns, "keys": ()})
 
 
 def _parsed(path: Path, name: str) -> Any:

@@ -72,9 +72,11 @@ class TapTables:
         about = self._found()
         key = _digest(list(about))
         with self._looking:
-            if self._state is None or self._state[0] != key:
-                self._state = key, self._looked_at(about, key)
-            return self._state[1]
+            known = self._state
+            # What lies in scratch for long is removed.
+            if known is None or known[0] != key or not any(known[1].targets[-1].glob("*.parquet")):
+                known = self._state = key, self._looked_at(about, key)
+            return known[1]
 
     def _found(self) -> dict[Path, str]:
         """Return what there is on disk, and what each is."""
