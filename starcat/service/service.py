@@ -93,6 +93,7 @@ def open_service(settings: Settings) -> Service:
     records = Records(places.records)
     shelf, sessions = Shelf(places), Sessions(settings)
     most = round(settings.job_memory_gib * GIB)
+    confined = Confined(settings, places.scratch)
     return Service(
         settings=settings,
         places=places,
@@ -100,8 +101,8 @@ def open_service(settings: Settings) -> Service:
         shelf=shelf,
         jobs=JobStore(records),
         sessions=sessions,
-        confined=Confined(settings, places.scratch),
-        tap=Tap(settings, places, records, shelf, sessions),
+        confined=confined,
+        tap=Tap(settings, places, records, shelf, sessions, confined),
         queue=open_queue(settings, places),
         catalogs=Catalogs(places.catalogs / READ, most),
     )
