@@ -33,6 +33,7 @@ from starcat.service.guard.retention import keep_removing
 from starcat.service.guard.shape import Shape
 from starcat.service.guard.who import Who
 from starcat.service.jobs.pool import WorkerPool
+from starcat.service.pages.rendering import add_missing_page
 from starcat.service.problems import REFUSALS, add_problem_handlers
 from starcat.service.service import Service, open_service
 from starcat.service.settings import Settings
@@ -103,6 +104,7 @@ def make_app(settings: Settings) -> FastAPI:
     app.state.service, app.state.metrics, app.state.identities = service, metrics, identities
     app.state.workers = WorkerPool(service)
     add_problem_handlers(app)
+    add_missing_page(app)
     for router in RESOURCES:
         app.include_router(router, prefix=API, responses=REFUSALS)
     for router in OTHERS:
