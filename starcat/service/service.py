@@ -16,6 +16,7 @@ from starcat.service.records import Records
 from starcat.service.sessions import Sessions
 from starcat.service.settings import Settings
 from starcat.service.shelf import Shelf
+from starcat.service.vo.tap_service import Tap
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,8 @@ class Service:
         What waits for workers.
     confined : Confined
         Processes that read uploads and make files.
+    tap : Tap
+        What TAP needs.
     stopping : threading.Event
         Set when the service stops.
     """
@@ -50,8 +53,9 @@ class Service:
     shelf: Shelf
     jobs: JobStore
     sessions: Sessions
-    queue: JobQueue
     confined: Confined
+    tap: Tap
+    queue: JobQueue
     stopping: threading.Event = field(default_factory=threading.Event)
 
 
@@ -78,15 +82,17 @@ def open_service(settings: Settings) -> Service:
     places = Places(settings.root)
     places.make()
     records = Records(places.records)
+    shelf, sessions = Shelf(places), Sessions(settings)
     return Service(
         settings=settings,
         places=places,
         records=records,
-        shelf=Shelf(places),
+        shelf=shelf,
         jobs=JobStore(records),
-        sessions=Sessions(settings),
-        queue=open_queue(settings, places),
+        sessions=sessions,
         confined=Confined(settings, places.scratch),
+        tap=Tap(settings, places, records, shelf, sessions),
+        queue=open_queue(settings, places),
     )
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import json
 import shutil
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO, Literal
@@ -13,7 +15,7 @@ from fastapi import APIRouter, Query, Request
 from fastapi import Path as PathParameter
 from fastapi.responses import Response
 from pydantic import BaseModel, Field, ValidationError
-from starlette.datastructures import UploadFile
+from starlette.datastructures import FormData, UploadFile
 
 from starcat.images.identification import IMAGE_SUFFIXES
 from starcat.service.access import Reader
@@ -120,9 +122,9 @@ async def identify(
     database: DatabaseId, request: Request, service: TheService, reader: Reader
 ) -> Identified:
     """Identify the stars of frames and find the camera's attitude."""
-    asked = await _asked(request, service.settings.upload_mib)
-    found = await service.confined.run(_identify, service, database, asked, None)
-    return Identified.model_validate(found[0])
+    async with _asked(request, service.settings.upload_mib) as asked:
+        found, _ = await service.confined.run(_identify, service, database, asked, None)
+    return Identified.model_validate(found)
 
 
 @router.post(
@@ -145,8 +147,8 @@ async def picture(
     kind: Annotated[Kind, Query(alias="format")] = "png",
 ) -> Response:
     """Return the first frame as a picture with its stars named, or as it is where none is."""
-    asked = await _asked(request, service.settings.upload_mib)
-    _, drawn = await service.confined.run(_identify, service, database, asked, kind)
+    async with _asked(request, service.settings.upload_mib) as asked:
+        _, drawn = await service.confined.run(_identify, service, database, asked, kind)
     return Response(drawn, media_type=type_of(f"picture.{kind}"))
 
 
@@ -159,18 +161,14 @@ class _Asked:
     options: IdentifyOptions
 
 
-async def _asked(request: Request, most_mib: float) -> _Asked:
+@asynccontextmanager
+async def _asked(request: Request, most_mib: float) -> AsyncIterator[_Asked]:
+    """Give what a request brought; its file is closed afterwards."""
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind == "multipart/form-data":
-        form = await request.form(max_files=1, max_fields=4)
-        upload = form.get("file")
-        if not isinstance(upload, UploadFile):
-            raise Problem(422, "no file was sent; send centroids or an image as 'file'", key="file")
-        if upload.size is None or upload.size > most_mib * MIB:
-            raise Problem(413, f"the file is larger than {most_mib:g} MiB; send a smaller one")
-        options = _options(_json(str(form.get("options") or "{}"), "options"))
-        name = safe_name(upload.filename, SUFFIXES, "frame")
-        return _Asked(name, upload.file, options)
+        async with request.form(max_files=1, max_fields=4) as form:
+            yield _of_form(form, most_mib)
+        return
     if kind != "application/json":
         raise Problem(
             415,
@@ -182,7 +180,17 @@ async def _asked(request: Request, most_mib: float) -> _Asked:
         raise Problem(422, "expected an object with 'centroids_px', or with 'frames'", key="body")
     options = _options(content.pop("options", {}))
     # Not named by whoever sent it: messages call it so.
-    return _Asked("frame.json", io.BytesIO(json.dumps(content).encode()), options)
+    yield _Asked("frame.json", io.BytesIO(json.dumps(content).encode()), options)
+
+
+def _of_form(form: FormData, most_mib: float) -> _Asked:
+    upload = form.get("file")
+    if not isinstance(upload, UploadFile):
+        raise Problem(422, "no file was sent; send centroids or an image as 'file'", key="file")
+    if upload.size is None or upload.size > most_mib * MIB:
+        raise Problem(413, f"the file is larger than {most_mib:g} MiB; send a smaller one")
+    options = _options(_json(str(form.get("options") or "{}"), "options"))
+    return _Asked(safe_name(upload.filename, SUFFIXES, "frame"), upload.file, options)
 
 
 def _json(text: str, where: str) -> Any:
@@ -212,17 +220,13 @@ def _identify(
     artifact = service.shelf.database(database).folder
     with scratch_folder(service.places) as folder:
         _keep(asked, folder)
-        limit_s = service.settings.query_time_s
-        options = asked.options.model_copy(
-            update={"time_limit_s": min(asked.options.time_limit_s or limit_s, limit_s)}
-        )
         found = service.confined.call(
             "identify",
             {
                 "folder": str(folder),
                 "file": asked.name,
                 "artifact": str(artifact),
-                "options": options.model_dump(),
+                "options": asked.options.model_dump(),
                 "picture": kind,
             },
         )

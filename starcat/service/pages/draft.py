@@ -17,7 +17,7 @@ from starcat.catalog.source import data_source, source_names
 from starcat.errors import ConfigError, StarcatError
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.keys import REQUIRED, SpecKey, spec_sections
-from starcat.specs.reading import preset, spec_from_dict
+from starcat.specs.reading import spec_from_dict
 from starcat.specs.spec_toml import toml_value
 
 ORIGIN = "spec"
@@ -117,27 +117,6 @@ class Draft:
         words = str(self.error).removeprefix(f"{ORIGIN}: ")
         told = [name for name in inside if name.rpartition(".")[2] in words]
         return {(named or told or [TEXT])[0]: words}
-
-
-def draft_of_preset(name: str) -> Draft:
-    """Return the draft that is a preset.
-
-    Parameters
-    ----------
-    name : str
-        Of the preset.
-
-    Returns
-    -------
-    Draft
-        Which can be built as it is.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such preset.
-    """
-    return draft_of_content(_without_defaults(preset(name).recorded()))
 
 
 def draft_of_text(text: str) -> Draft:
@@ -251,14 +230,27 @@ def _inline(value: Any) -> str:
     if isinstance(value, list):
         return f"[{', '.join(map(_inline, value))}]"
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{_key(name)} = {_inline(one)}" for name, one in value.items()) + "}"
+        return (
+            "{" + ", ".join(f"{_key(name)} = {_inline(one)}" for name, one in value.items()) + "}"
+        )
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     return toml_value(value) if isinstance(value, bool | int | float | str) else f"{value}"
 
 
-def _without_defaults(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of a spec that are not as by default."""
+def without_defaults(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of a spec that are not as by default.
+
+    Parameters
+    ----------
+    content : mapping
+        A spec as an artifact or a job records it.
+
+    Returns
+    -------
+    dict
+        Tables with values only.
+    """
     kept: dict[str, Any] = {}
     for path, key in _KEYS.items():
         value = _at(content, path)

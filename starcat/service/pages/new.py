@@ -14,10 +14,15 @@ from starcat.catalog.source import data_source, source_names
 from starcat.errors import SourceError, StarcatError
 from starcat.pipeline.estimate import Estimate, choose_stars, estimate
 from starcat.pipeline.stars_read import StarsRead, read_stars, what_is_read
-from starcat.specs.build_spec import BuildSpec
-from starcat.service.access import Builder, Reader, Role, principal_of
+from starcat.service.access import Reader, Role, principal_of
 from starcat.service.jobs.submission import submit_build
-from starcat.service.pages.draft import TEXT, Draft, draft_of_form, draft_of_preset
+from starcat.service.pages.draft import (
+    TEXT,
+    Draft,
+    draft_of_content,
+    draft_of_form,
+    without_defaults,
+)
 from starcat.service.pages.preview import MOST_MAPPED, Preview, preview_of, tiling_content
 from starcat.service.pages.rendering import (
     ENVIRONMENT,
@@ -29,7 +34,9 @@ from starcat.service.pages.rendering import (
 )
 from starcat.service.problems import Problem, problem_of
 from starcat.service.service import Service, TheService
+from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset, preset_names
+
 
 @lru_cache(maxsize=2)
 def _read(key: str, spec_json: str) -> StarsRead:
@@ -61,10 +68,21 @@ def new_page(
     request: Request,
     service: TheService,
     _: Reader,
-    chosen: Annotated[str, Query(alias="preset")] = "gaia-12deg",
+    chosen: Annotated[str | None, Query(alias="preset")] = None,
+    job: Annotated[str | None, Query()] = None,
+    database: Annotated[str | None, Query()] = None,
 ) -> Response:
-    """Show the form with a preset."""
-    return _page(request, service, draft_of_preset(chosen), chosen)
+    """Show the form with a preset, or with the spec of a job or of a database."""
+    if job is not None:
+        spec = service.jobs.get(job).request.get("spec")
+    elif database is not None:
+        spec = service.shelf.database(database).manifest["spec"]
+    else:
+        chosen = chosen or preset_names()[0]
+        spec = preset(chosen).recorded()
+    if spec is None:
+        raise Problem(404, f"job {job} builds nothing; choose one that does")
+    return _page(request, service, draft_of_content(without_defaults(spec)), chosen or "")
 
 
 @router.post("/new")
@@ -113,9 +131,7 @@ def tiling(count: Annotated[int, Query(ge=1, le=MOST_MAPPED)], _: Reader) -> Res
     return JSONResponse(tiling_content(count), headers={"Cache-Control": "private, max-age=86400"})
 
 
-def _preview(
-    service: Service, draft: Draft
-) -> tuple[Preview | None, str | None]:
+def _preview(service: Service, draft: Draft) -> tuple[Preview | None, str | None]:
     if draft.spec is None:
         return None, None
     try:

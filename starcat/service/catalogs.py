@@ -1,0 +1,310 @@
+"""The catalogs that a service offers, and estimates of specs from them.
+
+Reading takes seconds, so what was read is kept, on disk and in memory; so are the guide stars of the
+last specs, so that a slider that does not change them is answered at once.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from starcat.catalog.blocks import CATALOGS
+from starcat.catalog.fetching.locate import locate
+from starcat.catalog.readers.files import find_files
+from starcat.catalog.source import DataSource, data_source
+from starcat.errors import SourceMissing
+from starcat.pipeline.estimate import Choice, Estimate, choose_stars, estimate
+from starcat.pipeline.stars_read import StarsRead, read_stars, what_is_read
+from starcat.service.kept import Kept
+from starcat.service.problems import Problem
+from starcat.service.star_cache import CatalogRead, StarCache
+from starcat.specs.build_spec import BuildSpec
+from starcat.storage.digests import json_bytes
+from starcat.store.layout import is_store
+from starcat.version import __version__
+
+WAIT_S = 10.0
+"""Seconds that a request waits for a catalog to be read, or for its turn."""
+
+RETRY_S = 5
+"""Seconds after which to ask again."""
+
+READ_BYTES, CHOICE_BYTES, ESTIMATE_BYTES = 1 << 30, 128 << 20, 64 << 20
+"""Memory for catalogs that were read, for guide stars, and for estimates."""
+
+MOST_INPUT_BYTES = 2 << 30
+"""Larger files are read for an estimate only down to ``catalog.read_limit_mag``."""
+
+AT_ONCE = 2
+"""Estimates that are made at the same time."""
+
+
+@dataclass(frozen=True)
+class Offered:
+    """A catalog that a spec may name.
+
+    Attributes
+    ----------
+    source : DataSource
+        What it is.
+    is_here : bool
+        Whether its files are.
+    read : tuple of CatalogRead
+        What is known of it where it was read.
+    """
+
+    source: DataSource
+    is_here: bool
+    read: tuple[CatalogRead, ...]
+
+
+class Catalogs:
+    """The catalogs of a service, and estimates from them.
+
+    Parameters
+    ----------
+    folder : Path
+        Where those that were read are kept.
+    wait_s : float
+        Seconds that a request waits.
+    """
+
+    def __init__(self, folder: Path, wait_s: float = WAIT_S) -> None:
+        self._cache = StarCache(folder)
+        self._wait_s = wait_s
+        self._read: Kept[StarsRead] = Kept(READ_BYTES)
+        self._choices: Kept[Choice] = Kept(CHOICE_BYTES)
+        self._estimates: Kept[Estimate] = Kept(ESTIMATE_BYTES)
+        self._turns = threading.Semaphore(AT_ONCE)
+        self._lock = threading.Lock()
+        self._underway: dict[str, Future[StarsRead]] = {}
+        # One at a time: a catalog takes memory.
+        self._reader = ThreadPoolExecutor(1, "catalog-reader")
+
+    def offered(self) -> list[Offered]:
+        """Return the catalogs that a spec may name.
+
+        Returns
+        -------
+        list of Offered
+            Those that are here first, in the order of the documentation.
+        """
+        known = list(self._cache.catalogs().values())
+        found = []
+        for name in CATALOGS:
+            read = tuple(one for one in known if one.source == name)
+            found.append(Offered(data_source(name), is_here(name), read))
+        return sorted(found, key=lambda one: not one.is_here)
+
+    def estimate(self, spec: BuildSpec, max_memory_bytes: int | None = None) -> Estimate:
+        """Estimate what a spec will give.
+
+        Parameters
+        ----------
+        spec : BuildSpec
+            Checked.
+        max_memory_bytes : int, optional
+            What a build may take; by default what this machine has left.
+
+        Returns
+        -------
+        Estimate
+            What its build will give.
+
+        Raises
+        ------
+        SourceError, BuildError
+            If a catalog is not here, too few stars are left, or the tiling is too large.
+        Problem
+            With status 503, while a catalog is being read, or too many ask.
+        """
+        key = self._key(spec)
+        whole = (key, spec.model_dump_json(), max_memory_bytes)
+        found = self._estimates.get(whole)
+        if found is not None:
+            return found
+        read = self.read(spec, key)
+        with self._turn():
+            choice = self._choice(read, key, spec)
+            found = estimate(read, choice, spec, max_memory_bytes)
+        self._estimates.put(whole, found, 16 * len(found.fields.offsets) + (1 << 15))
+        return found
+
+    def read(self, spec: BuildSpec, key: str | None = None) -> StarsRead:
+        """Return the catalogs of a spec; read them where that was not done yet.
+
+        Parameters
+        ----------
+        spec : BuildSpec
+            Checked.
+        key : str, optional
+            What they are kept under, where that is known.
+
+        Returns
+        -------
+        StarsRead
+            Which nobody may change.
+
+        Raises
+        ------
+        SourceError
+            If a catalog is not here, or cannot be read.
+        Problem
+            With status 503, if that takes longer than a request waits.
+        """
+        key = self._key(spec) if key is None else key
+        found = self._read.get(key)
+        if found is not None:
+            return found
+        check_size(spec)
+        with self._lock:
+            future = self._underway.get(key)
+            if future is None:
+                future = self._reader.submit(self._from_disk_or_files, key, spec)
+                self._underway[key] = future
+                future.add_done_callback(lambda _: self._forget(key))
+        try:
+            return future.result(self._wait_s)
+        except TimeoutError:
+            if future.done():
+                raise
+            raise Problem(
+                503,
+                f"{', '.join(spec.sources)}: being read for the first time, which takes longer "
+                f"than a request waits; ask again in {RETRY_S} s",
+                headers={"Retry-After": str(RETRY_S)},
+            ) from None
+
+    def close(self) -> None:
+        """Begin no more reading; what is underway is not waited for."""
+        self._reader.shutdown(wait=False, cancel_futures=True)
+
+    def _forget(self, key: str) -> None:
+        with self._lock:
+            self._underway.pop(key, None)
+
+    def _from_disk_or_files(self, key: str, spec: BuildSpec) -> StarsRead:
+        found = self._cache.load(key)
+        if found is None:
+            found = read_stars(spec, {})
+            self._cache.keep(key, found, _facts(spec, found))
+        self._read.put(key, found, found.nbytes)
+        return found
+
+    def _choice(self, read: StarsRead, key: str, spec: BuildSpec) -> Choice:
+        content = spec.model_dump(mode="json")
+        own = {name: content[name] for name in ("selection", "camera", "boresights")}
+        own["levels"] = content["products"]["levels"]
+        part = (key, spec.name, json_bytes(own))
+        found = self._choices.get(part)
+        if found is None:
+            found = choose_stars(read, spec)
+            self._choices.put(part, found, found.nbytes)
+        return found
+
+    @contextmanager
+    def _turn(self) -> Iterator[None]:
+        if not self._turns.acquire(timeout=self._wait_s):
+            raise Problem(
+                503,
+                "too many estimates are being made; ask again in a second",
+                headers={"Retry-After": "1"},
+            )
+        try:
+            yield
+        finally:
+            self._turns.release()
+
+    @staticmethod
+    def _key(spec: BuildSpec) -> str:
+        """Return what the catalogs of a spec are kept under: what was asked for, of which files."""
+        files = {name: _stamps(name) for name in _sources_read(spec)}
+        content = {"starcat": __version__, "asked": what_is_read(spec), "files": files}
+        return hashlib.sha256(json_bytes(content)).hexdigest()[:32]
+
+
+def is_here(name: str) -> bool:
+    """Return whether the files of a source are here.
+
+    Parameters
+    ----------
+    name : str
+        A name of ``data_sources``.
+
+    Returns
+    -------
+    bool
+        Whether a build would find them.
+    """
+    try:
+        return bool(locate(name, {}))
+    except SourceMissing:
+        return False
+
+
+def check_size(spec: BuildSpec) -> None:
+    """Check that the files of a spec's catalogs are not too large to be read for an estimate.
+
+    Parameters
+    ----------
+    spec : BuildSpec
+        Which catalogs, and how faint they are read.
+
+    Raises
+    ------
+    Problem
+        With status 413.
+    """
+    for name in _sources_read(spec):
+        limit = spec.catalog.read_limit_mag
+        key = "catalog.read_limit_mag"
+        if name in spec.catalog.motions:
+            limit, key = spec.products.crossmatch.read_limit_mag, "crossmatch.read_limit_mag"
+        size = sum(stamp[1] for stamp in _stamps(name))
+        if limit is None and size > MOST_INPUT_BYTES:
+            raise Problem(
+                413,
+                f"{name}: its files have {size / 1e9:,.1f} GB, more than an estimate reads whole; "
+                f"give {key}, and fainter records are only counted",
+                key=key,
+            )
+
+
+def _sources_read(spec: BuildSpec) -> tuple[str, ...]:
+    """Return the sources that an estimate reads: counterparts are none of them."""
+    names = (spec.catalog.source, *spec.catalog.motions, *spec.selection.variables.join)
+    return tuple(dict.fromkeys(names))
+
+
+def _stamps(name: str) -> list[tuple[str, int, int]]:
+    """Return path, size and time of the files of a source."""
+    files: list[Path] = []
+    for path in locate(name, {}):
+        if path.is_dir() and is_store(path):
+            files += sorted(one for one in path.rglob("*") if one.is_file())
+        else:
+            files += [file.path for file in find_files(data_source(name), [path])]
+    found = []
+    for path in files:
+        stat = path.stat()
+        found.append((str(path), stat.st_size, stat.st_mtime_ns))
+    return found
+
+
+def _facts(spec: BuildSpec, read: StarsRead) -> CatalogRead:
+    mags = read.magnitudes
+    band = spec.catalog.band or data_source(spec.catalog.source).bands[0]
+    return CatalogRead(
+        spec.catalog.source,
+        band,
+        spec.epoch_jyear,
+        len(read.stars),
+        mags and mags[0],
+        mags and mags[1],
+    )
