@@ -27,7 +27,7 @@ from starcat.service.jobs.pool import WorkerPool
 from starcat.service.problems import REFUSALS, add_problem_handlers
 from starcat.service.service import Service, open_service
 from starcat.service.settings import Settings
-from starcat.service.vo import cone_search
+from starcat.service.vo import cone_search, tap, tap_jobs
 from starcat.version import __version__
 
 API = "/api/v1"
@@ -46,6 +46,8 @@ OTHERS: tuple[APIRouter, ...] = (
     health.router,
     signing.router,
     cone_search.router,
+    tap.router,
+    tap_jobs.router,
     *pages.ROUTERS,
 )
 """Routers of everything else: pages, the registry, TAP, cone searches, health."""

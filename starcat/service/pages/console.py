@@ -158,9 +158,7 @@ async def console(
         text=text,
         chosen=chosen,
         values=values_in(text, chosen, asked.values),
-        others=[
-            (one.id, one.title) for one in service.shelf.databases() if one.id != database.id
-        ],
+        others=[(one.id, one.title) for one in service.shelf.databases() if one.id != database.id],
         queries=list(gallery().values()),
         macros=sorted(macros(), key=lambda macro: (not macro.is_table, macro.name)),
         products=products_of(database.manifest),

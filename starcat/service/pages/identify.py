@@ -128,9 +128,7 @@ def _page(
     )
 
 
-def frame_of(
-    form: FormData, given: dict[str, str], database: Database, service: Service
-) -> Frame:
+def frame_of(form: FormData, given: dict[str, str], database: Database, service: Service) -> Frame:
     """Return the frame that a form brings.
 
     Parameters

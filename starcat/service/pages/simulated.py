@@ -50,8 +50,6 @@ def write_frame(path: Path, database: Database, seed: int) -> None:
     """
     stars = open_database(database.folder, ())
     frame = next(
-        simulate_frames(
-            stars.directions, stars.camera, 1, Noise(NOISE_PX), seed, mag=stars.mag
-        )
+        simulate_frames(stars.directions, stars.camera, 1, Noise(NOISE_PX), seed, mag=stars.mag)
     )
     write_simulated(path, frame, stars.camera, seed)
