@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import re
+import time
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
@@ -24,6 +25,7 @@ from starcat.query.session import open_session
 from starcat.report.sky_map import project
 from starcat.service.app import make_app
 from starcat.service.pages import sky
+from starcat.service.pages.rendering import time_text
 from starcat.service.settings import Settings
 
 LATER = "fedcba9876543210"
@@ -126,7 +128,7 @@ def test_one_database_tells_filters_rates_products_and_columns(client, small_art
     for product in report["products"]:
         assert product in words
     assert "great-circle separation" in words.lower()
-    assert "<form method=\"post\"" in client.get(PAGE).text
+    assert '<form method="post"' in client.get(PAGE).text
 
 
 def test_what_a_database_says_of_itself_is_escaped(tmp_path, small_artifact):
@@ -149,15 +151,16 @@ def test_what_a_database_says_of_itself_is_escaped(tmp_path, small_artifact):
 
 
 @pytest.mark.parametrize("page", ["", "/coverage", "/coverage.png", "/sql", "/report", "/compare"])
-@pytest.mark.parametrize("database", ["0" * 16, "..", "x" * 300])
+@pytest.mark.parametrize("database", ["0" * 16, "x" * 300])
 def test_a_page_of_no_database_is_a_page_that_says_so(client, page, database):
     answer = client.get(f"/databases/{database}{page}")
     assert answer.status_code == 404
-    assert database == ".." or "no database has the id" in text_of(answer.text)
+    assert "no database has the id" in text_of(answer.text)
 
 
 def rows_of_csv(artifact: Path) -> list[dict[str, str]]:
-    return list(csv.DictReader((artifact / "report" / "coverage.csv").open()))
+    text = (artifact / "report" / "coverage.csv").read_text()
+    return list(csv.DictReader(text.splitlines()))
 
 
 def fields_of_table(page: str) -> list[int]:
@@ -377,12 +380,13 @@ def test_the_time_of_a_build_is_that_of_its_job(tmp_path, small_artifact):
     shelve(tmp_path / "service", small_artifact)
     settings = Settings(root=tmp_path / "service", anonymous="reader", workers=0)
     app = make_app(settings)
+    ended_s = time.time() - 86_400.0
     with TestClient(app, base_url=LOCAL) as client:
         service = app.state.service
         job = service.jobs.add("build", {}, key=DATABASE + 48 * "0", title="t", owner="o")
         with service.records.writing() as connection:
             connection.execute(
                 "UPDATE jobs SET state = 'done', ended_s = ?, result = ? WHERE id = ?",
-                (1_700_000_000.0, json.dumps({"database": DATABASE}), job.id),
+                (ended_s, json.dumps({"database": DATABASE}), job.id),
             )
-        assert "2023-11-14 22:13" in text_of(client.get("/databases").text)
+        assert time_text(ended_s)[:16] in text_of(client.get("/databases").text)

@@ -62,9 +62,7 @@ def publish(
         released = api.publish(wanted, Response(), service, publisher)
     except (StarcatError, Problem) as error:
         problem = problem_of(error)
-        return _page(
-            request, service, publisher, database=database, note=note, problem=problem
-        )
+        return _page(request, service, publisher, database=database, note=note, problem=problem)
     return RedirectResponse(f"/releases?published={released.title}#{released.title}", 303)
 
 
