@@ -11,7 +11,16 @@ from fastapi import APIRouter, FastAPI
 from starlette.middleware import Middleware
 
 from starcat.service import pages
-from starcat.service.api import databases, identify, jobs, registry, releases, sql
+from starcat.service.api import (
+    catalogs,
+    databases,
+    identify,
+    jobs,
+    registry,
+    releases,
+    specs,
+    sql,
+)
 from starcat.service.guard import health, signing
 from starcat.service.guard.bodies import Bodies
 from starcat.service.guard.headers import SafeHeaders
@@ -33,6 +42,8 @@ from starcat.version import __version__
 API = "/api/v1"
 
 RESOURCES: tuple[APIRouter, ...] = (
+    specs.router,
+    catalogs.router,
     jobs.router,
     databases.router,
     releases.router,
@@ -116,6 +127,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         await to_thread.run_sync(pool.stop)
         service.queue.close()
         service.tap.close()
+        service.catalogs.close()
         service.sessions.close()
         service.confined.close()
         service.records.close()
