@@ -60,7 +60,7 @@ class Tabledata:
         last = pc.binary_join_element_wise(last, _ROW_ENDS + _ROW_BEGINS, "", **_NULL_IS_EMPTY)
         joined = pc.binary_join_element_wise(*parts, last, _BETWEEN, **_NULL_IS_EMPTY)
         _, content = text_bytes(joined)
-        return _ROW_BEGINS.encode() + content[: -len(_ROW_BEGINS)].tobytes()
+        return b"".join([_ROW_BEGINS.encode(), content.data[: -len(_ROW_BEGINS)]])
 
 
 _NULL_IS_EMPTY = {"null_handling": "replace", "null_replacement": ""}

@@ -11,7 +11,7 @@ from fastapi import APIRouter, FastAPI
 from starlette.middleware import Middleware
 
 from starcat.service import pages
-from starcat.service.api import databases, jobs, registry, releases
+from starcat.service.api import databases, identify, jobs, registry, releases, sql
 from starcat.service.guard import health, signing
 from starcat.service.guard.bodies import Bodies
 from starcat.service.guard.headers import SafeHeaders
@@ -27,6 +27,7 @@ from starcat.service.jobs.pool import WorkerPool
 from starcat.service.problems import REFUSALS, add_problem_handlers
 from starcat.service.service import Service, open_service
 from starcat.service.settings import Settings
+from starcat.service.vo import cone_search, tap, tap_jobs
 from starcat.version import __version__
 
 API = "/api/v1"
@@ -35,6 +36,8 @@ RESOURCES: tuple[APIRouter, ...] = (
     jobs.router,
     databases.router,
     releases.router,
+    identify.router,
+    sql.router,
 )
 """Routers of the REST interface, under `API`."""
 
@@ -42,6 +45,9 @@ OTHERS: tuple[APIRouter, ...] = (
     registry.router,
     health.router,
     signing.router,
+    cone_search.router,
+    tap.router,
+    tap_jobs.router,
     *pages.ROUTERS,
 )
 """Routers of everything else: pages, the registry, TAP, cone searches, health."""
@@ -98,6 +104,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     service: Service = app.state.service
     pool: WorkerPool = app.state.workers
     await to_thread.run_sync(pool.start)
+    service.tap.runner.start()
     removing = asyncio.create_task(keep_removing(service))
     try:
         yield
@@ -107,6 +114,8 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         with suppress(asyncio.CancelledError):
             await removing
         await to_thread.run_sync(pool.stop)
-        service.sessions.close()
         service.queue.close()
+        service.tap.close()
+        service.sessions.close()
+        service.confined.close()
         service.records.close()

@@ -8,6 +8,7 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
+from starcat.service.confined import Confined
 from starcat.service.jobs.job import JobStore
 from starcat.service.jobs.queue import JobQueue, open_queue
 from starcat.service.places import Places
@@ -15,6 +16,7 @@ from starcat.service.records import Records
 from starcat.service.sessions import Sessions
 from starcat.service.settings import Settings
 from starcat.service.shelf import Shelf
+from starcat.service.vo.tap_service import Tap
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,16 @@ class Service:
         The databases there are.
     jobs : JobStore
         The jobs there are.
+    sessions : Sessions
+        Open query sessions.
+    queue : JobQueue
+        What waits for workers.
+    confined : Confined
+        Processes that read uploads and make files.
+    tap : Tap
+        What TAP needs.
+    stopping : threading.Event
+        Set when the service stops.
     """
 
     settings: Settings
@@ -41,6 +53,8 @@ class Service:
     shelf: Shelf
     jobs: JobStore
     sessions: Sessions
+    confined: Confined
+    tap: Tap
     queue: JobQueue
     stopping: threading.Event = field(default_factory=threading.Event)
 
@@ -68,8 +82,18 @@ def open_service(settings: Settings) -> Service:
     places = Places(settings.root)
     places.make()
     records = Records(places.records)
-    queue, sessions = open_queue(settings, places), Sessions(settings)
-    return Service(settings, places, records, Shelf(places), JobStore(records), sessions, queue)
+    shelf, sessions = Shelf(places), Sessions(settings)
+    return Service(
+        settings=settings,
+        places=places,
+        records=records,
+        shelf=shelf,
+        jobs=JobStore(records),
+        sessions=sessions,
+        confined=Confined(settings, places.scratch),
+        tap=Tap(settings, places, records, shelf, sessions),
+        queue=open_queue(settings, places),
+    )
 
 
 def service_of(request: Request) -> Service:

@@ -40,6 +40,7 @@ from starcat.vo.adql import GEOMETRY
 from starcat.vo.adql_functions import USER_FUNCTIONS
 from starcat.vo.formats import FORMATS
 from starcat.vo.tables import Schema, Table, Tables, adql_name, full_name
+from starcat.vo.uws import xml_text
 
 MEDIA_TYPE = "application/xml"
 VOTABLE_TYPE = "application/x-votable+xml"
@@ -276,12 +277,11 @@ def error_votable(message: str) -> bytes:
     bytes
         A VOTable without a table.
     """
-    shown = "".join(c if c.isprintable() or c in "\n\t" else " " for c in message)
     return (
         '<?xml version="1.0" encoding="UTF-8"?>\n'
         '<VOTABLE version="1.4" xmlns="http://www.ivoa.net/xml/VOTable/v1.3">\n'
         '<RESOURCE type="results">\n'
-        f'<INFO name="QUERY_STATUS" value="ERROR">{escape(shown)}</INFO>\n'
+        f'<INFO name="QUERY_STATUS" value="ERROR">{escape(xml_text(message))}</INFO>\n'
         "</RESOURCE>\n</VOTABLE>\n"
     ).encode()
 

@@ -14,8 +14,7 @@ from starcat.catalog.source import data_source, source_names
 from starcat.errors import SourceError, StarcatError
 from starcat.pipeline.estimate import Estimate, choose_stars, estimate
 from starcat.pipeline.stars_read import StarsRead, read_stars, what_is_read
-from starcat.specs.build_spec import BuildSpec
-from starcat.service.access import Builder, Reader, Role, principal_of
+from starcat.service.access import Reader, Role, principal_of
 from starcat.service.jobs.submission import submit_build
 from starcat.service.pages.draft import (
     TEXT,
@@ -35,6 +34,7 @@ from starcat.service.pages.rendering import (
 )
 from starcat.service.problems import Problem, problem_of
 from starcat.service.service import Service, TheService
+from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset, preset_names
 
 
