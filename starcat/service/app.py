@@ -37,14 +37,15 @@ from starcat.service.pages.rendering import add_missing_page
 from starcat.service.problems import REFUSALS, add_problem_handlers
 from starcat.service.service import Service, open_service
 from starcat.service.settings import Settings
+from starcat.service.vo import cone_search, tap, tap_jobs
 from starcat.version import __version__
 
 API = "/api/v1"
 
 RESOURCES: tuple[APIRouter, ...] = (
-    jobs.router,
     specs.router,
     catalogs.router,
+    jobs.router,
     databases.router,
     releases.router,
     identify.router,
@@ -56,6 +57,9 @@ OTHERS: tuple[APIRouter, ...] = (
     registry.router,
     health.router,
     signing.router,
+    cone_search.router,
+    tap.router,
+    tap_jobs.router,
     *pages.ROUTERS,
 )
 """Routers of everything else: pages, the registry, TAP, cone searches, health."""
@@ -113,6 +117,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     service: Service = app.state.service
     pool: WorkerPool = app.state.workers
     await to_thread.run_sync(pool.start)
+    service.tap.runner.start()
     removing = asyncio.create_task(keep_removing(service))
     try:
         yield
@@ -122,8 +127,9 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         with suppress(asyncio.CancelledError):
             await removing
         await to_thread.run_sync(pool.stop)
+        service.queue.close()
+        service.tap.close()
         service.catalogs.close()
         service.sessions.close()
         service.confined.close()
-        service.queue.close()
         service.records.close()

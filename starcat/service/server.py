@@ -1,4 +1,4 @@
-"""The web server: one for each root, and what happens when it is to stop."""
+"""The web server: one for each root."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ import shutil
 import signal
 import socket
 import sys
-from collections.abc import Callable
-from signal import SIGINT, SIGTERM
-from types import FrameType
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 
 import uvicorn
 from fastapi import FastAPI
@@ -37,52 +36,6 @@ Announce = Callable[[str], None]
 """Takes the address that people open, when the server listens."""
 
 
-class Server(uvicorn.Server):
-    """A web server that says where it is, and has jobs end as soon as it is told to stop.
-
-    Parameters
-    ----------
-    config : uvicorn.Config
-        Of the server.
-    app : FastAPI
-        The application, as `make_app` makes it.
-    announce : callable
-        Called with the address when the server listens.
-    """
-
-    def __init__(self, config: uvicorn.Config, app: FastAPI, announce: Announce) -> None:
-        super().__init__(config)
-        self._service: Service = app.state.service
-        self._workers: WorkerPool = app.state.workers
-        self._announce = announce
-
-    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Begin to answer.
-
-        Parameters
-        ----------
-        sockets : list of socket, optional
-            What it listens at.
-        """
-        await super().startup(sockets)
-        if self.started and sockets:
-            self._announce(_address(self._service.settings, sockets[0].getsockname()[1]))
-
-    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Begin to stop: requests, streams of events and jobs end at the same time.
-
-        Parameters
-        ----------
-        sig : int
-            The signal.
-        frame : FrameType, optional
-            Where it arrived.
-        """
-        self._service.stopping.set()
-        self._workers.begin_stop()
-        super().handle_exit(sig, frame)
-
-
 def run_server(settings: Settings, announce: Announce) -> None:
     """Serve until a signal ends it.
 
@@ -96,31 +49,39 @@ def run_server(settings: Settings, announce: Announce) -> None:
     Raises
     ------
     ConfigError
-        If others than this machine are to reach it and nobody has a token, if the port is taken,
-        or if another server runs with the same root.
+        If another server runs with the same root, if others than this machine are to reach it and
+        nobody has a token, or if the port is taken.
     OutputError
         If the root cannot be written to.
     """
     places = Places(settings.root)
-    try:
-        make_folder(places.root)
-        with locked(places.lock, wait=False):
-            _serve(settings, places, announce)
-    except BlockingIOError:
-        raise ConfigError(
-            f"another server runs with --root {places.root}; stop it, or choose another root",
-            key="root",
-            value=str(places.root),
-        ) from None
-    except OSError as error:
-        raise OutputError(
-            f"{places.root}: cannot be used ({reason(error)}); choose another --root",
-            path=places.root,
-        ) from error
+    with _only_server(places):
+        shutil.rmtree(places.scratch, ignore_errors=True)
+        _serve(settings, announce)
 
 
-def _serve(settings: Settings, places: Places, announce: Announce) -> None:
-    shutil.rmtree(places.scratch, ignore_errors=True)
+@contextmanager
+def _only_server(places: Places) -> Iterator[None]:
+    """See that no other server uses a root."""
+    with ExitStack() as stack:
+        try:
+            make_folder(places.root)
+            stack.enter_context(locked(places.lock, wait=False))
+        except BlockingIOError:
+            raise ConfigError(
+                f"another server runs with --root {places.root}; stop it, or choose another root",
+                key="root",
+                value=str(places.root),
+            ) from None
+        except OSError as error:
+            raise OutputError(
+                f"{places.root}: cannot be used ({reason(error)}); choose another --root",
+                path=places.root,
+            ) from error
+        yield
+
+
+def _serve(settings: Settings, announce: Announce) -> None:
     app = make_app(settings)
     _see_to_tokens(app.state.identities.tokens, settings)
     listening = _listen(settings)
@@ -135,17 +96,30 @@ def _serve(settings: Settings, places: Places, announce: Announce) -> None:
         h11_max_incomplete_event_size=MOST_HEADER_BYTES + MOST_TARGET_BYTES,
         timeout_graceful_shutdown=round(settings.shutdown_s),
     )
-    # uvicorn raises the signal that ended it once more when it has ended, for whoever is outside.
-    before = {number: signal.signal(number, _is_heard) for number in (SIGINT, SIGTERM)}
-    try:
-        Server(config, app, announce).run([listening])
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    with _signals_end_nothing_else():
+        _Server(config, app, announce).run([listening])
 
 
-def _is_heard(number: int, frame: FrameType | None) -> None:
-    """Do nothing more about a signal: the server has ended because of it."""
+class _Server(uvicorn.Server):
+    """Says where it is, and has jobs and streams of events end as soon as it is told to stop."""
+
+    def __init__(self, config: uvicorn.Config, app: FastAPI, announce: Announce) -> None:
+        super().__init__(config)
+        self._service: Service = app.state.service
+        self._workers: WorkerPool = app.state.workers
+        self._announce = announce
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to answer."""
+        await super().startup(sockets)
+        if self.started and sockets:
+            self._announce(_address(self._service.settings, sockets[0].getsockname()[1]))
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Stop: streams of events end at once, requests and jobs within the time that they have."""
+        self._service.stopping.set()
+        self._workers.begin_stop()
+        await super().shutdown(sockets)
 
 
 def _address(settings: Settings, port: int) -> str:
@@ -159,7 +133,7 @@ def _listen(settings: Settings) -> socket.socket:
         [(family, _, _, _, address), *_] = socket.getaddrinfo(
             settings.host, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         )
-        return socket.create_server(address[:2], family=family, backlog=2048)
+        listening = socket.create_server(address[:2], family=family, backlog=2048)
     except OSError as error:
         raise ConfigError(
             f"cannot listen at {settings.host}, port {settings.port}: {reason(error)}; choose "
@@ -167,6 +141,20 @@ def _listen(settings: Settings) -> socket.socket:
             key="port",
             value=settings.port,
         ) from error
+    return listening
+
+
+@contextmanager
+def _signals_end_nothing_else() -> Iterator[None]:
+    """See that a signal that has ended the server in good order is not an error of the command."""
+    known = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        for number in known:
+            signal.signal(number, lambda number, frame: None)
+        yield
+    finally:
+        for number, handler in known.items():
+            signal.signal(number, handler)
 
 
 def _see_to_tokens(tokens: TokenStore, settings: Settings) -> None:

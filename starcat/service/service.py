@@ -17,6 +17,7 @@ from starcat.service.records import Records
 from starcat.service.sessions import Sessions
 from starcat.service.settings import Settings
 from starcat.service.shelf import Shelf
+from starcat.service.vo.tap_service import Tap
 
 READ = "read"
 """Folder, among the catalogs, of what estimates start from."""
@@ -41,15 +42,17 @@ class Service:
     jobs : JobStore
         The jobs there are.
     sessions : Sessions
-        Processes of their own, for what takes long or may take too much.
+        Open query sessions.
+    queue : JobQueue
+        What waits for workers.
     confined : Confined
         Processes that read uploads and make files.
-    queue : JobQueue
-        Where jobs wait.
+    tap : Tap
+        What TAP needs.
     catalogs : Catalogs
         The catalogs there are, and estimates from them.
     stopping : threading.Event
-        Set when the service is about to end.
+        Set when the service stops.
     """
 
     settings: Settings
@@ -59,6 +62,7 @@ class Service:
     jobs: JobStore
     sessions: Sessions
     confined: Confined
+    tap: Tap
     queue: JobQueue
     catalogs: Catalogs
     stopping: threading.Event = field(default_factory=threading.Event)
@@ -87,15 +91,18 @@ def open_service(settings: Settings) -> Service:
     places = Places(settings.root)
     places.make()
     records = Records(places.records)
+    shelf, sessions = Shelf(places), Sessions(settings)
     most = round(settings.job_memory_gib * GIB)
+    confined = Confined(settings, places.scratch)
     return Service(
         settings=settings,
         places=places,
         records=records,
-        shelf=Shelf(places),
+        shelf=shelf,
         jobs=JobStore(records),
-        sessions=Sessions(settings),
-        confined=Confined(settings, places.scratch),
+        sessions=sessions,
+        confined=confined,
+        tap=Tap(settings, places, records, shelf, sessions, confined),
         queue=open_queue(settings, places),
         catalogs=Catalogs(places.catalogs / READ, most),
     )
