@@ -64,7 +64,10 @@ def new_page(
         spec = preset(chosen).recorded()
     if spec is None:
         raise Problem(404, f"job {job} builds nothing; choose one that does")
-    return _page(request, service, draft_of_content(without_defaults(spec)), chosen or "")
+    # A page that waits for no catalog is there at once; its script asks for the estimate.
+    return _page(
+        request, service, draft_of_content(without_defaults(spec)), chosen or "", is_first=True
+    )
 
 
 @router.post("/new")
@@ -104,7 +107,8 @@ def preview(request: Request, service: TheService, form: Form, _: Reader) -> Res
         "result": ENVIRONMENT.get_template("new_result.html").render(preview=seen),
         "summary": summary(seen),
         "is_busy": error is not None and error.status == 503,
-        "stars": [] if seen is None else seen.estimate.fields.count.tolist(),
+        "is_known": seen is not None,
+        "stars": [] if seen is None or seen.map is None else seen.estimate.fields.count.tolist(),
     }
     return JSONResponse(content, headers={"Cache-Control": "no-store"})
 
@@ -130,8 +134,10 @@ def _page(
     draft: Draft,
     chosen: str,
     refused: StarcatError | Problem | None = None,
+    *,
+    is_first: bool = False,
 ) -> Response:
-    seen, error = _preview(service, draft)
+    seen, error = (None, None) if is_first else _preview(service, draft)
     problem = None if refused is None else problem_of(refused)
     status = problem.status if problem else 422 if draft.errors else 200
     return render(
@@ -144,6 +150,7 @@ def _page(
         errors=draft.errors,
         refused=problem and problem.detail,
         summary=summary(seen),
+        is_first=is_first,
         presets=[(name, preset(name).description) for name in preset_names()],
         chosen=chosen,
         sources=_sources(service),

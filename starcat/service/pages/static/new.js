@@ -110,8 +110,8 @@ function show(state) {
   showValues(state);
   showErrors(state.errors);
   wrong.innerHTML = state.wrong;
-  body.classList.toggle("stale", state.stars.length === 0);
-  if (state.stars.length > 0) {  // else the last estimate stays, pale
+  body.classList.toggle("stale", !state.is_known);
+  if (state.is_known) {  // else the last estimate stays, pale
     const hadFocus = body.querySelector(".sky svg") === document.activeElement;
     body.innerHTML = state.result;
     showMap(state.stars);
