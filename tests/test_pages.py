@@ -271,6 +271,14 @@ def test_a_text_that_was_edited_wins_over_the_fields():
     assert "# mine" in draft.text
 
 
+def test_a_text_that_cannot_be_read_leaves_the_fields_as_they_were():
+    form = _form(SPEC, **{"selection.faint_limit_mag": "3"})
+    draft = draft_of_form({**form, "toml": "name = "})
+    assert list(draft.errors) == ["toml"]
+    assert draft.values["selection.faint_limit_mag"] == "3"
+    assert draft.bands == ("G",)
+
+
 def test_a_camera_changes_between_its_field_and_its_lens():
     draft = draft_of_form(_form(SPEC, lens="focal"))
     assert draft.spec is not None

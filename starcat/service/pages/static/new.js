@@ -103,10 +103,9 @@ function showMap(stars) {
 }
 
 function show(state) {
-  const isReadable = state.errors.toml === undefined || state.toml !== text.value;
   if (document.activeElement !== text && text.value !== state.toml) text.value = state.toml;
   before.value = state.toml;
-  if (isReadable || Object.values(state.values).some(Boolean)) showValues(state);
+  showValues(state);
   showErrors(state.errors);
   const hadFocus = result.querySelector(".sky svg") === document.activeElement;
   result.innerHTML = state.result;
