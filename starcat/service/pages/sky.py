@@ -355,5 +355,8 @@ def ordered(fields: Fields, order: str) -> list[int]:
 def field_at(fields: Fields, number: int) -> Field:
     """Return one of the fields with its place on the map."""
     ra_deg, dec_deg = float(fields.ra_deg[number]), float(fields.dec_deg[number])
-    counts = (int(one[number]) for one in (fields.stars, fields.pairs, fields.triangles))
-    return Field(number, ra_deg, dec_deg, *counts, *place(ra_deg, dec_deg))
+    stars, pairs, triangles = (
+        int(one[number]) for one in (fields.stars, fields.pairs, fields.triangles)
+    )
+    x, y = place(ra_deg, dec_deg)
+    return Field(number, ra_deg, dec_deg, stars, pairs, triangles, x, y)
