@@ -130,11 +130,11 @@ def table_bytes(table: pa.Table, rows: int | None = None) -> int:
     count = len(table) if rows is None else rows
     if len(table) <= PART_ROWS * PARTS and count == len(table):
         return parquet_bytes(table)
-    empty = parquet_bytes(table.slice(0, 0))
+    one = parquet_bytes(table.slice(0, 1))
     starts = np.linspace(0, max(0, len(table) - PART_ROWS), PARTS).astype(int).tolist()
     parts = [table.slice(start, PART_ROWS) for start in dict.fromkeys(starts)]
-    some = sum(parquet_bytes(part) - empty for part in parts)
-    return round(empty + some * count / max(1, sum(map(len, parts))))
+    some = sum(parquet_bytes(part) - one for part in parts)
+    return round(one + some * max(0, count - 1) / max(1, sum(len(part) - 1 for part in parts)))
 
 
 def product_files(
