@@ -21,6 +21,7 @@ from starcat.service.app import make_app
 from starcat.service.settings import Settings
 
 OTHER = "fedcba9876543210"
+LOCAL = "http://127.0.0.1:8000"
 API = f"/api/v1/databases/{DATABASE}"
 
 
@@ -32,9 +33,7 @@ def root(tmp_path: Path, small_artifact: Path) -> Path:
 
 @pytest.fixture
 def client(root: Path) -> Iterator[TestClient]:
-    with TestClient(
-        make_app(Settings(root=root, anonymous="publisher")), base_url="http://127.0.0.1:8000"
-    ) as client:
+    with TestClient(make_app(Settings(root=root, anonymous="publisher")), base_url=LOCAL) as client:
         yield client
 
 
@@ -202,11 +201,11 @@ def test_a_database_that_a_job_makes_is_not_removed(client):
 
 
 def test_who_may_only_read_neither_removes_nor_publishes(root):
-    with TestClient(make_app(Settings(root=root))) as client:
+    with TestClient(make_app(Settings(root=root)), base_url=LOCAL) as client:
         assert client.delete(API).status_code == 401
         assert client.post("/api/v1/releases", json={"database": DATABASE}).status_code == 401
         assert client.get(API).status_code == 200
-    with TestClient(make_app(Settings(root=root, anonymous="none"))) as client:
+    with TestClient(make_app(Settings(root=root, anonymous="none")), base_url=LOCAL) as client:
         for path in (API, f"{API}/files/stars.parquet", "/registry/index.json", "/api/v1/releases"):
             assert client.get(path).status_code == 401
 

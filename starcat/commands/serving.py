@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from starcat.commands.shared import Json
-from starcat.errors import ConfigError
+from starcat.errors import ConfigError, TargetMissing
 
 if TYPE_CHECKING:
     from starcat.service.guard.tokens import Token, TokenStore
@@ -45,8 +45,11 @@ def serve(
     workers: Annotated[
         int | None, typer.Option(min=0, max=64, help="Jobs at the same time; default: 1.")
     ] = None,
+    json: Json = False,
 ) -> None:
     """Run the service: a page, a REST interface, TAP and a registry, from one folder.
+
+    It prints its address when it listens, and ends at Ctrl-C or a termination signal.
 
     Example: starcat serve --root service --port 8000
     """
@@ -56,7 +59,15 @@ def serve(
         raise _not_installed(error) from error
     from starcat.service.settings import read_settings
 
-    run_server(read_settings(root, host=host, port=port, workers=workers))
+    def announce(address: str) -> None:
+        from starcat.terminal.console import print_json_line, say
+
+        if json:
+            print_json_line({"address": address, "root": str(root)})
+        else:
+            say(f"starcat serves {root} at {address}")
+
+    run_server(read_settings(root, host=host, port=port, workers=workers), announce)
 
 
 @tokens.command()
@@ -93,7 +104,7 @@ def list_tokens(root: Root = Path("service"), json: Json = False) -> None:
 
     Example: starcat token list --root service
     """
-    store = _tokens_of(root)
+    store = _tokens_of(root, is_new=False)
     _print_tokens(store.all(), as_json=json)
 
 
@@ -107,7 +118,7 @@ def revoke(
 
     Example: starcat token revoke anna --root service
     """
-    store = _tokens_of(root)
+    store = _tokens_of(root, is_new=False)
     _print_tokens(store.revoke(name), as_json=json)
 
 
@@ -122,15 +133,20 @@ def _print_tokens(found: Sequence[Token], *, as_json: bool) -> None:
     print_table("", columns, [[row[column] or "never" for column in columns] for row in rows])
 
 
-def _tokens_of(root: Path) -> TokenStore:
+def _tokens_of(root: Path, *, is_new: bool = True) -> TokenStore:
     try:
         from starcat.service.guard.tokens import TokenStore
-        from starcat.service.service import open_service
+        from starcat.service.places import Places
+        from starcat.service.records import Records
     except ModuleNotFoundError as error:
         raise _not_installed(error) from error
     from starcat.service.settings import read_settings
 
-    return TokenStore(open_service(read_settings(root)).records)
+    places = Places(read_settings(root).root)
+    if not is_new and not places.records.exists():
+        raise TargetMissing(f"{root}: no service has kept anything here; give its --root")
+    places.make()
+    return TokenStore(Records(places.records))
 
 
 def _not_installed(error: ModuleNotFoundError) -> ConfigError:

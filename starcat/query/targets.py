@@ -84,8 +84,8 @@ def open_targets(
     ----------
     given : sequence of str
         For each target the folder of an artifact or of a store (a HATS collection or catalog), a
-        Parquet file, an archive's file under its own name, ``SOURCE=PATH``, or the name of a source
-        that `locate` finds.
+        folder of Parquet files, a Parquet file, an archive's file under its own name,
+        ``SOURCE=PATH``, or the name of a source that `locate` finds.
     scratch : Path
         Folder for the star tables of archive files.
     engine : Engine
@@ -125,6 +125,8 @@ def _open_target(text: str, scratch: Path, engine: Engine, progress: Progress) -
         return _artifact(path)
     if path.is_dir() and (store := _store_in(path)):
         return _store(store, engine)
+    if path.is_dir() and (files := sorted(path.glob("*.parquet"))):
+        return _folder(path, files, engine)
     if path.is_file() and path.suffix == ".parquet":
         return _tables(path, engine)
     source, inputs = _source_of(text, path)
@@ -183,6 +185,17 @@ def _tables(path: Path, engine: Engine) -> Target:
     if beside.is_file():
         views.append(_table(beside, engine))
     return Target(identifier(path.stem), "", tuple(views))
+
+
+def _folder(path: Path, files: Sequence[Path], engine: Engine) -> Target:
+    """Return a folder of Parquet files, each a table with the name of the file."""
+    views = [_many_files(identifier(file.stem), path, [file], engine) for file in files]
+    names = distinct([view.name for view in views])
+    return Target(
+        identifier(path.resolve().name),
+        "",
+        tuple(replace(view, name=name) for view, name in zip(views, names, strict=True)),
+    )
 
 
 def _store_in(folder: Path) -> Store | None:

@@ -6,11 +6,21 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 
+from anyio import to_thread
 from fastapi import APIRouter, FastAPI
 from starlette.middleware import Middleware
 
 from starcat.service import pages
-from starcat.service.api import catalogs, databases, registry, releases, specs
+from starcat.service.api import (
+    catalogs,
+    databases,
+    identify,
+    jobs,
+    registry,
+    releases,
+    specs,
+    sql,
+)
 from starcat.service.guard import health, signing
 from starcat.service.guard.bodies import Bodies
 from starcat.service.guard.headers import SafeHeaders
@@ -21,11 +31,13 @@ from starcat.service.guard.origin import Origin
 from starcat.service.guard.request_id import RequestId
 from starcat.service.guard.retention import keep_removing
 from starcat.service.guard.shape import Shape
-from starcat.service.guard.streams import Stopping, Streams
 from starcat.service.guard.who import Who
+from starcat.service.jobs.pool import WorkerPool
+from starcat.service.pages.rendering import add_missing_page
 from starcat.service.problems import REFUSALS, add_problem_handlers
 from starcat.service.service import Service, open_service
 from starcat.service.settings import Settings
+from starcat.service.vo import cone_search, tap, tap_jobs
 from starcat.version import __version__
 
 API = "/api/v1"
@@ -33,8 +45,11 @@ API = "/api/v1"
 RESOURCES: tuple[APIRouter, ...] = (
     specs.router,
     catalogs.router,
+    jobs.router,
     databases.router,
     releases.router,
+    identify.router,
+    sql.router,
 )
 """Routers of the REST interface, under `API`."""
 
@@ -42,6 +57,9 @@ OTHERS: tuple[APIRouter, ...] = (
     registry.router,
     health.router,
     signing.router,
+    cone_search.router,
+    tap.router,
+    tap_jobs.router,
     *pages.ROUTERS,
 )
 """Routers of everything else: pages, the registry, TAP, cone searches, health."""
@@ -58,10 +76,11 @@ def make_app(settings: Settings) -> FastAPI:
     Returns
     -------
     FastAPI
-        With the service as ``app.state.service``. Its workers run while its lifespan lasts.
+        With the service as ``app.state.service`` and its workers as ``app.state.workers``, which
+        run while its lifespan lasts.
     """
     service = open_service(settings)
-    metrics, identities, stopping = Metrics(service), Identities(service), Stopping()
+    metrics, identities = Metrics(service), Identities(service)
     app = FastAPI(
         title="starcat",
         version=__version__,
@@ -79,13 +98,13 @@ def make_app(settings: Settings) -> FastAPI:
             Middleware(Origin, settings=settings),
             Middleware(Who, settings=settings, identities=identities),
             Middleware(Bodies, settings=settings),
-            Middleware(Streams, stopping=stopping),
             Middleware(Defects),
         ],
     )
-    app.state.service, app.state.metrics = service, metrics
-    app.state.identities, app.state.stopping = identities, stopping
+    app.state.service, app.state.metrics, app.state.identities = service, metrics, identities
+    app.state.workers = WorkerPool(service)
     add_problem_handlers(app)
+    add_missing_page(app)
     for router in RESOURCES:
         app.include_router(router, prefix=API, responses=REFUSALS)
     for router in OTHERS:
@@ -96,13 +115,21 @@ def make_app(settings: Settings) -> FastAPI:
 @asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     service: Service = app.state.service
+    pool: WorkerPool = app.state.workers
+    await to_thread.run_sync(pool.start)
+    service.tap.runner.start()
     removing = asyncio.create_task(keep_removing(service))
     try:
         yield
     finally:
+        service.stopping.set()
         removing.cancel()
         with suppress(asyncio.CancelledError):
             await removing
+        await to_thread.run_sync(pool.stop)
+        service.queue.close()
+        service.tap.close()
         service.catalogs.close()
         service.sessions.close()
+        service.confined.close()
         service.records.close()

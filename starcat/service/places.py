@@ -110,6 +110,51 @@ class Places:
         """
         return self.jobs / checked(job_id, JOB_ID, "job")
 
+    def job_lock(self, job_id: str) -> Path:
+        """Return what the process of a job holds while it lives.
+
+        Parameters
+        ----------
+        job_id : str
+            Thirty-two hexadecimal digits.
+
+        Returns
+        -------
+        Path
+            Which need not exist.
+        """
+        return self.job(job_id) / "lock"
+
+    def job_work(self, job_id: str) -> Path:
+        """Return the folder of what a job makes before it is whole.
+
+        Parameters
+        ----------
+        job_id : str
+            Thirty-two hexadecimal digits.
+
+        Returns
+        -------
+        Path
+            Which exists only while an attempt lasts.
+        """
+        return self.job(job_id) / "work"
+
+    def job_stderr(self, job_id: str) -> Path:
+        """Return the file of what the processes of a job said of their troubles.
+
+        Parameters
+        ----------
+        job_id : str
+            Thirty-two hexadecimal digits.
+
+        Returns
+        -------
+        Path
+            For the operator; no request gets it.
+        """
+        return self.job(job_id) / "stderr.txt"
+
     def make(self) -> None:
         """Make the folders that are not there, readable by their owner only."""
         for folder in (self.databases, self.catalogs, self.jobs, self.results, self.scratch):

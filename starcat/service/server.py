@@ -1,47 +1,93 @@
-"""The web server."""
+"""The web server: one for each root."""
 
 from __future__ import annotations
 
+import shutil
+import signal
+import socket
 import sys
-from types import FrameType
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 
 import uvicorn
 from fastapi import FastAPI
 
-from starcat.errors import ConfigError
+from starcat.errors import ConfigError, OutputError, reason
 from starcat.service.access import Role
 from starcat.service.app import make_app
 from starcat.service.guard.logs import log_settings
+from starcat.service.guard.patience import Patience
 from starcat.service.guard.shape import MOST_HEADER_BYTES, MOST_TARGET_BYTES
 from starcat.service.guard.tokens import TokenStore
+from starcat.service.jobs.pool import WorkerPool
+from starcat.service.places import Places
+from starcat.service.service import Service
 from starcat.service.settings import Settings
+from starcat.storage.atomic import make_folder
+from starcat.storage.locks import locked
 
 CONNECTIONS = 1_000
-"""Requests that are answered at the same time; of more, the server says that it is busy."""
+"""Connections at the same time; of more, the server says that it is busy."""
 
 FIRST = "operator"
 """Name of the token that the first start makes."""
 
+Announce = Callable[[str], None]
+"""Takes the address that people open, when the server listens."""
 
-def run_server(settings: Settings) -> None:
+
+def run_server(settings: Settings, announce: Announce) -> None:
     """Serve until a signal ends it.
 
     Parameters
     ----------
     settings : Settings
         What the operator set.
+    announce : callable
+        Called with the address, such as ``http://127.0.0.1:8000/``, when the server listens.
 
     Raises
     ------
     ConfigError
-        If others than this machine are to reach it, and nobody has a token.
+        If another server runs with the same root, if others than this machine are to reach it and
+        nobody has a token, or if the port is taken.
+    OutputError
+        If the root cannot be written to.
     """
+    places = Places(settings.root)
+    with _only_server(places):
+        shutil.rmtree(places.scratch, ignore_errors=True)
+        _serve(settings, announce)
+
+
+@contextmanager
+def _only_server(places: Places) -> Iterator[None]:
+    """See that no other server uses a root."""
+    with ExitStack() as stack:
+        try:
+            make_folder(places.root)
+            stack.enter_context(locked(places.lock, wait=False))
+        except BlockingIOError:
+            raise ConfigError(
+                f"another server runs with --root {places.root}; stop it, or choose another root",
+                key="root",
+                value=str(places.root),
+            ) from None
+        except OSError as error:
+            raise OutputError(
+                f"{places.root}: cannot be used ({reason(error)}); choose another --root",
+                path=places.root,
+            ) from error
+        yield
+
+
+def _serve(settings: Settings, announce: Announce) -> None:
     app = make_app(settings)
     _see_to_tokens(app.state.identities.tokens, settings)
+    listening = _listen(settings)
     config = uvicorn.Config(
         app,
-        host=settings.host,
-        port=settings.port,
+        http=Patience,
         log_config=log_settings(),
         access_log=False,
         server_header=False,
@@ -50,30 +96,65 @@ def run_server(settings: Settings) -> None:
         h11_max_incomplete_event_size=MOST_HEADER_BYTES + MOST_TARGET_BYTES,
         timeout_graceful_shutdown=round(settings.shutdown_s),
     )
-    _Server(config, app, settings).run()
+    with _signals_end_nothing_else():
+        _Server(config, app, announce).run([listening])
 
 
 class _Server(uvicorn.Server):
-    """Says where it is, and ends streams of events when it is told to stop."""
+    """Says where it is, and has jobs and streams of events end as soon as it is told to stop."""
 
-    def __init__(self, config: uvicorn.Config, app: FastAPI, settings: Settings) -> None:
+    def __init__(self, config: uvicorn.Config, app: FastAPI, announce: Announce) -> None:
         super().__init__(config)
-        self._app = app
-        self._settings = settings
+        self._service: Service = app.state.service
+        self._workers: WorkerPool = app.state.workers
+        self._announce = announce
 
-    async def startup(self, sockets: list[object] | None = None) -> None:  # type: ignore[override]
-        """Begin to listen."""
-        await super().startup(sockets)  # type: ignore[arg-type]
-        if self.started:
-            port = self.servers[0].sockets[0].getsockname()[1]
-            host = f"[{self._settings.host}]" if ":" in self._settings.host else self._settings.host
-            address = self._settings.public_url or f"http://{host}:{port}"
-            _say(f"starcat serves {self._settings.root} at {address.rstrip('/')}/")
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to answer."""
+        await super().startup(sockets)
+        if self.started and sockets:
+            self._announce(_address(self._service.settings, sockets[0].getsockname()[1]))
 
-    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Begin to stop."""
-        self._app.state.stopping.stop()
-        super().handle_exit(sig, frame)
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Stop: streams of events end at once, requests and jobs within the time that they have."""
+        self._service.stopping.set()
+        self._workers.begin_stop()
+        await super().shutdown(sockets)
+
+
+def _address(settings: Settings, port: int) -> str:
+    host = f"[{settings.host}]" if ":" in settings.host else settings.host
+    return f"{(settings.public_url or f'http://{host}:{port}').rstrip('/')}/"
+
+
+def _listen(settings: Settings) -> socket.socket:
+    """Return the socket that the server listens at."""
+    try:
+        [(family, _, _, _, address), *_] = socket.getaddrinfo(
+            settings.host, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )
+        listening = socket.create_server(address[:2], family=family, backlog=2048)
+    except OSError as error:
+        raise ConfigError(
+            f"cannot listen at {settings.host}, port {settings.port}: {reason(error)}; choose "
+            "another with --host and --port, or end what uses it",
+            key="port",
+            value=settings.port,
+        ) from error
+    return listening
+
+
+@contextmanager
+def _signals_end_nothing_else() -> Iterator[None]:
+    """See that a signal that has ended the server in good order is not an error of the command."""
+    known = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        for number in known:
+            signal.signal(number, lambda number, frame: None)
+        yield
+    finally:
+        for number, handler in known.items():
+            signal.signal(number, handler)
 
 
 def _see_to_tokens(tokens: TokenStore, settings: Settings) -> None:

@@ -9,6 +9,7 @@ from typing import Annotated
 from fastapi import Depends, Request
 
 from starcat.service.catalogs import Catalogs
+from starcat.service.confined import Confined
 from starcat.service.jobs.job import JobStore
 from starcat.service.jobs.queue import JobQueue, open_queue
 from starcat.service.places import Places
@@ -16,6 +17,7 @@ from starcat.service.records import Records
 from starcat.service.sessions import Sessions
 from starcat.service.settings import Settings
 from starcat.service.shelf import Shelf
+from starcat.service.vo.tap_service import Tap
 
 READ = "read"
 """Folder, among the catalogs, of what estimates start from."""
@@ -40,13 +42,17 @@ class Service:
     jobs : JobStore
         The jobs there are.
     sessions : Sessions
-        Processes of their own, for what takes long or may take too much.
+        Open query sessions.
     queue : JobQueue
-        Where jobs wait.
+        What waits for workers.
+    confined : Confined
+        Processes that read uploads and make files.
+    tap : Tap
+        What TAP needs.
     catalogs : Catalogs
         The catalogs there are, and estimates from them.
     stopping : threading.Event
-        Set when the service is about to end.
+        Set when the service stops.
     """
 
     settings: Settings
@@ -55,6 +61,8 @@ class Service:
     shelf: Shelf
     jobs: JobStore
     sessions: Sessions
+    confined: Confined
+    tap: Tap
     queue: JobQueue
     catalogs: Catalogs
     stopping: threading.Event = field(default_factory=threading.Event)
@@ -83,17 +91,20 @@ def open_service(settings: Settings) -> Service:
     places = Places(settings.root)
     places.make()
     records = Records(places.records)
-    queue, sessions = open_queue(settings, places), Sessions(settings)
+    shelf, sessions = Shelf(places), Sessions(settings)
     most = round(settings.job_memory_gib * GIB)
+    confined = Confined(settings, places.scratch)
     return Service(
-        settings,
-        places,
-        records,
-        Shelf(places),
-        JobStore(records),
-        sessions,
-        queue,
-        Catalogs(places.catalogs / READ, most),
+        settings=settings,
+        places=places,
+        records=records,
+        shelf=shelf,
+        jobs=JobStore(records),
+        sessions=sessions,
+        confined=confined,
+        tap=Tap(settings, places, records, shelf, sessions, confined),
+        queue=open_queue(settings, places),
+        catalogs=Catalogs(places.catalogs / READ, most),
     )
 
 

@@ -26,7 +26,7 @@ _WITHOUT_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EBADF}
 
 
 @contextmanager
-def locked(path: Path) -> Iterator[bool]:
+def locked(path: Path, *, wait: bool = True) -> Iterator[bool]:
     """Hold a lock that ends with the process, however it ends.
 
     Parameters
@@ -34,11 +34,18 @@ def locked(path: Path) -> Iterator[bool]:
     path : Path
         A folder, or a file that is made if need be, with its folder. Who holds the lock may
         remove it.
+    wait : bool, default True
+        Whether to wait for who holds it.
 
     Yields
     ------
     bool
         Whether nobody else holds it; False where the system or the file system has no locks.
+
+    Raises
+    ------
+    BlockingIOError
+        If it is held and ``wait`` is false.
     """
     if fcntl is None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -53,7 +60,7 @@ def locked(path: Path) -> Iterator[bool]:
         except FileNotFoundError:  # the one before has removed the folder
             continue
         try:
-            is_real = _wait_for(descriptor, path)
+            is_real = _take(descriptor, path, wait=wait)
             if _is_still(descriptor, path):
                 yield is_real
                 return
@@ -61,9 +68,11 @@ def locked(path: Path) -> Iterator[bool]:
             os.close(descriptor)
 
 
-def _wait_for(descriptor: int, path: Path) -> bool:
+def _take(descriptor: int, path: Path, *, wait: bool) -> bool:
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        fcntl.flock(descriptor, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise
     except OSError as error:
         if error.errno not in _WITHOUT_LOCKS:
             raise

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from typer.main import get_command
+from every_command import every_command
 from typer.testing import CliRunner
 
 from starcat.catalog.source import data_source, source_names
@@ -27,8 +27,7 @@ def cli_page() -> str:
     """Return the reference of all commands, from their own help."""
     page = [NOTE + "# Commands\n"]
     runner = CliRunner(env={"COLUMNS": "96", "TERMINAL_WIDTH": "96"})
-    names = sorted(get_command(app).commands)
-    for arguments in ([], *([name] for name in names)):
+    for arguments in ([], *(name.split() for name in every_command())):
         done = runner.invoke(app, [*arguments, "--help"], prog_name="starcat")
         title = " ".join(["starcat", *arguments])
         body = "\n".join(line.rstrip() for line in done.output.strip().splitlines())

@@ -20,6 +20,7 @@ from starcat.service.jobs.transitions import add_once, cancel, retry
 from starcat.service.problems import Problem
 from starcat.service.service import Service
 from starcat.specs.build_spec import BuildSpec
+from starcat.specs.reading import spec_from_dict
 
 Format = Literal["parquet", "hats"]
 
@@ -164,13 +165,13 @@ def submit_evaluation(
         If there is no room for it, or too many jobs of the owner wait.
     """
     database = service.shelf.database(database_id)
-    test = database.manifest["spec"]["self_test"]
+    test = spec_from_dict(database.manifest["spec"], database.title).self_test
     request = {
         "database": database_id,
         "frames": frames,
-        "noise_px": test["noise_px"] if noise_px is None else noise_px,
-        "noise_mag": test["noise_mag"] if noise_mag is None else noise_mag,
-        "seed": test["seed"] if seed is None else seed,
+        "noise_px": test.noise_px if noise_px is None else noise_px,
+        "noise_mag": test.noise_mag if noise_mag is None else noise_mag,
+        "seed": test.seed if seed is None else seed,
     }
     key = key_of("evaluate", request)
     return _submit(service, "evaluate", request, key, f"{database.title} self-test", owner)

@@ -1,0 +1,76 @@
+"""What a killed server has left: jobs that ran, messages that are lost, halves of things."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import time
+from contextlib import suppress
+
+from starcat.service.jobs.job import Job
+from starcat.service.jobs.transitions import interrupt
+from starcat.service.places import JOB_ID, Places
+from starcat.service.service import Service
+from starcat.storage.locks import locked
+
+WAIT_S = 10.0
+"""Seconds that a process of a job has to die, after its worker has."""
+
+_logger = logging.getLogger(__name__)
+
+
+def recover(service: Service) -> None:
+    """Take up the jobs of a service where nobody runs any.
+
+    Parameters
+    ----------
+    service : Service
+        Jobs that ran wait again, and those that wait get a message each, in their order. Folders
+        of what was not finished are removed.
+    """
+    for job in _all(service, "running"):
+        _wait_for_end(service.places, job.id)
+        _logger.warning("job %s was interrupted in attempt %d", job.id, job.attempt)
+        interrupt(service.records, job.id, job.attempt)
+    _remove_halves(service)
+    send_waiting(service)
+
+
+def send_waiting(service: Service) -> None:
+    """Send a message for each job that waits, and forget all others.
+
+    Parameters
+    ----------
+    service : Service
+        Whose jobs they are.
+    """
+    waiting = _all(service, "queued")
+    service.queue.send_again(job.id for job in reversed(waiting))
+
+
+def _all(service: Service, state: str) -> list[Job]:
+    return service.jobs.all(state=state, most=1_000_000)  # type: ignore[arg-type]
+
+
+def _wait_for_end(places: Places, job_id: str) -> None:
+    """Wait until the process of a job is gone; the next attempt waits too, if it is not."""
+    lock = places.job_lock(job_id)
+    if not lock.exists():
+        return
+    until_s = time.monotonic() + WAIT_S
+    while time.monotonic() < until_s:
+        with suppress(BlockingIOError), locked(lock, wait=False):
+            return
+        time.sleep(0.05)
+    _logger.error("job %s: its process does not end", job_id)
+
+
+def _remove_halves(service: Service) -> None:
+    places = service.places
+    running = {job.id for job in _all(service, "running")}
+    for folder in places.jobs.iterdir():
+        if JOB_ID.fullmatch(folder.name) and folder.name not in running:
+            shutil.rmtree(places.job_work(folder.name), ignore_errors=True)
+    for folder in places.databases.iterdir():
+        with suppress(OSError):  # it is not empty
+            folder.rmdir()

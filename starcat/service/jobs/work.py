@@ -1,0 +1,216 @@
+"""What the kinds of jobs do: a function each, from a request to a result.
+
+What a job makes is made in a folder of its own, and moved to its place in one step when it is
+whole; what is there already is not made again.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from starcat.errors import TargetMissing
+from starcat.progress import Progress
+from starcat.service.jobs.job import Kind
+from starcat.service.places import Places
+from starcat.service.shelf import Shelf
+from starcat.storage.atomic import sync
+
+Tell = Callable[[str, str], None]
+"""Called with a level of the log and a line."""
+
+
+@dataclass(frozen=True)
+class Order:
+    """What the process of a job is told to do.
+
+    Attributes
+    ----------
+    places : Places
+        What lies where.
+    job_id, kind, key, request
+        As those of `starcat.service.jobs.job.Job`.
+    memory_bytes : int
+        Memory that the process may take.
+    scheduler : str, optional
+        Address of a Dask cluster.
+    threads : int
+        Threads that it may use.
+    """
+
+    places: Places
+    job_id: str
+    kind: Kind
+    key: str
+    request: Mapping[str, Any]
+    memory_bytes: int
+    scheduler: str | None
+    threads: int
+
+    @property
+    def work(self) -> Path:
+        """The folder that it makes things in."""
+        return self.places.job_work(self.job_id)
+
+
+def do_job(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
+    """Do a job.
+
+    Parameters
+    ----------
+    order : Order
+        What is to be done.
+    progress : Progress
+        Called with (stage, done, total).
+    tell : callable
+        Called with what is worth telling.
+
+    Returns
+    -------
+    dict
+        The result, of plain values.
+
+    Raises
+    ------
+    StarcatError
+        If it cannot be done.
+    """
+    shutil.rmtree(order.work, ignore_errors=True)
+    order.work.mkdir(parents=True)
+    return _DOES[order.kind](order, progress, tell)
+
+
+def _build(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
+    database_id = order.key[:16]
+    shelf = Shelf(order.places)
+    result = {"database": database_id}
+    try:
+        shelf.database(database_id)
+    except TargetMissing:
+        pass
+    else:
+        tell("info", f"database {database_id} is there already")
+        return result
+    from starcat.pipeline.build import build
+    from starcat.specs.reading import spec_from_dict
+
+    spec = spec_from_dict(dict(order.request["spec"]), "spec")
+    made = order.work / database_id
+    built = build(
+        spec,
+        {},
+        made,
+        workers=order.threads,
+        progress=progress,
+        announce=lambda cost: tell("info", cost.in_words),
+        max_memory_bytes=order.memory_bytes,
+    )
+    for problem in built.problems:
+        tell("warning", problem)
+    for warning in built.warnings:
+        tell("warning", warning)
+    clean = built.rates[0]
+    tell(
+        "info",
+        f"{clean.identified} of {clean.identifiable} clean frames were identified, "
+        f"{clean.wrong} wrongly",
+    )
+    _place(made, order.places.database(database_id))
+    return result
+
+
+def _place(made: Path, final: Path) -> None:
+    """Give a folder its name; one that is empty, or holds no database, makes way."""
+    if final.is_dir():
+        aside = made.with_name("aside")
+        final.rename(aside)
+        shutil.rmtree(aside, ignore_errors=True)
+    sync(made)
+    made.rename(final)
+    sync(final.parent)
+
+
+def _ingest(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
+    from starcat.catalog.fetching.locate import locate
+
+    asked = order.request
+    source, to = str(asked["source"]), asked["to"]
+    how = {name: asked[name] for name in ("band", "epoch_jyear", "read_limit_mag")}
+    paths = locate(source, {})
+    name = f"{source}-{order.key[:16]}" + (".parquet" if to == "parquet" else "")
+    result: dict[str, Any] = {"catalog": name, "source": source}
+    final = order.places.catalogs / name
+    made = order.work / name
+    if to == "hats":
+        from starcat.store.ingest import ingest_to_store
+        from starcat.store.options import StoreOptions
+
+        options = StoreOptions(
+            memory_bytes=order.memory_bytes, workers=order.threads, scheduler=order.scheduler
+        )
+        stored = ingest_to_store(source, paths, made, **how, options=options, progress=progress)
+        problems, notes, rows = stored.problems, stored.notes, int(stored.manifest["kept"])
+    else:
+        from starcat.catalog.star_files import rejected_path, write_star_tables
+        from starcat.store.reading import read_catalog
+
+        read = read_catalog(source, paths, **how, workers=order.threads, progress=progress)
+        write_star_tables(read, made)
+        problems, notes, rows = read.problems, read.notes, len(read.stars)
+        if rejected_path(made).exists():
+            rejected_path(made).replace(rejected_path(final))
+    for line in (*problems, *notes):
+        tell("warning", line)
+    if made.is_dir() and final.is_dir():  # the same content: it has the same key
+        shutil.rmtree(made)
+    else:
+        made.replace(final)
+    sync(final.parent)
+    return {**result, "rows": rows}
+
+
+def _evaluate(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
+    from starcat.matcher.matcher import Matcher
+    from starcat.simulation.selftest import self_test
+
+    asked = order.request
+    database = Shelf(order.places).database(str(asked["database"]))
+    noise_px = float(asked["noise_px"])
+    matcher = Matcher.open(database.folder, None, tolerance_px=max(0.5, 4.0 * noise_px))
+    tell("info", f"{asked['frames']} frames of each kind, of {database.title}")
+    rates = self_test(
+        matcher,
+        int(asked["frames"]),
+        noise_px,
+        int(asked["seed"]),
+        progress,
+        noise_mag=float(asked["noise_mag"]),
+    )
+    return {"database": database.id, "rates": [each.as_dict() for each in rates]}
+
+
+_DOES: Mapping[Kind, Callable[[Order, Progress, Tell], dict[str, Any]]] = {
+    "build": _build,
+    "ingest": _ingest,
+    "evaluate": _evaluate,
+}
+
+
+def threads_of(workers: int) -> int:
+    """Return how many threads a job may use where several run at the same time.
+
+    Parameters
+    ----------
+    workers : int
+        Jobs at the same time.
+
+    Returns
+    -------
+    int
+        At least 1.
+    """
+    return max(1, (os.cpu_count() or 1) // max(1, workers))

@@ -1,0 +1,174 @@
+"""The page *New database*: a spec is designed, and what it would give is seen at once."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import Depends, Query, Request
+from fastapi.responses import JSONResponse, RedirectResponse, Response
+
+from starcat.errors import StarcatError
+from starcat.service.access import Reader, Role, principal_of
+from starcat.service.jobs.submission import submit_build
+from starcat.service.pages.draft import (
+    TEXT,
+    Draft,
+    draft_of_content,
+    draft_of_form,
+    without_defaults,
+)
+from starcat.service.pages.preview import MOST_MAPPED, Preview, preview_of, tiling_content
+from starcat.service.pages.rendering import (
+    ENVIRONMENT,
+    count_text,
+    duration_text,
+    page_router,
+    render,
+    size_text,
+)
+from starcat.service.problems import Problem, ProblemDetails, problem_of
+from starcat.service.service import Service, TheService
+from starcat.specs.reading import preset, preset_names
+
+MOST_FIELDS = 100
+"""Fields of a form; this one has 30."""
+
+router = page_router()
+
+
+async def form_of(request: Request) -> dict[str, str]:
+    """Return the fields of the form that a request brings; files are none of them."""
+    async with request.form(max_files=1, max_fields=MOST_FIELDS) as form:
+        return {name: value for name, value in form.items() if isinstance(value, str)}
+
+
+Form = Annotated[dict[str, str], Depends(form_of)]
+
+
+@router.get("/new")
+def new_page(
+    request: Request,
+    service: TheService,
+    _: Reader,
+    chosen: Annotated[str | None, Query(alias="preset")] = None,
+    job: Annotated[str | None, Query()] = None,
+    database: Annotated[str | None, Query()] = None,
+) -> Response:
+    """Show the form with a preset, or with the spec of a job or of a database."""
+    if job is not None:
+        spec = service.jobs.get(job).request.get("spec")
+    elif database is not None:
+        spec = service.shelf.database(database).manifest["spec"]
+    else:
+        chosen = chosen or preset_names()[0]
+        spec = preset(chosen).recorded()
+    if spec is None:
+        raise Problem(404, f"job {job} builds nothing; choose one that does")
+    return _page(request, service, draft_of_content(without_defaults(spec)), chosen or "")
+
+
+@router.post("/new")
+def sent_page(request: Request, service: TheService, form: Form, _: Reader) -> Response:
+    """Build what the form has, or show what it would give."""
+    draft = draft_of_form(form)
+    if form.get("do") != "build" or draft.spec is None:
+        return _page(request, service, draft, form.get("preset", ""))
+    who = principal_of(request)
+    try:
+        if who.role < Role.BUILDER:
+            raise Problem(
+                403,
+                "building needs the role builder; sign in with a token that has it "
+                "('starcat token create --role builder')",
+            )
+        job = submit_build(service, draft.spec, who.name).job
+    except (StarcatError, Problem) as error:
+        return _page(request, service, draft, form.get("preset", ""), error)
+    return RedirectResponse(f"/jobs/{job.id}", 303)
+
+
+@router.post("/new/preview")
+def preview(request: Request, service: TheService, form: Form, _: Reader) -> Response:
+    """Tell a script what the form has become, and what that would give."""
+    draft = draft_of_form(form)
+    seen, error = _preview(service, draft)
+    part = ENVIRONMENT.get_template("new_result.html").render(
+        preview=seen, problem=error and error.detail
+    )
+    content: dict[str, Any] = {
+        "toml": draft.text,
+        "values": draft.values,
+        "lens": draft.lens,
+        "products": draft.products,
+        "bands": draft.bands,
+        "errors": draft.errors,
+        "result": part,
+        "summary": summary(seen),
+        "is_busy": error is not None and error.status == 503,
+        "stars": [] if seen is None else seen.estimate.fields.count.tolist(),
+    }
+    return JSONResponse(content, headers={"Cache-Control": "no-store"})
+
+
+@router.get("/new/tiling")
+def tiling(count: Annotated[int, Query(ge=1, le=MOST_MAPPED)], _: Reader) -> Response:
+    """Tell a script where the fields of a tiling are."""
+    return JSONResponse(tiling_content(count), headers={"Cache-Control": "private, max-age=86400"})
+
+
+def _preview(service: Service, draft: Draft) -> tuple[Preview | None, ProblemDetails | None]:
+    if draft.spec is None:
+        return None, None
+    try:
+        return preview_of(service.catalogs.estimate(draft.spec)), None
+    except (StarcatError, Problem) as error:
+        return None, problem_of(error)
+
+
+def _page(
+    request: Request,
+    service: Service,
+    draft: Draft,
+    chosen: str,
+    refused: StarcatError | Problem | None = None,
+) -> Response:
+    seen, error = _preview(service, draft)
+    problem = None if refused is None else problem_of(refused)
+    status = problem.status if problem else 422 if draft.errors else 200
+    return render(
+        request,
+        "new.html",
+        status=status,
+        draft=draft,
+        preview=seen,
+        problem=error and error.detail,
+        refused=problem and problem.detail,
+        summary=summary(seen),
+        presets=[(name, preset(name).description) for name in preset_names()],
+        chosen=chosen,
+        sources=_sources(service),
+        may_build=principal_of(request).role >= Role.BUILDER,
+        text_error=draft.errors.get(TEXT),
+    )
+
+
+def summary(seen: Preview | None) -> str:
+    """Return what a spec would give in one line."""
+    if seen is None:
+        return "No estimate: see what is wrong above."
+    found = seen.estimate
+    stars = found.coverage.stars
+    return (
+        f"{count_text(found.cost.stars)} guide stars, {count_text(stars.median)} in the middle "
+        f"field ({stars.minimum} to {stars.maximum}), {size_text(found.total_bytes)}, built in "
+        f"about {duration_text(max(1.0, found.build_seconds))}"
+    )
+
+
+def _sources(service: Service) -> list[tuple[str, str]]:
+    """Return the star catalogs there are, those whose files are here first."""
+    found = []
+    for one in service.catalogs.offered():
+        told = one.source.identifier if one.is_here else "its files are not here"
+        found.append((one.source.name, f"{one.source.name} – {told}"))
+    return found

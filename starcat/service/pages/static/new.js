@@ -1,0 +1,156 @@
+// New database: sliders, the spec and what it would give, kept in step by the server.
+
+import { announce } from "./starcat.js";
+import { startMap } from "./sky.js";
+
+const form = document.getElementById("design");
+const result = document.getElementById("result");
+const text = document.getElementById("toml");
+const before = document.getElementById("toml-before");
+const summary = document.getElementById("summary");
+const FIELDS_AFTER_MS = 120;
+const TEXT_AFTER_MS = 450;
+const BUSY_AFTER_MS = 2500;
+
+let waiting = 0;
+let asked = null;
+let tiling = { count: 0, fields: null };
+
+// Sliders
+
+function places(step) {
+  return (String(step).split(".")[1] ?? "").length;
+}
+
+function valueOf(range) {
+  const position = Number(range.value);
+  if (range.dataset.noneAt === "low" && position <= Number(range.min)) return "";
+  if (range.dataset.noneAt === "high" && position >= Number(range.max)) return "";
+  if (range.dataset.scale !== "log") return String(position);
+  const { low, high, step } = range.own;
+  const value = low * (high / low) ** (position / 1000);
+  const rounded = step < 1 ? value : Number(value.toPrecision(3));
+  return String(Number(rounded.toFixed(places(step))));
+}
+
+function follow(range) {
+  const number = document.getElementById(range.dataset.of);
+  if (range === document.activeElement && range.matches(":active")) return;
+  const value = Number(number.value);
+  if (number.value === "") range.value = range.dataset.noneAt === "low" ? range.min : range.max;
+  else if (range.dataset.scale !== "log") range.value = String(value);
+  else range.value = String((1000 * Math.log(value / range.own.low)) / Math.log(range.own.high / range.own.low));
+  const unit = document.querySelector(`label[for="${number.id}"] .unit`)?.textContent ?? "";
+  range.setAttribute("aria-valuetext", number.value === "" ? number.placeholder : `${number.value} ${unit}`);
+}
+
+const ranges = [...form.querySelectorAll("input[type=range]")];
+for (const range of ranges) {
+  const own = { low: Number(range.min), high: Number(range.max), step: Number(range.step) };
+  range.own = own;
+  if (range.dataset.scale === "log") [range.min, range.max, range.step] = ["0", "1000", "1"];
+  range.hidden = false;
+  range.closest(".slider").classList.add("live");
+  range.addEventListener("input", () => {
+    document.getElementById(range.dataset.of).value = valueOf(range);
+    follow(range);
+  });
+  follow(range);
+}
+
+// What the server says
+
+function showErrors(errors) {
+  for (const told of form.querySelectorAll("[id$='-error']")) {
+    const key = told.id.slice(0, -"-error".length);
+    const message = errors[key] ?? "";
+    if (told.textContent !== message) told.textContent = message;
+    const control = document.getElementById(key);
+    (control?.closest(".field") ?? control?.closest(".copybox"))?.classList.toggle("wrong", message !== "");
+    if (message) control?.setAttribute("aria-invalid", "true");
+    else control?.removeAttribute("aria-invalid");
+  }
+}
+
+function showValues(state) {
+  const bands = document.getElementById("catalog.band");
+  const names = state.values["catalog.band"] === "" ? ["", ...state.bands] : state.bands;
+  if ([...bands.options].map((one) => one.value).join("\n") !== names.join("\n")) {
+    bands.replaceChildren(...names.map((name) => new Option(name || "the catalog's first", name)));
+  }
+  for (const [key, value] of Object.entries(state.values)) {
+    const control = document.getElementById(key);
+    if (control && control !== document.activeElement && control.value !== value) control.value = value;
+  }
+  document.getElementById(`lens-${state.lens}`).checked = true;
+  for (const [name, wanted] of Object.entries(state.products)) {
+    document.getElementById(`products.${name}.enabled`).checked = wanted;
+  }
+  ranges.forEach(follow);
+}
+
+function showMap(stars) {
+  const figure = result.querySelector(".sky");
+  if (!figure || stars.length === 0) return;
+  startMap(figure, async () => {
+    if (tiling.count !== stars.length) {
+      const answer = await fetch(`${form.dataset.tiling}?count=${stars.length}`);
+      if (!answer.ok) throw new Error(String(answer.status));
+      tiling = { count: stars.length, fields: await answer.json() };
+    }
+    return { ...tiling.fields, stars };
+  });
+}
+
+function show(state) {
+  const isReadable = state.errors.toml === undefined || state.toml !== text.value;
+  if (document.activeElement !== text && text.value !== state.toml) text.value = state.toml;
+  before.value = state.toml;
+  if (isReadable || Object.values(state.values).some(Boolean)) showValues(state);
+  showErrors(state.errors);
+  const hadFocus = result.querySelector(".sky svg") === document.activeElement;
+  result.innerHTML = state.result;
+  showMap(state.stars);
+  if (hadFocus) result.querySelector(".sky svg")?.focus();
+  if (summary.textContent !== state.summary) summary.textContent = state.summary;
+}
+
+async function ask() {
+  asked?.abort();
+  asked = new AbortController();
+  result.setAttribute("aria-busy", "true");
+  try {
+    const answer = await fetch(form.dataset.preview, {
+      method: "POST", body: new URLSearchParams(new FormData(form)), signal: asked.signal,
+    });
+    if (!answer.ok) {
+      const problem = await answer.json().catch(() => null);
+      throw new Error(problem?.detail ?? `the service answers ${answer.status}`);
+    }
+    const state = await answer.json();
+    show(state);
+    if (state.is_busy) {
+      clearTimeout(waiting);
+      waiting = setTimeout(ask, BUSY_AFTER_MS);
+      return;
+    }
+  } catch (error) {
+    if (error.name === "AbortError") return;
+    summary.textContent = `No estimate: ${error.message}`;
+  }
+  result.setAttribute("aria-busy", "false");
+  form.dataset.state = "settled";
+}
+
+form.addEventListener("input", (event) => {
+  form.dataset.state = "changed";
+  clearTimeout(waiting);
+  const range = ranges.find((one) => one.dataset.of === event.target.id);
+  if (range) follow(range);
+  waiting = setTimeout(ask, event.target === text ? TEXT_AFTER_MS : FIELDS_AFTER_MS);
+});
+text.addEventListener("blur", () => { if (text.value !== before.value && text.value.trim() === before.value.trim()) text.value = before.value; });
+// What a browser kept of a page that was left is newer than what the server sent.
+document.getElementById("update").hidden = true;
+form.addEventListener("submit", () => { announce("Sent"); clearTimeout(waiting); });
+ask();

@@ -1,0 +1,447 @@
+"""Geometry of ADQL on the sphere, as SQL: places, circles, polygons and what they have in common.
+
+Separations are those of the macro ``separation`` (by the arc tangent, exact at all angles). Sides
+of polygons are arcs of great circles. A polygon is the smaller of the two parts of the sphere that
+its sides divide, whatever the order of its corners; its inside is found by the angle that its sides
+go round a place. What is known when the query is read is computed then.
+
+References
+----------
+ADQL 2.1, section 4.2. Todhunter 1886, Spherical Trigonometry, for the area.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+Term = float | str
+"""A number, or SQL that gives one."""
+
+Vector = tuple[Term, Term, Term]
+
+MARGIN_DEG = 1e-9
+"""By how much the band of declinations is wider that is looked at first."""
+
+_COMPARISONS: dict[str, Callable[[float, float], bool]] = {
+    "<": operator.lt, ">": operator.gt, "<=": operator.le, ">=": operator.ge, "=": operator.eq,
+}  # fmt: skip
+
+SQUARE_DEGREES = (180.0 / math.pi) ** 2
+
+
+@dataclass(frozen=True)
+class Point:
+    """A place.
+
+    Attributes
+    ----------
+    lon, lat : str
+        SQL of right ascension and declination, degrees.
+    """
+
+    lon: str
+    lat: str
+
+    @cached_property
+    def known(self) -> tuple[float, float] | None:
+        """The place in degrees, if it does not depend on a row."""
+        lon, lat = _number(self.lon), _number(self.lat)
+        return (lon, lat) if lon is not None and lat is not None else None
+
+    @cached_property
+    def vector(self) -> Vector:
+        """The direction of the place."""
+        if self.known is None:
+            x, y = f"cosd({self.lat}) * cosd({self.lon})", f"cosd({self.lat}) * sind({self.lon})"
+            return f"({x})", f"({y})", f"sind({self.lat})"
+        lon, lat = map(math.radians, self.known)
+        return math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)
+
+    @property
+    def value(self) -> str:
+        """SQL of the place as DALI writes it."""
+        return _list(self.lon, self.lat)
+
+
+@dataclass(frozen=True)
+class Circle:
+    """All places that are no farther from a centre than a radius.
+
+    Attributes
+    ----------
+    centre : Point
+        Its centre.
+    radius : str
+        SQL of the radius, degrees.
+    """
+
+    centre: Point
+    radius: str
+
+    @property
+    def value(self) -> str:
+        """SQL of the circle as DALI writes it."""
+        return _list(self.centre.lon, self.centre.lat, self.radius)
+
+
+@dataclass(frozen=True)
+class Polygon:
+    """What great circles between corners enclose.
+
+    Attributes
+    ----------
+    corners : tuple of Point
+        Three or more.
+    centre : Point, optional
+        The middle, if it was made from that.
+    """
+
+    corners: tuple[Point, ...]
+    centre: Point | None = None
+
+    @property
+    def value(self) -> str:
+        """SQL of the polygon as DALI writes it."""
+        return _list(*(part for corner in self.corners for part in (corner.lon, corner.lat)))
+
+    @cached_property
+    def sides(self) -> tuple[tuple[Point, Point], ...]:
+        """Pairs of corners."""
+        return tuple(zip(self.corners, (*self.corners[1:], self.corners[0]), strict=True))
+
+    @cached_property
+    def turn(self) -> Term:
+        """The area in steradians; negative where the corners go clockwise as seen from inside."""
+        first, *others = (corner.vector for corner in self.corners)
+        parts: list[Term] = []
+        for a, b in pairwise(others):
+            whole = _sum(1.0, _dot(first, a), _dot(a, b), _dot(b, first))
+            parts.append(_times(2.0, _arctan(_dot(first, _cross(a, b)), whole)))
+        return _sum(*parts)
+
+
+Shape = Point | Circle | Polygon
+
+
+def contains(inner: Shape, outer: Shape) -> str:
+    """Return SQL of whether a shape is within another.
+
+    Parameters
+    ----------
+    inner, outer : Shape
+        The second is a circle or a polygon; a place contains equal places only.
+
+    Returns
+    -------
+    str
+        True, false, or null where a number is missing. The edge of a circle is within it.
+    """
+    if isinstance(outer, Point):
+        return _compared(_apart(inner, outer), "=", 0.0) if isinstance(inner, Point) else "false"
+    if isinstance(outer, Circle):
+        if isinstance(inner, Point):
+            return _in_circle(inner, outer)
+        if isinstance(inner, Circle):
+            reach = _plus(_apart(inner.centre, outer.centre), _term(inner.radius))
+            return _compared(reach, "<=", _term(outer.radius))
+        return _all(_in_circle(corner, outer) for corner in inner.corners)
+    if isinstance(inner, Point):
+        return _in_polygon(inner, outer)
+    if isinstance(inner, Circle):
+        centre, radius = inner.centre, _term(inner.radius)
+        edge = (_compared(_from_side(centre, a, b), ">=", radius) for a, b in outer.sides)
+        return _all([_in_polygon(centre, outer), *edge])
+    within = [_in_polygon(corner, outer) for corner in inner.corners]
+    crossing = _sides_cross(inner, outer)
+    return _all([*within, {"true": "false", "false": "true"}.get(crossing, f"NOT {crossing}")])
+
+
+def intersects(one: Shape, other: Shape) -> str:
+    """Return SQL of whether two shapes have a place in common.
+
+    Parameters
+    ----------
+    one, other : Shape
+        The shapes.
+
+    Returns
+    -------
+    str
+        True, false, or null where a number is missing.
+    """
+    if isinstance(one, Point):
+        return contains(one, other)
+    if isinstance(other, Point):
+        return contains(other, one)
+    if isinstance(one, Circle) and isinstance(other, Circle):
+        reach = _plus(_term(one.radius), _term(other.radius))
+        return _compared(_apart(one.centre, other.centre), "<=", reach)
+    if isinstance(one, Circle) and isinstance(other, Polygon):
+        centre, radius = one.centre, _term(one.radius)
+        near = (_compared(_from_side(centre, a, b), "<=", radius) for a, b in other.sides)
+        return _any([_in_polygon(centre, other), *near])
+    if isinstance(one, Polygon) and isinstance(other, Polygon):
+        inside = [_in_polygon(one.corners[0], other), _in_polygon(other.corners[0], one)]
+        return _any([*inside, _sides_cross(one, other)])
+    return intersects(other, one)
+
+
+def distance(one: Point, other: Point) -> str:
+    """Return SQL of the separation of two places, degrees."""
+    return _text(_apart(one, other))
+
+
+def area(shape: Shape) -> str:
+    """Return SQL of the area of a shape, square degrees."""
+    if isinstance(shape, Point):
+        return "0.0e0"
+    if isinstance(shape, Circle):
+        # 1 - cos r with all its digits for small circles.
+        half = f"sind(least({shape.radius}, 180) / 2e0)"
+        return f"({4.0 * math.pi * SQUARE_DEGREES!r} * {half} * {half})"
+    return f"({SQUARE_DEGREES!r} * abs({_text(shape.turn)}))"
+
+
+def centroid(shape: Shape) -> Point:
+    """Return the middle of a shape: of a polygon the direction of its mean place."""
+    if isinstance(shape, Point):
+        return shape
+    if isinstance(shape, Circle):
+        return shape.centre
+    if shape.centre is not None:
+        return shape.centre
+    # The mean is half the sum of the normals of the sides, each as long as its side.
+    total: Vector = (0.0, 0.0, 0.0)
+    for a, b in shape.sides:
+        normal = _cross(a.vector, b.vector)
+        length = _root(_dot(normal, normal))
+        factor = _over(_arctan(length, _dot(a.vector, b.vector)), length)
+        x, y, z = (_sum(t, _times(factor, n)) for t, n in zip(total, normal, strict=True))
+        total = (x, y, z)
+    sign = _sign(shape.turn)
+    x, y, z = (_times(sign, part) for part in total)
+    level = _root(_sum(_times(x, x), _times(y, y)))
+    lon = f"degrees({_text(_arctan(y, x))})"
+    return Point(
+        f"({lon} + CASE WHEN {lon} < 0 THEN 360 ELSE 0 END)", f"degrees({_text(_arctan(z, level))})"
+    )
+
+
+def box(centre: Point, width: str, height: str) -> Polygon:
+    """Return the polygon with the corners of a box around a place.
+
+    Parameters
+    ----------
+    centre : Point
+        Its middle.
+    width, height : str
+        SQL of the differences of right ascension and declination between corners, degrees.
+
+    Returns
+    -------
+    Polygon
+        With four corners, as ADQL 2.1 says in section 4.2.9.
+    """
+    corners = tuple(
+        Point(_folded(centre.lon, right, width), _folded(centre.lat, up, height))
+        for right, up in (("-", "-"), ("+", "-"), ("+", "+"), ("-", "+"))
+    )
+    return Polygon(corners, centre)
+
+
+def _folded(middle: str, sign: str, width: str) -> str:
+    known = _number(middle), _number(width)
+    if known[0] is not None and known[1] is not None:
+        half = known[1] / 2.0
+        return _text(known[0] + half if sign == "+" else known[0] - half)
+    return f"({middle} {sign} ({width}) / 2e0)"
+
+
+def _in_circle(place: Point, circle: Circle) -> str:
+    near = _compared(_apart(place, circle.centre), "<=", _term(circle.radius))
+    if place.known:
+        return near
+    lat, radius = _term(circle.centre.lat), _term(circle.radius)
+    reach = _plus(radius, MARGIN_DEG)
+    low, high = _text(_plus(lat, _times(-1.0, reach))), _text(_plus(lat, reach))
+    # Declinations are looked at first: files tell which they have.
+    return f"({place.lat} BETWEEN {low} AND {high} AND {near})"
+
+
+def _in_polygon(place: Point, polygon: Polygon) -> str:
+    p = place.vector
+    angles = []
+    for a, b in polygon.sides:
+        u, v = a.vector, b.vector
+        across = _dot(p, _cross(u, v))
+        along = _sum(_dot(u, v), _times(-1.0, _times(_dot(p, u), _dot(p, v))))
+        angles.append(_arctan(across, along))
+    round_ = _times(_sign(polygon.turn), _sum(*angles))
+    inside = _compared(round_, ">", math.pi)
+    band = None if place.known else _band(polygon)
+    return f"({place.lat} BETWEEN {band[0]} AND {band[1]} AND {inside})" if band else inside
+
+
+def _band(polygon: Polygon) -> tuple[str, str] | None:
+    """Return declinations between which a polygon lies, if its corners are known."""
+    vectors = [corner.vector for corner in polygon.corners if corner.known]
+    if len(vectors) < len(polygon.corners):
+        return None
+    numbers = [[float(part) for part in vector] for vector in vectors]
+    total = [sum(parts) for parts in zip(*numbers, strict=True)]
+    length = math.hypot(*total)
+    if length < 1e-6:
+        return None
+    middle = [part / length for part in total]
+    cosine = min(sum(m * v for m, v in zip(middle, vector, strict=True)) for vector in numbers)
+    reach = math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
+    if reach >= 90.0:
+        return None
+    lat = math.degrees(math.asin(max(-1.0, min(1.0, middle[2]))))
+    return _text(lat - reach - 1e-6), _text(lat + reach + 1e-6)
+
+
+def _from_side(place: Point, a: Point, b: Point) -> Term:
+    """Return the separation of a place from the arc between two others, degrees."""
+    p, u, v = place.vector, a.vector, b.vector
+    normal = _cross(u, v)
+    away = _cross(p, normal)
+    height = _arctan(_dot(p, normal), _root(_dot(away, away)))
+    beside = _dot(p, _cross(normal, u)), _dot(p, _cross(v, normal))
+    ends = _apart(place, a), _apart(place, b)
+    if isinstance(height, float) and place.known and a.known and b.known:
+        is_beside = min(map(float, beside)) >= 0.0
+        return math.degrees(abs(height)) if is_beside else min(map(float, ends))
+    asked = " AND ".join(_compared(one, ">=", 0.0) for one in beside)
+    nearest = f"least({_text(ends[0])}, {_text(ends[1])})"
+    return f"(CASE WHEN {asked} THEN abs(degrees({_text(height)})) ELSE {nearest} END)"
+
+
+def _sides_cross(one: Polygon, other: Polygon) -> str:
+    """Return SQL of whether a side of a polygon crosses one of another."""
+    found = []
+    for a, b in one.sides:
+        for c, d in other.sides:
+            u, v, w, t = a.vector, b.vector, c.vector, d.vector
+            turns = (
+                _dot(u, _cross(w, v)), _dot(w, _cross(v, t)),
+                _dot(v, _cross(t, u)), _dot(t, _cross(u, w)),
+            )  # fmt: skip
+            found += [_all(_compared(turn, sign, 0.0) for turn in turns) for sign in "<>"]
+    return _any(found)
+
+
+def _compared(a: Term, sign: str, b: Term) -> str:
+    """Return SQL of a comparison, or its value where both numbers are known."""
+    if isinstance(a, float) and isinstance(b, float):
+        return "true" if _COMPARISONS[sign](a, b) else "false"
+    return f"({_text(a)} {sign} {_text(b)})"
+
+
+def _all(conditions: Iterable[str]) -> str:
+    left = [one for one in conditions if one != "true"]
+    return "false" if "false" in left else _joined(left, " AND ", "true")
+
+
+def _any(conditions: Iterable[str]) -> str:
+    left = [one for one in conditions if one != "false"]
+    return "true" if "true" in left else _joined(left, " OR ", "false")
+
+
+def _joined(conditions: list[str], word: str, nothing: str) -> str:
+    return f"({word.join(conditions)})" if conditions else nothing
+
+
+def _apart(one: Point, other: Point) -> Term:
+    """Return the separation of two places, degrees."""
+    if one.known and other.known:
+        across = _cross(one.vector, other.vector)
+        return math.degrees(
+            float(_arctan(_root(_dot(across, across)), _dot(one.vector, other.vector)))
+        )
+    return f"separation({one.lon}, {one.lat}, {other.lon}, {other.lat})"
+
+
+def _list(*numbers: str) -> str:
+    return f"[{', '.join(f'({number})::DOUBLE' for number in numbers)}]"
+
+
+def _term(text: str) -> Term:
+    found = _number(text)
+    return f"({text})" if found is None else found
+
+
+def _number(text: str) -> float | None:
+    """Return the number that SQL says, if it is one."""
+    try:
+        found = float(text.strip("() ").replace("- ", "-"))
+    except ValueError:
+        return None
+    return found if math.isfinite(found) else None
+
+
+def _text(term: Term) -> str:
+    return term if isinstance(term, str) else f"({term!r}::DOUBLE)"
+
+
+def _times(a: Term, b: Term) -> Term:
+    if isinstance(a, float) and isinstance(b, float):
+        return a * b
+    if a == 1.0 or b == 1.0:
+        return b if a == 1.0 else a
+    return f"({_text(a)} * {_text(b)})"
+
+
+def _plus(a: Term, b: Term) -> Term:
+    if isinstance(a, float) and isinstance(b, float):
+        return a + b
+    if a == 0.0 or b == 0.0:
+        return b if a == 0.0 else a
+    return f"({_text(a)} + {_text(b)})"
+
+
+def _sum(*terms: Term) -> Term:
+    total: Term = 0.0
+    for term in terms:
+        total = _plus(total, term)
+    return total
+
+
+def _over(a: Term, b: Term) -> Term:
+    if isinstance(a, float) and isinstance(b, float):
+        return a / b if b else 1.0
+    return f"({_text(a)} / {_text(b)})"
+
+
+def _arctan(y: Term, x: Term) -> Term:
+    if isinstance(y, float) and isinstance(x, float):
+        return math.atan2(y, x)
+    return f"atan2({_text(y)}, {_text(x)})"
+
+
+def _root(a: Term) -> Term:
+    return math.sqrt(a) if isinstance(a, float) else f"sqrt({a})"
+
+
+def _sign(a: Term) -> Term:
+    return math.copysign(1.0, a) if isinstance(a, float) else f"sign({a})"
+
+
+def _dot(a: Vector, b: Vector) -> Term:
+    return _sum(*(_times(x, y) for x, y in zip(a, b, strict=True)))
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    def minus(p: Term, q: Term, r: Term, s: Term) -> Term:
+        return _plus(_times(p, q), _times(-1.0, _times(r, s)))
+
+    return (
+        minus(a[1], b[2], a[2], b[1]),
+        minus(a[2], b[0], a[0], b[2]),
+        minus(a[0], b[1], a[1], b[0]),
+    )

@@ -1,0 +1,340 @@
+"""The grammar of ADQL 2.1, as a dialect of sqlglot: text to a syntax tree, or a refusal.
+
+sqlglot reads far more than ADQL. Here it knows the words of ADQL only, takes every function for a
+call of that name, and every part of the tree has to be of a kind that ADQL has.
+
+References
+----------
+ADQL 2.1, IVOA Recommendation, December 2023.
+"""
+
+from __future__ import annotations
+
+import re
+
+from sqlglot import exp, parser, tokens
+from sqlglot.dialects.dialect import Dialect
+from sqlglot.errors import ParseError, TokenError
+from sqlglot.tokenizer_core import TokenType
+
+from starcat.errors import QueryError, quoted
+
+MAX_CHARACTERS = 200_000
+"""Length of the longest query that is read."""
+
+POINTED_CHARACTERS = 160
+"""How much of a line with an error is shown."""
+
+_WORDS = {
+    "ALL": TokenType.ALL, "AND": TokenType.AND, "AS": TokenType.ALIAS, "ASC": TokenType.ASC,
+    "BETWEEN": TokenType.BETWEEN, "CROSS": TokenType.CROSS, "DESC": TokenType.DESC,
+    "DISTINCT": TokenType.DISTINCT, "ELSE": TokenType.ELSE, "END": TokenType.END,
+    "ESCAPE": TokenType.ESCAPE, "EXCEPT": TokenType.EXCEPT, "EXISTS": TokenType.EXISTS,
+    "FALSE": TokenType.FALSE, "FROM": TokenType.FROM, "FULL": TokenType.FULL,
+    "GROUP BY": TokenType.GROUP_BY, "HAVING": TokenType.HAVING, "ILIKE": TokenType.ILIKE,
+    "IN": TokenType.IN, "INNER": TokenType.INNER, "INTERSECT": TokenType.INTERSECT,
+    "INTO": TokenType.INTO, "IS": TokenType.IS, "JOIN": TokenType.JOIN, "LEFT": TokenType.LEFT,
+    "LIKE": TokenType.LIKE, "LIMIT": TokenType.LIMIT, "NATURAL": TokenType.NATURAL,
+    "NOT": TokenType.NOT, "NULL": TokenType.NULL, "OFFSET": TokenType.OFFSET, "ON": TokenType.ON,
+    "OR": TokenType.OR, "ORDER BY": TokenType.ORDER_BY, "OUTER": TokenType.OUTER,
+    "OVER": TokenType.OVER, "RECURSIVE": TokenType.RECURSIVE, "RIGHT": TokenType.RIGHT,
+    "SELECT": TokenType.SELECT, "THEN": TokenType.THEN, "TOP": TokenType.TOP,
+    "TRUE": TokenType.TRUE, "UNION": TokenType.UNION, "USING": TokenType.USING,
+    "WHEN": TokenType.WHEN, "WHERE": TokenType.WHERE, "WITH": TokenType.WITH,
+    "||": TokenType.DPIPE, ">=": TokenType.GTE, "<=": TokenType.LTE, "<>": TokenType.NEQ,
+    "!=": TokenType.NEQ,
+}  # fmt: skip
+
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+
+_ARGUMENTS: dict[type[exp.Expr], frozenset[str]] = {
+    kind: frozenset(names.split())
+    for kind, names in (
+        (
+            exp.Select,
+            "expressions distinct limit from_ joins where group having order offset with_",
+        ),
+        (exp.Union, "this expression distinct order offset with_"),
+        (exp.Except, "this expression distinct order offset with_"),
+        (exp.Intersect, "this expression distinct order offset with_"),
+        (exp.From, "this"), (exp.Where, "this"), (exp.Having, "this"),
+        (exp.Group, "expressions"), (exp.Order, "expressions"),
+        (exp.Ordered, "this desc nulls_first"), (exp.Limit, "expression"),
+        (exp.Offset, "expression"), (exp.Distinct, "expressions"),
+        (exp.Join, "this side kind on using method"), (exp.Table, "this db alias joins"),
+        (exp.TableAlias, "this columns"), (exp.Subquery, "this alias joins"),
+        (exp.With, "expressions"), (exp.CTE, "this alias"), (exp.Column, "this table db"),
+        (exp.Identifier, "this quoted"), (exp.Star, ""), (exp.Alias, "this alias"),
+        (exp.Literal, "this is_string"), (exp.HexString, "this is_integer"), (exp.Null, ""),
+        (exp.Boolean, "this"), (exp.Paren, "this"), (exp.And, "this expression"),
+        (exp.Or, "this expression"), (exp.Not, "this"), (exp.EQ, "this expression"),
+        (exp.NEQ, "this expression"), (exp.GT, "this expression"), (exp.GTE, "this expression"),
+        (exp.LT, "this expression"), (exp.LTE, "this expression"),
+        (exp.Between, "this low high"), (exp.In, "this expressions query"), (exp.Exists, "this"),
+        (exp.Is, "this expression"), (exp.Like, "this expression negate"),
+        (exp.ILike, "this expression negate"), (exp.Concat, "expressions safe coalesce"),
+        (exp.Add, "this expression"),
+        (exp.Sub, "this expression"), (exp.Mul, "this expression"),
+        (exp.Div, "this expression typed safe"), (exp.Neg, "this"),
+        (exp.DPipe, "this expression safe"), (exp.Anonymous, "this expressions"),
+        (exp.Cast, "this to"), (exp.DataType, "this expressions nested"),
+        (exp.DataTypeParam, "this"),
+    )
+}  # fmt: skip
+"""Kinds of parts that a query may have, and what each of them may hold."""
+
+_ADVICE = {
+    "limit": "LIMIT is not ADQL; write SELECT TOP n",
+    "case": "CASE is not ADQL 2.1; COALESCE is, and UNION of queries with WHERE",
+    "window": "window functions are not ADQL",
+    "recursive": "RECURSIVE is not ADQL 2.1",
+    "into": "a query only reads: INTO is refused",
+    "escape": "LIKE ... ESCAPE is not ADQL",
+}
+
+_TYPES = {
+    "CHAR": "VARCHAR", "VARCHAR": "VARCHAR", "SMALLINT": "SMALLINT", "INTEGER": "INT",
+    "BIGINT": "BIGINT", "REAL": "FLOAT", "DOUBLE PRECISION": "DOUBLE", "TIMESTAMP": "TIMESTAMP",
+}  # fmt: skip
+"""What CAST may make, and how DuckDB calls it."""
+
+
+class _Tokenizer(tokens.Tokenizer):
+    COMMENTS = ["--"]  # noqa: RUF012 - so it is in sqlglot
+    QUOTES = ["'"]  # noqa: RUF012
+    IDENTIFIERS = ['"']  # noqa: RUF012
+    HEX_STRINGS = [("0x", ""), ("0X", "")]  # noqa: RUF012
+    KEYWORDS = _WORDS
+
+
+class _Parser(parser.Parser):
+    FUNCTIONS = {}  # noqa: RUF012
+    NO_PAREN_FUNCTIONS = {}  # noqa: RUF012
+    SET_OP_MODIFIERS = {"order", "offset"}  # noqa: RUF012 - TOP stays with its SELECT
+    NO_PAREN_FUNCTION_PARSERS = {}  # noqa: RUF012
+    STATEMENT_PARSERS = {}  # noqa: RUF012
+    FUNCTION_PARSERS = {"CAST": lambda self: self.parse_adql_cast()}  # noqa: RUF012
+
+    def _parse_limit_options(self) -> exp.LimitOptions | None:
+        # Behind the number of TOP stands a column, which may be called row.
+        return None
+
+    def parse_adql_cast(self) -> exp.Expr:
+        """Return the cast whose parenthesis was just opened."""
+        value = self._parse_disjunction()
+        if value is None or not self._match(TokenType.ALIAS):
+            self.raise_error("CAST needs AS: write CAST(value AS INTEGER)")
+        word = self._curr.text.upper()
+        place = self._curr
+        self._advance()
+        if word == "DOUBLE" and self._curr and self._curr.text.upper() == "PRECISION":
+            self._advance()
+            word = "DOUBLE PRECISION"
+        if word not in _TYPES:
+            self.raise_error(f"CAST makes {', '.join(_TYPES)}, and not {word}", place)
+        sizes: list[exp.Expr] = []
+        if word in ("CHAR", "VARCHAR") and self._match(TokenType.L_PAREN):
+            size = self._parse_number()
+            if size is None:
+                self.raise_error(f"{word} needs a number of characters in its parentheses")
+            else:
+                sizes.append(exp.DataTypeParam(this=size))
+            self._match_r_paren()
+        kind = exp.DataType(this=exp.DType(_TYPES[word]), expressions=sizes)
+        return self.expression(exp.Cast(this=value, to=kind))
+
+
+class Adql(Dialect):
+    """ADQL 2.1 for sqlglot."""
+
+    NULL_ORDERING = "nulls_are_last"
+    Tokenizer = _Tokenizer
+    Parser = _Parser
+
+
+def parse_adql(text: str) -> exp.Expr:
+    """Return the syntax tree of a query in ADQL.
+
+    Parameters
+    ----------
+    text : str
+        One query; a semicolon may stand behind it.
+
+    Returns
+    -------
+    sqlglot.exp.Expr
+        A SELECT, or several that are united. Every part of it is one that ADQL 2.1 has.
+
+    Raises
+    ------
+    QueryError
+        If the text is no ADQL; the message has the place.
+
+    Examples
+    --------
+    >>> parse_adql("SELECT TOP 3 ra FROM stars").sql()
+    'SELECT ra FROM stars LIMIT 3'
+    """
+    if len(text) > MAX_CHARACTERS:
+        raise QueryError(
+            f"the query has {len(text):,} characters; at most {MAX_CHARACTERS:,} are read. Upload "
+            "a table for long lists"
+        )
+    if not text.strip():
+        raise QueryError("the query is empty; try SELECT TOP 10 * FROM tap_schema.tables")
+    dialect = Adql()
+    try:
+        first = next(iter(dialect.tokenize(text)), None)
+        if first is not None and first.text.upper() not in ("SELECT", "WITH", "("):
+            raise QueryError(
+                f"no ADQL: found {quoted(first.text)}; a query begins with SELECT or WITH, and "
+                "only reads"
+            )
+        found = [tree for tree in dialect.parse(text) if tree is not None]
+        if len(found) != 1:
+            raise QueryError(f"found {len(found)} queries; send one at a time")
+        tree = found[0]
+        if not isinstance(tree, (exp.Select, exp.SetOperation, exp.Subquery)):
+            raise QueryError("no ADQL: a query begins with SELECT or WITH")
+        for part in tree.walk():
+            _check_part(part, text)
+    except ParseError as error:
+        raise _refusal(error, text) from error
+    except TokenError as error:
+        place = error.start if error.start is not None else 0
+        raise QueryError(
+            "no ADQL: a quotation mark that is opened here is not closed, or a character has no "
+            f"place here{pointer(text, place)}"
+        ) from error
+    except RecursionError as error:
+        raise QueryError(
+            "the query is nested too deeply; write it with fewer parentheses within each other"
+        ) from error
+    return tree
+
+
+def place_of(node: exp.Expr) -> int | None:
+    """Return where a part of a query begins.
+
+    Parameters
+    ----------
+    node : sqlglot.exp.Expr
+        A part of a tree that `parse_adql` gave.
+
+    Returns
+    -------
+    int or None
+        Characters before it; None where the parser noted none in it.
+    """
+    for part in node.walk():
+        if "start" in part.meta:
+            return int(part.meta["start"])
+    return None
+
+
+def pointer(text: str, place: int | None) -> str:
+    """Return the line of a place with a mark under it.
+
+    Parameters
+    ----------
+    text : str
+        The query.
+    place : int or None
+        Characters before the place.
+
+    Returns
+    -------
+    str
+        To be put behind a message; empty without a place.
+    """
+    if place is None or not 0 <= place <= len(text):
+        return ""
+    before = text[:place]
+    number = before.count("\n")
+    line = text.split("\n")[number]
+    column = place - (before.rfind("\n") + 1)
+    start = max(0, column - POINTED_CHARACTERS // 2)
+    shown = line[start : start + POINTED_CHARACTERS]
+    where = f" (line {number + 1}, character {column + 1})"
+    return f"{where}\n  {shown}\n  {' ' * (column - start)}^"
+
+
+def refuse(message: str, node: exp.Expr, text: str) -> QueryError:
+    """Return the error that tells what is wrong with a part of a query.
+
+    Parameters
+    ----------
+    message : str
+        What was found, what was expected.
+    node : sqlglot.exp.Expr
+        The part.
+    text : str
+        The query.
+
+    Returns
+    -------
+    QueryError
+        To be raised.
+    """
+    return QueryError(f"{message}{pointer(text, place_of(node))}")
+
+
+def _check_part(part: exp.Expr, text: str) -> None:
+    allowed = _ARGUMENTS.get(type(part))
+    if allowed is None:
+        told = _ADVICE.get(part.key, f"{part.key.upper()} is not ADQL 2.1")
+        raise refuse(f"no ADQL: {told}", part, text)
+    for name, value in part.args.items():
+        if value and name not in allowed:
+            name = name.rstrip("_")
+            told = _ADVICE.get(name, f"{name.upper()} has no place in ADQL here")
+            raise refuse(f"no ADQL: {told}", value if isinstance(value, exp.Expr) else part, text)
+    if isinstance(part, exp.Limit) and not part.meta.get("top"):
+        raise refuse(f"no ADQL: {_ADVICE['limit']}", part, text)
+    if isinstance(part, (exp.Limit, exp.Offset)) and not _is_whole(part.expression):
+        raise refuse(f"{part.key.upper()} needs a whole number", part, text)
+    if isinstance(part, exp.Select) and not part.args.get("from_"):
+        raise refuse("no ADQL: SELECT needs FROM and a table", part, text)
+    if isinstance(part, exp.Table) and not isinstance(part.this, exp.Identifier):
+        raise refuse("no ADQL: FROM takes tables and queries in parentheses", part, text)
+    if isinstance(part, exp.Distinct) and len(part.expressions) > 1:
+        raise refuse("no ADQL: DISTINCT takes one value here", part, text)
+    if isinstance(part, exp.Identifier) and not part.args.get("quoted"):
+        _check_name(part, text)
+    if isinstance(part, exp.Join) and str(part.args.get("kind") or "").upper() not in (
+        "", "INNER", "OUTER", "CROSS",
+    ):  # fmt: skip
+        raise refuse(f"no ADQL: {part.args['kind']} JOIN", part, text)
+
+
+def _is_whole(node: exp.Expr) -> bool:
+    return isinstance(node, exp.Literal) and not node.is_string and node.name.isdigit()
+
+
+def _check_name(part: exp.Identifier, text: str) -> None:
+    if not _NAME.fullmatch(part.name):
+        raise refuse(
+            f"no ADQL: {quoted(part.name)} is no name: it has letters, digits and underscores "
+            'and begins with a letter; write others in double quotes, as "2mass"',
+            part,
+            text,
+        )
+
+
+def _refusal(error: ParseError, text: str) -> QueryError:
+    """Return what to say of a text that the parser refuses."""
+    first = error.errors[0] if error.errors else {}
+    told = str(first.get("description") or "not understood").rstrip(".")
+    line, column = first.get("line"), first.get("col")
+    place = None
+    if line and column:
+        lines = text.split("\n")
+        word = str(first.get("highlight") or "")
+        # The parser gives the end of a word.
+        place = sum(len(one) + 1 for one in lines[: line - 1]) + max(0, column - len(word))
+        if told.startswith("Required keyword"):
+            told = "something is missing here"
+        if "Unexpected token" in told:
+            told = f"{quoted(word)} is not expected"
+            told = _ADVICE["case"] if word.upper() in ("CASE", "WHEN") else told
+    return QueryError(f"no ADQL: {told}{pointer(text, place)}")

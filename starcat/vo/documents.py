@@ -1,0 +1,307 @@
+"""What a TAP service tells of itself: VOSI's documents, and errors as VOTable.
+
+The XML is that of vo-models, which has the elements of each schema in their order.
+
+References
+----------
+VOSI 1.1, TAPRegExt 1.1, VODataService 1.1, DALI 1.1 section 4.4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any, Literal, TypeVar
+from xml.sax.saxutils import escape
+
+from pydantic import AnyUrl, field_validator
+from pydantic_xml import BaseXmlModel
+from vo_models.tapregext.models import (
+    DataLimit,
+    DataLimits,
+    Language,
+    LanguageFeature,
+    LanguageFeatureList,
+    OutputFormat,
+    TableAccess,
+    TimeLimits,
+    UploadMethod,
+    Version,
+)
+from vo_models.vodataservice.models import DataType, ForeignKey, TableParam, TableSchema
+from vo_models.vodataservice.models import Table as TableElement
+from vo_models.voresource.models import AccessURL, Capability, Interface
+from vo_models.voresource.types import UTCTimestamp
+from vo_models.vosi.availability.models import Availability
+from vo_models.vosi.capabilities.models import VOSICapabilities
+from vo_models.vosi.tables.models import VOSITable, VOSITableSet
+
+from starcat.vo.adql import GEOMETRY
+from starcat.vo.adql_functions import USER_FUNCTIONS
+from starcat.vo.formats import FORMATS
+from starcat.vo.tables import Column, Schema, Table, Tables, adql_name, full_name
+from starcat.vo.uws import xml_text
+
+MEDIA_TYPE = "application/xml"
+VOTABLE_TYPE = "application/x-votable+xml"
+
+Element = TypeVar("Element", VOSITable, TableElement, TableSchema)
+
+_FEATURES = "ivo://ivoa.net/std/TAPRegExt#features-"
+_VOSI = "ivo://ivoa.net/std/VOSI#"
+
+LANGUAGE_FEATURES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
+    ("udf", USER_FUNCTIONS),
+    ("adqlgeo", tuple((name, "") for name in GEOMETRY)),
+    ("adql-string", (("LOWER", ""), ("UPPER", ""), ("ILIKE", ""))),
+    ("adql-sets", (("UNION", ""), ("EXCEPT", ""), ("INTERSECT", ""))),
+    ("adql-common-table", (("WITH", ""),)),
+    ("adql-type", (("CAST", ""),)),
+    ("adql-unit", (("IN_UNIT", ""),)),
+    ("adql-offset", (("OFFSET", ""),)),
+)
+"""What ADQL leaves to services, and is there. COALESCE is there too, but clients that check what
+they read know no name for it yet."""
+
+
+@dataclass(frozen=True)
+class ServiceLimits:
+    """What the service grants.
+
+    Attributes
+    ----------
+    run_s, keep_s : int
+        Seconds that a query may take, and that its answer is kept.
+    rows, upload_bytes : int
+        Rows of an answer, and bytes of an upload at most.
+    """
+
+    run_s: int
+    keep_s: int
+    rows: int
+    upload_bytes: int
+
+
+class _Column(TableParam, tag="column"):
+    """A column whose description is escaped once, as XML is written, and not twice."""
+
+    @field_validator("description")
+    def validate_description(cls, value: str) -> str:  # noqa: N805 - so pydantic calls it
+        return value
+
+
+def capabilities(base_url: str, limits: ServiceLimits) -> bytes:
+    """Return what the service can do.
+
+    Parameters
+    ----------
+    base_url : str
+        Its address, without a slash at the end.
+    limits : ServiceLimits
+        What it grants.
+
+    Returns
+    -------
+    bytes
+        A document of VOSI.
+    """
+    others = [
+        (f"{_VOSI}capabilities", "capabilities", None),
+        (f"{_VOSI}availability", "availability", None),
+        (f"{_VOSI}tables-1.1", "tables", "1.1"),
+        ("ivo://ivoa.net/std/DALI#examples", "examples", None),
+    ]
+    found: list[Capability] = [
+        Capability(
+            standard_id=AnyUrl(name), interface=[_interface(f"{base_url}/{path}", "full", version)]
+        )
+        for name, path, version in others
+    ]
+    return _document(VOSICapabilities(capability=[_table_access(base_url, limits), *found]))
+
+
+def _table_access(base_url: str, limits: ServiceLimits) -> TableAccess:
+    rows = DataLimit(value=limits.rows, unit="row")
+    size = DataLimit(value=limits.upload_bytes, unit="byte")
+    language = Language(
+        name="ADQL",
+        version=[
+            Version(value="2.1", ivo_id="ivo://ivoa.net/std/ADQL#v2.1"),
+            Version(value="2.0", ivo_id="ivo://ivoa.net/std/ADQL#v2.0"),
+        ],
+        description="ADQL 2.1. All places are ICRS, degrees.",
+        language_features=[
+            LanguageFeatureList(
+                type=f"{_FEATURES}{kind}",
+                feature=[
+                    LanguageFeature(form=form, description=told or None) for form, told in forms
+                ],
+            )
+            for kind, forms in LANGUAGE_FEATURES
+        ],
+    )
+    return TableAccess(
+        interface=[_interface(base_url, "base", "1.1", role="std")],
+        language=[language],
+        output_format=[
+            OutputFormat(
+                mime=one.media_type,
+                alias=[one.name, *(a for a in one.aliases if "/" not in a or ";" not in a)],
+                ivo_id=one.standard_id or None,
+            )
+            for one in FORMATS
+        ],
+        upload_method=[
+            UploadMethod(ivo_id=f"ivo://ivoa.net/std/TAPRegExt#upload-{kind}")
+            for kind in ("inline", "http")
+        ],
+        retention_period=TimeLimits(default=limits.keep_s, hard=limits.keep_s),
+        execution_duration=TimeLimits(default=limits.run_s, hard=limits.run_s),
+        output_limit=DataLimits(default=rows, hard=rows),
+        upload_limit=DataLimits(default=size, hard=size),
+    )
+
+
+def _interface(
+    url: str, use: Literal["full", "base"], version: str | None, role: str | None = None
+) -> Interface:
+    address = AccessURL(value=AnyUrl(url), use=use)
+    return Interface(type="vs:ParamHTTP", access_url=[address], version=version, role=role)
+
+
+def availability(up_since: datetime) -> bytes:
+    """Return that the service is there.
+
+    Parameters
+    ----------
+    up_since : datetime
+        When it was started, UTC.
+
+    Returns
+    -------
+    bytes
+        A document of VOSI.
+    """
+    return _document(
+        Availability(available=True, up_since=UTCTimestamp.fromisoformat(_utc(up_since)))
+    )
+
+
+def tableset(tables: Tables, with_columns: bool = True) -> bytes:
+    """Return all schemas and tables.
+
+    Parameters
+    ----------
+    tables : Tables
+        What there is.
+    with_columns : bool, default True
+        Whether columns are told too.
+
+    Returns
+    -------
+    bytes
+        A document of VOSI.
+    """
+    schemas = [_schema(schema, with_columns) for schema in tables.schemas]
+    return _document(VOSITableSet(tableset_schema=schemas))
+
+
+def table_document(table: Table) -> bytes:
+    """Return a table with its columns.
+
+    Parameters
+    ----------
+    table : Table
+        The table.
+
+    Returns
+    -------
+    bytes
+        A document of VOSI.
+    """
+    return _document(_described(VOSITable(**_about(table, True)), table.description))
+
+
+def _schema(schema: Schema, with_columns: bool) -> TableSchema:
+    tables = [
+        _described(TableElement(**_about(table, with_columns)), table.description)
+        for table in schema.tables
+    ]
+    found = TableSchema(schema_name=adql_name(schema.name), table=tables)
+    return _described(found, schema.description)
+
+
+def _described(element: Element, text: str) -> Element:
+    """Give an element its description, which its constructor would escape twice."""
+    element.description = text or None
+    return element
+
+
+def _about(table: Table, with_columns: bool) -> dict[str, Any]:
+    about: dict[str, Any] = {
+        "table_type": "table",
+        "table_name": full_name(table),
+    }
+    if not with_columns:
+        return about
+    columns = [
+        _Column(
+            column_name=adql_name(one.name),
+            description=one.description or None,
+            unit=one.unit or None,
+            ucd=one.ucd or None,
+            xtype=one.xtype or None,
+            datatype=DataType(value=one.datatype, arraysize=one.arraysize or None),
+            flag=[name for name, is_so in _flags(one) if is_so],
+        )
+        for one in table.columns
+    ]
+    keys = [
+        ForeignKey(
+            target_table=key.target,
+            from_column=key.column,
+            target_column=key.target_column,
+            description=key.description or None,
+        )
+        for key in table.keys
+    ]
+    return {**about, "column": columns, "foreign_key": keys}
+
+
+def _flags(column: Column) -> tuple[tuple[str, bool], ...]:
+    return (
+        ("principal", column.is_principal),
+        ("indexed", column.is_indexed),
+        ("std", column.is_standard),
+    )
+
+
+def error_votable(message: str) -> bytes:
+    """Return an error as DALI has it.
+
+    Parameters
+    ----------
+    message : str
+        What went wrong.
+
+    Returns
+    -------
+    bytes
+        A VOTable without a table.
+    """
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n'
+        '<VOTABLE version="1.4" xmlns="http://www.ivoa.net/xml/VOTable/v1.3">\n'
+        '<RESOURCE type="results">\n'
+        f'<INFO name="QUERY_STATUS" value="ERROR">{escape(xml_text(message))}</INFO>\n'
+        "</RESOURCE>\n</VOTABLE>\n"
+    ).encode()
+
+
+def _utc(time: datetime) -> str:
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def _document(model: BaseXmlModel) -> bytes:
+    found = model.to_xml(skip_empty=True, encoding="UTF-8", xml_declaration=True)
+    return found if isinstance(found, bytes) else found.encode()

@@ -1,0 +1,209 @@
+"""What is known of tables that ADQL may ask: schemas, tables, columns and keys."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from starcat.query.columns import column_facts
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column as TAP_SCHEMA and VOTable describe it.
+
+    Attributes
+    ----------
+    name : str
+        As the table has it, without quotes.
+    datatype, arraysize : str
+        VOTable's name of the type, and the size where it is an array or a text; else empty.
+    unit, ucd, description, xtype : str
+        Empty where there is none.
+    is_indexed, is_principal, is_standard : bool
+        Whether asking for it is fast, whether it is one to look at first, and whether a standard
+        defines it.
+    """
+
+    name: str
+    datatype: str = "double"
+    arraysize: str = ""
+    unit: str = ""
+    ucd: str = ""
+    description: str = ""
+    xtype: str = ""
+    is_indexed: bool = False
+    is_principal: bool = False
+    is_standard: bool = False
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """What the metadata of an Arrow field holds of it."""
+        known = {
+            "unit": self.unit,
+            "ucd": self.ucd,
+            "description": self.description,
+            "xtype": self.xtype,
+        }
+        return {key: text for key, text in known.items() if text}
+
+    def named(self, name: str) -> Column:
+        """Return the same under another name."""
+        return replace(self, name=name)
+
+    @classmethod
+    def unknown(cls, name: str) -> Column:
+        """Return a column of which its name is known: the unit is that which it ends with."""
+        return cls(name, unit=column_facts(name, {}).unit)
+
+
+@dataclass(frozen=True)
+class Key:
+    """A reference of a table's column to that of another table.
+
+    Attributes
+    ----------
+    column : str
+        The column that refers.
+    target, target_column : str
+        Full name of the table that it refers to, and the column there.
+    description : str
+        What the reference means.
+    """
+
+    column: str
+    target: str
+    target_column: str
+    description: str = ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table.
+
+    Attributes
+    ----------
+    schema, name : str
+        As the session has them, without quotes.
+    columns : tuple of Column
+        In order.
+    description : str
+        What a row is.
+    keys : tuple of Key
+        References to other tables.
+    view : str
+        Name of its view in a session, where it has another; else empty.
+    """
+
+    schema: str
+    name: str
+    columns: tuple[Column, ...]
+    description: str = ""
+    keys: tuple[Key, ...] = ()
+    view: str = ""
+
+
+@dataclass(frozen=True)
+class Schema:
+    """A schema: the tables of a database, of a catalog, or those of TAP itself.
+
+    Attributes
+    ----------
+    name : str
+        As the session has it.
+    description : str
+        What it is.
+    tables : tuple of Table
+        In order.
+    """
+
+    name: str
+    description: str
+    tables: tuple[Table, ...]
+
+
+class Tables:
+    """All tables that a query may name.
+
+    Parameters
+    ----------
+    schemas : tuple of Schema
+        Names differ, whatever their case.
+    """
+
+    def __init__(self, schemas: tuple[Schema, ...]) -> None:
+        self.schemas = schemas
+        self._found = {(t.schema.lower(), t.name.lower()): t for t in self}
+
+    def __iter__(self) -> Iterator[Table]:
+        """Go through all tables."""
+        for schema in self.schemas:
+            yield from schema.tables
+
+    def with_schema(self, schema: Schema) -> Tables:
+        """Return these tables, and those of another schema."""
+        return Tables((*self.schemas, schema))
+
+    def find(self, schema: str, name: str) -> Table | None:
+        """Return a table.
+
+        Parameters
+        ----------
+        schema, name : str
+            In any case; a schema may be left out where only one has a table of that name.
+
+        Returns
+        -------
+        Table or None
+            None where there is none, or several.
+        """
+        if schema:
+            return self._found.get((schema.lower(), name.lower()))
+        named = [table for (_, one), table in self._found.items() if one == name.lower()]
+        return named[0] if len(named) == 1 else None
+
+    def names(self) -> list[str]:
+        """Return the full names of all tables as ADQL writes them."""
+        return [full_name(table) for table in self]
+
+
+def full_name(table: Table) -> str:
+    """Return the name of a table as ADQL writes it.
+
+    Parameters
+    ----------
+    table : Table
+        The table.
+
+    Returns
+    -------
+    str
+        Schema and name, quoted where ADQL needs it.
+
+    Examples
+    --------
+    >>> full_name(Table("_2mass", "stars", ()))
+    '"_2mass".stars'
+    """
+    return f"{adql_name(table.schema)}.{adql_name(table.name)}"
+
+
+def adql_name(name: str) -> str:
+    """Return a name as ADQL writes it: in quotes where it is a word of ADQL, or no plain name.
+
+    Parameters
+    ----------
+    name : str
+        Without quotes.
+
+    Returns
+    -------
+    str
+        Such as ``ra_deg`` or ``"catalog"``.
+    """
+    from vo_models.adql.misc import ADQL_SQL_KEYWORDS
+
+    is_plain = name.isascii() and name.isidentifier() and not name.startswith("_")
+    if is_plain and name.upper() not in ADQL_SQL_KEYWORDS:
+        return name
+    return '"' + name.replace('"', '""') + '"'

@@ -1,0 +1,127 @@
+"""A server of the service in its own process, on a port that is free, ended in good order."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlsplit
+
+END_S = 30.0
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a server said."""
+
+    status: int
+    headers: Mapping[str, str]
+    body: bytes
+
+    @property
+    def text(self) -> str:
+        return self.body.decode("utf-8", "replace")
+
+
+@dataclass(frozen=True)
+class Served:
+    """A server that runs.
+
+    Attributes
+    ----------
+    address : str
+        Without a slash at its end.
+    root : Path
+        Folder of the service.
+    process : Popen
+        Its process.
+    log : Path
+        What it writes to stderr.
+    """
+
+    address: str
+    root: Path
+    process: subprocess.Popen[str]
+    log: Path
+
+    @property
+    def port(self) -> int:
+        return urlsplit(self.address).port or 0
+
+    def raw(
+        self,
+        method: str,
+        target: str,
+        headers: Mapping[str, str] | None = None,
+        body: bytes | None = None,
+        timeout_s: float = 20.0,
+    ) -> Answer:
+        """Send a request letter by letter: nothing is put in order on the way, as clients do."""
+        given = {"Host": f"127.0.0.1:{self.port}", **(headers or {})}
+        if body is not None:
+            given.setdefault("Content-Length", str(len(body)))
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=timeout_s)
+        try:
+            connection.putrequest(method, target, skip_host=True, skip_accept_encoding=True)
+            for name, value in given.items():
+                connection.putheader(name, value)
+            connection.endheaders()
+            if body:
+                connection.send(body)
+            answer = connection.getresponse()
+            return Answer(
+                answer.status,
+                {name.lower(): value for name, value in answer.getheaders()},
+                answer.read() if method != "HEAD" else b"",
+            )
+        finally:
+            connection.close()
+
+
+@contextmanager
+def serve(root: Path, log: Path, **settings: object) -> Iterator[Served]:
+    """Run ``starcat serve`` until the context ends; it has to end with 0 then.
+
+    Parameters
+    ----------
+    root : Path
+        Folder of the service.
+    log : Path
+        File for what it writes to stderr.
+    **settings
+        What ``service.toml`` is to say.
+
+    Yields
+    ------
+    Served
+        When it listens.
+    """
+    root.mkdir(parents=True, exist_ok=True)
+    lines = [f"{name} = {json.dumps(value)}" for name, value in settings.items()]
+    (root / "service.toml").write_text("\n".join(lines) + "\n")
+    command = [sys.executable, "-m", "starcat", "serve", "--root", root, "--port", "0", "--json"]
+    with log.open("w") as errors:
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
+    try:
+        assert process.stdout is not None
+        address = json.loads(process.stdout.readline() or "{}")
+        assert address, log.read_text()
+        yield Served(address["address"].rstrip("/"), root, process, log)
+    finally:
+        if process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+        try:
+            process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            raise
+        finally:
+            if process.stdout is not None:
+                process.stdout.close()
+    assert process.returncode == 0, log.read_text()[-4000:]
