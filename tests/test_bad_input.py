@@ -422,6 +422,29 @@ def _(place: Place) -> Call:
     return place.build('name = "small"', "name: small")
 
 
+@case("spec with a key of endless parts", 2)
+def _(place: Place) -> Call:
+    return place.build('name = "small"', "a." * 300 + "a = 1")
+
+
+@case("spec of too many characters", 2)
+def _(place: Place) -> Call:
+    return place.build('name = "small"', 'name = "small"  ' + "#" * 100_000)
+
+
+@case("number of too many digits", 2)
+def _(place: Place) -> Call:
+    return place.build("boresights.count = 200", "boresights.count = 0x" + "f" * 5000)
+
+
+@case("doubles that are no doubles", 1)
+def _(place: Place) -> Call:
+    return [
+        *("build", "--preset", "gaia-12deg", "--set", "selection.faint_limit_mag=10"),
+        *("--set", "selection.doubles.min_separation_deg=10.0", "-o", place.out),
+    ]
+
+
 @case("spec not text", 2)
 def _(place: Place) -> Call:
     return ["build", place.write("spec.toml", b"name = \xff"), "-o", place.out]
