@@ -17,7 +17,7 @@ from starcat.artifact.writer import Product
 from starcat.catalog.blocks import reject_rows
 from starcat.catalog.ingest import count_by_reason
 from starcat.catalog.selection import Selected
-from starcat.catalog.stars import sort_rows
+from starcat.catalog.stars import floats_of, sort_rows
 from starcat.catalog.verdict import Reason
 from starcat.errors import BuildError
 from starcat.geometry.sphere import saff_kuijlaars
@@ -261,9 +261,8 @@ def estimate(
 
 def _rejected_bytes(read: StarsRead, choice: Choice, spec: BuildSpec) -> int:
     """Return the size of the file of rejected records, of which only some are at hand."""
-    order, mag = read.by_brightness
-    seen = choice.selected.rejected
-    faint = np.sort(order[np.searchsorted(mag, _faintest(spec.selection), side="right") :])
+    seen, mag = choice.selected.rejected, floats_of(read.stars, "mag")
+    faint = np.flatnonzero(~(mag <= _faintest(spec.selection)))  # or of no magnitude
     first = max(0, (len(faint) - SAMPLE_ROWS) // 2)
     some = read.stars.take(pa.array(faint[first : first + SAMPLE_ROWS]))
     some = reject_rows(some, pa.repeat(Reason.too_faint.name, len(some)))
