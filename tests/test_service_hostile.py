@@ -236,11 +236,11 @@ SPECS = [
         422,
         {"kind": "build", "spec": ".".join("a" * 50_000) + " = 1"},
     ),
-    as_json("brackets within brackets as JSON", "/api/v1/jobs", 422, b"[" * 200_000),
+    as_json("brackets within brackets as JSON", "/api/v1/jobs", (400, 422), b"[" * 200_000),
     as_json(
-        "objects within objects", "/api/v1/jobs", 422, b'{"a":' * 100_000 + b"1" + b"}" * 100_000
+        "objects within objects", "/api/v1/jobs", (400, 422), b'{"a":' * 100_000 + b"1" + b"}" * 100_000
     ),
-    as_json("a number of 10,000 digits", "/api/v1/jobs", 422, b'{"kind": ' + b"9" * 10_000 + b"}"),
+    as_json("a number of 10,000 digits", "/api/v1/jobs", (400, 422), b'{"kind": ' + b"9" * 10_000 + b"}"),
     as_json("not a number", "/api/v1/jobs", 422, b'{"kind": "evaluate", "noise_px": NaN}'),
     as_json(
         "unknown keys",
@@ -398,7 +398,7 @@ SIZES = [
         (200, 400, 416),
         Range="bytes=" + ",".join(f"{k}-{k}" for k in range(1_000)),
     ),
-    get("more jobs than there are numbers", "/api/v1/jobs?most=" + "9" * 400, 422),
+    get("more jobs than there are numbers", "/api/v1/jobs?limit=" + "9" * 400, 422),
     get("a NUL byte in a query", "/api/v1/jobs?state=%00", 400),
 ]
 
@@ -487,9 +487,11 @@ def test_a_hostile_request_is_refused(one: Hostile, target: Target) -> None:
     answer = target.send(one)
     assert answer.status in one.statuses, answer.text[:500]
     assert time.monotonic() - begun_s < 15.0
-    for told in ("Traceback", 'File "', str(target.around), "site-packages", "root:x:0", SCRIPT):
+    for told in ("Traceback", 'File "', str(target.around), "site-packages", "root:x:0"):
         assert told not in answer.text, answer.text[:500]
     assert "what nobody is to see" not in answer.text
+    if "html" in answer.headers.get("content-type", ""):
+        assert SCRIPT not in answer.text
     assert '"detail":"Not Found"' not in answer.text, "there is no such address to attack"
     if "x-request-id" in answer.headers:  # else the server itself took it for no request at all
         assert answer.headers["x-content-type-options"] == "nosniff"
