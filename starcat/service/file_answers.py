@@ -23,6 +23,9 @@ IMMUTABLE = "private, max-age=31536000, immutable"
 REVALIDATED = "private, no-cache"
 """What may change is asked for anew each time, and not sent again where it did not."""
 
+SMALL_BYTES = 1 << 20
+"""Files that are sent as a whole, and not bit by bit."""
+
 TYPES = {
     ".parquet": "application/vnd.apache.parquet",
     ".h5": "application/x-hdf5",
@@ -101,8 +104,22 @@ def file_answer(
         return Response(status_code=304, headers=headers)
     kind = content_type or type_of(file_name)
     answer = _Part(path, headers=headers, media_type=kind, filename=file_name, stat_result=found)
-    answer.may_be_part = _wants_part(request, found.st_size, answer.headers)
-    return answer
+    part = _part(request, found.st_size, answer.headers)
+    answer.may_be_part = part is not None
+    if request.method == "HEAD" or found.st_size > SMALL_BYTES:
+        return answer
+    return _at_once(path.read_bytes(), part, dict(answer.headers))
+
+
+def _at_once(content: bytes, part: tuple[int, int] | None, headers: dict[str, str]) -> Response:
+    """Answer with a small file: to open, read and close it in other threads takes longer."""
+    status = 200
+    if part is not None:
+        status, (start, end) = 206, part
+        headers["content-range"] = f"bytes {start}-{end - 1}/{len(content)}"
+        content = content[start:end]
+    del headers["content-length"]
+    return Response(content, status_code=status, headers=headers)
 
 
 def has_already(request: Request, sha256: str) -> bool:
@@ -146,21 +163,22 @@ def type_of(file_name: str) -> str:
     return TYPES.get(PurePosixPath(file_name).suffix.lower(), "application/octet-stream")
 
 
-def _wants_part(request: Request, size: int, headers: Mapping[str, str]) -> bool:
-    """Return whether a range is to be sent; refuse one that lies outside of the file."""
+def _part(request: Request, size: int, headers: Mapping[str, str]) -> tuple[int, int] | None:
+    """Return which bytes are to be sent, if not all; refuse what lies outside of the file."""
     found = _RANGE.fullmatch(request.headers.get("range", ""))
     if request.method != "GET" or found is None or found[1] == found[2] == "":
-        return False
+        return None
     known = request.headers.get("if-range")
     if known is not None and known not in (headers["etag"], headers["last-modified"]):
-        return False
+        return None
     start = int(found[1]) if found[1] else max(size - int(found[2]), 0)
+    end = min(int(found[2]) + 1, size) if found[1] and found[2] else size
     if found[1] and found[2] and int(found[2]) < start:
-        return False
+        return None
     if start >= size:
         raise Problem(
             416,
             f"the range begins at byte {start:,}, and the file has {size:,}; ask for less",
             headers={"Content-Range": f"bytes */{size}"},
         )
-    return True
+    return start, end
