@@ -33,7 +33,9 @@ def root(tmp_path: Path, small_artifact: Path) -> Path:
 
 @pytest.fixture
 def client(root: Path) -> Iterator[TestClient]:
-    with TestClient(make_app(Settings(root=root, anonymous="publisher")), base_url=LOCAL) as client:
+    with TestClient(
+        make_app(Settings(root=root, anonymous="publisher", workers=0)), base_url=LOCAL
+    ) as client:
         yield client
 
 
@@ -201,11 +203,13 @@ def test_a_database_that_a_job_makes_is_not_removed(client):
 
 
 def test_who_may_only_read_neither_removes_nor_publishes(root):
-    with TestClient(make_app(Settings(root=root)), base_url=LOCAL) as client:
+    with TestClient(make_app(Settings(root=root, workers=0)), base_url=LOCAL) as client:
         assert client.delete(API).status_code == 401
         assert client.post("/api/v1/releases", json={"database": DATABASE}).status_code == 401
         assert client.get(API).status_code == 200
-    with TestClient(make_app(Settings(root=root, anonymous="none")), base_url=LOCAL) as client:
+    with TestClient(
+        make_app(Settings(root=root, anonymous="none", workers=0)), base_url=LOCAL
+    ) as client:
         for path in (API, f"{API}/files/stars.parquet", "/registry/index.json", "/api/v1/releases"):
             assert client.get(path).status_code == 401
 

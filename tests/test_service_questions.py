@@ -40,7 +40,9 @@ def root(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Path
 
 @pytest.fixture(scope="module")
 def client(root: Path) -> Iterator[TestClient]:
-    settings = Settings(root=root, query_time_s=20.0, max_rows=500, query_memory_gib=0.75)
+    settings = Settings(
+        root=root, workers=0, query_time_s=20.0, max_rows=500, query_memory_gib=0.75
+    )
     with TestClient(make_app(settings)) as client:
         yield client
 
@@ -318,6 +320,6 @@ def test_bombs_are_refused_and_the_next_one_is_answered(client, frame, root, nam
 
 
 def test_a_database_serves_whoever_may_read_only(root):
-    with TestClient(make_app(Settings(root=root, anonymous="none"))) as client:
+    with TestClient(make_app(Settings(root=root, anonymous="none", workers=0))) as client:
         assert ask(client, "SELECT 1").status_code == 401
         assert client.post(IDENTIFY, json={"centroids_px": []}).status_code == 401
