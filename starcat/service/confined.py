@@ -64,7 +64,7 @@ class Confined:
 
         Parameters
         ----------
-        task : {"identify", "convert"}
+        task : {"identify", "convert", "upload"}
             What.
         arguments : mapping
             As JSON has them.
@@ -123,7 +123,12 @@ class Confined:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            env={**os.environ, "MPLCONFIGDIR": str(self._scratch / "matplotlib")},
+            # astropy tries out a temporary file where it writes FITS.
+            env={
+                **os.environ,
+                "MPLCONFIGDIR": str(self._scratch / "matplotlib"),
+                "TMPDIR": str(self._scratch),
+            },
         )
         with suppress(OSError):
             opening = {"scratch": str(self._scratch), "memory_bytes": self._memory_bytes}
