@@ -373,7 +373,8 @@ class Client:
         dict
             Stars, sizes and time.
         """
-        return self._json("POST", "specs/estimate", json={"spec": spec})
+        key = "toml" if isinstance(spec, str) else "spec"
+        return self._json("POST", "specs/estimate", json={key: spec})
 
     def _events(self, job_id: str, after: str) -> Iterator[tuple[str, str, Content]]:
         """Give what happens to a job: number, kind, data."""
