@@ -9,13 +9,14 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 from fastapi import Request
 from fastapi.responses import FileResponse, Response
 from starlette.types import Receive, Scope, Send
 
 from starcat.errors import TargetMissing
-from starcat.service.problems import Problem
+from starcat.service.problems import MEDIA_TYPE, Problem, ProblemDetails
 
 IMMUTABLE = "private, max-age=31536000, immutable"
 """What lies under its digest never changes."""
@@ -40,6 +41,25 @@ TYPES = {
     ".toml": "application/toml",
 }
 """Content types by suffix; all else are bytes."""
+
+BYTES = "application/octet-stream"
+
+CONTENTS: dict[str, dict[str, object]] = {
+    kind: {} for kind in sorted({BYTES, *(kind.partition(";")[0] for kind in TYPES.values())})
+}
+"""All of them, as OpenAPI has them."""
+
+FILE: dict[int | str, dict[str, Any]] = {
+    200: {"content": CONTENTS, "description": "The file."},
+    206: {"content": CONTENTS, "description": "The range that was asked for."},
+    304: {"description": "The same as you have (``If-None-Match``)."},
+    416: {
+        "model": ProblemDetails,
+        "content": {MEDIA_TYPE: {}},
+        "description": "The range lies outside of the file.",
+    },
+}
+"""For ``responses=`` of what answers with files."""
 
 _RANGE = re.compile(r"\s*bytes\s*=\s*([0-9]{0,18})-([0-9]{0,18})\s*", re.IGNORECASE | re.ASCII)
 
@@ -160,7 +180,7 @@ def type_of(file_name: str) -> str:
     >>> type_of("stars.parquet")
     'application/vnd.apache.parquet'
     """
-    return TYPES.get(PurePosixPath(file_name).suffix.lower(), "application/octet-stream")
+    return TYPES.get(PurePosixPath(file_name).suffix.lower(), BYTES)
 
 
 def _part(request: Request, size: int, headers: Mapping[str, str]) -> tuple[int, int] | None:
