@@ -24,6 +24,7 @@ from starcat.service.app import make_app
 from starcat.service.settings import Settings
 
 SQL = "/api/v1/sql"
+LOCAL = "http://127.0.0.1"
 IDENTIFY = f"/api/v1/identify/{DATABASE}"
 CATALOG = "sao-00112233445566aa"
 
@@ -43,7 +44,7 @@ def client(root: Path) -> Iterator[TestClient]:
     settings = Settings(
         root=root, workers=0, query_time_s=20.0, max_rows=500, query_memory_gib=0.75
     )
-    with TestClient(make_app(settings)) as client:
+    with TestClient(make_app(settings), base_url=LOCAL) as client:
         yield client
 
 
@@ -320,6 +321,8 @@ def test_bombs_are_refused_and_the_next_one_is_answered(client, frame, root, nam
 
 
 def test_a_database_serves_whoever_may_read_only(root):
-    with TestClient(make_app(Settings(root=root, anonymous="none", workers=0))) as client:
+    with TestClient(
+        make_app(Settings(root=root, anonymous="none", workers=0)), base_url=LOCAL
+    ) as client:
         assert ask(client, "SELECT 1").status_code == 401
         assert client.post(IDENTIFY, json={"centroids_px": []}).status_code == 401
