@@ -309,7 +309,13 @@ def bombs() -> dict[str, bytes]:
     }
 
 
-@pytest.mark.parametrize("name", list(bombs()))
+LONG = ("bomb.fits.gz", "large.png")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] if name in LONG else []) for name in bombs()],
+)
 def test_bombs_are_refused_and_the_next_one_is_answered(client, frame, root, name):
     began = time.monotonic()
     answer = client.post(IDENTIFY, files={"file": (name, bombs()[name])})
