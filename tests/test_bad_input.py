@@ -1252,6 +1252,35 @@ def _(place: Place) -> Call:
     return ["sql", place.artifact, "--named", "densest-feilds"]
 
 
+NOBODY = ("--server", "http://127.0.0.1:9")
+"""An address at which no service is."""
+
+
+@case("service at no address", 2)
+def _(place: Place) -> Call:
+    return ["--server", "localhost:8000", "sql", "small-1.0.0", "SELECT 1 AS one"]
+
+
+@case("service for a command that runs here", 2)
+def _(place: Place) -> Call:
+    return [*NOBODY, "releases", "registry"]
+
+
+@case("option that a service does not take", 2)
+def _(place: Place) -> Call:
+    return [*NOBODY, "sql", "small-1.0.0", "SELECT 1 AS one", "--memory-limit-gb", "1"]
+
+
+@case("service that does not answer", 1)
+def _(place: Place) -> Call:
+    return [*NOBODY, "sql", "small-1.0.0", "SELECT 1 AS one"]
+
+
+@case("question to a service without a query", 2)
+def _(place: Place) -> Call:
+    return [*NOBODY, "sql", "small-1.0.0"]
+
+
 @case("value of a named query of the wrong type", 2)
 def _(place: Place) -> Call:
     return ["sql", place.artifact, "--named", "densest-fields", "--set", "count=many"]
