@@ -211,6 +211,16 @@ def test_tables_are_told_with_and_without_columns(client):
     assert client.get("/tap/tables/small.nothing").status_code == 404
 
 
+def test_tables_are_told_as_tap_plus_reads_them(client):
+    one = client.get("/tap/tables", params={"tables": "small.stars"}).text
+    assert re.findall(r"<table .*?<name>(.*?)</name>", one) == ["small.stars"]
+    assert one.count('<column esatapplus:flags="0">') == one.count("</column>") > 20
+    assert "esatapplus" not in client.get("/tap/tables").text
+    short = client.get("/tap/tables", params={"only_tables": "true"}).text
+    assert "small.stars" in short
+    assert "<column" not in short
+
+
 def test_texts_in_documents_are_escaped_once(client):
     """Descriptions of triangles have a comparison in them."""
     text = client.get("/tap/tables").text

@@ -20,12 +20,12 @@ from starcat.vo.documents import (
     MEDIA_TYPE,
     availability,
     capabilities,
+    for_tap_plus,
     table_document,
     tableset,
 )
 from starcat.vo.examples import examples_page
 from starcat.vo.parameters import Question, question
-from starcat.vo.tables import full_name
 
 router = APIRouter(prefix=PREFIX, tags=["TAP"], route_class=TapRoute)
 
@@ -87,23 +87,34 @@ def get_availability() -> Response:
     return Response(availability(_STARTED), media_type=MEDIA_TYPE)
 
 
+TAP_PLUS = ("tables", "only_tables", "share_accessible")
+"""Parameters that TapPlus of astroquery asks for tables with, beside those of VOSI."""
+
+
 @router.get("/tables", summary="All tables (VOSI)")
 def get_tables(
+    request: Request,
     service: TheService,
     who: Reader,
     detail: Annotated[Literal["min", "max"], Query(description="min without columns")] = "max",
 ) -> Response:
     """Return schemas, tables and columns."""
+    given = request.query_params
     found = service.tap.tables.state().tables
-    return Response(tableset(found, detail == "max"), media_type=MEDIA_TYPE)
+    if "tables" in given:
+        found = found.chosen(given["tables"].split(","))
+    content = tableset(found, detail == "max" and given.get("only_tables") != "true")
+    # TapPlus is the one client that does not say its name.
+    if any(name in given for name in TAP_PLUS) or "user-agent" not in request.headers:
+        content = for_tap_plus(content)
+    return Response(content, headers={"Vary": "User-Agent"}, media_type=MEDIA_TYPE)
 
 
 @router.get("/tables/{name}", summary="A table (VOSI)")
 def get_table(name: str, service: TheService, who: Reader) -> Response:
     """Return a table with its columns."""
-    for table in service.tap.tables.state().tables:
-        if name.lower() in (full_name(table).lower(), f"{table.schema}.{table.name}".lower()):
-            return Response(table_document(table), media_type=MEDIA_TYPE)
+    for table in service.tap.tables.state().tables.chosen([name]):
+        return Response(table_document(table), media_type=MEDIA_TYPE)
     raise TargetMissing(f"no table {quoted(name)}; /tap/tables lists those that there are")
 
 
