@@ -18,8 +18,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from starcat import errors
-from starcat.errors import ConfigError, QueryLimitError, StarcatError
+from starcat.errors import QueryLimitError, error_of_kind
 from starcat.service import turns
 from starcat.service.problems import Problem
 from starcat.service.settings import Settings
@@ -179,12 +178,9 @@ def _write(process: subprocess.Popen[bytes], content: Mapping[str, Any]) -> None
 
 def _error_of(answer: Mapping[str, Any]) -> Exception:
     """Return the error that a process told of."""
-    kind = getattr(errors, str(answer["kind"]), None)
-    if isinstance(kind, type) and issubclass(kind, ConfigError):
-        return kind(answer["words"], key=answer.get("key"))
-    if isinstance(kind, type) and issubclass(kind, StarcatError):
-        with suppress(TypeError):
-            return kind(answer["words"])
+    told = error_of_kind(str(answer["kind"]), str(answer["words"]), key=answer.get("key"))
+    if told is not None:
+        return told
     return RuntimeError(f"{answer['kind']}: {answer['words']}")
 
 

@@ -44,6 +44,8 @@ def alive() -> Alive:
 def ready(request: Request, service: TheService, who: Reader) -> Response:
     """Look at the records, the disk, the catalogs and the workers."""
     reasons = [reason for check in CHECKS if (reason := check(service)) is not None]
+    if not request.app.state.workers.is_alive:
+        reasons.append("the process that has jobs done has ended; it is started again")
     content = Readiness(ready=not reasons, reasons=reasons)
     return JSONResponse(content.model_dump(), 503 if reasons else 200)
 

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from starcat.errors import ConfigError
+from starcat.exchange.label import Label
 from starcat.progress import Progress, no_progress
 from starcat.service.confined import Confined
 from starcat.service.places import Places
@@ -21,6 +22,8 @@ from starcat.vo.parameters import Question, Upload
 from starcat.vo.tables import Schema, Table
 from starcat.vo.tap_schema import UPLOADS
 from starcat.vo.uploads import table_of_facts
+
+_LABEL = Label("result")
 
 
 class TapQueries:
