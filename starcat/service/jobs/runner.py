@@ -18,11 +18,12 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import IO, Any
 
 from starcat.service.jobs.job import Job
 from starcat.service.jobs.limits import disk_shortage, folder_bytes, owner_excess
-from starcat.service.jobs.task import PROGRAM
+from starcat.service.jobs.task import PROGRAM, memory_problem
 from starcat.service.jobs.transitions import Attempt, claim
 from starcat.service.jobs.work import threads_of
 from starcat.service.service import Service
@@ -33,6 +34,11 @@ TICK_S = 0.2
 
 DISK_TICK_S = 2.0
 """How often the disk that it takes is counted."""
+
+TAIL_BYTES = 4096
+
+NO_MEMORY = ("bad_alloc", "out of memory", "memory allocation", "cannot allocate memory")
+"""What libraries say, in small letters, that end a process which is refused memory."""
 
 STOPPED = "the service stops"
 
@@ -93,7 +99,7 @@ class Slots:
         """
         places = self.service.places
         make_folder(places.job(job.id))
-        with places.job_stderr(job.id).open("ab") as stderr:
+        with places.job_stderr(job.id).open("wb") as stderr:
             process = subprocess.Popen(
                 [sys.executable, "-c", PROGRAM, *sys.path],
                 stdin=subprocess.PIPE,
@@ -222,18 +228,26 @@ class _Run:
         if code == -signal.SIGTERM:  # the system goes down, and has told all processes
             self._attempt.wait_again()
             return
-        job, settings = self._attempt.job, self._slots.service.settings
+        service, job = self._slots.service, self._attempt.job
+        last_words = _tail(service.places.job_stderr(job.id)).lower()
+        if any(word in last_words for word in NO_MEMORY):
+            problem = memory_problem(int(service.settings.job_memory_gib * 2**30))
+            self._attempt.fail(problem)
+            return
         name = signal.Signals(-code).name if code < 0 else f"code {code}"
-        hint = {
-            -signal.SIGKILL: ", as a system does that runs out of memory",
-            -signal.SIGABRT: ", as a program does that is refused memory; it may take "
-            f"{settings.job_memory_gib:g} GiB (job_memory_gib)",
-        }.get(code, "")
+        hint = ", as a system does that runs out of memory" if code == -signal.SIGKILL else ""
         detail = (
             f"the process of the job ended by {name}{hint}; the operator finds more in "
             f"jobs/{job.id}/stderr.txt under the root"
         )
         self._attempt.fail(_problem("Ended", 500, detail))
+
+
+def _tail(path: Path) -> str:
+    """Return the end of what a process said of its troubles."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - TAIL_BYTES))
+        return file.read().decode(errors="replace")
 
 
 def lines_of(pipe: IO[bytes], tick_s: float) -> Iterator[bytes | None]:
