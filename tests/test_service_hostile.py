@@ -131,6 +131,7 @@ OUTSIDE = (
 )
 
 DB = f"/api/v1/databases/{DATABASE}"
+IDENTIFY = f"/api/v1/identify/{DATABASE}"
 UP = "..%2f..%2f..%2f"
 
 PATHS = [
@@ -235,11 +236,11 @@ SPECS = [
         422,
         {"kind": "build", "spec": ".".join("a" * 50_000) + " = 1"},
     ),
-    as_json("brackets within brackets as JSON", "/api/v1/jobs", 422, b"[" * 200_000),
+    as_json("brackets within brackets as JSON", "/api/v1/jobs", (400, 422), b"[" * 200_000),
     as_json(
-        "objects within objects", "/api/v1/jobs", 422, b'{"a":' * 100_000 + b"1" + b"}" * 100_000
+        "objects within objects", "/api/v1/jobs", (400, 422), b'{"a":' * 100_000 + b"1" + b"}" * 100_000
     ),
-    as_json("a number of 10,000 digits", "/api/v1/jobs", 422, b'{"kind": ' + b"9" * 10_000 + b"}"),
+    as_json("a number of 10,000 digits", "/api/v1/jobs", (400, 422), b'{"kind": ' + b"9" * 10_000 + b"}"),
     as_json("not a number", "/api/v1/jobs", 422, b'{"kind": "evaluate", "noise_px": NaN}'),
     as_json(
         "unknown keys",
@@ -252,7 +253,7 @@ SPECS = [
 
 def sql(name: str, text: str) -> Hostile:
     return as_json(
-        f"SQL: {name}", "/api/v1/sql", (400, 422), {"sql": text, "databases": [DATABASE]}
+        f"SQL: {name}", "/api/v1/sql", (400, 422), {"query": text, "targets": [DATABASE]}
     )
 
 
@@ -261,6 +262,18 @@ def adql(name: str, text: str) -> Hostile:
 
 
 QUERIES = [
+    as_json(
+        "SQL: a path as a target",
+        "/api/v1/sql",
+        (404, 422),
+        {"query": "SELECT 1", "targets": ["../../../etc/passwd"]},
+    ),
+    as_json(
+        "SQL: a path as a named query",
+        "/api/v1/sql",
+        (400, 404, 422),
+        {"named": "../../../etc/passwd", "targets": [DATABASE]},
+    ),
     sql("a file", "SELECT * FROM read_text('/etc/passwd')"),
     sql("a file without a function", "SELECT * FROM '/etc/passwd'"),
     sql("all files", "SELECT * FROM glob('/**')"),
@@ -321,7 +334,7 @@ def table(name: str, content: bytes, file_name: str = "t.xml") -> Hostile:
 def image(name: str, file_name: str, content: bytes, status: int | tuple[int, ...]) -> Hostile:
     return as_files(
         f"image: {name}",
-        "/api/v1/identify",
+        IDENTIFY,
         status,
         {"file": (file_name, content)},
         database=DATABASE,
@@ -329,6 +342,7 @@ def image(name: str, file_name: str, content: bytes, status: int | tuple[int, ..
 
 
 UPLOADS = [
+    as_files("a path as the database of a frame", f"/api/v1/identify/{UP}etc", 400, {}),
     table("entities within entities", LAUGHS),
     table("an entity from a file", OUTSIDE),
     table("no table", b"\x00\xff" * 1000),
@@ -349,7 +363,7 @@ UPLOADS = [
     ),
     as_files(
         "a thousand files",
-        "/api/v1/identify",
+        IDENTIFY,
         (400, 422),
         {f"f{k}": ("x", b"") for k in range(1_100)},
     ),
@@ -359,7 +373,7 @@ SIZES = [
     Hostile(
         "a body that says to be too large",
         "POST",
-        "/api/v1/identify",
+        IDENTIFY,
         413,
         {"Content-Length": str(10**12)},
     ),
@@ -384,7 +398,7 @@ SIZES = [
         (200, 400, 416),
         Range="bytes=" + ",".join(f"{k}-{k}" for k in range(1_000)),
     ),
-    get("more jobs than there are numbers", "/api/v1/jobs?most=" + "9" * 400, 422),
+    get("more jobs than there are numbers", "/api/v1/jobs?limit=" + "9" * 400, 422),
     get("a NUL byte in a query", "/api/v1/jobs?state=%00", 400),
 ]
 
@@ -473,9 +487,11 @@ def test_a_hostile_request_is_refused(one: Hostile, target: Target) -> None:
     answer = target.send(one)
     assert answer.status in one.statuses, answer.text[:500]
     assert time.monotonic() - begun_s < 15.0
-    for told in ("Traceback", 'File "', str(target.around), "site-packages", "root:x:0", SCRIPT):
+    for told in ("Traceback", 'File "', str(target.around), "site-packages", "root:x:0"):
         assert told not in answer.text, answer.text[:500]
     assert "what nobody is to see" not in answer.text
+    if "html" in answer.headers.get("content-type", ""):
+        assert SCRIPT not in answer.text
     assert '"detail":"Not Found"' not in answer.text, "there is no such address to attack"
     if "x-request-id" in answer.headers:  # else the server itself took it for no request at all
         assert answer.headers["x-content-type-options"] == "nosniff"
@@ -503,7 +519,7 @@ def talk(served: Served, *parts: bytes, wait_s: float = 0.0) -> bytes:
 
 def test_a_slow_upload_is_ended(target: Target) -> None:
     head = (
-        f"POST /api/v1/identify HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {target.token}"
+        f"POST {IDENTIFY} HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {target.token}"
         "\r\nContent-Type: application/octet-stream\r\nContent-Length: 1000\r\n\r\n"
     )
     begun_s = time.monotonic()
@@ -523,7 +539,7 @@ def test_a_head_without_an_end_is_ended(target: Target, first: bytes) -> None:
 
 def test_parts_without_an_end_are_ended(target: Target) -> None:
     head = (
-        f"POST /api/v1/identify HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {target.token}"
+        f"POST {IDENTIFY} HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {target.token}"
         "\r\nContent-Type: multipart/form-data; boundary=edge\r\nTransfer-Encoding: chunked\r\n\r\n"
     )
     part = b"%x\r\n" % (1 << 18) + b"x" * (1 << 18) + b"\r\n"

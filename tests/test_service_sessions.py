@@ -13,7 +13,7 @@ import pytest
 
 from starcat.errors import QueryError, QueryLimitError
 from starcat.query.session import MAX_CHECKED, Session
-from starcat.service import sessions as module
+from starcat.service import turns
 from starcat.service.problems import Problem
 from starcat.service.sessions import IDLE, Sessions
 from starcat.service.settings import Settings
@@ -125,7 +125,7 @@ def test_a_target_that_was_replaced_is_opened_anew(
 def test_who_waits_too_long_is_told_to_come_again(
     sessions: Sessions, small_artifact: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "WAIT_S", 0.05)
+    monkeypatch.setattr(turns, "WAIT_S", 0.05)
     with (
         sessions.session([small_artifact]),
         pytest.raises(Problem, match="ask again later") as caught,

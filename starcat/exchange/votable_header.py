@@ -9,14 +9,14 @@ from xml.sax.saxutils import escape, quoteattr
 from starcat.exchange.label import Label
 from starcat.exchange.votable_columns import VotableColumn, said_in_xml
 
-_BEGINNING = (
+_VOTABLE = (
     '<?xml version="1.0" encoding="utf-8"?>\n'
     '<VOTABLE version="1.4" xmlns="http://www.ivoa.net/xml/VOTable/v1.3"\n'
     ' xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance"\n'
     ' xsi:schemaLocation="http://www.ivoa.net/xml/VOTable/v1.3'
     ' http://www.ivoa.net/xml/VOTable/VOTable-1.4.xsd">\n'
-    ' <RESOURCE type="results">\n'
 )
+_RESULTS = ' <RESOURCE type="results">\n'
 _BEFORE_ROWS = {
     "binary2": '   <DATA>\n    <BINARY2>\n     <STREAM encoding="base64">\n',
     "tabledata": "   <DATA>\n    <TABLEDATA>\n",
@@ -69,7 +69,7 @@ def head(
     SchemaError
         If VOUnits has no such unit.
     """
-    parts = [_BEGINNING]
+    parts = [_VOTABLE, _RESULTS]
     for name, text in label.origin.items():
         parts.append(info(name, text, f"starcat.{name}"))
     parts += [info(name, text) for name, text in infos.items()]
@@ -121,20 +121,22 @@ def info(name: str, value: str, identifier: str = "", text: str = "") -> str:
     return f"{start}>{escape(said_in_xml(text))}</INFO>\n" if text else f"{start}/>\n"
 
 
-def message(name: str, value: str, text: str) -> str:
-    """Return a VOTable without a table, which says what went wrong.
+def error_document(text: str) -> str:
+    """Return a VOTable that says why there is no answer.
 
     Parameters
     ----------
-    name, value, text : str
-        Of the one ``INFO`` element.
+    text : str
+        What went wrong.
 
     Returns
     -------
     str
-        XML.
+        XML with an ``INFO`` named ``Error``, as a simple cone search has it, and one named
+        ``QUERY_STATUS``, as DALI has it.
     """
-    return f"{_BEGINNING}{info(name, value, text=text)}{_AFTER_TABLE}"
+    said = info("Error", text) + _RESULTS + info("QUERY_STATUS", "ERROR", text=text)
+    return f"{_VOTABLE}{said}{_AFTER_TABLE}"
 
 
 def has_places(columns: Sequence[VotableColumn]) -> bool:

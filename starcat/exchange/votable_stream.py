@@ -157,7 +157,8 @@ def row_chunks(
             yield b2a_base64(memoryview(content)[:whole])
     except Exception as error:
         failure = error
-    yield b2a_base64(left)
+    if left:
+        yield b2a_base64(left)
     if failure is not None:
         raise failure
 

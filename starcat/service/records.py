@@ -78,6 +78,25 @@ MIGRATIONS: tuple[str, ...] = (
     );
     """,
     PUBLICATIONS,
+    """
+    CREATE TABLE tap_jobs (
+        id TEXT PRIMARY KEY,
+        owner TEXT NOT NULL,
+        phase TEXT NOT NULL,
+        parameters TEXT NOT NULL,
+        files TEXT NOT NULL,
+        run_id TEXT NOT NULL DEFAULT '',
+        created_s REAL NOT NULL,
+        queued_s REAL,
+        started_s REAL,
+        ended_s REAL,
+        destroyed_s REAL NOT NULL,
+        limit_s REAL NOT NULL,
+        error TEXT NOT NULL DEFAULT '',
+        media_type TEXT NOT NULL DEFAULT ''
+    );
+    CREATE INDEX tap_jobs_by_owner ON tap_jobs (owner, created_s);
+    """,
 )
 """Statements that bring the file from each version to the next; one that is out never changes."""
 

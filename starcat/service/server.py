@@ -101,7 +101,7 @@ def _serve(settings: Settings, announce: Announce) -> None:
 
 
 class _Server(uvicorn.Server):
-    """Says where it is, and that it is about to stop, so that streams of events end."""
+    """Says where it is, and has jobs and streams of events end as soon as it is told to stop."""
 
     def __init__(self, config: uvicorn.Config, app: FastAPI, announce: Announce) -> None:
         super().__init__(config)

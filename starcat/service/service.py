@@ -8,6 +8,8 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
+from starcat.service.catalogs import Catalogs
+from starcat.service.confined import Confined
 from starcat.service.jobs.job import JobStore
 from starcat.service.jobs.queue import JobQueue, open_queue
 from starcat.service.places import Places
@@ -15,6 +17,12 @@ from starcat.service.records import Records
 from starcat.service.sessions import Sessions
 from starcat.service.settings import Settings
 from starcat.service.shelf import Shelf
+from starcat.service.vo.tap_service import Tap
+
+READ = "read"
+"""Folder, among the catalogs, of what estimates start from."""
+
+GIB = 2**30
 
 
 @dataclass(frozen=True)
@@ -33,6 +41,18 @@ class Service:
         The databases there are.
     jobs : JobStore
         The jobs there are.
+    sessions : Sessions
+        Open query sessions.
+    queue : JobQueue
+        What waits for workers.
+    confined : Confined
+        Processes that read uploads and make files.
+    tap : Tap
+        What TAP needs.
+    catalogs : Catalogs
+        The catalogs there are, and estimates from them.
+    stopping : threading.Event
+        Set when the service stops.
     """
 
     settings: Settings
@@ -41,7 +61,10 @@ class Service:
     shelf: Shelf
     jobs: JobStore
     sessions: Sessions
+    confined: Confined
+    tap: Tap
     queue: JobQueue
+    catalogs: Catalogs
     stopping: threading.Event = field(default_factory=threading.Event)
 
 
@@ -68,8 +91,21 @@ def open_service(settings: Settings) -> Service:
     places = Places(settings.root)
     places.make()
     records = Records(places.records)
-    queue, sessions = open_queue(settings, places), Sessions(settings)
-    return Service(settings, places, records, Shelf(places), JobStore(records), sessions, queue)
+    shelf, sessions = Shelf(places), Sessions(settings)
+    most = round(settings.job_memory_gib * GIB)
+    confined = Confined(settings, places.scratch)
+    return Service(
+        settings=settings,
+        places=places,
+        records=records,
+        shelf=shelf,
+        jobs=JobStore(records),
+        sessions=sessions,
+        confined=confined,
+        tap=Tap(settings, places, records, shelf, sessions, confined),
+        queue=open_queue(settings, places),
+        catalogs=Catalogs(places.catalogs / READ, most),
+    )
 
 
 def service_of(request: Request) -> Service:

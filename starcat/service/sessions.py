@@ -8,23 +8,16 @@ from __future__ import annotations
 
 import threading
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import ParamSpec, TypeVar
-
-import anyio
-from anyio import CapacityLimiter, to_thread
 
 from starcat.errors import QueryError
 from starcat.query.session import Limits, Session, open_session
-from starcat.service.problems import Problem
+from starcat.service import turns
 from starcat.service.settings import Settings
-
-WAIT_S = 10.0
-"""Seconds that a question waits for others to be answered."""
+from starcat.service.turns import Turns, busy
 
 IDLE = 4
 """Sessions that are kept while nobody asks; those that were asked longest ago are closed first."""
@@ -33,9 +26,6 @@ DISK_GB = 4.0
 """Gigabytes of disk that a query may take for what does not fit into its memory."""
 
 GIB_IN_GB = 2**30 / 1e9
-
-P = ParamSpec("P")
-T = TypeVar("T")
 
 Key = tuple[tuple[str, int, int], ...]
 
@@ -56,6 +46,12 @@ class Sessions:
     ----------
     settings : Settings
         How many answer at the same time, and what each query may take.
+
+    Attributes
+    ----------
+    run : coroutine function
+        Calls a function that uses `session` in a thread, when it is its turn (`Turns.run`): for
+        handlers that are ``async def``.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -64,7 +60,7 @@ class Sessions:
         self._places = threading.BoundedSemaphore(settings.queries)
         self._lock = threading.Lock()
         self._idle: list[_Open] = []
-        self._threads = CapacityLimiter(settings.queries)
+        self.run = Turns(settings.queries).run
         self._is_closed = False
         weakref.finalize(self, _close, self._idle)
 
@@ -93,8 +89,8 @@ class Sessions:
         QueryError, ProductError, SourceError
             If a target cannot be read, and whatever is raised within the context.
         """
-        if not self._places.acquire(timeout=WAIT_S):
-            raise _busy()
+        if not self._places.acquire(timeout=turns.WAIT_S):
+            raise busy()
         try:
             key = tuple(map(_identity, targets))
             one = self._taken(key) or self._opened(key)
@@ -110,41 +106,6 @@ class Sessions:
                 self._give_back(one, is_kept and one.session.is_running)
         finally:
             self._places.release()
-
-    async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function that asks a session, in a thread that only queries use.
-
-        Handlers that only read have the other threads for themselves.
-
-        Parameters
-        ----------
-        function : callable
-            What asks; it uses `session`.
-        *args, **kwargs
-            Its arguments.
-
-        Returns
-        -------
-        object
-            What the function returns.
-
-        Raises
-        ------
-        Problem
-            With status 503, if others take too long.
-        """
-        place = object()
-        with anyio.move_on_after(WAIT_S) as waiting:
-            await self._threads.acquire_on_behalf_of(place)
-        if waiting.cancelled_caught:
-            raise _busy()
-        try:
-            # The place is taken already: this limiter keeps nobody waiting.
-            return await to_thread.run_sync(
-                partial(function, *args, **kwargs), limiter=CapacityLimiter(1)
-            )
-        finally:
-            self._threads.release_on_behalf_of(place)
 
     def forget(self, target: str | Path) -> None:
         """Close the sessions about a target that is to be removed and that nobody uses.
@@ -205,11 +166,3 @@ def _identity(target: str | Path) -> tuple[str, int, int]:
 def _close(sessions: list[_Open]) -> None:
     for one in sessions:
         one.closing.close()
-
-
-def _busy() -> Problem:
-    return Problem(
-        503,
-        f"all queries that may run at the same time were busy for {WAIT_S:g} s; ask again later",
-        headers={"Retry-After": f"{WAIT_S:.0f}"},
-    )

@@ -20,8 +20,8 @@ TEXT_MIB = 1.0
 TEXTS = ("application/json", "application/x-www-form-urlencoded", "text/")
 MIB, GIB = 2**20, 2**30
 
-FILLING = ("/api/v1/jobs", "/tap/async")
-"""Where a POST makes something that stays on the disk."""
+FILLING = ("/tap/async",)
+"""Where a POST makes something that stays on the disk; jobs see to their room themselves."""
 
 
 class Bodies:

@@ -7,7 +7,7 @@ the server is gone: then all of its processes end at once, and the next server t
 
 from __future__ import annotations
 
-import logging
+import logging.config
 import os
 import signal
 import sys
@@ -16,6 +16,7 @@ import time
 
 from huey.consumer import Consumer
 
+from starcat.service.guard.logs import log_settings
 from starcat.service.jobs.runner import Slots
 from starcat.service.jobs.task import end_with_parent
 from starcat.service.service import open_service
@@ -32,7 +33,7 @@ POLL_S = (0.05, 0.25)
 def main() -> None:
     """Have jobs done until the server says otherwise."""
     end_with_parent()
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
+    logging.config.dictConfig(log_settings())
     settings = Settings.model_validate_json(sys.stdin.buffer.readline())
     slots = Slots(open_service(settings))
     slots.service.queue.on_job(slots.run_job)

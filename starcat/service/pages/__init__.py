@@ -4,12 +4,27 @@ from __future__ import annotations
 
 from fastapi import APIRouter
 
-from starcat.service.pages import jobs, new, sign_in, static_files
+from starcat.service.pages import (
+    console,
+    databases,
+    home,
+    identify,
+    jobs,
+    new,
+    releases,
+    sign_in,
+    static_files,
+)
 
 ROUTERS: tuple[APIRouter, ...] = (
     static_files.router,
     sign_in.router,
+    home.router,
     new.router,
     jobs.router,
+    databases.router,
+    console.router,
+    identify.router,
+    releases.router,
 )
 """Routers of the page, in the order in which they are asked."""

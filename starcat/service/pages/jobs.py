@@ -153,7 +153,9 @@ def facts_of(job: Job) -> list[tuple[str, str]]:
     asked = {name: value for name, value in job.request.items() if name != "spec"}
     made = {} if job.result is None else job.result
     told: dict[str, Any] = {**asked, **{key: made[key] for key in made if key != "rates"}}
-    return [(name.replace("_", " "), str(value)) for name, value in told.items() if value is not None]
+    return [
+        (name.replace("_", " "), str(value)) for name, value in told.items() if value is not None
+    ]
 
 
 def steps_of(job: Job, events: Sequence[Event]) -> list[Step]:

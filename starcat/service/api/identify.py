@@ -1,0 +1,243 @@
+"""Identification: centroids or an image in, attitude and named stars out."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, BinaryIO, Literal
+
+from fastapi import APIRouter, Query, Request
+from fastapi import Path as PathParameter
+from fastapi.responses import Response
+from pydantic import BaseModel, Field, ValidationError
+from starlette.datastructures import FormData, UploadFile
+
+from starcat.images.identification import IMAGE_SUFFIXES
+from starcat.service.access import Reader
+from starcat.service.file_answers import type_of
+from starcat.service.identifying import CAMERA_NAME, IdentifyOptions
+from starcat.service.problems import Problem
+from starcat.service.service import Service, TheService
+from starcat.service.targets import database_of
+from starcat.service.uploading import safe_name, scratch_folder
+
+router = APIRouter(prefix="/identify", tags=["identify"])
+
+MIB = 2**20
+SUFFIXES = (*IMAGE_SUFFIXES, ".csv", ".json")
+Kind = Literal["png", "svg"]
+
+DatabaseId = Annotated[
+    str,
+    PathParameter(description="Id or title.", examples=["0123456789abcdef", "gaia-12deg-1.0.0"]),
+]
+
+
+class Identified(BaseModel):
+    """The answers to some frames."""
+
+    database: str = Field(examples=["gaia-12deg-1.0.0"])
+    method: str = Field(examples=["triangle"])
+    frames: list[dict[str, Any]] = Field(
+        description="One a frame, as 'starcat identify --json' prints it: ``status``; where it "
+        "is identified ``q_body_from_icrs``, ``boresight_ra_deg``, ``boresight_dec_deg``, "
+        "``roll_deg``, ``covariance_arcsec2`` and the names of ``stars``; else ``refusal``."
+    )
+    notes: list[str] = Field(description="For people.")
+
+
+_OPTIONS = IdentifyOptions.model_json_schema()
+_CENTROIDS = {
+    "type": "object",
+    "required": ["centroids_px"],
+    "properties": {
+        "centroids_px": {
+            "type": "array",
+            "items": {"type": "array", "items": {"type": "number"}},
+            "description": "Pairs of x to the right and y down, pixels.",
+        },
+        "mag": {"type": "array", "items": {"type": ["number", "null"]}},
+        "name": {"type": "string"},
+        "options": _OPTIONS,
+    },
+}
+BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "application/json": {
+                "schema": {
+                    "oneOf": [
+                        _CENTROIDS,
+                        {
+                            "type": "object",
+                            "required": ["frames"],
+                            "properties": {
+                                "frames": {"type": "array", "items": _CENTROIDS},
+                                "options": _OPTIONS,
+                            },
+                        },
+                    ]
+                },
+                "example": {
+                    "centroids_px": [[101.2, 33.1], [400.0, 211.9], [88.4, 300.7], [251, 96.6]],
+                    "mag": [3.1, 4.0, 4.4, 5.2],
+                    "options": {"tolerance_px": 1.5},
+                },
+            },
+            "multipart/form-data": {
+                "schema": {
+                    "type": "object",
+                    "required": ["file"],
+                    "properties": {
+                        "file": {
+                            "type": "string",
+                            "format": "binary",
+                            "description": "Centroids (CSV, JSON) or image (FITS, PNG, TIFF).",
+                        },
+                        "options": {
+                            "type": "string",
+                            "description": "IdentifyOptions as JSON.",
+                            "example": '{"fov_error": 0.02}',
+                        },
+                    },
+                }
+            },
+        },
+    }
+}
+
+
+@router.get("/options", summary="Options")
+def options_schema(reader: Reader) -> dict[str, Any]:
+    """Return the JSON schema of the options."""
+    return IdentifyOptions.model_json_schema()
+
+
+@router.post("/{database}", summary="Identify frames", openapi_extra=BODY)
+async def identify(
+    database: DatabaseId, request: Request, service: TheService, reader: Reader
+) -> Identified:
+    """Identify the stars of frames and find the camera's attitude."""
+    async with _asked(request, service.settings.upload_mib) as asked:
+        found, _ = await service.confined.run(_identify, service, database, asked, None)
+    return Identified.model_validate(found)
+
+
+@router.post(
+    "/{database}/picture",
+    summary="Identify a frame and draw it",
+    openapi_extra=BODY,
+    response_class=Response,
+    responses={
+        200: {
+            "content": {"image/png": {}, "image/svg+xml": {}},
+            "description": "The first frame with its stars circled and named.",
+        }
+    },
+)
+async def picture(
+    database: DatabaseId,
+    request: Request,
+    service: TheService,
+    reader: Reader,
+    kind: Annotated[Kind, Query(alias="format")] = "png",
+) -> Response:
+    """Return the first frame as a picture with its stars named, or as it is where none is."""
+    async with _asked(request, service.settings.upload_mib) as asked:
+        _, drawn = await service.confined.run(_identify, service, database, asked, kind)
+    return Response(drawn, media_type=type_of(f"picture.{kind}"))
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What a request brought."""
+
+    name: str
+    content: BinaryIO
+    options: IdentifyOptions
+
+
+@asynccontextmanager
+async def _asked(request: Request, most_mib: float) -> AsyncIterator[_Asked]:
+    """Give what a request brought; its file is closed afterwards."""
+    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if kind == "multipart/form-data":
+        async with request.form(max_files=1, max_fields=4) as form:
+            yield _of_form(form, most_mib)
+        return
+    if kind != "application/json":
+        raise Problem(
+            415,
+            f"the content is {kind[:60] or 'of no type'!r}; send centroids as application/json, or "
+            "a file as multipart/form-data",
+        )
+    content = _json((await request.body()).decode(errors="replace"), "body")
+    if not isinstance(content, dict):
+        raise Problem(422, "expected an object with 'centroids_px', or with 'frames'", key="body")
+    options = _options(content.pop("options", {}))
+    # Not named by whoever sent it: messages call it so.
+    yield _Asked("frame.json", io.BytesIO(json.dumps(content).encode()), options)
+
+
+def _of_form(form: FormData, most_mib: float) -> _Asked:
+    upload = form.get("file")
+    if not isinstance(upload, UploadFile):
+        raise Problem(422, "no file was sent; send centroids or an image as 'file'", key="file")
+    if upload.size is None or upload.size > most_mib * MIB:
+        raise Problem(413, f"the file is larger than {most_mib:g} MiB; send a smaller one")
+    options = _options(_json(str(form.get("options") or "{}"), "options"))
+    return _Asked(safe_name(upload.filename, SUFFIXES, "frame"), upload.file, options)
+
+
+def _json(text: str, where: str) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise Problem(422, f"{where}: not JSON ({str(error)[:200]})", key=where) from None
+
+
+def _options(content: Any) -> IdentifyOptions:
+    try:
+        return IdentifyOptions.model_validate(content)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False)[0]
+        key = ".".join(["options", *map(str, first["loc"])])
+        raise Problem(
+            422,
+            f"{key}: {first['msg']} (found {str(first['input'])[:80]!r}); "
+            "/api/v1/identify/options says what there is",
+            key=key,
+        ) from None
+
+
+def _identify(
+    service: Service, database: str, asked: _Asked, kind: Kind | None
+) -> tuple[dict[str, Any], bytes]:
+    artifact = database_of(service, database).folder
+    with scratch_folder(service.places) as folder:
+        _keep(asked, folder)
+        found = service.confined.call(
+            "identify",
+            {
+                "folder": str(folder),
+                "file": asked.name,
+                "artifact": str(artifact),
+                "options": asked.options.model_dump(),
+                "picture": kind,
+            },
+        )
+        drawn = folder / f"picture.{kind}"
+        return found, drawn.read_bytes() if drawn.is_file() else b""
+
+
+def _keep(asked: _Asked, folder: Path) -> None:
+    with (folder / asked.name).open("wb") as kept:
+        shutil.copyfileobj(asked.content, kept)
+    if asked.options.camera:
+        (folder / CAMERA_NAME).write_text(asked.options.camera, encoding="utf-8")

@@ -1,0 +1,235 @@
+"""Questions in SQL."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Query
+from fastapi.responses import JSONResponse, Response, StreamingResponse
+from pydantic import BaseModel, ConfigDict, Field
+
+from starcat.query.gallery import gallery
+from starcat.query.macros import macros
+from starcat.service.access import Reader
+from starcat.service.asking import Question, file_of, named_text, rows_of
+from starcat.service.file_answers import type_of
+from starcat.service.problems import Problem
+from starcat.service.service import Service, TheService
+from starcat.service.targets import target_paths
+
+router = APIRouter(prefix="/sql", tags=["sql"])
+
+Form = Literal["rows", "csv", "json", "parquet", "votable", "fits", "ecsv", "npz"]
+
+SUFFIXES = {"votable": ".vot"}
+"""Suffixes of files that are not the name of the format."""
+
+MAX_SHOWN = 100_000
+"""Rows of an answer that is no file."""
+
+Plain = int | float | bool | str | None
+
+TargetName = Annotated[str, Field(max_length=200)]
+
+
+class SqlQuestion(BaseModel):
+    """What is asked, and how the answer is wanted."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [
+                {
+                    "targets": ["0123456789abcdef"],
+                    "query": "SELECT designation, mag FROM cone($ra, $dec, 5) ORDER BY mag",
+                    "values": {"ra": 37.95, "dec": 89.26},
+                },
+                {"targets": ["gaia-12deg-1.0.0"], "named": "densest-fields", "format": "csv"},
+            ]
+        },
+    )
+
+    targets: Annotated[list[TargetName], Field(min_length=1, max_length=8)] = Field(
+        description="Ids or titles of databases, names of catalogs. One has its views in the main "
+        "schema; several have a schema each, and are a, b, c ... too."
+    )
+    query: str | None = Field(None, max_length=100_000, description="SQL, one that reads.")
+    named: str | None = Field(None, max_length=100, description="Instead: one of the gallery.")
+    values: dict[str, Plain] = Field(
+        default_factory=dict, description="The values of the $name in it."
+    )
+    format: Form = Field("rows", description="Rows as JSON lists, or a file.")
+    max_rows: int | None = Field(None, ge=1, description="Rows at most; by default 1000, or all.")
+    time_limit_s: float | None = Field(None, gt=0, description="Seconds that it may take.")
+
+
+class Column(BaseModel):
+    """A column of an answer."""
+
+    name: str
+    type: str = Field(description="As DuckDB calls it.", examples=["DOUBLE"])
+    unit: str = Field(examples=["deg"])
+    description: str
+
+
+class SqlRows(BaseModel):
+    """An answer in rows."""
+
+    columns: list[Column]
+    rows: list[list[Any]] = Field(
+        description="Whole numbers beyond 2^53 are texts; what is no number is null."
+    )
+    is_cut: bool = Field(description="Whether there are more rows.")
+
+
+class GalleryValue(BaseModel):
+    """A value that a named query can be given."""
+
+    name: str
+    default: Plain
+    help: str
+
+
+class GalleryQuery(BaseModel):
+    """A query that people ask often."""
+
+    name: str
+    help: str = Field(description="What it finds.")
+    targets: int = Field(description="How many targets it is about.")
+    values: list[GalleryValue]
+    text: str = Field(description="SQL.")
+
+
+class MacroFacts(BaseModel):
+    """A function of queries."""
+
+    name: str
+    arguments: str
+    is_table: bool = Field(description="Whether it stands after FROM.")
+    help: str
+    example: str
+
+
+class ViewColumn(BaseModel):
+    """A column of a view."""
+
+    name: str
+    dtype: str = Field(description="Empty where it is not known.")
+    unit: str
+    description: str
+
+
+class ViewFacts(BaseModel):
+    """A table that queries see."""
+
+    target: str = Field(description="Its schema, where there are several.")
+    view: str
+    description: str
+    columns: list[ViewColumn]
+
+
+@router.post(
+    "",
+    summary="Ask a question",
+    response_model=SqlRows,
+    responses={
+        200: {
+            "description": "Rows, or a file; ``X-Starcat-Rows`` says how many rows it has, and "
+            "``X-Starcat-Cut`` whether there are more.",
+            "content": {"application/octet-stream": {}},
+        }
+    },
+)
+async def ask(question: SqlQuestion, service: TheService, reader: Reader) -> Response:
+    """Ask a question about databases and catalogs in SQL; nothing is ever written."""
+    asked = _checked(service, question)
+    if question.format == "rows":
+        return await service.sessions.run(_rows, service, asked)
+    return await service.sessions.run(_file, service, asked, question.format)
+
+
+@router.get("/queries", summary="Queries by name")
+def queries(reader: Reader) -> list[GalleryQuery]:
+    """Return the queries that people ask often, with their values."""
+    return [GalleryQuery.model_validate(asdict(query)) for query in gallery().values()]
+
+
+@router.get("/macros", summary="Functions of queries")
+def all_macros(reader: Reader) -> list[MacroFacts]:
+    """Return the functions that queries have beside those of DuckDB."""
+    facts = ("name", "arguments", "is_table", "help", "example")
+    listed = sorted(macros(), key=lambda macro: (macro.is_table, macro.name))
+    return [MacroFacts(**{fact: getattr(one, fact) for fact in facts}) for one in listed]
+
+
+@router.get("/views", summary="Tables of targets")
+async def views(
+    service: TheService,
+    reader: Reader,
+    target: Annotated[
+        list[TargetName],
+        Query(min_length=1, max_length=8, description="As in a question. Repeatable."),
+    ],
+) -> list[ViewFacts]:
+    """Return the tables that a query about some targets sees."""
+    return await service.sessions.run(_views, service, target)
+
+
+def _checked(service: Service, question: SqlQuestion) -> Question:
+    """Return what is asked, within the limits that the operator set."""
+    if (question.query is None) == (question.named is None):
+        raise Problem(422, "give either a query or the name of one", key="query")
+    settings = service.settings
+    default, most = settings.max_rows, settings.max_rows
+    if question.format == "rows":
+        default, most = min(1000, most), min(MAX_SHOWN, most)
+    count = len(question.targets)
+    if question.named is not None:
+        text, values = named_text(question.named, question.values, count)
+    else:
+        text, values = question.query or "", dict(question.values)  # type: ignore[arg-type]
+    time_s = min(question.time_limit_s or settings.query_time_s, settings.query_time_s)
+    return Question(question.targets, text, values, min(question.max_rows or default, most), time_s)
+
+
+def _rows(service: Service, asked: Question) -> Response:
+    found = rows_of(service, asked)
+    # What JSON has was made sure of: a model would check every value once more.
+    return JSONResponse({"columns": found.columns, "rows": found.rows, "is_cut": found.is_cut})
+
+
+def _file(service: Service, asked: Question, form: str) -> Response:
+    found = file_of(service, asked, form)
+    name = "answer" + SUFFIXES.get(form, f".{form}")
+    headers = {
+        "Content-Length": str(found.size),
+        "Content-Disposition": f'attachment; filename="{name}"',
+        "X-Starcat-Rows": str(found.rows),
+        "X-Starcat-Cut": str(found.is_cut).lower(),
+    }
+    return StreamingResponse(found.chunks, media_type=type_of(name), headers=headers)
+
+
+def _views(service: Service, targets: list[str]) -> list[ViewFacts]:
+    with service.sessions.session(target_paths(service, targets)) as session:
+        return [
+            ViewFacts(
+                target=target.name,
+                view=view.name,
+                description=view.schema.description if view.schema else "",
+                columns=[
+                    ViewColumn(
+                        name=c.name, dtype=c.dtype, unit=c.unit or "", description=c.description
+                    )
+                    for c in view.schema.columns
+                ]
+                if view.schema
+                else [
+                    ViewColumn(name=name, dtype="", unit="", description="")
+                    for name in view.columns
+                ],
+            )
+            for target in session.targets
+            for view in target.views
+        ]

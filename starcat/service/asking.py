@@ -1,0 +1,249 @@
+"""Questions in SQL that requests ask: to rows, or to a file of any format."""
+
+from __future__ import annotations
+
+import datetime as dt
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from decimal import Decimal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from starcat.errors import QueryError, QueryLimitError
+from starcat.query.gallery import named_query
+from starcat.service.service import Service
+from starcat.service.targets import target_paths
+from starcat.service.uploading import scratch_folder, sent_once
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+MAX_BYTES = 4 << 30
+"""Size of an answer that is kept until it is sent."""
+
+LARGEST_WHOLE = 2**53 - 1
+"""The largest whole number that every reader of JSON keeps."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is asked.
+
+    Attributes
+    ----------
+    targets : sequence of str
+        What it is about, as `target_paths` takes it.
+    text : str
+        SQL.
+    values : mapping of str to object
+        The values of the ``$name`` in it.
+    max_rows : int
+        Rows that are wanted at most.
+    time_s : float
+        Seconds that it may take.
+    """
+
+    targets: Sequence[str]
+    text: str
+    values: Mapping[str, Any]
+    max_rows: int
+    time_s: float
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The rows that were found.
+
+    Attributes
+    ----------
+    columns : list of dict
+        ``name``, ``type``, ``unit`` and ``description`` of each.
+    rows : list of list
+        Values that JSON has.
+    is_cut : bool
+        Whether there are more.
+    """
+
+    columns: list[dict[str, str]]
+    rows: list[list[Any]]
+    is_cut: bool
+
+
+@dataclass(frozen=True)
+class Answered:
+    """An answer in a file.
+
+    Attributes
+    ----------
+    chunks : iterator of bytes
+        The content.
+    size : int
+        Bytes.
+    rows : int
+        Rows.
+    is_cut : bool
+        Whether there are more.
+    """
+
+    chunks: Iterator[bytes]
+    size: int
+    rows: int
+    is_cut: bool
+
+
+def named_text(
+    name: str, values: Mapping[str, Any], targets: int
+) -> tuple[str, dict[str, int | float | str]]:
+    """Return a query of the gallery.
+
+    Parameters
+    ----------
+    name : str
+        Its name.
+    values : mapping of str to object
+        Values that take the place of those by default.
+    targets : int
+        How many targets there are.
+
+    Returns
+    -------
+    text : str
+        SQL.
+    values : dict of str to int, float or str
+        All values.
+
+    Raises
+    ------
+    QueryError
+        If there is none of that name, or it is about another number of targets.
+    """
+    query = named_query(name)
+    if query.targets != targets:
+        raise QueryError(f"{query.name} is about {query.targets} targets; {targets} given")
+    return query.text, query.with_values({key: str(value) for key, value in values.items()})
+
+
+def rows_of(service: Service, question: Question) -> Rows:
+    """Answer a question with rows.
+
+    Parameters
+    ----------
+    service : Service
+        The service.
+    question : Question
+        What is asked.
+
+    Returns
+    -------
+    Rows
+        The first ones.
+
+    Raises
+    ------
+    QueryError
+        If it cannot be answered.
+    """
+    paths = target_paths(service, question.targets)
+    with (
+        service.sessions.session(paths, question.time_s) as session,
+        session.ask(question.text, question.values) as running,
+    ):
+        found = running.rows(question.max_rows + 1)
+        columns = [
+            {"name": name, "type": kind, "unit": facts.unit, "description": facts.description}
+            for name, kind, facts in zip(running.columns, running.types, running.facts, strict=True)
+        ]
+    shown = [[plain(value) for value in row] for row in found[: question.max_rows]]
+    return Rows(columns, shown, len(found) > question.max_rows)
+
+
+def file_of(service: Service, question: Question, form: str) -> Answered:
+    """Answer a question with a file.
+
+    Parameters
+    ----------
+    service : Service
+        The service.
+    question : Question
+        What is asked.
+    form : str
+        One of `starcat.exchange.formats.FORMATS`.
+
+    Returns
+    -------
+    Answered
+        Whole: what goes wrong is raised here.
+
+    Raises
+    ------
+    QueryError
+        If it cannot be answered.
+    SchemaError
+        If a column cannot be said in the format.
+    """
+    paths = target_paths(service, question.targets)
+    with scratch_folder(service.places) as folder:
+        source, target = folder / "rows.arrow", folder / "answer"
+        with (
+            service.sessions.session(paths, question.time_s) as session,
+            session.ask(question.text, question.values) as running,
+        ):
+            count, is_cut = _keep(running.batches(), source, question.max_rows)
+        arguments = {"source": str(source), "target": str(target), "form": form}
+        service.confined.call("convert", arguments)
+        chunks, size = sent_once(target)
+    return Answered(chunks, size, count, is_cut)
+
+
+def _keep(batches: pa.RecordBatchReader, path: Path, most: int) -> tuple[int, bool]:
+    """Write the first rows to a file; return how many, and whether there are more."""
+    import pyarrow as pa
+
+    count = size = 0
+    with pa.OSFile(str(path), "wb") as file, pa.ipc.new_stream(file, batches.schema) as stream:
+        for batch in batches:
+            part = batch.slice(0, most - count)
+            stream.write_batch(part)
+            count, size = count + part.num_rows, size + part.nbytes
+            if part.num_rows < batch.num_rows:
+                return count, True
+            if size > MAX_BYTES:
+                raise QueryLimitError(
+                    f"the answer is larger than {MAX_BYTES >> 30} GiB; ask for fewer rows"
+                )
+    return count, False
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON has it.
+
+    Parameters
+    ----------
+    value : object
+        Of a row.
+
+    Returns
+    -------
+    object
+        Whole numbers that some readers would round are texts, and so are times; what is no
+        number is none.
+
+    Examples
+    --------
+    >>> plain(2**60), plain(float("nan")), plain([1, 0.5])
+    ('1152921504606846976', None, [1, 0.5])
+    """
+    if value is None or isinstance(value, bool | str):
+        return value
+    if isinstance(value, int):
+        return value if abs(value) <= LARGEST_WHOLE else str(value)
+    if isinstance(value, float | Decimal):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, dt.date | dt.time):
+        return value.isoformat()
+    return value.hex() if isinstance(value, bytes) else str(value)

@@ -1,0 +1,37 @@
+"""Tables to files of other formats, in a confined process: some are held in memory as a whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+def convert(source: str, target: str, form: str) -> int:
+    """Write a table to a file.
+
+    Parameters
+    ----------
+    source : str
+        An Arrow stream.
+    target : str
+        The file to write.
+    form : str
+        One of `starcat.exchange.formats.FORMATS`.
+
+    Returns
+    -------
+    int
+        Rows.
+
+    Raises
+    ------
+    SchemaError
+        If a column cannot be said in the format.
+    OutputError
+        If the file cannot be written.
+    """
+    import pyarrow as pa
+
+    from starcat.exchange.formats import write_batches
+
+    with pa.OSFile(source) as file, pa.ipc.open_stream(file) as stream:
+        return write_batches(stream, Path(target), form)

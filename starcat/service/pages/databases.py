@@ -1,0 +1,178 @@
+"""The pages of databases: the list, one database, its coverage, its report, two versions."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from fastapi import Query, Request
+from fastapi.responses import JSONResponse, RedirectResponse, Response
+
+from starcat.artifact.diff import diff_artifacts
+from starcat.artifact.reader import Artifact
+from starcat.errors import TargetMissing
+from starcat.matcher.methods.table import METHODS
+from starcat.service.access import Builder, Reader
+from starcat.service.jobs.submission import submit_evaluation
+from starcat.service.pages import sky
+from starcat.service.pages.facts import (
+    MANIFEST_DIGEST,
+    database_row,
+    database_rows,
+    products_of,
+    report_of,
+)
+from starcat.service.pages.rendering import page_router, render
+from starcat.service.pages.simulated import camera_of
+from starcat.service.service import Service, TheService
+from starcat.service.shelf import Database
+
+router = page_router()
+
+REPORT_PAGE = "report/index.html"
+REPORT_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; sandbox"
+"""A report has its style and its plots inside, and nothing else; no script of it runs."""
+
+FIELDS_SHOWN = 25
+"""Fields of the tiling on a page."""
+
+DIFFERENCES_SHOWN = 100
+"""Stars of each kind that a comparison lists."""
+
+KEPT = {"Cache-Control": "private, max-age=86400"}
+"""What never changes under its address: the id says what is in a database."""
+
+Order = Literal["fewest", "most", "number"]
+
+
+@router.get("/databases")
+def list_of_databases(request: Request, service: TheService, _: Reader) -> Response:
+    """Show all databases."""
+    return render(request, "databases.html", rows=database_rows(service))
+
+
+@router.get("/databases/{database_id}")
+def one_database(request: Request, service: TheService, _: Reader, database_id: str) -> Response:
+    """Show what is known of a database."""
+    database = service.shelf.database(database_id)
+    manifest = database.manifest
+    return render(
+        request,
+        "database.html",
+        **_head(service, database, "overview"),
+        report=report_of(database),
+        products=products_of(manifest),
+        methods=[
+            name
+            for name, method in METHODS.items()
+            if set(method.products) <= set(manifest["products"])
+        ],
+        files=sorted(manifest["files"].items()),
+        digest=manifest[MANIFEST_DIGEST],
+    )
+
+
+@router.get("/databases/{database_id}/coverage")
+def coverage_page(
+    request: Request,
+    service: TheService,
+    _: Reader,
+    database_id: str,
+    order: Annotated[Order, Query()] = "fewest",
+    page: Annotated[int, Query(ge=1, le=1_000_000)] = 1,
+) -> Response:
+    """Show the map of the sky and the fields of the tiling."""
+    database = service.shelf.database(database_id)
+    fields = sky.fields_of(database)
+    pages = max(1, -(-len(fields) // FIELDS_SHOWN))
+    page = min(page, pages)
+    numbers = sky.ordered(fields, order)[(page - 1) * FIELDS_SHOWN : page * FIELDS_SHOWN]
+    return render(
+        request,
+        "coverage.html",
+        **_head(service, database, "coverage"),
+        report=report_of(database),
+        sky_map=sky.sky_map(fields),
+        fields=[sky.field_at(fields, number) for number in numbers],
+        fov=_field_of_view(database),
+        order=order,
+        page=page,
+        pages=pages,
+        count=len(fields),
+    )
+
+
+@router.get("/databases/{database_id}/coverage.png")
+def coverage_raster(service: TheService, _: Reader, database_id: str) -> Response:
+    """Give the raster of the map of the sky."""
+    database = service.shelf.database(database_id)
+    raster = sky.map_png(database.id, sky.fields_of(database))
+    return Response(raster, media_type="image/png", headers=KEPT)
+
+
+@router.get("/databases/{database_id}/fields.json")
+def fields_of_map(service: TheService, _: Reader, database_id: str) -> Response:
+    """Give the fields of the tiling to the script of the map."""
+    fields = sky.fields_of(service.shelf.database(database_id))
+    content = {
+        "ra_deg": fields.ra_deg.round(4).tolist(),
+        "dec_deg": fields.dec_deg.round(4).tolist(),
+        "stars": fields.stars.tolist(),
+    }
+    return JSONResponse(content, headers=KEPT)
+
+
+@router.get("/databases/{database_id}/report")
+def build_report(service: TheService, _: Reader, database_id: str) -> Response:
+    """Give the page that the build wrote; it cannot do anything."""
+    database = service.shelf.database(database_id)
+    path = database.folder / REPORT_PAGE
+    if REPORT_PAGE not in database.manifest["files"] or not path.is_file():
+        raise TargetMissing(f"{database.title} has no report; build it again to get one")
+    headers = {**KEPT, "Content-Security-Policy": REPORT_POLICY}
+    return Response(path.read_bytes(), media_type="text/html; charset=utf-8", headers=headers)
+
+
+@router.get("/databases/{database_id}/compare")
+def compare(
+    request: Request,
+    service: TheService,
+    _: Reader,
+    database_id: str,
+    other: Annotated[str, Query(max_length=64)] = "",
+) -> Response:
+    """Show what differs between this database and a later or other one."""
+    database = service.shelf.database(database_id)
+    others = [one for one in service.shelf.databases() if one.id != database.id]
+    content: dict[str, Any] = {"others": others, "later": None, "difference": None}
+    if other:
+        later = service.shelf.database(other)
+        sides = (Artifact(one.folder, one.manifest) for one in (database, later))
+        content |= {"later": later, "difference": diff_artifacts(*sides)}
+    else:
+        same_name = [one for one in others if one.name == database.name]
+        content["suggested"] = same_name[-1].id if same_name else ""
+    return render(
+        request,
+        "compare.html",
+        **_head(service, database, "compare"),
+        most=DIFFERENCES_SHOWN,
+        **{"suggested": other, **content},
+    )
+
+
+@router.post("/databases/{database_id}/evaluate")
+def evaluate(service: TheService, builder: Builder, database_id: str) -> Response:
+    """Have it measured how often frames are identified, and show the job."""
+    submitted = submit_evaluation(service, database_id, builder.name)
+    return RedirectResponse(f"/jobs/{submitted.job.id}", 303)
+
+
+def _head(service: Service, database: Database, tab: str) -> dict[str, Any]:
+    """Return what the head of every page of a database needs."""
+    return {"row": database_row(service, database), "database": database, "tab": tab}
+
+
+def _field_of_view(database: Database) -> tuple[float, float]:
+    """Return the full angles of the field across width and height, degrees."""
+    camera = camera_of(database)
+    return camera.fov_x_deg, camera.fov_y_deg

@@ -1,0 +1,306 @@
+"""The page *Identify*: a frame in, its attitude and its named stars out."""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, BinaryIO
+
+from fastapi import Query, Request
+from fastapi.responses import Response
+from pydantic import ValidationError
+from starlette.datastructures import FormData, UploadFile
+
+from starcat.errors import StarcatError
+from starcat.images.identification import IMAGE_SUFFIXES
+from starcat.matcher.methods.table import METHODS
+from starcat.service.access import Reader
+from starcat.service.identifying import IdentifyOptions
+from starcat.service.pages.centroid_text import centroid_file
+from starcat.service.pages.rendering import page_router, render
+from starcat.service.pages.simulated import camera_of, frame_suffix, write_frame
+from starcat.service.problems import Problem, problem_of
+from starcat.service.service import Service, TheService
+from starcat.service.shelf import Database
+from starcat.service.uploading import safe_name, scratch_folder
+
+router = page_router()
+
+SUFFIXES = (*IMAGE_SUFFIXES, ".csv", ".json")
+MIB = 2**20
+MAX_SEED = 2**31 - 1
+
+FIELDS = (
+    "database", "method", "field_error", "tolerance_px", "centroids", "brightness", "seed",
+)  # fmt: skip
+"""Fields of the form that are texts."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What is to be identified.
+
+    Attributes
+    ----------
+    name : str
+        Name that its file may have.
+    keep : callable
+        Writes the file to a path.
+    """
+
+    name: str
+    keep: Callable[[Path], None]
+
+
+@router.get("/identify")
+def identify_page(
+    request: Request,
+    service: TheService,
+    _: Reader,
+    database: Annotated[str, Query(max_length=64)] = "",
+) -> Response:
+    """Show the form."""
+    return _page(request, service, {"database": database})
+
+
+@router.post("/identify")
+async def identify(request: Request, service: TheService, _: Reader) -> Response:
+    """Identify the frame of a form, and show the form again with the answer."""
+    async with request.form(max_files=1, max_fields=20) as form:
+        given = {name: str(form.get(name) or "")[:MIB] for name in FIELDS}
+        try:
+            database = service.shelf.database(given["database"])
+            frame, options = frame_of(form, given, database, service), options_of(given)
+            found, picture = await service.confined.run(
+                identified, service, database, frame, options
+            )
+        except (StarcatError, Problem) as error:
+            problem = problem_of(error)
+            return _page(request, service, given, status=problem.status, problem=problem)
+    first = found["frames"][0]
+    return _page(
+        request,
+        service,
+        given,
+        found=found,
+        picture=_address(picture),
+        errors=_errors(first),
+        field_deg=_field_deg(first, database),
+    )
+
+
+@router.get("/identify/frame/{database_id}")
+async def simulated_frame(
+    service: TheService,
+    _: Reader,
+    database_id: str,
+    seed: Annotated[int, Query(ge=0, le=MAX_SEED)] = 0,
+) -> Response:
+    """Give a simulated frame of a database's camera, to try things with."""
+    database = service.shelf.database(database_id)
+    name = f"{database.title}-{seed}{frame_suffix(database)}"
+    content = await service.confined.run(_simulated, service, database, name, seed)
+    kind = "image/png" if name.endswith(".png") else "text/csv; charset=utf-8"
+    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+    return Response(content, media_type=kind, headers=headers)
+
+
+def _page(
+    request: Request, service: Service, given: dict[str, str], status: int = 200, **answer: Any
+) -> Response:
+    databases = service.shelf.databases()
+    nothing = dict.fromkeys(("found", "picture", "problem", "errors", "field_deg"))
+    return render(
+        request,
+        "identify.html",
+        status=status,
+        databases=[(one.id, one.title) for one in databases],
+        methods=[(name, f"{name}: {one.description}") for name, one in METHODS.items()],
+        given={**dict.fromkeys(FIELDS, ""), **given},
+        suffixes=",".join(SUFFIXES),
+        most_mib=service.settings.upload_mib,
+        **{**nothing, **answer},
+    )
+
+
+def frame_of(form: FormData, given: dict[str, str], database: Database, service: Service) -> Frame:
+    """Return the frame that a form brings.
+
+    Parameters
+    ----------
+    form : FormData
+        With a file, or without.
+    given : dict of str to str
+        Its other fields.
+    database : Database
+        Whose camera a simulated frame has.
+    service : Service
+        With the limit of an upload.
+
+    Returns
+    -------
+    Frame
+        A simulated one where a seed is given, else the file, else what was pasted.
+
+    Raises
+    ------
+    ConfigError
+        If what was pasted is no list of centroids.
+    Problem
+        If there is none, or the file is too large.
+    """
+    if given["seed"]:
+        number = _number(given["seed"], "seed")
+        seed = int(min(max(number or 0, 0), MAX_SEED))
+        name = f"simulated-{seed}{frame_suffix(database)}"
+        return Frame(name, lambda path: write_frame(path, database, seed))
+    upload = form.get("file")
+    if isinstance(upload, UploadFile) and upload.filename:
+        if upload.size is None or upload.size > service.settings.upload_mib * MIB:
+            raise Problem(413, f"the file is larger than {service.settings.upload_mib:g} MiB")
+        file = upload.file
+        return Frame(safe_name(upload.filename, SUFFIXES, "frame"), lambda path: _copy(file, path))
+    if not given["centroids"].strip():
+        raise Problem(
+            422,
+            "no frame was given; choose an image or a file of centroids, paste centroids, or try "
+            "a simulated frame",
+            key="file",
+        )
+    is_mag = given["brightness"] == "mag"
+    suffix, text = centroid_file(given["centroids"], "mag" if is_mag else "light")
+    return Frame(f"pasted{suffix}", lambda path: _write(path, text))
+
+
+def options_of(given: dict[str, str]) -> IdentifyOptions:
+    """Return how a frame is to be identified.
+
+    Parameters
+    ----------
+    given : dict of str to str
+        Fields of the form.
+
+    Returns
+    -------
+    IdentifyOptions
+        What is empty is not stated.
+
+    Raises
+    ------
+    Problem
+        If a value is no number, or out of range.
+    """
+    percent = _number(given["field_error"], "field_error")
+    content = {
+        "method": given["method"] or None,
+        "fov_error": None if percent is None else percent / 100.0,
+        "tolerance_px": _number(given["tolerance_px"], "tolerance_px"),
+    }
+    try:
+        return IdentifyOptions.model_validate(content)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False)[0]
+        key = str(first["loc"][0])
+        raise Problem(422, f"{key}: {first['msg']} (found {first['input']!r})", key=key) from None
+
+
+def identified(
+    service: Service, database: Database, frame: Frame, options: IdentifyOptions
+) -> tuple[dict[str, Any], bytes]:
+    """Identify a frame and draw it, in a confined process.
+
+    Parameters
+    ----------
+    service : Service
+        With the processes and the limits.
+    database : Database
+        With which.
+    frame : Frame
+        What.
+    options : IdentifyOptions
+        How.
+
+    Returns
+    -------
+    found : dict
+        As `starcat.service.identifying.identify` returns it.
+    picture : bytes
+        PNG; empty where nothing was drawn.
+
+    Raises
+    ------
+    StarcatError
+        What the identification raised.
+    """
+    limited = options.model_copy(update={"time_limit_s": service.settings.query_time_s})
+    with scratch_folder(service.places) as folder:
+        frame.keep(folder / frame.name)
+        arguments = {
+            "folder": str(folder),
+            "file": frame.name,
+            "artifact": str(database.folder),
+            "options": limited.model_dump(),
+            "picture": "png",
+        }
+        found = service.confined.call("identify", arguments)
+        drawn = folder / "picture.png"
+        return found, drawn.read_bytes() if drawn.is_file() else b""
+
+
+def _simulated(service: Service, database: Database, name: str, seed: int) -> bytes:
+    with scratch_folder(service.places) as folder:
+        write_frame(folder / name, database, seed)
+        return (folder / name).read_bytes()
+
+
+def _address(picture: bytes) -> str | None:
+    """Return a picture as an address that holds it, as JPEG: nothing of a frame is kept."""
+    if not picture:
+        return None
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.open(io.BytesIO(picture)).convert("RGB").save(file, "JPEG", quality=85)
+    return f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode()}"
+
+
+def _errors(answer: dict[str, Any]) -> list[str] | None:
+    """Return the standard deviations of the attitude about the three axes, arcseconds."""
+    rows: list[list[float | None]] = answer.get("covariance_arcsec2") or []
+    squares = [row[k] for k, row in enumerate(rows)]
+    known = [f"{math.sqrt(one):.3g}" for one in squares if one is not None]
+    return known if len(known) == 3 else None
+
+
+def _field_deg(answer: dict[str, Any], database: Database) -> float | None:
+    """Return the full angle across the width, degrees, by the focal length that was found."""
+    focal_length_px = answer.get("focal_length_px")
+    if not focal_length_px:
+        return None
+    half = 0.5 * camera_of(database).width_px / float(focal_length_px)
+    return 2.0 * math.degrees(math.atan(half))
+
+
+def _number(text: str, name: str) -> float | None:
+    if not text.strip():
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        raise Problem(
+            422, f"{name}: {text[:40]!r} is not a number; give one, or leave it empty", key=name
+        ) from None
+
+
+def _copy(file: BinaryIO, path: Path) -> None:
+    with path.open("wb") as kept:
+        shutil.copyfileobj(file, kept)
+
+
+def _write(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")

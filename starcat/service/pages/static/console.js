@@ -1,0 +1,45 @@
+// The SQL console: the answer comes without the page being loaded again; Ctrl and Enter run.
+
+import { announce } from "./starcat.js";
+
+const form = document.getElementById("console");
+const query = document.getElementById("query");
+const answer = document.getElementById("answer");
+let asking = null;
+
+document.getElementById("keys").hidden = false;
+query.addEventListener("keydown", (event) => {
+  if (event.key === "Enter" && (event.ctrlKey || event.metaKey)) {
+    event.preventDefault();
+    form.requestSubmit(form.querySelector("button.primary"));
+  }
+});
+
+// A name that the query has got since has no field yet: the page is loaded again to give it one.
+function lacksFields() {
+  const names = query.value.matchAll(/\$([A-Za-z_]\w{0,63})/g);
+  return [...names].some(([, name]) => !form.elements.namedItem(`value.${name}`));
+}
+
+form.addEventListener("submit", async (event) => {
+  if (event.submitter?.formAction !== form.action || lacksFields()) return;
+  event.preventDefault();
+  asking?.abort();
+  const mine = new AbortController();
+  asking = mine;
+  const wanted = new URLSearchParams(new FormData(form));
+  answer.setAttribute("aria-busy", "true");
+  try {
+    const found = await fetch(`${form.action}?${wanted}&part=answer`, { signal: mine.signal });
+    const text = await found.text();
+    if (found.headers.get("Content-Type")?.startsWith("text/html")) answer.innerHTML = text;
+    else answer.textContent = JSON.parse(text).detail;
+    history.replaceState(null, "", `?${wanted}`);
+    announce(document.getElementById("answer-count")?.textContent ?? "The query failed");
+  } catch (error) {
+    if (error.name === "AbortError") return;
+    answer.textContent = "The service does not answer; is it running?";
+  } finally {
+    if (asking === mine) answer.removeAttribute("aria-busy");
+  }
+});

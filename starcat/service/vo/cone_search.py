@@ -1,0 +1,162 @@
+"""Simple cone searches of databases and of catalogs that were read."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import SpooledTemporaryFile
+
+from fastapi import APIRouter, Request
+from fastapi.responses import Response, StreamingResponse
+
+from starcat.errors import QueryLimitError, StarcatError, TargetMissing
+from starcat.exchange.label import Label
+from starcat.service.access import Reader
+from starcat.service.problems import Problem, problem_of
+from starcat.service.service import Service, TheService
+from starcat.store.layout import is_store
+from starcat.vo.cone import (
+    MEDIA_TYPE,
+    ConeRequest,
+    cone_error,
+    cone_query,
+    cone_request,
+    star_view,
+    with_ucds,
+)
+from starcat.vo.results import result_chunks
+
+router = APIRouter(prefix="/scs", tags=["cone search"])
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}(\.[A-Za-z0-9_-]{1,99}){0,9}")
+_OF_A_JOB = re.compile(r"-[0-9a-f]{16}(\.parquet)?$")
+_VOTABLE = {"Content-Type": MEDIA_TYPE}
+_STARS = "stars.parquet"
+_HELD_BYTES = 4 << 20
+"""What an answer may take of the memory; a larger one is held in a file without a name."""
+
+_CHUNK_BYTES = 1 << 18
+PARAMETERS = {
+    "parameters": [
+        {
+            "name": name,
+            "in": "query",
+            "required": name in ("RA", "DEC", "SR"),
+            "description": text,
+            "schema": {"type": kind},
+            "example": example,
+        }
+        for name, kind, example, text in (
+            ("RA", "number", 83.6, "Right ascension of the centre, ICRS, decimal degrees."),
+            ("DEC", "number", -5.4, "Declination of the centre, ICRS, decimal degrees."),
+            ("SR", "number", 1.0, "Radius in degrees; 0 asks for the columns only."),
+            ("VERB", "integer", 2, "1: identity and place; 2: columns with a UCD; 3: all."),
+            ("MAXREC", "integer", 1000, "Rows at most."),
+            ("RESPONSEFORMAT", "string", "text/xml", "A format of TAP; VOTable by default."),
+        )
+    ]
+}
+
+
+@router.get(
+    "/{catalog}",
+    summary="Stars in a circle (Simple Cone Search 1.03)",
+    response_class=Response,
+    responses={
+        200: {"content": {MEDIA_TYPE: {}}, "description": "The stars, nearest first."},
+        400: {"content": {MEDIA_TYPE: {}}, "description": "A VOTable with an INFO named Error."},
+    },
+    openapi_extra=PARAMETERS,
+)
+async def search(catalog: str, request: Request, service: TheService, reader: Reader) -> Response:
+    """Find the stars within a radius of a place.
+
+    The catalog is the id or the name of a database, with its version or without (then it is the
+    newest), or the name of a catalog that was read.
+    """
+    try:
+        asked = cone_request(request.query_params.multi_items())
+        found = await service.sessions.run(_answer, service, catalog, asked)
+    except (StarcatError, Problem) as error:
+        told = problem_of(error)
+        headers = error.headers if isinstance(error, Problem) else {}
+        return Response(cone_error(told.detail), _status(error), {**headers, **_VOTABLE})
+    return StreamingResponse(_chunks(found), headers={"Content-Type": asked.media_type})
+
+
+def target_of(service: Service, name: str) -> tuple[Path, Label]:
+    """Return the database or the catalog of a name.
+
+    Parameters
+    ----------
+    service : Service
+        What has them.
+    name : str
+        As a request says it: an id, ``name``, ``name-version``, or a catalog that was read.
+
+    Returns
+    -------
+    folder : Path
+        What a session opens.
+    label : Label
+        What a file says of it.
+
+    Raises
+    ------
+    TargetMissing
+        If there is none.
+    """
+    named = [one for one in service.shelf.databases() if name in (one.id, one.name, one.title)]
+    if named:
+        newest = named[-1]
+        return newest.folder, Label("stars", newest.name, newest.version)
+    if _NAME.fullmatch(name):
+        for path in _read_ones(service.places.catalogs, name):
+            if path.is_file() or (path.is_dir() and is_store(path)):
+                return path, Label(name)
+    raise TargetMissing(
+        f"no database and no catalog is called {name[:80]!r}; /api/v1/databases lists the databases"
+    )
+
+
+def _read_ones(folder: Path, name: str) -> list[Path]:
+    """Return where a catalog that was read may lie: under its name, or as jobs name theirs."""
+    own = folder / name
+    of_jobs = [path for path in folder.glob(f"{name}-*") if _OF_A_JOB.match(path.name, len(name))]
+    newest_first = sorted(of_jobs, key=lambda path: (-path.stat().st_mtime_ns, path.name))
+    return [own / _STARS, folder / f"{name}.parquet", own, *newest_first]
+
+
+def _answer(service: Service, name: str, asked: ConeRequest) -> SpooledTemporaryFile[bytes]:
+    """Return the whole answer, so that a slow reader keeps no session from others."""
+    folder, label = target_of(service, name)
+    max_rows = service.settings.max_rows
+    maxrec = max_rows if asked.maxrec is None else min(asked.maxrec, max_rows)
+    with service.sessions.session([folder]) as session:
+        view = star_view(session)
+        with session.ask(cone_query(view, asked, maxrec)) as running:
+            rows = with_ucds(running.batches(), view)
+            scratch = service.places.scratch
+            chunks = result_chunks(rows, asked.form, scratch, label=label, maxrec=maxrec)
+            held: SpooledTemporaryFile[bytes]
+            held = SpooledTemporaryFile(_HELD_BYTES, dir=str(scratch))  # noqa: SIM115
+            try:
+                held.writelines(chunks)
+            except BaseException:
+                held.close()
+                raise
+    held.seek(0)
+    return held
+
+
+def _chunks(held: SpooledTemporaryFile[bytes]) -> Iterator[bytes]:
+    with held:
+        while chunk := held.read(_CHUNK_BYTES):
+            yield chunk
+
+
+def _status(error: Exception) -> int:
+    """Return the status of an answer: what is wrong with a parameter is a bad request."""
+    status = problem_of(error).status
+    return 400 if status == 422 and not isinstance(error, QueryLimitError) else status

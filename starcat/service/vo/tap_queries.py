@@ -1,0 +1,131 @@
+"""A question of TAP from its parameters to the bytes of its answer."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from starcat.errors import ConfigError
+from starcat.exchange.label import Label
+from starcat.progress import Progress, no_progress
+from starcat.service.confined import Confined
+from starcat.service.places import Places
+from starcat.service.sessions import Sessions
+from starcat.service.vo.tap_answers import Answers
+from starcat.service.vo.tap_tables import TapTables
+from starcat.vo.adql import translate
+from starcat.vo.answer import ask
+from starcat.vo.parameters import Question, Upload
+from starcat.vo.tables import Schema, Table
+from starcat.vo.tap_schema import UPLOADS
+from starcat.vo.uploads import table_of_facts
+
+_LABEL = Label("result")
+
+
+class TapQueries:
+    """What answers questions.
+
+    Parameters
+    ----------
+    places : Places
+        What lies where.
+    tables : TapTables
+        What may be asked.
+    sessions : Sessions
+        What runs queries, in processes of their own.
+    confined : Confined
+        What reads uploads and makes files, in processes of their own.
+    most_rows : int
+        Rows of an answer at most.
+    """
+
+    def __init__(
+        self,
+        places: Places,
+        tables: TapTables,
+        sessions: Sessions,
+        confined: Confined,
+        most_rows: int,
+    ) -> None:
+        self._confined = confined
+        self.most_rows = most_rows
+        self._places = places
+        self._tables = tables
+        self._sessions = sessions
+        self._answers = Answers(places.scratch, confined)
+
+    def answer(
+        self,
+        asked: Question,
+        files: Mapping[str, Path],
+        time_s: float | None = None,
+        progress: Progress = no_progress,
+    ) -> Iterator[bytes]:
+        """Yield the answer to a question.
+
+        Parameters
+        ----------
+        asked : Question
+            The question.
+        files : mapping of str to Path
+            Parts of the request that are files, by their names; only read.
+        time_s : float, optional
+            Seconds that the query may take; by default what the operator set.
+        progress : Progress
+            Called while the query runs; what it raises ends the query.
+
+        Yields
+        ------
+        bytes
+            In the format of the question. What is wrong with the question is raised before the
+            first.
+
+        Raises
+        ------
+        StarcatError
+            If it cannot be answered.
+        """
+        with self._uploaded(asked.uploads, files) as (folder, uploaded):
+            state = self._tables.state()
+            tables, targets = state.tables, list(state.targets)
+            if uploaded is not None and folder is not None:
+                tables = tables.with_schema(uploaded)
+                targets.append(folder)
+            translated = translate(asked.query, tables)
+            with self._sessions.session(targets, time_s) as session:
+                batches = ask(session, translated, asked.max_rows, progress)
+                yield from self._answers.chunks(batches, asked.form, asked.max_rows)
+
+    @contextmanager
+    def _uploaded(
+        self, uploads: tuple[Upload, ...], files: Mapping[str, Path]
+    ) -> Iterator[tuple[Path | None, Schema | None]]:
+        """Give the folder and the schema of what came with a question, while it is answered."""
+        if not uploads:
+            yield None, None
+            return
+        for one in uploads:
+            if one.part and one.part not in files:
+                raise ConfigError(
+                    f"UPLOAD of {one.table}: the request has no file {one.part!r}; send it as a "
+                    "part of multipart/form-data with that name",
+                    key="UPLOAD",
+                )
+        top = Path(tempfile.mkdtemp(prefix="upload-", dir=self._places.scratch))
+        try:
+            folder = top / UPLOADS
+            folder.mkdir()
+            tables = tuple(
+                self._read(files[one.part or one.job_id], one, folder) for one in uploads
+            )
+            yield folder, Schema(UPLOADS, "Tables that came with the query", tables)
+        finally:
+            shutil.rmtree(top, ignore_errors=True)
+
+    def _read(self, file: Path, upload: Upload, folder: Path) -> Table:
+        given = {"path": str(file), "name": upload.table, "folder": str(folder)}
+        return table_of_facts(self._confined.call("upload", given))

@@ -1,0 +1,184 @@
+"""What TAP's handlers share: parameters of a request wherever they stand, and errors as VOTable."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import AsyncIterator, Callable, Coroutine
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from fastapi import Depends, Request
+from fastapi.responses import Response
+from fastapi.routing import APIRoute
+from starlette.datastructures import FormData, UploadFile
+from starlette.exceptions import HTTPException
+
+from starcat.errors import ConfigError, StarcatError
+from starcat.service.problems import Problem, problem_of
+from starcat.service.service import Service, service_of
+from starcat.vo.documents import VOTABLE_TYPE, error_votable
+from starcat.vo.parameters import MAX_UPLOADS, Parameters
+
+PREFIX = "/tap"
+
+MAX_PARAMETERS = 100
+MAX_PARAMETER_BYTES = 1 << 20
+
+_COPIED_BYTES = 1 << 20
+
+_FORMS = ("application/x-www-form-urlencoded", "multipart/form-data")
+
+_logger = logging.getLogger(__name__)
+
+Handler = Callable[[Request], Coroutine[Any, Any, Response]]
+
+
+class TapRoute(APIRoute):
+    """A route whose errors are VOTables, but for those of who may do what."""
+
+    def get_route_handler(self) -> Handler:
+        """Return the handler with errors caught."""
+        handle = super().get_route_handler()
+
+        async def answer(request: Request) -> Response:
+            try:
+                return await handle(request)
+            except (StarcatError, Problem) as error:
+                if isinstance(error, Problem) and error.status in (401, 403):
+                    raise
+                return error_response(error)
+
+        return answer
+
+
+def error_response(error: Exception) -> Response:
+    """Return an error as TAP has it.
+
+    Parameters
+    ----------
+    error : Exception
+        What a handler raised.
+
+    Returns
+    -------
+    Response
+        A VOTable; the status is that of the rest of the service.
+    """
+    problem = problem_of(error)
+    headers = error.headers if isinstance(error, Problem) else None
+    return Response(error_votable(problem.detail), problem.status, headers, VOTABLE_TYPE)
+
+
+@dataclass(frozen=True)
+class TapRequest:
+    """A request.
+
+    Attributes
+    ----------
+    parameters : Parameters
+        Of the address and of the body.
+    uploads : dict of str to UploadFile
+        Parts of the body that are files, by their names.
+    """
+
+    parameters: Parameters
+    uploads: dict[str, UploadFile]
+
+    def keep(self, folder: Path) -> dict[str, Path]:
+        """Copy the files of the request into a folder.
+
+        Parameters
+        ----------
+        folder : Path
+            Which is there.
+
+        Returns
+        -------
+        dict of str to Path
+            Names of our own, by the names of the parts.
+        """
+        kept = {}
+        for number, (name, upload) in enumerate(self.uploads.items()):
+            kept[name] = folder / f"upload-{number}.vot"
+            upload.file.seek(0)
+            with kept[name].open("wb") as stream:
+                while part := upload.file.read(_COPIED_BYTES):
+                    stream.write(part)
+        return kept
+
+
+async def tap_request(request: Request) -> AsyncIterator[TapRequest]:
+    """Give what a request says; its files are there while it is answered.
+
+    Parameters
+    ----------
+    request : Request
+        GET, or POST with a form.
+
+    Yields
+    ------
+    TapRequest
+        Parameters of the address first.
+    """
+    service = service_of(request)
+    given = list(request.query_params.multi_items())
+    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if request.method != "POST" or not kind:
+        yield TapRequest(Parameters(given), {})
+        return
+    if kind not in _FORMS:
+        raise Problem(415, f"the body is {kind[:60]}; send one of {', '.join(_FORMS)}")
+    form = await _form(request, service)
+    try:
+        uploads = {}
+        for name, value in form.multi_items():
+            if isinstance(value, UploadFile):
+                _check_size(value, service)
+                uploads[name] = value
+            else:
+                given.append((name, value))
+        yield TapRequest(Parameters(given), uploads)
+    finally:
+        await form.close()
+
+
+TheRequest = Annotated[TapRequest, Depends(tap_request)]
+
+
+async def _form(request: Request, service: Service) -> FormData:
+    most = int(service.settings.upload_mib * 2**20)
+    stated = request.headers.get("content-length", "0")
+    if stated.isdigit() and int(stated) > most + MAX_PARAMETERS * MAX_PARAMETER_BYTES:
+        raise Problem(413, f"the request has {int(stated):,} bytes; at most {most:,} are read")
+    try:
+        return await request.form(
+            max_files=MAX_UPLOADS, max_fields=MAX_PARAMETERS, max_part_size=MAX_PARAMETER_BYTES
+        )
+    except HTTPException as error:
+        if error.status_code != 400:  # too large, or too slow
+            raise
+        raise ConfigError(f"the form cannot be read: {error.detail}") from error
+
+
+def _check_size(upload: UploadFile, service: Service) -> None:
+    most = int(service.settings.upload_mib * 2**20)
+    if (upload.size or 0) > most:
+        raise Problem(413, f"an upload has {upload.size:,} bytes; at most {most:,} are read")
+
+
+def base_url(request: Request) -> str:
+    """Return the address of TAP as the client sees it.
+
+    Parameters
+    ----------
+    request : Request
+        Any of its requests.
+
+    Returns
+    -------
+    str
+        Without a slash at the end.
+    """
+    own = service_of(request).settings.public_url or str(request.base_url)
+    return own.rstrip("/") + PREFIX

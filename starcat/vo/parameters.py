@@ -1,0 +1,245 @@
+"""The parameters of a request to TAP: names in any case, values checked.
+
+References
+----------
+DALI 1.1, section 3; TAP 1.1, section 2.7.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from starcat.errors import ConfigError, quoted
+from starcat.vo.formats import Format, format_named
+
+LANGUAGES = ("ADQL", "ADQL-2.0", "ADQL-2.1")
+
+MAX_UPLOADS = 10
+
+_RESULT = re.compile(r"https?://[^/?#]+(?:/[^?#]*)?/tap/async/([0-9a-f]{32})/results/result")
+"""The address of an answer of the service, whatever name the client knows its host by."""
+
+_TABLE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}", re.ASCII)
+
+
+@dataclass(frozen=True)
+class Upload:
+    """A table that comes with a query.
+
+    Attributes
+    ----------
+    table : str
+        Its name after ``TAP_UPLOAD.``
+    part : str
+        Name of the part of the request that it is; empty where it is an answer of the service.
+    job_id : str
+        The job whose answer it is; empty where it is a part of the request.
+    """
+
+    table: str
+    part: str = ""
+    job_id: str = ""
+
+
+@dataclass(frozen=True)
+class Question:
+    """What a request asks.
+
+    Attributes
+    ----------
+    query : str
+        ADQL.
+    form : Format
+        How to write the answer.
+    max_rows : int
+        Rows of the answer at most.
+    uploads : tuple of Upload
+        The tables that come with it.
+    run_id : str
+        What the client calls it.
+    """
+
+    query: str
+    form: Format
+    max_rows: int
+    uploads: tuple[Upload, ...] = ()
+    run_id: str = ""
+
+
+class Parameters:
+    """Parameters of a request, in the order in which they came.
+
+    Parameters
+    ----------
+    given : iterable of (str, str)
+        Names and values, as the request has them.
+    """
+
+    def __init__(self, given: Iterable[tuple[str, str]]) -> None:
+        self._given = [(name.upper(), value) for name, value in given]
+
+    def all(self, name: str) -> list[str]:
+        """Return all values of a parameter that are not empty."""
+        return [value for one, value in self._given if one == name and value != ""]
+
+    def one(self, name: str) -> str | None:
+        """Return the value of a parameter.
+
+        Parameters
+        ----------
+        name : str
+            In capitals.
+
+        Returns
+        -------
+        str or None
+            None where it is not given.
+
+        Raises
+        ------
+        ConfigError
+            If it has several values that differ.
+        """
+        values = list(dict.fromkeys(self.all(name)))
+        if len(values) > 1:
+            raise ConfigError(
+                f"{name} is given {len(values)} times: {quoted(values[0])} and "
+                f"{quoted(values[1])}; give it once",
+                key=name,
+                value=values[1],
+            )
+        return values[0] if values else None
+
+    def items(self) -> list[tuple[str, str]]:
+        """Return names, in capitals, and values."""
+        return list(self._given)
+
+
+def question(given: Parameters, most_rows: int) -> Question:
+    """Return what a request asks.
+
+    Parameters
+    ----------
+    given : Parameters
+        Of the request, or of the job.
+    most_rows : int
+        Rows that the service gives at most.
+
+    Returns
+    -------
+    Question
+        Checked but for the query itself.
+
+    Raises
+    ------
+    ConfigError
+        If a parameter is missing or has a value that it must not have.
+    """
+    request = given.one("REQUEST")
+    if request not in (None, "doQuery"):
+        raise ConfigError(
+            f"REQUEST is {quoted(request or '')}; it may be doQuery only, or be left out",
+            key="REQUEST",
+            value=request,
+        )
+    language = given.one("LANG")
+    if language is not None and language.upper() not in LANGUAGES:
+        raise ConfigError(
+            f"LANG is {quoted(language)}; queries are written in one of {', '.join(LANGUAGES)}",
+            key="LANG",
+            value=language,
+        )
+    query = given.one("QUERY")
+    if query is None:
+        raise ConfigError(
+            "QUERY is missing; it has the query in ADQL, such as SELECT * FROM tap_schema.tables",
+            key="QUERY",
+        )
+    return Question(
+        query,
+        format_named(given.one("RESPONSEFORMAT") or given.one("FORMAT")),
+        max_rows(given.one("MAXREC"), most_rows),
+        uploads(given.all("UPLOAD")),
+        given.one("RUNID") or "",
+    )
+
+
+def max_rows(text: str | None, most: int) -> int:
+    """Return how many rows are wanted.
+
+    Parameters
+    ----------
+    text : str or None
+        Value of MAXREC.
+    most : int
+        Rows that the service gives at most.
+
+    Returns
+    -------
+    int
+        At most that.
+
+    Raises
+    ------
+    ConfigError
+        If it is no whole number from 0 on.
+    """
+    if text is None:
+        return most
+    if not (text.isascii() and text.isdigit() and len(text) < 20):
+        raise ConfigError(
+            f"MAXREC is {quoted(text)}; it is a whole number from 0 on", key="MAXREC", value=text
+        )
+    return min(int(text), most)
+
+
+def uploads(given: list[str]) -> tuple[Upload, ...]:
+    """Return the tables that a request brings.
+
+    Parameters
+    ----------
+    given : list of str
+        Values of UPLOAD: ``name,param:part`` or ``name,`` and the address of an answer of this
+        service; several with semicolons between them.
+
+    Returns
+    -------
+    tuple of Upload
+        In order.
+
+    Raises
+    ------
+    ConfigError
+        If one is named wrongly or twice, or is not in the request.
+    """
+    found: list[Upload] = []
+    for pair in (pair for value in given for pair in value.split(";") if pair.strip()):
+        name, comma, place = (word.strip() for word in pair.partition(","))
+        if not comma or not _TABLE_NAME.fullmatch(name):
+            raise ConfigError(
+                f"UPLOAD is {quoted(pair)}; it is a name of letters, digits and underscores, a "
+                "comma and param: with the name of a part of the request",
+                key="UPLOAD",
+                value=pair,
+            )
+        scheme, _, part = place.partition(":")
+        result = _RESULT.fullmatch(place)
+        is_part = scheme.lower() == "param" and part
+        if not is_part and not result:
+            raise ConfigError(
+                f"UPLOAD of {name} is at {quoted(place)}; nothing is fetched from elsewhere: send "
+                f"the table in the request and write {name},param:PART, or give the address of an "
+                "answer of this service",
+                key="UPLOAD",
+                value=place,
+            )
+        if name.lower() in [one.table.lower() for one in found]:
+            raise ConfigError(f"UPLOAD has {name} twice; give each its own name", key="UPLOAD")
+        found.append(Upload(name, part="" if result else part, job_id=result[1] if result else ""))
+    if len(found) > MAX_UPLOADS:
+        raise ConfigError(
+            f"UPLOAD has {len(found)} tables; at most {MAX_UPLOADS} come with a query", key="UPLOAD"
+        )
+    return tuple(found)

@@ -1,0 +1,211 @@
+"""Jobs as UWS 1.1 describes them: what a client reads of an asynchronous query.
+
+The XML is that of vo-models.
+
+References
+----------
+UWS 1.1, IVOA Recommendation, October 2016.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+from pydantic_xml import BaseXmlModel, element
+from vo_models.uws.models import (
+    NSMAP,
+    ErrorSummary,
+    Jobs,
+    JobSummary,
+    Parameter,
+    Parameters,
+    ResultReference,
+    Results,
+    ShortJobDescription,
+)
+from vo_models.uws.types import ErrorType, ExecutionPhase
+from vo_models.voresource.types import UTCTimestamp
+
+_NOT_XML = re.compile("[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+ACTIVE = ("PENDING", "QUEUED", "EXECUTING")
+"""Phases that a job leaves again."""
+
+
+@dataclass(frozen=True)
+class JobFacts:
+    """A job.
+
+    Attributes
+    ----------
+    job_id, owner, phase, run_id : str
+        Its name, who made it, how far it is, what the client calls it.
+    parameters : tuple of (str, str)
+        As the client gave them.
+    created_s, started_s, ended_s, destroyed_s : float
+        Seconds since 1970; the second and third are None before it is so far.
+    limit_s : float
+        Seconds that it may run.
+    error : str
+        Why it failed; empty where it did not.
+    media_type : str
+        Type of the result.
+    """
+
+    job_id: str
+    owner: str
+    phase: str
+    run_id: str
+    parameters: tuple[tuple[str, str], ...]
+    created_s: float
+    started_s: float | None
+    ended_s: float | None
+    destroyed_s: float
+    limit_s: float
+    error: str = ""
+    media_type: str = ""
+
+
+class _Parameters(Parameters, tag="parameters", ns="uws", nsmap=NSMAP):
+    """Parameters of any names."""
+
+    parameter: list[Parameter] = element(tag="parameter", default=[])
+
+    def __init__(self, **data: Any) -> None:
+        BaseXmlModel.__init__(self, **data)
+
+
+def xml_text(text: str) -> str:
+    """Return a text with marks in place of the characters that XML cannot hold."""
+    return _NOT_XML.sub("\ufffd", text)
+
+
+def iso_time(seconds: float) -> str:
+    """Return a time as UWS writes it.
+
+    Parameters
+    ----------
+    seconds : float
+        Since 1970.
+
+    Returns
+    -------
+    str
+        UTC, in ISO 8601.
+
+    Examples
+    --------
+    >>> iso_time(0.5)
+    '1970-01-01T00:00:00.500Z'
+    """
+    moment = datetime.fromtimestamp(seconds, UTC)
+    return moment.strftime("%Y-%m-%dT%H:%M:%S.") + f"{moment.microsecond // 1000:03d}Z"
+
+
+def job_document(job: JobFacts, url: str) -> bytes:
+    """Return all that is known of a job.
+
+    Parameters
+    ----------
+    job : JobFacts
+        The job.
+    url : str
+        Its address.
+
+    Returns
+    -------
+    bytes
+        XML.
+    """
+    summary = JobSummary[_Parameters](
+        job_id=job.job_id,
+        run_id=xml_text(job.run_id) or None,
+        owner_id=job.owner,
+        phase=ExecutionPhase(job.phase),
+        creation_time=_time(job.created_s),
+        start_time=_time(job.started_s),
+        end_time=_time(job.ended_s),
+        execution_duration=int(job.limit_s),
+        destruction=_time(job.destroyed_s),
+        parameters=_parameters(job),
+        results=_results(job, url),
+        error_summary=_error(job),
+    )
+    return _document(summary)
+
+
+def parameters_document(job: JobFacts) -> bytes:
+    """Return the parameters of a job as XML."""
+    return _document(_parameters(job))
+
+
+def results_document(job: JobFacts, url: str) -> bytes:
+    """Return where the results of a job are as XML."""
+    return _document(_results(job, url))
+
+
+def jobs_document(jobs: Sequence[JobFacts], url: str) -> bytes:
+    """Return a list of jobs.
+
+    Parameters
+    ----------
+    jobs : sequence of JobFacts
+        The jobs.
+    url : str
+        Address of the list.
+
+    Returns
+    -------
+    bytes
+        XML.
+    """
+    found = [
+        ShortJobDescription(
+            job_id=job.job_id,
+            phase=ExecutionPhase(job.phase),
+            run_id=xml_text(job.run_id) or None,
+            owner_id=job.owner,
+            creation_time=_time(job.created_s),
+            href=f"{url}/{job.job_id}",
+        )
+        for job in jobs
+    ]
+    return _document(Jobs(jobref=found))
+
+
+def _parameters(job: JobFacts) -> _Parameters:
+    return _Parameters(
+        parameter=[
+            Parameter(id=xml_text(name), value=xml_text(text)) for name, text in job.parameters
+        ]
+    )
+
+
+def _results(job: JobFacts, url: str) -> Results:
+    if job.phase != "COMPLETED":
+        return Results()
+    reference = ResultReference(
+        id="result", href=f"{url}/results/result", mime_type=job.media_type or None
+    )
+    return Results(results=[reference])
+
+
+def _error(job: JobFacts) -> ErrorSummary | None:
+    if not job.error:
+        return None
+    return ErrorSummary(message=xml_text(job.error), type=ErrorType.FATAL, has_detail=True)
+
+
+def _time(seconds: float | None) -> UTCTimestamp | None:
+    return None if seconds is None else UTCTimestamp.fromtimestamp(seconds, UTC)
+
+
+def _document(model: BaseXmlModel) -> bytes:
+    found = model.to_xml(
+        exclude_none=False, skip_empty=False, encoding="UTF-8", xml_declaration=True
+    )
+    return found if isinstance(found, bytes) else found.encode()

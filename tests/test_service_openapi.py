@@ -1,0 +1,89 @@
+"""The REST interface does what its schema says, whatever it is sent: schemathesis against a server.
+
+The tool runs as a command of its own, since its plugin for pytest warns of what other tests do.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from served import Served, serve
+from shelved import shelve
+
+from starcat.service.access import Role
+from starcat.service.guard.tokens import TokenStore
+from starcat.service.records import Records
+
+CHECKS = "not_a_server_error,status_code_conformance,content_type_conformance,"
+CHECKS += "response_headers_conformance,response_schema_conformance"
+
+UNTESTED = (
+    "/api/v1/jobs/{job_id}/events",  # has no end where a job waits
+    "/metrics",
+)
+
+
+@pytest.fixture(scope="module")
+def attacked(
+    tmp_path_factory: pytest.TempPathFactory, small_artifact: Path
+) -> Iterator[tuple[Served, str]]:
+    root = tmp_path_factory.mktemp("openapi") / "root"
+    shelve(root, small_artifact)
+    records = Records(root / "records.sqlite")
+    _, token = TokenStore(records).create("fuzzer", Role.PUBLISHER)
+    records.close()
+    settings = {"workers": 0, "jobs_waiting": 5, "requests_per_minute": 1_000_000}
+    with serve(root, root.parent / "log", query_time_s=2.0, **settings) as served:
+        yield served, token
+
+
+def fuzz(attacked: tuple[Served, str], report: Path, examples: int, *options: str) -> None:
+    """Run schemathesis with the same examples each time."""
+    served, token = attacked
+    command = [
+        sys.executable, "-m", "schemathesis.cli", "run", f"{served.address}/api/openapi.json",
+        "--header", f"Authorization: Bearer {token}", "--checks", CHECKS, "--seed", "1",
+        "--max-examples", str(examples), "--generation-deterministic", "--no-color",
+        "--request-timeout", "20", "--exclude-path-regex", "/events$|^/metrics$", *options,
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=report)
+    said = f"{done.stdout[-8000:]}\n{done.stderr[-2000:]}"
+    assert done.returncode == 0, said
+    entries = [json.loads(line) for line in served.log.read_text().splitlines() if line[0] == "{"]
+    assert not [entry for entry in entries if entry.get("status", 0) >= 500]
+
+
+def test_each_operation_is_described_with_an_example_of_how_it_refuses(
+    attacked: tuple[Served, str],
+) -> None:
+    served, token = attacked
+    answer = served.raw("GET", "/api/openapi.json", {"Authorization": f"Bearer {token}"})
+    schema = json.loads(answer.body)
+    assert schema["openapi"].startswith("3.")
+    for path, operations in schema["paths"].items():
+        for method, operation in operations.items():
+            where = f"{method} {path}"
+            assert operation.get("summary"), where
+            assert operation.get("description"), where
+            if path.startswith("/api/"):
+                assert "422" in operation["responses"] or "404" in operation["responses"], where
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_no_request_that_the_schema_allows_or_forbids_breaks_it(
+    attacked: tuple[Served, str], tmp_path: Path
+) -> None:
+    fuzz(attacked, tmp_path, 25, "--phases", "examples,coverage,fuzzing")
+
+
+@pytest.mark.timeout(120)
+def test_the_examples_of_the_schema_are_answered(
+    attacked: tuple[Served, str], tmp_path: Path
+) -> None:
+    fuzz(attacked, tmp_path, 2, "--phases", "examples")

@@ -1,0 +1,323 @@
+"""SQL and identification over REST, on a small artifact: the same answers as the commands give."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import shutil
+import struct
+import time
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from astropy.io.votable import parse_single_table
+from astropy.table import Table
+from fastapi.testclient import TestClient
+from shelved import DATABASE, shelve
+
+from starcat.service.app import make_app
+from starcat.service.settings import Settings
+
+SQL = "/api/v1/sql"
+IDENTIFY = f"/api/v1/identify/{DATABASE}"
+CATALOG = "sao-00112233445566aa"
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Path:
+    root = tmp_path_factory.mktemp("questions") / "service"
+    folder = shelve(root, small_artifact)
+    (root / "catalogs").mkdir()
+    shutil.copy(folder / "stars.parquet", root / "catalogs" / f"{CATALOG}.parquet")
+    (root / "catalogs" / "other.parquet").write_bytes(b"")
+    return root
+
+
+@pytest.fixture(scope="module")
+def client(root: Path) -> Iterator[TestClient]:
+    settings = Settings(root=root, query_time_s=20.0, max_rows=500, query_memory_gib=0.75)
+    with TestClient(make_app(settings)) as client:
+        yield client
+
+
+def ask(client: TestClient, query: str, targets: list[str] | None = None, **more):
+    asked = {"targets": targets or [DATABASE], "query": query, **more}
+    return client.post(SQL, json=asked)
+
+
+def test_rows_are_those_of_the_table_with_units(client, small_artifact):
+    answer = ask(client, "SELECT star_id, mag FROM stars ORDER BY mag, star_id", max_rows=3).json()
+    stars = pq.read_table(small_artifact / "stars.parquet").sort_by([("mag", "ascending")])
+    assert [row[1] for row in answer["rows"]] == stars["mag"].to_pylist()[:3]
+    assert answer["is_cut"]
+    assert [column["unit"] for column in answer["columns"]] == ["", "mag"]
+    assert answer["columns"][1]["description"]
+
+
+def test_values_and_named_queries_are_as_those_of_the_command(client, starcat, small_artifact):
+    text = "SELECT designation FROM cone($ra, $dec, 20) ORDER BY mag"
+    answer = ask(client, text, values={"ra": 10.0, "dec": 20.0}).json()
+    ran = starcat(["sql", small_artifact, text, "--set", "ra=10", "--set", "dec=20", "--json"])
+    assert [row[0] for row in answer["rows"]] == [row["designation"] for row in json.loads(ran.out)]
+    named = {"targets": [DATABASE], "named": "densest-fields", "values": {"count": 3}}
+    answer = client.post(SQL, json=named).json()
+    ran = starcat(
+        ["sql", small_artifact, "--named", "densest-fields", "--set", "count=3", "--json"]
+    )
+    assert answer["rows"] == [list(row.values()) for row in json.loads(ran.out)]
+
+
+@pytest.mark.parametrize("form", ["csv", "json", "parquet", "votable", "fits", "ecsv", "npz"])
+def test_every_format_holds_the_rows(client, form):
+    answer = ask(client, "SELECT star_id, mag FROM stars ORDER BY star_id", format=form, max_rows=7)
+    assert answer.status_code == 200, answer.text
+    data = answer.content
+    assert int(answer.headers["content-length"]) == len(data)
+    assert answer.headers["x-starcat-rows"] == "7"
+    assert answer.headers["x-starcat-cut"] == "true"
+    read = {
+        "csv": lambda: Table.read(data.decode(), format="ascii.csv"),
+        "json": lambda: json.loads(data),
+        "parquet": lambda: pq.read_table(io.BytesIO(data)),
+        "votable": lambda: parse_single_table(io.BytesIO(data)).array,
+        "fits": lambda: Table.read(io.BytesIO(data), format="fits"),
+        "ecsv": lambda: Table.read(data.decode(), format="ascii.ecsv"),
+        "npz": lambda: np.load(io.BytesIO(data))["star_id"],
+    }
+    assert len(read[form]()) == 7
+
+
+def test_an_answer_never_has_more_rows_than_the_operator_allows(client):
+    answer = ask(client, "SELECT a.star_id FROM stars a, stars b", format="csv", max_rows=10**6)
+    assert len(answer.text.splitlines()) == 1 + 500
+    assert answer.headers["x-starcat-cut"] == "true"
+
+
+@pytest.mark.parametrize("name", [DATABASE, "small-1.0.0"])
+def test_a_database_has_an_id_and_a_title(client, name):
+    assert ask(client, "SELECT count(*) FROM stars", [name]).json()["rows"][0][0] > 100
+
+
+@pytest.mark.parametrize("name", ["sao", CATALOG, f"{CATALOG}.parquet"])
+def test_a_catalog_has_a_name_and_a_source(client, name):
+    assert ask(client, "SELECT count(*) FROM stars", [name]).json()["rows"][0][0] > 100
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "gaia",
+        "other",
+        "other.parquet",
+        "../databases",
+        "/etc/passwd",
+        "databases/0123456789abcdef/small-1.0.0",
+        "sao=/etc/passwd",
+        "s3://bucket/stars.parquet",
+        "",
+        "..",
+    ],
+)
+def test_no_text_of_a_request_becomes_a_path(client, root, name):
+    for given in (name, str(root / "databases" / DATABASE / "small-1.0.0")):
+        answer = ask(client, "SELECT 1", [given])
+        assert answer.status_code == 404
+        assert answer.json()["kind"] == "TargetMissing"
+
+
+@pytest.mark.parametrize(
+    ("query", "status", "words"),
+    [
+        ("SELECT nothing FROM stars", 400, "nothing"),
+        ("SELEC", 400, "SELEC"),
+        ("SELECT * FROM '/etc/passwd'", 400, "does not exist"),
+        ("SELECT * FROM read_csv('/etc/passwd')", 400, "read_csv"),
+        ("COPY stars TO '/tmp/x.csv'", 400, "COPY"),
+        ("SELECT $count", 400, "$count"),
+        ("SELECT 1; SELECT 2", 400, ""),
+        ("SELECT sum(a.mag + d.mag) FROM stars a, stars b, stars c, stars d", 422, "stopped"),
+    ],
+)
+def test_what_cannot_be_answered_is_refused_with_words(client, query, status, words):
+    answer = ask(client, query, time_limit_s=0.5)
+    assert answer.status_code == status
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert words in answer.json()["detail"]
+
+
+def test_a_query_and_a_name_are_not_given_both(client):
+    assert client.post(SQL, json={"targets": [DATABASE]}).status_code == 422
+    both = {"targets": [DATABASE], "query": "SELECT 1", "named": "star"}
+    assert client.post(SQL, json=both).status_code == 422
+
+
+def test_whole_numbers_that_readers_round_are_texts(client):
+    answer = ask(
+        client, "SELECT 9007199254740993, 1, 'nan'::DOUBLE, [1.5, NULL], DATE '2026-01-02'"
+    )
+    assert answer.json()["rows"] == [["9007199254740993", 1, None, [1.5, None], "2026-01-02"]]
+
+
+def test_gallery_macros_and_views_are_told(client, small_artifact):
+    assert "densest-fields" in [one["name"] for one in client.get(f"{SQL}/queries").json()]
+    assert "cone" in [one["name"] for one in client.get(f"{SQL}/macros").json()]
+    views = client.get(f"{SQL}/views", params={"target": DATABASE}).json()
+    manifest = json.loads((small_artifact / "manifest.json").read_bytes())
+    assert {one["view"] for one in views} == set(manifest["products"])
+    assert all(column["description"] for one in views for column in one["columns"])
+
+
+def test_nothing_is_left_in_scratch(client, root):
+    ask(client, "SELECT * FROM stars", format="fits")
+    ask(client, "SELECT nothing FROM stars", format="fits")
+    client.post(IDENTIFY, json={"centroids_px": []})
+    assert [one.name for one in (root / "scratch").iterdir() if one.name != "matplotlib"] == []
+
+
+@pytest.fixture(scope="module")
+def frame(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Path:
+    from starcat.images.identification import write_simulated
+    from starcat.matcher.database import open_database
+    from starcat.simulation.simulate import Noise, simulate_frames
+
+    database = open_database(small_artifact)
+    eye, folder = database.camera, tmp_path_factory.mktemp("frames")
+    given = simulate_frames(database.directions, eye, 1, Noise(0.2), 3, mag=database.mag)
+    one = next(given)
+    for suffix in (".csv", ".png", ".fits"):
+        write_simulated(folder / f"frame{suffix}", one, eye, 3)
+    return folder / "frame.csv"
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".png"])
+def test_an_upload_is_answered_as_by_the_command(client, starcat, small_artifact, frame, suffix):
+    path = frame.with_suffix(suffix)
+    with path.open("rb") as file:
+        answer = client.post(IDENTIFY, files={"file": (path.name, file)})
+    assert answer.status_code == 200, answer.text
+    found = answer.json()
+    ran = starcat(["identify", small_artifact, path, "--json"])
+    [mine], [theirs] = found["frames"], json.loads(ran.out)
+    differing = {key: (value, theirs[key]) for key, value in mine.items() if value != theirs[key]}
+    assert differing.keys() <= {"time_s"}, differing
+    assert found["frames"][0]["status"] == "identified"
+    assert found["database"] == "small-1.0.0"
+
+
+def test_centroids_are_answered_with_options(client, frame):
+    rows = np.loadtxt(frame, delimiter=",", skiprows=1)
+    asked = {"centroids_px": rows[:, :2].tolist(), "mag": rows[:, 2].tolist(), "name": "mine"}
+    [one] = client.post(IDENTIFY, json=asked).json()["frames"]
+    assert (one["status"], one["frame"]) == ("identified", "mine")
+    assert len(one["q_body_from_icrs"]) == 4
+    assert any(star["star"] for star in one["stars"])
+    asked["options"] = {"method": "pyramid", "tolerance_px": 1.0, "max_steps": 1}
+    [one] = client.post(IDENTIFY, json=asked).json()["frames"]
+    assert one["status"] != "identified"
+    assert one["refusal"]["words"]
+
+
+@pytest.mark.parametrize("kind", ["png", "svg"])
+def test_the_frame_is_drawn(client, frame, kind):
+    with frame.with_suffix(".png").open("rb") as file:
+        answer = client.post(
+            f"{IDENTIFY}/picture", params={"format": kind}, files={"file": ("x.png", file)}
+        )
+    assert answer.status_code == 200
+    assert answer.content.startswith(b"\x89PNG") if kind == "png" else b"<svg" in answer.content
+
+
+@pytest.mark.parametrize(
+    ("options", "key"),
+    [
+        ({"nothing": 1}, "options.nothing"),
+        ({"tolerance_px": -1}, "options.tolerance_px"),
+        ({"prior_q": [0, 0, 0, 1]}, "options"),
+        ({"camera": "x" * 30_000}, "options.camera"),
+        ([], "options"),
+    ],
+)
+def test_an_option_that_is_none_is_told(client, options, key):
+    answer = client.post(IDENTIFY, json={"centroids_px": [], "options": options})
+    assert (answer.status_code, answer.json()["key"]) == (422, key)
+
+
+@pytest.mark.parametrize(
+    ("body", "status"),
+    [
+        ({"centroids_px": [[1]]}, 422),
+        ({"centroids_px": "x"}, 422),
+        ({"frames": []}, 422),
+        ([], 422),
+        ({"centroids_px": [], "options": {"camera": "x ="}}, 422),
+        ({"centroids_px": [], "options": {"method": "no"}}, 422),
+    ],
+)
+def test_what_is_no_frame_is_told_without_a_path(client, root, body, status):
+    answer = client.post(IDENTIFY, json=body)
+    assert answer.status_code == status
+    assert str(root) not in answer.text
+
+
+def test_other_contents_are_refused(client):
+    assert (
+        client.post(IDENTIFY, content=b"x", headers={"Content-Type": "text/x"}).status_code == 415
+    )
+    assert client.post(IDENTIFY, files={"other": b"x"}).status_code == 422
+    unknown = client.post(f"/api/v1/identify/{'0' * 16}", json={"centroids_px": []})
+    assert unknown.status_code == 404
+
+
+def png_of(width: int, height: int, data: bytes = b"") -> bytes:
+    def part(kind: bytes, content: bytes) -> bytes:
+        crc = struct.pack(">I", zlib.crc32(kind + content))
+        return struct.pack(">I", len(content)) + kind + content + crc
+
+    head = part(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + head + part(b"IDAT", data) + part(b"IEND", b"")
+
+
+def bombs() -> dict[str, bytes]:
+    compressed = gzip.compress(bytes(1 << 27), 9)
+    fits = b"".join(
+        card.ljust(80)
+        for card in (
+            b"SIMPLE  =                    T",
+            b"BITPIX  =                  -64",
+            b"NAXIS   =                    2",
+            b"NAXIS1  =               200000",
+            b"NAXIS2  =               200000",
+            b"END",
+        )
+    ).ljust(2880)
+    return {
+        "bomb.png": png_of(60_000, 60_000, zlib.compress(bytes(1 << 20))),
+        "large.png": png_of(13_000, 13_000, zlib.compress(bytes(13_001 * 13_000), 9)),
+        "bomb.fits": fits,
+        "bomb.fits.gz": compressed * 16,
+        "not.png": b"\x89PNG\r\n\x1a\n" + b"x" * 100,
+        "not.fits": b"SIMPLE  = nothing",
+        "not.tif": b"II*\0" + b"\xff" * 64,
+    }
+
+
+@pytest.mark.parametrize("name", list(bombs()))
+def test_bombs_are_refused_and_the_next_one_is_answered(client, frame, root, name):
+    began = time.monotonic()
+    answer = client.post(IDENTIFY, files={"file": (name, bombs()[name])})
+    assert answer.status_code in (413, 422), answer.text
+    assert str(root) not in answer.text
+    assert time.monotonic() - began < 25.0
+    with frame.open("rb") as file:
+        assert client.post(IDENTIFY, files={"file": ("f.csv", file)}).status_code == 200
+
+
+def test_a_database_serves_whoever_may_read_only(root):
+    with TestClient(make_app(Settings(root=root, anonymous="none"))) as client:
+        assert ask(client, "SELECT 1").status_code == 401
+        assert client.post(IDENTIFY, json={"centroids_px": []}).status_code == 401

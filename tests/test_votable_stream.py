@@ -1,0 +1,474 @@
+"""VOTables written as a stream: other readers get back what went in, and the status is told."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import shutil
+import subprocess
+from collections.abc import Iterator
+from datetime import UTC, date, datetime
+from decimal import Decimal
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from astropy.io.votable import parse, validate
+from astropy.io.votable.tree import VOTableFile
+from hypothesis import given
+from hypothesis import strategies as st
+
+from starcat.artifact.reader import open_artifact
+from starcat.errors import QueryLimitError, SchemaError
+from starcat.exchange import votable_stream
+from starcat.exchange.label import Label
+from starcat.exchange.votable_stream import Serialization, votable_chunks
+
+SERIALIZATIONS: tuple[Serialization, ...] = get_args(Serialization)
+both = pytest.mark.parametrize("serialization", SERIALIZATIONS)
+
+KINDS = {
+    "truth": (pa.bool_(), st.booleans()),
+    "byte": (pa.uint8(), st.integers(0, 255)),
+    "small": (pa.int8(), st.integers(-128, 127)),
+    "short": (pa.int16(), st.integers(-(2**15), 2**15 - 1)),
+    "unsigned": (pa.uint16(), st.integers(0, 2**16 - 1)),
+    "int": (pa.int32(), st.integers(-(2**31), 2**31 - 1)),
+    "long": (pa.int64(), st.integers(-(2**63), 2**63 - 1)),
+    "single": (pa.float32(), st.floats(width=32)),
+    "double": (pa.float64(), st.floats()),
+    "text": (pa.string(), st.text(st.characters(codec="utf-8", exclude_categories=["Cc"]))),
+}
+LISTS = {
+    "shorts": (pa.list_(pa.int16()), st.lists(st.integers(-(2**15), 2**15 - 1))),
+    "longs": (pa.list_(pa.int64()), st.lists(st.integers(-(2**63), 2**63 - 1))),
+    "doubles": (pa.list_(pa.float64()), st.lists(st.floats())),
+}
+
+
+def document(table: pa.Table, rows_a_batch: int = 1000, **options: Any) -> bytes:
+    """Return the whole stream of a table."""
+    reader = pa.RecordBatchReader.from_batches(table.schema, table.to_batches(rows_a_batch))
+    return b"".join(votable_chunks(reader, **options))
+
+
+def parsed(content: bytes) -> VOTableFile:
+    return parse(io.BytesIO(content), verify="exception")
+
+
+def statuses(content: bytes) -> list[tuple[str, str]]:
+    """Return the values of QUERY_STATUS and their texts, in the order of the document."""
+    infos = parsed(content).resources[0].infos
+    return [(i.value, (i.content or "").strip()) for i in infos if i.name == "QUERY_STATUS"]
+
+
+def rows_of(content: bytes) -> list[tuple[Any, ...]]:
+    """Return rows as astropy reads them, with None for null and for NaN."""
+    found = parsed(content).get_first_table()
+    names = [field.ID for field in found.fields]
+    columns = []
+    for name in names:
+        values, masks = found.array[name].data, found.array[name].mask
+        columns.append([_plain(v, m) for v, m in zip(values, masks, strict=True)])
+    return list(zip(*columns, strict=True)) if columns and len(columns[0]) else []
+
+
+def _plain(value: Any, mask: Any) -> Any:
+    if isinstance(value, (list, tuple, np.ndarray)):
+        data = np.ma.getdata(value)
+        return [_plain(item, False) for item in data]
+    if np.all(mask) and not isinstance(value, str):
+        return None
+    value = value.item() if isinstance(value, np.generic) else value
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def wanted(table: pa.Table, serialization: Serialization) -> list[tuple[Any, ...]]:
+    """Return the rows as a VOTable can say them.
+
+    Of the text of a cell in TABLEDATA, astropy drops the blanks at both ends.
+    """
+    columns = []
+    for field, column in zip(table.schema, table.columns, strict=True):
+        values = column.to_pylist()
+        if pa.types.is_string(field.type):
+            values = [value or "" for value in values]
+            if serialization == "tabledata":
+                values = [value.strip() for value in values]
+        elif pa.types.is_list(field.type):
+            values = [[_plain(item, item is None) for item in value or []] for value in values]
+        else:
+            values = [_plain(value, value is None) for value in values]
+        columns.append(values)
+    return list(zip(*columns, strict=True)) if len(table) else []
+
+
+@st.composite
+def tables(draw: st.DrawFn, kinds: dict[str, Any]) -> pa.Table:
+    chosen = draw(st.lists(st.sampled_from(sorted(kinds)), min_size=1, max_size=12))
+    count = draw(st.integers(0, 5))
+    columns, fields = [], []
+    for number, name in enumerate(chosen):
+        kind, values = kinds[name]
+        cells = draw(st.lists(st.none() | values, min_size=count, max_size=count))
+        columns.append(pa.array(cells, kind))
+        fields.append(pa.field(f"{name}_{number}", kind))
+    return pa.Table.from_arrays(columns, schema=pa.schema(fields))
+
+
+# Round trips -------------------------------------------------------------------------------
+
+
+@both
+@given(data=st.data())
+def test_astropy_reads_back_every_value(serialization: Serialization, data: st.DataObject) -> None:
+    table = data.draw(tables({**KINDS, **LISTS}))
+    content = document(table, data.draw(st.integers(1, 6)), serialization=serialization)
+    found = rows_of(content)
+    assert found == wanted(table, serialization)
+    for field, again in zip(table.schema, parsed(content).get_first_table().fields, strict=True):
+        assert again.name == field.name
+
+
+@both
+def test_the_smallest_and_largest_numbers_are_exact(serialization: Serialization) -> None:
+    doubles = [5e-324, 1.7976931348623157e308, 0.1, 1 / 3, -0.0, 1e22, 123456789.12345679]
+    singles = np.array([1e-45, 3.4028235e38, 0.1, 1 / 3, 0.0, 1e22, 16777217], np.float32)
+    longs = [-(2**63), 2**63 - 1, 4472832130942575872, 0, -1, 2**53 + 1, 7]
+    table = pa.table({"a": doubles, "b": singles, "c": longs})
+    array = parsed(document(table, serialization=serialization)).get_first_table().array
+    assert array["a"].data.tobytes() == np.array(doubles).tobytes()
+    assert array["b"].data.tobytes() == singles.tobytes()
+    assert array["c"].tolist() == longs
+
+
+@both
+def test_infinite_and_missing_numbers(serialization: Serialization) -> None:
+    table = pa.table({"a": [math.inf, -math.inf, math.nan, None, 1.0], "b": [None, 2, 3, None, 5]})
+    array = parsed(document(table, serialization=serialization)).get_first_table().array
+    assert array["a"].data.tolist()[:2] == [math.inf, -math.inf]
+    assert np.isnan(array["a"].data.astype(float)[2])
+    assert array["b"].mask.tolist() == [True, False, False, True, False]
+    assert array["b"].data[[1, 2, 4]].tolist() == [2, 3, 5]
+
+
+@both
+def test_texts_of_all_planes_are_in_their_rows(serialization: Serialization) -> None:
+    texts = ["\U0001f52d", "", None, "α Cen", "a<b>&c]]>", "plain", "é\U0001f52dé", "  spaces "]
+    table = pa.table({"a": texts, "n": list(range(8)), "b": texts[::-1]})
+    assert rows_of(document(table, 3, serialization=serialization)) == wanted(table, serialization)
+
+
+@both
+def test_times_decimals_and_records_become_what_votable_has(serialization: Serialization) -> None:
+    table = pa.table(
+        {
+            "t": pa.array([datetime(2026, 1, 31, 12, 0, 0, 5), None], pa.timestamp("us")),
+            "z": pa.array([datetime(2026, 1, 31, tzinfo=UTC), None], pa.timestamp("us", "UTC")),
+            "d": pa.array([date(2026, 1, 31), None]),
+            "n": pa.array([Decimal("1.50"), None], pa.decimal128(5, 2)),
+            "r": [{"p": 1}, None],
+            "b": [[True, False], None],
+        }
+    )
+    content = document(table, serialization=serialization)
+    assert rows_of(content) == [
+        ("2026-01-31T12:00:00.000005", "2026-01-31T00:00:00.000000Z", "2026-01-31", 1.5,
+         '{"p": 1}', "[true,false]"),
+        ("", "", "", None, "", ""),
+    ]  # fmt: skip
+    fields = {field.name: field for field in parsed(content).get_first_table().fields}
+    for name in "tzd":
+        assert (fields[name].datatype, fields[name].xtype) == ("char", "timestamp")
+    assert (fields["r"].datatype, fields["r"].xtype) == ("unicodeChar", None)
+
+
+@both
+def test_an_xtype_of_the_metadata_is_passed_on(serialization: Serialization) -> None:
+    field = pa.field("p", pa.list_(pa.float64()), metadata={"xtype": "point"})
+    table = pa.Table.from_arrays([pa.array([[1.0, 2.0]])], schema=pa.schema([field]))
+    [again] = parsed(document(table, serialization=serialization)).get_first_table().fields
+    assert (again.xtype, again.datatype, again.arraysize) == ("point", "double", "*")
+
+
+@both
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 64, 65, 1000])
+def test_rows_go_on_from_step_to_step(
+    serialization: Serialization, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(votable_stream, "_STEP_ROWS", 64)
+    # Texts of 0 to 6 letters, so that base64 is cut at all three places.
+    texts = ["abcdef"[: k % 7] for k in range(count)]
+    table = pa.table({"k": np.arange(count), "t": pa.array(texts, pa.string())})
+    for rows_a_batch in (10_000, 99):
+        content = document(table, rows_a_batch, serialization=serialization)
+        array = parsed(content).get_first_table().array
+        assert len(array) == count
+        if count:
+            assert (array["k"].data == np.arange(count)).all()
+            assert array["t"].data.tolist() == texts
+
+
+@both
+def test_batches_that_are_slices_of_larger_ones(serialization: Serialization) -> None:
+    table = pa.table(
+        {
+            "a": pa.array([1.5, None, 3.5, 4.5, 4.5, 4.5]),
+            "b": [True, None, False, True, True, True],
+            "c": ["x", "yy", None, "é", "é", "é"],
+            "d": [[1], [], None, [2, 3], [2], [4]],
+            "e": [7, 8, 9, 5, 5, 5],
+        }
+    )
+    for start in range(6):
+        part = table.slice(start, 3)
+        assert rows_of(document(part, serialization=serialization)) == wanted(part, serialization)
+
+
+@both
+def test_columns_that_do_not_change_are_in_every_row(serialization: Serialization) -> None:
+    table = pa.table(
+        {
+            "null": pa.nulls(5, pa.string()),
+            "same": ["<a>"] * 5,
+            "number": [2.0] * 5,
+            "differs": [1, 2, 3, 4, 5],
+            "truth": [True] * 5,
+            "none": pa.nulls(5, pa.float64()),
+        }
+    )
+    assert rows_of(document(table, serialization=serialization)) == wanted(table, serialization)
+    alike = table.drop_columns("differs")
+    assert rows_of(document(alike, serialization=serialization)) == wanted(alike, serialization)
+
+
+@both
+def test_wide_rows_have_as_many_bits_for_null_as_columns(serialization: Serialization) -> None:
+    for width in (1, 7, 8, 9, 16, 17, 100):
+        table = pa.table({f"c{k}": [None if k % 3 else k, k] for k in range(width)})
+        assert rows_of(document(table, serialization=serialization)) == wanted(table, serialization)
+
+
+@both
+def test_products_come_back(small_artifact: Path, serialization: Serialization) -> None:
+    artifact = open_artifact(small_artifact)
+    for name in artifact.products:
+        table = artifact.table(name).slice(0, 150)
+        content = document(table, 64, serialization=serialization, label=Label(name, "small", "1"))
+        again = parsed(content)
+        assert again.get_first_table().name == name
+        assert rows_of(content) == wanted(table, serialization)
+        for field, column in zip(table.schema, again.get_first_table().fields, strict=True):
+            said = {key.decode(): text.decode() for key, text in (field.metadata or {}).items()}
+            assert (column.description, column.ucd) == (said.get("description"), said.get("ucd"))
+
+
+@both
+def test_the_document_is_valid(
+    small_artifact: Path, tmp_path: Path, serialization: Serialization
+) -> None:
+    path = tmp_path / "stars.vot"
+    path.write_bytes(document(open_artifact(small_artifact).table("stars"), infos={"a": "<b>"}))
+    report = io.StringIO()
+    assert validate(path, output=report, xmllint=False), report.getvalue()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(120)
+@pytest.mark.skipif(shutil.which("stilts") is None, reason="stilts is not installed")
+@both
+def test_stilts_reads_back_every_value(tmp_path: Path, serialization: Serialization) -> None:
+    table = pa.table(
+        {
+            "long": [4472832130942575872, None, -(2**63)],
+            "double": [0.1, None, 5e-324],
+            "single": pa.array([0.1, None, 3.4028235e38], pa.float32()),
+            "byte": pa.array([255, None, 0], pa.uint8()),
+            "short": pa.array([-32768, None, 7], pa.int16()),
+            "truth": [True, None, False],
+            "text": ["a<b>&c", None, "α \U0001f52d"],
+            "time": pa.array([datetime(2026, 1, 31), None, datetime(1, 1, 1)], pa.timestamp("s")),
+            "list": [[1.5, 2.5], None, [3.5]],
+        }
+    )
+    path, out = tmp_path / "a.vot", tmp_path / "a.csv"
+    path.write_bytes(document(table, 2, serialization=serialization))
+    lint = subprocess.run(
+        ["stilts", "votlint", f"votable={path}"], capture_output=True, text=True, check=True
+    )
+    assert "ERROR" not in lint.stdout, lint.stdout
+    subprocess.run(
+        ["stilts", "tpipe", f"in={path}", "ifmt=votable", f"out={out}", "ofmt=csv"], check=True
+    )
+    found = list(csv.DictReader(io.StringIO(out.read_text(encoding="utf-8"))))
+    assert [row["long"] for row in found] == ["4472832130942575872", "", str(-(2**63))]
+    assert [float(row["double"] or "nan") for row in found[::2]] == [0.1, 5e-324]
+    assert [np.float32(row["single"]) for row in found[::2]] == [
+        np.float32(0.1), np.float32(3.4028235e38)
+    ]  # fmt: skip
+    assert [row["byte"] for row in found] == ["255", "", "0"]
+    assert [row["short"] for row in found] == ["-32768", "", "7"]
+    assert [row["truth"].lower() for row in found] == ["true", "", "false"]
+    assert [row["text"] for row in found] == ["a<b>&c", "", "α \U0001f52d"]
+    assert [row["time"] for row in found] == ["2026-01-31T00:00:00", "", "0001-01-01T00:00:00"]
+    assert [row["list"] for row in found][::2] == ["(1.5, 2.5)", "(3.5)"]
+
+
+# What the document says of itself ----------------------------------------------------------
+
+
+@both
+def test_infos_and_the_name_are_escaped(serialization: Serialization) -> None:
+    odd = "a \"b\" 'c' <d> & \n e"
+    table = pa.table({"a": [1]})
+    content = document(
+        table, serialization=serialization, label=Label(odd, odd, "1"), infos={"query": odd}
+    )
+    found = parsed(content)
+    assert {info.name: info.value for info in found.resources[0].infos} == {
+        "QUERY_STATUS": "OK", "artifact": odd, "version": "1", "query": odd
+    }  # fmt: skip
+    assert found.get_first_table().name == odd
+
+
+@pytest.mark.parametrize(
+    ("epochs", "rows_a_batch", "expected"),
+    [([2026.0] * 4, 10, "J2026"), ([1991.25] * 4, 10, "J1991.25"), ([2026.0, 2000.5], 10, None),
+     ([2026.0] * 4, 2, None), ([2015.123456789], 10, "J2015.123456789"), ([], 10, None)],
+)  # fmt: skip
+def test_an_epoch_is_said_where_it_is_sure_to_be_that_of_all_rows(
+    epochs: list[float], rows_a_batch: int, expected: str | None
+) -> None:
+    fields = [
+        pa.field("ra_deg", pa.float64(), metadata={"ucd": "pos.eq.ra;meta.main"}),
+        pa.field("epoch_jyear", pa.float64()),
+    ]
+    columns = [pa.array([1.0] * len(epochs), pa.float64()), pa.array(epochs, pa.float64())]
+    table = pa.Table.from_arrays(columns, schema=pa.schema(fields))
+    [system] = parsed(document(table, rows_a_batch)).resources[0].coordinate_systems
+    assert (system.system, system.epoch) == ("ICRS", expected)
+
+
+@pytest.mark.parametrize(
+    "name", ["a b", "1a", "é", "<a&'\"b", "starcat.table", "starcat.icrs", "xml:id"]
+)
+def test_a_name_that_is_no_identifier_is_a_name_all_the_same(name: str) -> None:
+    found = parse(io.BytesIO(document(pa.table({name: [1], "b": [2]}))), verify="ignore")
+    assert [field.name for field in found.get_first_table().fields] == [name, "b"]
+
+
+# The status --------------------------------------------------------------------------------
+
+
+@both
+@pytest.mark.parametrize(
+    ("maxrec", "kept", "is_over"),
+    [(None, 10, False), (11, 10, False), (10, 10, False), (9, 9, True), (4, 4, True),
+     (3, 3, True), (1, 1, True), (0, 0, True)],
+)  # fmt: skip
+def test_overflow_is_told_when_rows_were_left_out(
+    serialization: Serialization, maxrec: int | None, kept: int, is_over: bool
+) -> None:
+    table = pa.table({"k": range(10), "t": [str(k) for k in range(10)]})
+    for rows_a_batch in (1, 3, 4, 10):
+        content = document(table, rows_a_batch, serialization=serialization, maxrec=maxrec)
+        assert [row[0] for row in rows_of(content)] == list(range(kept))
+        assert [status for status, _ in statuses(content)] == ["OK", "OVERFLOW"][: 1 + is_over]
+        # DALI: the first status before the table, the other after it.
+        assert content.index(b'"OK"') < content.index(b"<TABLE")
+        assert not is_over or content.index(b"</TABLE>") < content.index(b'"OVERFLOW"')
+
+
+def test_no_rows_are_read_where_none_are_wanted() -> None:
+    def never() -> Iterator[pa.RecordBatch]:
+        raise AssertionError("read")
+        yield
+
+    reader = pa.RecordBatchReader.from_batches(pa.schema({"a": pa.int64()}), never())
+    assert b'"OVERFLOW"' in b"".join(votable_chunks(reader, maxrec=0))
+
+
+def failing(batches: int, error: Exception) -> pa.RecordBatchReader:
+    """Return a reader of 3 rows a batch that fails after some batches."""
+
+    def read() -> Iterator[pa.RecordBatch]:
+        for _ in range(batches):
+            yield pa.record_batch({"a": [1, 2, 3]})
+        raise error
+
+    return pa.RecordBatchReader.from_batches(pa.schema({"a": pa.int64()}), read())
+
+
+@both
+def test_a_query_that_fails_midway_is_told_at_the_end(serialization: Serialization) -> None:
+    late = QueryLimitError("stopped after 2 s; ask for <less>\x01")
+    content = b"".join(votable_chunks(failing(5, late), serialization=serialization))
+    assert [row[0] for row in rows_of(content)] == [1, 2, 3] * 5
+    assert statuses(content) == [("OK", ""), ("ERROR", "stopped after 2 s; ask for <less>?")]
+    broken = b"".join(votable_chunks(failing(2, OSError("/a/secret")), serialization=serialization))
+    assert statuses(broken)[1] == ("ERROR", "the rest of the rows cannot be read")
+    assert b"secret" not in broken
+
+
+@both
+def test_a_query_that_fails_at_once_is_raised(serialization: Serialization) -> None:
+    chunks = votable_chunks(failing(0, QueryLimitError("late")), serialization=serialization)
+    with pytest.raises(QueryLimitError, match="late"):
+        next(chunks)
+
+
+@both
+def test_a_text_that_no_xml_can_hold_ends_the_rows(serialization: Serialization) -> None:
+    batches = [pa.record_batch({"a": [text]}) for text in ("x", "y", "\x01", "z")]
+    reader = pa.RecordBatchReader.from_batches(batches[0].schema, batches)
+    content = b"".join(votable_chunks(reader, serialization=serialization))
+    assert [row[0] for row in rows_of(content)] == ["x", "y"]
+    assert "a character that XML cannot hold" in statuses(content)[1][1]
+    for bad in ("\ufffe", "a\rb", "\x00"):
+        with pytest.raises(SchemaError, match=r"column 'a'.*XML cannot hold"):
+            document(pa.table({"a": [bad]}), serialization=serialization)
+        with pytest.raises(SchemaError, match="XML cannot hold"):
+            document(pa.table({f"a{bad}": [1]}), serialization=serialization)
+
+
+# Memory, order -----------------------------------------------------------------------------
+
+
+@both
+def test_the_table_is_never_held(serialization: Serialization) -> None:
+    held = []
+
+    def batches() -> Iterator[pa.RecordBatch]:
+        for k in range(40):
+            held.append(pa.total_allocated_bytes())
+            yield pa.record_batch({"a": pa.array(np.full(100_000, k, dtype=np.int64))})
+
+    before = pa.total_allocated_bytes()
+    reader = pa.RecordBatchReader.from_batches(pa.schema({"a": pa.int64()}), batches())
+    count = sum(map(len, votable_chunks(reader, serialization=serialization)))
+    assert count > 32e6
+    assert max(held) - before < 12e6  # the table is 32 MB, its text more
+
+
+@both
+def test_a_reader_who_stops_leaves_nothing_running(serialization: Serialization) -> None:
+    import threading
+
+    threads = threading.active_count()
+    reader = pa.table({"a": np.arange(200_000)}).to_reader(max_chunksize=1000)
+    chunks = votable_chunks(reader, serialization=serialization)
+    assert next(chunks).startswith(b"<?xml")
+    next(chunks)
+    chunks.close()  # type: ignore[attr-defined]
+    assert threading.active_count() == threads
+
+
+@both
+def test_the_same_rows_give_the_same_bytes(serialization: Serialization) -> None:
+    generator = np.random.default_rng(1)
+    table = pa.table({"a": generator.normal(size=50_000), "b": generator.integers(0, 9, 50_000)})
+    first = document(table, 20_000, serialization=serialization)
+    assert all(document(table, 20_000, serialization=serialization) == first for _ in range(3))
