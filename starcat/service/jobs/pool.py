@@ -10,9 +10,9 @@ import threading
 import time
 from contextlib import suppress
 
+from starcat.service.jobs.ground import Ground
 from starcat.service.jobs.recovery import recover, send_waiting
 from starcat.service.jobs.worker import PROGRAM
-from starcat.service.service import Service
 
 LOOK_S = 5.0
 """How often it is looked whether jobs wait that nobody was told of."""
@@ -31,11 +31,11 @@ class WorkerPool:
 
     Parameters
     ----------
-    service : Service
+    service : Ground
         Whose jobs it does.
     """
 
-    def __init__(self, service: Service) -> None:
+    def __init__(self, service: Ground) -> None:
         self._service = service
         self._stopping = threading.Event()
         self._process: subprocess.Popen[bytes] | None = None

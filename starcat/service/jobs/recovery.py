@@ -7,10 +7,10 @@ import shutil
 import time
 from contextlib import suppress
 
+from starcat.service.jobs.ground import Ground
 from starcat.service.jobs.job import Job
 from starcat.service.jobs.transitions import interrupt
 from starcat.service.places import JOB_ID, Places
-from starcat.service.service import Service
 from starcat.storage.locks import locked
 
 WAIT_S = 10.0
@@ -19,12 +19,12 @@ WAIT_S = 10.0
 _logger = logging.getLogger(__name__)
 
 
-def recover(service: Service) -> None:
+def recover(service: Ground) -> None:
     """Take up the jobs of a service where nobody runs any.
 
     Parameters
     ----------
-    service : Service
+    service : Ground
         Jobs that ran wait again, and those that wait get a message each, in their order. Folders
         of what was not finished are removed.
     """
@@ -36,19 +36,19 @@ def recover(service: Service) -> None:
     send_waiting(service)
 
 
-def send_waiting(service: Service) -> None:
+def send_waiting(service: Ground) -> None:
     """Send a message for each job that waits, and forget all others.
 
     Parameters
     ----------
-    service : Service
+    service : Ground
         Whose jobs they are.
     """
     waiting = _all(service, "queued")
     service.queue.send_again(job.id for job in reversed(waiting))
 
 
-def _all(service: Service, state: str) -> list[Job]:
+def _all(service: Ground, state: str) -> list[Job]:
     return service.jobs.all(state=state, most=1_000_000)  # type: ignore[arg-type]
 
 
@@ -65,7 +65,7 @@ def _wait_for_end(places: Places, job_id: str) -> None:
     _logger.error("job %s: its process does not end", job_id)
 
 
-def _remove_halves(service: Service) -> None:
+def _remove_halves(service: Ground) -> None:
     places = service.places
     running = {job.id for job in _all(service, "running")}
     for folder in places.jobs.iterdir():

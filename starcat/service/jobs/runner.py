@@ -21,12 +21,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
+from starcat.service.jobs.ground import Ground
 from starcat.service.jobs.job import Job
 from starcat.service.jobs.limits import disk_shortage, folder_bytes, owner_excess
 from starcat.service.jobs.task import PROGRAM, memory_problem
 from starcat.service.jobs.transitions import Attempt, claim
 from starcat.service.jobs.work import threads_of
-from starcat.service.service import Service
 from starcat.storage.atomic import make_folder
 
 TICK_S = 0.2
@@ -49,13 +49,13 @@ class Slots:
 
     Attributes
     ----------
-    service : Service
+    service : Ground
         Whose jobs they are.
     stop_at_s : float, optional
         When jobs that still run are ended, `time.monotonic`; None while nobody wants to stop.
     """
 
-    service: Service
+    service: Ground
     stop_at_s: float | None = None
     _groups: set[int] = field(default_factory=set)
     _lock: threading.Lock = field(default_factory=threading.Lock)

@@ -17,9 +17,9 @@ import time
 from huey.consumer import Consumer
 
 from starcat.service.guard.logs import log_settings
+from starcat.service.jobs.ground import open_ground
 from starcat.service.jobs.runner import Slots
 from starcat.service.jobs.task import end_with_parent
-from starcat.service.service import open_service
 from starcat.service.settings import Settings
 
 PROGRAM = (
@@ -35,7 +35,7 @@ def main() -> None:
     end_with_parent()
     logging.config.dictConfig(log_settings())
     settings = Settings.model_validate_json(sys.stdin.buffer.readline())
-    slots = Slots(open_service(settings))
+    slots = Slots(open_ground(settings))
     slots.service.queue.on_job(slots.run_job)
     first_s, most_s = POLL_S
     consumer = Consumer(
