@@ -9,7 +9,7 @@ from contextlib import suppress
 
 from starcat.service.jobs.ground import Ground
 from starcat.service.jobs.job import Job
-from starcat.service.jobs.transitions import interrupt
+from starcat.service.jobs.transitions import interrupt, running_here, silent_since
 from starcat.service.places import JOB_ID, Places
 from starcat.storage.locks import locked
 
@@ -20,7 +20,7 @@ _logger = logging.getLogger(__name__)
 
 
 def recover(service: Ground) -> None:
-    """Take up the jobs of a service where nobody runs any.
+    """Take up the jobs of a service where nobody runs any on this machine.
 
     Parameters
     ----------
@@ -28,12 +28,26 @@ def recover(service: Ground) -> None:
         Jobs that ran wait again, and those that wait get a message each, in their order. Folders
         of what was not finished are removed.
     """
-    for job in _all(service, "running"):
-        _wait_for_end(service.places, job.id)
-        _logger.warning("job %s was interrupted in attempt %d", job.id, job.attempt)
-        interrupt(service.records, job.id, job.attempt)
+    for job_id, attempt in running_here(service.records):
+        _wait_for_end(service.places, job_id)
+        _logger.warning("job %s was interrupted in attempt %d", job_id, attempt)
+        interrupt(service.records, job_id, attempt)
     _remove_halves(service)
     send_waiting(service)
+
+
+def give_up_silent(service: Ground) -> None:
+    """Have jobs wait again whose workers, on other machines, have been silent for long.
+
+    Parameters
+    ----------
+    service : Ground
+        Its settings say how long that is.
+    """
+    then_s = time.time() - service.settings.worker_silence_s
+    for job_id, attempt in silent_since(service.records, then_s):
+        _logger.warning("job %s: nobody hears of its worker; attempt %d is over", job_id, attempt)
+        interrupt(service.records, job_id, attempt)
 
 
 def send_waiting(service: Ground) -> None:

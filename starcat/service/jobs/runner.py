@@ -15,11 +15,11 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Protocol
 
 from starcat.service.jobs.ground import Ground
 from starcat.service.jobs.job import Job
@@ -41,6 +41,33 @@ NO_MEMORY = ("bad_alloc", "out of memory", "memory allocation", "cannot allocate
 """What libraries say, in small letters, that end a process which is refused memory."""
 
 STOPPED = "the service stops"
+
+
+class Told(Protocol):
+    """Who remembers what becomes of an attempt; as `starcat.service.jobs.transitions.Attempt`."""
+
+    job: Job
+
+    def wants_end(self) -> bool:
+        """Return whether the job is to end."""
+
+    def tell_stage(self, stage: str, done: int, total: int | None) -> None:
+        """Say how far it is."""
+
+    def tell(self, level: str, text: str) -> None:
+        """Say a line of the log."""
+
+    def succeed(self, result: Mapping[str, Any]) -> None:
+        """Say that it is done."""
+
+    def fail(self, error: Mapping[str, Any]) -> None:
+        """Say that it has failed."""
+
+    def be_cancelled(self) -> None:
+        """Say that it was cancelled."""
+
+    def wait_again(self) -> None:
+        """Say that it is to be begun again."""
 
 
 @dataclass
@@ -79,7 +106,7 @@ class Slots:
             attempt.fail(_problem("Insufficient storage", 507, short))
             return
         try:
-            _Run(self, attempt).run()
+            Run(self, attempt).run()
         finally:
             shutil.rmtree(self.service.places.job_work(job.id), ignore_errors=True)
 
@@ -155,16 +182,25 @@ def end_group(group: int) -> None:
         os.killpg(group, signal.SIGKILL)
 
 
-class _Run:
-    """An attempt that runs."""
+class Run:
+    """An attempt that runs.
 
-    def __init__(self, slots: Slots, attempt: Attempt) -> None:
+    Parameters
+    ----------
+    slots : Slots
+        Of the worker that it runs in.
+    attempt : Attempt
+        Who remembers what becomes of it.
+    """
+
+    def __init__(self, slots: Slots, attempt: Told) -> None:
         self._slots, self._attempt = slots, attempt
         self._began_s = self._disk_at_s = time.monotonic()
         self._result: dict[str, Any] | None = None
         self._error: dict[str, Any] | None = None
 
     def run(self) -> None:
+        """See it to its end."""
         with self._slots.process(self._attempt.job) as process:
             why = self._follow(process)
         if self._result is not None:  # it was faster than whoever wanted its end

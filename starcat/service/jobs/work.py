@@ -132,12 +132,20 @@ def _build(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
         f"{clean.identified} of {clean.identifiable} clean frames were identified, "
         f"{clean.wrong} wrongly",
     )
-    _place(made, order.places.database(database_id))
+    place_database(made, order.places.database(database_id))
     return result
 
 
-def _place(made: Path, final: Path) -> None:
-    """Give a folder its name; one that is empty, or holds no database, makes way."""
+def place_database(made: Path, final: Path) -> None:
+    """Give the folder of a database its name, in one step.
+
+    Parameters
+    ----------
+    made : Path
+        The folder that the artifact's own folder is in, whole and checked.
+    final : Path
+        Its name among the databases; a folder that holds no database makes way.
+    """
     if final.is_dir():
         aside = made.with_name("aside")
         final.rename(aside)
