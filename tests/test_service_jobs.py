@@ -576,7 +576,7 @@ def test_a_job_that_cannot_end_in_time_waits_for_the_next_start(service, spec):
     ("limits", "words"),
     [
         ({"job_time_s": 0.5}, "the job took more than 0.5 s (job_time_s)"),
-        ({"job_memory_gib": 0.2}, "GiB of memory"),
+        ({"job_memory_gib": 0.01}, "the job took more than the 0.01 GiB of memory that it may"),
     ],
 )
 def test_a_job_has_limits(opened, spec, limits, words):
