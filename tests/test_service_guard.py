@@ -371,8 +371,8 @@ def test_too_many_headers_and_odd_methods_are_refused(client: Make) -> None:
     many = {f"X-{k}": "v" for k in range(120)}
     assert at.get("/healthz", headers=many).status_code == 431
     assert at.get("/healthz", headers={"X-Long": "v" * 40_000}).status_code == 431
-    assert at.request("TRACE", "/healthz").status_code == 501
-    assert at.request("PURGE\u0130", "/healthz").status_code == 501
+    assert at.request("TRACE", "/healthz").status_code == 405
+    assert at.request("PURGE\u0130", "/healthz").status_code == 405
 
 
 def test_a_body_is_too_large_by_what_it_says_and_by_what_it_is(client: Make) -> None:

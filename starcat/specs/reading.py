@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import reprlib
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from pydantic import (
 from starcat.errors import ConfigError, quoted, suggest
 from starcat.resources import PathLike, resource_folder
 from starcat.specs.build_spec import BuildSpec
+from starcat.specs.toml_text import read_toml
 
 _SHOWN = reprlib.Repr()
 """Shows what was found, however long or deep it is."""
@@ -48,12 +48,12 @@ def read_spec(path: PathLike, changes: Changes | None = None) -> BuildSpec:
     """
     path = Path(path)
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = read_toml(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ConfigError(
             f"{path}: no such spec; 'starcat presets' lists those that ship with starcat"
         ) from None
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: not a readable TOML file: {error}") from error
     for key, text in (changes or {}).items():
         _change(content, key, text)
@@ -74,8 +74,8 @@ def _change(content: dict[str, Any], key: str, text: str) -> None:
 
 def _value(text: str) -> Any:
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+        return read_toml(f"value = {text}")["value"]
+    except ValueError:
         return text
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import AsyncIterator
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
@@ -29,6 +28,7 @@ from starcat.service.jobs.submission import (
 from starcat.service.service import Service, TheService
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset, spec_from_dict
+from starcat.specs.toml_text import read_toml
 
 router = APIRouter(prefix="/jobs", tags=["jobs"])
 
@@ -230,8 +230,8 @@ def _spec_of(wish: BuildWish) -> BuildSpec:
     content = wish.spec
     if isinstance(content, str):
         try:
-            content = tomllib.loads(content)
-        except (ValueError, RecursionError) as error:
+            content = read_toml(content)
+        except ValueError as error:
             raise ConfigError(f"spec: not readable as TOML: {error}", key="spec") from error
     return spec_from_dict(content or {}, "spec")
 

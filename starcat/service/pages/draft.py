@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -19,6 +18,7 @@ from starcat.specs.build_spec import BuildSpec
 from starcat.specs.keys import REQUIRED, SpecKey, spec_sections
 from starcat.specs.reading import spec_from_dict
 from starcat.specs.spec_toml import toml_value
+from starcat.specs.toml_text import read_toml
 
 ORIGIN = "spec"
 """What messages call the text."""
@@ -136,8 +136,8 @@ def draft_of_text(text: str) -> Draft:
     try:
         if len(text) > MOST_CHARACTERS:
             raise ValueError(f"{len(text):,} characters; at most {MOST_CHARACTERS:,} are read")
-        return _checked(tomllib.loads(text), text)
-    except (ValueError, RecursionError) as error:
+        return _checked(read_toml(text), text)
+    except ValueError as error:
         wrong = ConfigError(f"{ORIGIN}: not a readable TOML file: {error}", key=TEXT)
         return _draft({}, text, None, wrong)
 
@@ -162,12 +162,12 @@ def draft_of_form(form: Mapping[str, str]) -> Draft:
     known = draft_of_text(before)
     if known.error is not None and known.error.key == TEXT:
         return known
-    content = tomllib.loads(before)
+    content = read_toml(before)
     try:
         _fill(content, form)
     except ConfigError as error:
         return _draft(content, before, None, error)
-    return known if content == tomllib.loads(before) else draft_of_content(content)
+    return known if content == read_toml(before) else draft_of_content(content)
 
 
 def draft_of_content(content: Mapping[str, Any]) -> Draft:
