@@ -431,7 +431,13 @@ PEOPLE = [
     get("an empty token", "/api/v1/databases", 401, Authorization="Bearer "),
     get("a password that is no text", "/api/v1/databases", 401, Authorization="Basic /////w=="),
     Hostile(
-        "a made-up cookie", "POST", "/api/v1/jobs", 403, {"Cookie": "starcat=x"}, b"{}", is_signed=False
+        "a made-up cookie",
+        "POST",
+        "/api/v1/jobs",
+        403,
+        {"Cookie": "starcat=x"},
+        b"{}",
+        is_signed=False,
     ),
     Hostile("a form of another site", "POST", "/sign-in", 403, {"Origin": EVIL}, b"token=x"),
     Hostile("a form of no site", "POST", "/api/v1/jobs", 403, {"Origin": "null"}, b"{}"),
