@@ -72,6 +72,7 @@ bench: $(READY) ## time and memory beside bare parsers and other star trackers, 
 	$(BIN)/python tests/benchmarks/hostile.py
 	$(BIN)/python tests/benchmarks/fields.py
 	$(BIN)/python tests/benchmarks/sql.py
+	$(BIN)/python tests/benchmarks/votable.py
 
 reproduction: $(READY) ## measure what the papers print (half an hour), rewrite docs/reproduction.md
 	$(BIN)/starcat evaluate --paper all --output dist/evaluation $(INPUTS)

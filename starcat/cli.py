@@ -29,6 +29,7 @@ from starcat.commands import (
     serving,
     specs,
 )
+from starcat.commands.there import there
 from starcat.terminal.failures import failure_of
 from starcat.version import __version__
 
@@ -82,6 +83,7 @@ def _version(wanted: bool) -> None:
 
 @app.callback()
 def _options(
+    context: typer.Context,
     version: Annotated[
         bool,
         typer.Option("--version", callback=_version, is_eager=True, help="Print the versions."),
@@ -89,8 +91,18 @@ def _options(
     debug: Annotated[
         bool, typer.Option("--debug", help="Show the traceback of errors; anywhere on the line.")
     ] = False,
+    server: Annotated[
+        str | None,
+        typer.Option(metavar="URL", help="A service that builds, asks or identifies instead."),
+    ] = None,
+    token: Annotated[
+        str | None,
+        typer.Option(envvar="STARCAT_TOKEN", show_envvar=False, help="Or in STARCAT_TOKEN."),
+    ] = None,
 ) -> None:
     """Guide-star databases for star trackers, built from star catalogs."""
+    if server is not None:
+        context.obj = there(server, token, context.invoked_subcommand or "")
 
 
 def _stop(number: int, frame: Any) -> None:

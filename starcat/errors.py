@@ -86,6 +86,38 @@ def quoted(text: bytes | str, most: int = 60) -> str:
     return f"{words[:most]!r} (the first {most} of {len(words):,} characters)"
 
 
+def error_of_kind(kind: str, words: str, *, key: str | None = None) -> StarcatError | None:
+    """Return an error that another process told of.
+
+    Parameters
+    ----------
+    kind : str
+        Name of its class.
+    words : str
+        Its message.
+    key : str, optional
+        The offending key, where it is one that has one.
+
+    Returns
+    -------
+    StarcatError or None
+        None where starcat has no such class, or one that needs more than words.
+
+    Examples
+    --------
+    >>> error_of_kind("QueryError", "no such column")
+    QueryError('no such column')
+    >>> error_of_kind("SystemExit", "") is None
+    True
+    """
+    found = globals().get(kind)
+    if not (isinstance(found, type) and issubclass(found, StarcatError)):
+        return None
+    if issubclass(found, ConfigError):
+        return found(words, key=key)
+    return None if issubclass(found, OnboardSizeError) else found(words)
+
+
 class StarcatError(Exception):
     """Base of all errors that starcat raises on purpose."""
 
@@ -203,6 +235,25 @@ class NotIdentifiedError(StarcatError):
     """A frame that was not identified, where only an identified one will do."""
 
     exit_code = 6
+
+
+class ServiceError(StarcatError):
+    """A service that cannot be reached, or that refuses what is asked of it.
+
+    Parameters
+    ----------
+    message : str
+        What was found, what was expected, what to do.
+    exit_code : int, default 1
+        As the service says.
+    status : int, optional
+        Of its answer.
+    """
+
+    def __init__(self, message: str, *, exit_code: int = 1, status: int | None = None) -> None:
+        super().__init__(message)
+        self.exit_code = exit_code
+        self.status = status
 
 
 class OutputError(StarcatError):

@@ -51,6 +51,9 @@ def root(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Path
     kept = root / "catalogs" / "bright"
     kept.mkdir(parents=True)
     shutil.copyfile(small_artifact / "stars.parquet", kept / "stars.parquet")
+    shutil.copyfile(small_artifact / "stars.parquet", kept.with_name("faint.parquet"))
+    shutil.copyfile(small_artifact / "stars.parquet", kept.with_name(f"sao-{'0a' * 8}.parquet"))
+    (root / "catalogs" / "unfinished").mkdir()
     return root
 
 
@@ -104,7 +107,10 @@ def test_a_search_finds_what_brute_force_finds(
         assert sorted(found["mag"].tolist()) == sorted(stars["mag"].tolist())
 
 
-@pytest.mark.parametrize("catalog", [DATABASE, "small", "small-1.0.0", "bright"])
+@pytest.mark.parametrize(
+    "catalog",
+    [DATABASE, "small", "small-1.0.0", "bright", "faint", "sao", f"sao-{'0a' * 8}.parquet"],
+)
 def test_a_catalog_has_several_names(
     client: TestClient, stars: dict[str, np.ndarray], catalog: str
 ) -> None:
@@ -200,7 +206,7 @@ def test_the_document_is_of_the_artifact(client: TestClient) -> None:
         ({"VERB": "4"}, 400, "VERB is '4'; give a whole number from 1 to 3"),
         ({"MAXREC": "-1"}, 400, "MAXREC is '-1'; give a whole number from 0"),
         ({"MAXREC": "9" * 30}, 400, "MAXREC is "),
-        ({"RESPONSEFORMAT": "<script>"}, 400, "the format '<script>' is unknown"),
+        ({"RESPONSEFORMAT": "<script>"}, 400, "RESPONSEFORMAT '<script>' is not known"),
         ({"ra": "1"}, 400, "RA is given twice"),
     ],
 )
@@ -234,13 +240,22 @@ def test_what_is_missing_is_told(client: TestClient, missing: str) -> None:
 
 @pytest.mark.parametrize(
     "catalog",
-    ["nothing", "0" * 16, "..%2f..%2fetc%2fpasswd", "bright%00", "records.sqlite", "x" * 300],
+    [
+        "nothing",
+        "unfinished",
+        "sa",
+        "0" * 16,
+        "..%2f..%2fetc%2fpasswd",
+        "bright%00",
+        "records.sqlite",
+        "x" * 300,
+    ],
 )
 def test_a_catalog_that_is_not_there(client: TestClient, catalog: str) -> None:
     answer = ask(client, catalog)
     assert answer.status_code in (400, 404)
     assert b"root:" not in answer.content
-    if catalog in ("nothing", "0" * 16):
+    if catalog in ("nothing", "unfinished", "sa", "0" * 16):
         check_error(answer.content, "no database and no catalog is called")
 
 
@@ -253,7 +268,7 @@ def test_who_may_not_read_gets_nothing(root: Path) -> None:
 def test_parameters_as_they_are_checked() -> None:
     asked = cone_request([("ra", "1.5"), ("Dec", "-2"), ("SR", "1e-3"), ("UNKNOWN", "x")])
     assert (asked.ra_deg, asked.dec_deg, asked.radius_deg) == (1.5, -2.0, 0.001)
-    assert (asked.verbosity, asked.maxrec, asked.form.name) == (2, None, "tabledata")
+    assert (asked.verbosity, asked.maxrec, asked.form.name) == (2, None, "votable/td")
     edge = cone_request([("RA", "360"), ("DEC", "-90"), ("SR", "180"), ("VERB", "")])
     assert isinstance(edge, ConeRequest)
     with pytest.raises(ConfigError, match="RA is"):

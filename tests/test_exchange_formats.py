@@ -682,7 +682,7 @@ def test_a_table_without_rows(tmp_path: Path, file_format: str) -> None:
             assert file["b.offsets"].tolist() == [0]
 
 
-def test_text_formats_and_parquet_never_hold_the_table(tmp_path: Path) -> None:
+def test_streamed_formats_never_hold_the_table(tmp_path: Path) -> None:
     held = []
 
     def batches() -> Any:
@@ -691,7 +691,7 @@ def test_text_formats_and_parquet_never_hold_the_table(tmp_path: Path) -> None:
             yield pa.record_batch({"a": pa.array(np.full(100_000, k, dtype=np.int64))})
 
     schema = pa.schema({"a": pa.int64()})
-    for file_format in ("csv", "json", "parquet"):
+    for file_format in ("csv", "json", "parquet", "votable"):
         held.clear()
         before = pa.total_allocated_bytes()
         reader = pa.RecordBatchReader.from_batches(schema, batches())

@@ -20,6 +20,7 @@ from starcat.catalog.photometry import combined_magnitude
 from starcat.catalog.quality import Quality
 from starcat.catalog.stars import directions_of, floats_of, sort_rows, with_columns
 from starcat.catalog.verdict import Reason, Verdicts
+from starcat.errors import BuildError
 from starcat.geometry.proximity import pairs_within
 from starcat.geometry.sphere import radec_from_directions
 from starcat.specs.build_spec import Doubles, Selection, Variables
@@ -27,6 +28,9 @@ from starcat.tables.schema import product_schema
 
 Flags = NDArray[np.bool_]
 Array = NDArray[np.float64]
+
+MOST_PAIRS = 10_000_000
+"""Close pairs that are looked at; they take half a gigabyte, and no camera has a tenth of them."""
 
 
 @dataclass(frozen=True)
@@ -121,8 +125,20 @@ def _companion_pairs(stars: pa.Table, selection: Selection) -> tuple[NDArray[np.
     mag = floats_of(stars, "mag")
     with np.errstate(invalid="ignore"):
         pool = np.flatnonzero(mag <= (selection.faint_limit_mag if limit is None else limit))
+    _check_pairs(len(pool), doubles.min_separation_deg)
     pairs, _ = pairs_within(directions_of(stars)[pool], np.radians(doubles.min_separation_deg))
     return pool[pairs], mag
+
+
+def _check_pairs(stars: int, separation_deg: float) -> None:
+    """Check that stars are not so many, or so far apart, that nearly all of them are doubles."""
+    pairs = 0.25 * stars**2 * (1.0 - np.cos(np.radians(separation_deg)))
+    if pairs > MOST_PAIRS:
+        raise BuildError(
+            f"selection.doubles.min_separation_deg = {separation_deg:g} makes about {pairs:,.0f} "
+            f"doubles of {stars:,} stars, at most {MOST_PAIRS:,} are looked at; give the few "
+            "pixels that the camera cannot tell apart, or a brighter faint_limit_mag"
+        )
 
 
 def has_companion(stars: pa.Table, selection: Selection) -> Flags:

@@ -15,6 +15,7 @@ app = typer.Typer()
 
 @app.command()
 def build(
+    context: typer.Context,
     spec: Annotated[Path | None, typer.Argument(help="A build spec (TOML).")] = None,
     preset: Annotated[str | None, typer.Option(help="A spec that ships with starcat.")] = None,
     changes: Annotated[
@@ -45,6 +46,11 @@ def build(
 
     Example: starcat build --preset gaia-12deg -o dist
     """
+    if context.obj is not None:
+        from starcat.commands.there import build_there
+
+        build_there(context, chosen_spec(spec, preset, changes), output, as_json=json)
+        return
     from starcat.pipeline.build import Built
     from starcat.pipeline.build import build as run_build
     from starcat.terminal.builds import print_built, print_cost, print_refused

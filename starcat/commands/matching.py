@@ -81,6 +81,7 @@ def simulate(
 
 @app.command()
 def identify(
+    context: typer.Context,
     artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
     file: Annotated[
         Path,
@@ -139,6 +140,11 @@ def identify(
 
     Example: starcat identify dist/gaia-12deg-1.0.0 frame.csv --picture frame.png
     """
+    if context.obj is not None:
+        from starcat.commands.there import identify_there
+
+        identify_there(context, artifact.name, file)
+        return
     from starcat.images.answering import answer_each, camera_of_size, measure_input, write_extras
     from starcat.images.identification import PictureOptions
     from starcat.matcher.centroids import said_of_columns

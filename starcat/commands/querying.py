@@ -19,6 +19,7 @@ FORMATS = "table, csv, json, parquet, votable, fits, ecsv or npz"
 
 @app.command()
 def sql(
+    context: typer.Context,
     arguments: Annotated[
         list[str] | None,
         typer.Argument(
@@ -61,6 +62,14 @@ def sql(
         from starcat.terminal.queries import print_gallery, print_macros
 
         (print_gallery if show_list else print_macros)(as_json=json)
+        return
+    if context.obj is not None:
+        from starcat.commands.there import sql_there
+
+        targets, query = _split(arguments or [], named)
+        wanted = form or ("json" if json else None)
+        there = (targets, query, named, dict(_set(values)), wanted, output, rows, time_limit_s)
+        sql_there(context, *there)
         return
     from starcat.query.engine import warm_up
 

@@ -7,27 +7,18 @@ as bytes, each with its length at the end of the record before. One call joins t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from starcat.exchange.votable_columns import Cells, VotableColumn, is_ascii, text_bytes
+from starcat.exchange.votable_columns import Cells, VotableColumn, is_ascii, is_constant, text_bytes
 
 _TRUE, _FALSE, _UNKNOWN = ord("T"), ord("F"), ord("?")
 _FOUR_BYTES = 0xF0
 """The least first byte of a letter that UTF-8 says in four bytes, and UTF-16 in two units."""
-
-
-@dataclass(frozen=True)
-class _Run:
-    """Columns of fixed width, and the one of variable width that ends them, if there is one."""
-
-    record: np.dtype[np.void]
-    columns: tuple[int, ...]
-    last: int | None
 
 
 class Binary2:
@@ -41,7 +32,6 @@ class Binary2:
 
     def __init__(self, columns: Sequence[VotableColumn]) -> None:
         self._columns = tuple(columns)
-        self._runs = _runs(self._columns)
 
     def rows(self, cells: Sequence[Cells], count: int) -> bytes:
         """Return rows.
@@ -58,40 +48,49 @@ class Binary2:
         bytes
             Before base64.
         """
+        if not count:
+            return b""
         parts: list[pa.Array] = []
-        for number, run in enumerate(self._runs):
-            record = np.zeros(count, run.record)
-            if number == 0:
-                record["null"] = _null_bits(cells, count)
-            for place in run.columns:
-                record[f"c{place}"] = _fixed(self._columns[place], cells[place])
-            following: pa.Array | None = None
-            if run.last is not None:
-                lengths, following = _variable(self._columns[run.last], cells[run.last])
-                record["length"] = lengths
-            parts.append(_as_binary(record))
-            if following is not None:
-                parts.append(following)
-        joined = pc.binary_join_element_wise(*parts, b"")
-        _, content = text_bytes(joined)
-        return content.tobytes()
+        run = _Run()
+        run.add(f"V{(len(cells) + 7) // 8}", _null_bits(cells, count))
+        for column, found in zip(self._columns, cells, strict=True):
+            if not (column.is_text or column.is_list):
+                run.add(_big_endian(column), _fixed(column, found))
+                continue
+            same = _constant(column, found)
+            lengths, content = _variable(column, same or found)
+            run.add(">u4", lengths)
+            if same is not None:
+                # A text that is the same in all rows is of fixed width.
+                text = content[0].as_py()
+                run.add(f"V{len(text)}", np.void(text))
+                continue
+            parts += [run.bytes(count), content]
+            run = _Run()
+        parts.append(run.bytes(count))
+        _, joined = text_bytes(pc.binary_join_element_wise(*parts, b""))
+        return bytes(joined.data)
 
 
-def _runs(columns: Sequence[VotableColumn]) -> list[_Run]:
-    """Return the columns in runs, of which the first begins with the bits of null."""
-    runs = []
-    fields: list[tuple[str, str]] = [("null", f"V{(len(columns) + 7) // 8}")]
-    places: list[int] = []
-    for place, column in enumerate(columns):
-        if column.is_list or column.is_text:
-            runs.append(_Run(np.dtype([*fields, ("length", ">u4")]), tuple(places), place))
-            fields, places = [], []
-            continue
-        fields.append((f"c{place}", _big_endian(column)))
-        places.append(place)
-    if fields:
-        runs.append(_Run(np.dtype(fields), tuple(places), None))
-    return runs
+class _Run:
+    """Columns of fixed width, to be one record a row."""
+
+    def __init__(self) -> None:
+        self._filled: list[tuple[str, Any]] = []
+
+    def add(self, kind: str, values: Any) -> None:
+        """Add a column of a numpy type: a value for each row, or one for all."""
+        if kind != "V0":
+            self._filled.append((kind, values))
+
+    def bytes(self, count: int) -> pa.Array:
+        """Return the bytes of each row."""
+        record = np.zeros(count, [(f"c{k}", kind) for k, (kind, _) in enumerate(self._filled)])
+        for name, (_, values) in zip(record.dtype.names or (), self._filled, strict=True):
+            record[name] = values
+        offsets = np.arange(count + 1, dtype=np.int64) * record.dtype.itemsize
+        is_empty = record.dtype.itemsize == 0
+        return _binary(offsets, np.empty(0, np.uint8) if is_empty else record.view(np.uint8))
 
 
 def _big_endian(column: VotableColumn) -> str:
@@ -121,6 +120,14 @@ def _fixed(column: VotableColumn, cells: Cells) -> NDArray[np.generic]:
     if cells.is_null is not None:
         letters[cells.is_null] = _UNKNOWN
     return letters
+
+
+def _constant(column: VotableColumn, cells: Cells) -> Cells | None:
+    """Return the first row of texts that are the same in all rows; None where they are not."""
+    values = cells.values
+    if column.is_list or not (values.null_count == len(values) or is_constant(values)):
+        return None
+    return Cells(values.slice(0, 1), None, None)
 
 
 def _variable(column: VotableColumn, cells: Cells) -> tuple[NDArray[np.int64], pa.Array]:
@@ -153,8 +160,3 @@ def _binary(offsets: NDArray[np.int64], content: NDArray[np.uint8]) -> pa.Array:
     places = pa.py_buffer(offsets.astype(np.int32))
     held = pa.py_buffer(np.ascontiguousarray(content))
     return pa.BinaryArray.from_buffers(pa.binary(), len(offsets) - 1, [None, places, held])
-
-
-def _as_binary(record: NDArray[np.void]) -> pa.Array:
-    offsets = np.arange(len(record) + 1, dtype=np.int64) * record.dtype.itemsize
-    return _binary(offsets, record.view(np.uint8) if len(record) else np.empty(0, np.uint8))

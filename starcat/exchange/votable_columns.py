@@ -178,6 +178,37 @@ def text_bytes(values: pa.Array) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
     return offsets - offsets[0], letters
 
 
+def is_constant(values: pa.Array) -> bool:
+    """Return whether all of more than one value are the same.
+
+    Parameters
+    ----------
+    values : pyarrow.Array
+        Numbers, truth values or texts.
+
+    Returns
+    -------
+    bool
+        Whether they have the same bytes; False where there is but one, or a null.
+    """
+    if len(values) < 2 or values.null_count:
+        return False
+    if pa.types.is_string(values.type):
+        offsets, letters = text_bytes(values)
+        length = offsets[1]
+        if (np.diff(offsets) != length).any():
+            return False
+        table = letters.reshape(len(values), length)
+        return bool((table == table[0]).all())
+    if pa.types.is_boolean(values.type):
+        return values.true_count in (0, len(values))
+    width = values.type.bit_width // 8
+    numbers = np.frombuffer(values.buffers()[1], f"u{width}")
+    numbers = numbers[values.offset : values.offset + len(values)]
+    # A look at the first ones spares most columns the look at all.
+    return bool((numbers[:16] == numbers[0]).all() and (numbers == numbers[0]).all())
+
+
 def is_ascii(letters: NDArray[np.uint8]) -> bool:
     """Return whether UTF-8 bytes are all ASCII.
 

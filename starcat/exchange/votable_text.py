@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from starcat.exchange.votable_columns import Cells, VotableColumn, text_bytes
+from starcat.exchange.votable_columns import Cells, VotableColumn, is_constant, text_bytes
 
 _BETWEEN = "</TD><TD>"
 _ROW_BEGINS, _ROW_ENDS = "<TR><TD>", "</TD></TR>\n"
@@ -73,30 +73,10 @@ def _texts(column: VotableColumn, cells: Cells) -> pa.Array | str:
     values = cells.values
     if values.null_count == len(values):
         return ""
-    if values.null_count == 0 and _is_constant(values):
+    if values.null_count == 0 and is_constant(values):
         values = values.slice(0, 1)
     texts = _escaped(values) if column.is_text else _numbers(values)
     return texts[0].as_py() if len(texts) < len(cells.values) else texts
-
-
-def _is_constant(values: pa.Array) -> bool:
-    """Return whether all of more than one value have the same bytes."""
-    if len(values) < 2:
-        return False
-    if pa.types.is_string(values.type):
-        offsets, letters = text_bytes(values)
-        length = offsets[1]
-        if (np.diff(offsets) != length).any():
-            return False
-        table = letters.reshape(len(values), length)
-        return bool((table == table[0]).all())
-    if pa.types.is_boolean(values.type):
-        return values.true_count in (0, len(values))
-    width = values.type.bit_width // 8
-    numbers = np.frombuffer(values.buffers()[1], f"u{width}")
-    numbers = numbers[values.offset : values.offset + len(values)]
-    # A look at the first ones spares most columns the look at all.
-    return bool((numbers[:16] == numbers[0]).all() and (numbers == numbers[0]).all())
 
 
 def _numbers(values: pa.Array) -> pa.Array:

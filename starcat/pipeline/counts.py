@@ -26,8 +26,9 @@ Counts = NDArray[np.int64]
 SAMPLE = 2000
 """Stars around which neighbours are counted, and triangles whose fields are."""
 
-MOST_IN_TREE = 500_000
-"""Of more stars than these, only some are searched for neighbours; so many lose little."""
+MOST_IN_TREE, MOST_MET = 500_000, 20_000_000
+"""Of more stars than these, and more neighbours of all that are looked at, only some are searched
+for neighbours; so many lose little."""
 
 QUANTILES = 64
 """Numbers of neighbours that stand for those of all stars, where a pattern's cells are counted."""
@@ -171,15 +172,18 @@ def _inner_rad(name: str, spec: BuildSpec) -> float:
 def _neighbours_within(directions: Array, radii_rad: set[float]) -> Mapping[float, Array]:
     """Return the number of neighbours within each radius of some of the stars."""
     some = directions[:: -(-len(directions) // SAMPLE)]
-    thinning = -(-len(directions) // MOST_IN_TREE)
-    tree = cKDTree(directions[::thinning])
-    # Every star finds itself, in a tree of all of them.
-    return {
-        radius: np.maximum(
-            thinning * tree.query_ball_point(some, _chord(radius), return_length=True) - 1.0, 0.0
-        )
-        for radius in radii_rad
-    }
+    found: dict[float, Array] = {}
+    trees: dict[int, cKDTree] = {}
+    for radius in radii_rad:
+        # Wide circles hold so many stars that some of these tell of all.
+        share = 0.5 * (1.0 - np.cos(min(radius, np.pi)))
+        thinning = 1 + int(len(directions) * max(share * len(some) / MOST_MET, 1.0 / MOST_IN_TREE))
+        if thinning not in trees:
+            trees[thinning] = cKDTree(directions[::thinning])
+        near = trees[thinning].query_ball_point(some, _chord(radius), return_length=True)
+        # Every star finds itself, in a tree of all of them.
+        found[radius] = np.maximum(thinning * near - 1.0, 0.0)
+    return found
 
 
 def _chord(radius_rad: float) -> float:

@@ -22,10 +22,10 @@ from starcat.geometry.sphere import saff_kuijlaars
 from starcat.pipeline.build import Inputs
 from starcat.pipeline.cost import Cost, Made, base_memory, check_memory, whole_cost
 from starcat.pipeline.guide_stars import (
-    FIRST_LOOK,
     MIN_GUIDE_STARS,
+    MOST_FIELD_STARS,
     check_fields,
-    field_share,
+    check_tiling,
     thinned_stars,
 )
 from starcat.pipeline.motions import motions_of
@@ -44,9 +44,6 @@ from starcat.products.levels import boresights_of_level, level_fields
 from starcat.progress import Progress, no_progress
 from starcat.report.coverage_report import holes_warning
 from starcat.specs.build_spec import BuildSpec, Selection
-
-MOST_FIELD_STARS = 4_000_000
-"""Stars of all fields of a tiling that an estimate goes through at the most, and of all levels."""
 
 MOST_FOR_GAPS = 50_000
 """Of more boresights than these the widest gap is not looked for."""
@@ -74,9 +71,8 @@ class Choice:
     def nbytes(self) -> int:
         """Memory that it takes."""
         tables = (self.selected.guide_stars, self.selected.rejected)
-        arrays = (self.fields.boresights, self.fields.offsets, self.fields.star_index)
         steps = (step.directions for step in self.selected.steps)
-        return int(sum(each.nbytes for each in (*tables, *arrays, *steps)))
+        return int(self.fields.nbytes + sum(each.nbytes for each in (*tables, *steps)))
 
 
 def choose_stars(read: StarsRead, spec: BuildSpec) -> Choice:
@@ -103,9 +99,11 @@ def choose_stars(read: StarsRead, spec: BuildSpec) -> Choice:
     bright = np.sort(order[: np.searchsorted(mag, _faintest(spec.selection), side="right")])
     stars = read.stars.take(pa.array(bright)).combine_chunks()
     most = spec.selection.max_stars_per_field
-    _check_tiling(len(stars), spec, most)
+    check_tiling(len(stars), spec, most)
+    if len(stars) < MIN_GUIDE_STARS:
+        thinned_stars(read.stars, spec)  # says so, in the words of the build
     selected = thinned_stars(stars, spec)
-    _check_tiling(len(selected.guide_stars), spec, None)
+    check_tiling(len(selected.guide_stars), spec, None)
     _check_levels(len(selected.guide_stars), spec)
     fields = tile_guide_stars(selected.guide_stars, spec)
     blank = len(mag) - int(np.searchsorted(mag, np.inf))
@@ -127,21 +125,6 @@ def _faintest(selection: Selection) -> float:
     """Return the magnitude beyond which a star is too faint, and nobody's companion."""
     companions = selection.doubles.companion_limit_mag
     return max(selection.faint_limit_mag, -np.inf if companions is None else companions)
-
-
-def _check_tiling(stars: int, spec: BuildSpec, most: int | None) -> None:
-    """Check that the fields of a tiling have not more stars than an estimate goes through."""
-    in_field = stars * field_share(spec)
-    if most is not None:
-        in_field = min(in_field, FIRST_LOOK * most)
-    found = spec.boresights.count * in_field
-    if found > MOST_FIELD_STARS:
-        raise BuildError(
-            f"{spec.name}: the {spec.boresights.count:,} fields of the tiling have about "
-            f"{found:,.0f} stars in all, more than the {MOST_FIELD_STARS:,} that an estimate goes "
-            "through; a smaller boresights.count, or fewer stars "
-            "(selection.max_stars_per_field, a brighter faint_limit_mag), and it is there"
-        )
 
 
 def _check_levels(stars: int, spec: BuildSpec) -> None:

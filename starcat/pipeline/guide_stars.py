@@ -21,6 +21,9 @@ from starcat.specs.build_spec import BuildSpec
 MIN_GUIDE_STARS = 4
 """Fewer than these cannot be identified by anything."""
 
+MOST_FIELD_STARS = 4_000_000
+"""Stars of all fields of a tiling that an estimate goes through at the most, and of all levels."""
+
 FIRST_LOOK = 4.0
 """Times as many stars as fill a field of the mean are looked at first."""
 
@@ -136,6 +139,40 @@ def field_share(spec: BuildSpec) -> float:
         0 to 1: the share that the circle takes which the stars of a field are looked for in.
     """
     return 0.5 * (1.0 - float(np.cos(reach_rad(field_size(spec), spec.boresights.field))))
+
+
+def check_tiling(
+    stars: int, spec: BuildSpec, thinned_to: int | None, most: int = MOST_FIELD_STARS
+) -> None:
+    """Check that the fields of a tiling have not too many stars to be gone through in a moment.
+
+    Parameters
+    ----------
+    stars : int
+        Guide stars of the whole sky.
+    spec : BuildSpec
+        Number, size and shape of the fields.
+    thinned_to : int, optional
+        Only so many of each field are wanted.
+    most : int, default `MOST_FIELD_STARS`
+        Stars of all fields together.
+
+    Raises
+    ------
+    BuildError
+        Naming what makes them fewer.
+    """
+    in_field = stars * field_share(spec)
+    if thinned_to is not None:
+        in_field = min(in_field, FIRST_LOOK * thinned_to)
+    found = spec.boresights.count * in_field
+    if found > most:
+        raise BuildError(
+            f"{spec.name}: the {spec.boresights.count:,} fields of the tiling have about "
+            f"{found:,.0f} stars in all, more than the {most:,} that an estimate goes through; a "
+            "smaller boresights.count or fewer stars (selection.max_stars_per_field, a brighter "
+            "faint_limit_mag) give one"
+        )
 
 
 def check_guide_stars(selected: Selected, spec: BuildSpec) -> None:

@@ -15,14 +15,16 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from starcat.catalog.fetching.locate import locate
 from starcat.catalog.ingest import ingest
 from starcat.catalog.selection import reject_dense, select_guide_stars
 from starcat.catalog.stars import directions_of, floats_of
-from starcat.errors import OutputError
+from starcat.errors import BuildError, OutputError
 from starcat.geometry.camera import Camera
 from starcat.pipeline.cost import Cost, Made, base_memory, product_cost, whole_cost
+from starcat.pipeline.guide_stars import brightest_of_fields, check_tiling
 from starcat.pipeline.recipes import RECIPES, Ingredients, field_size, tile_guide_stars
 from starcat.pipeline.sizes import table_bytes
 from starcat.products.boresights import tile_sphere
@@ -59,6 +61,9 @@ OVERLAP = 4
 
 MEMORY_BYTES, SECONDS = 1.6e9, 15.0
 """A spec leaves out products, but never the triangles, of which the estimate is higher."""
+
+MOST_FIELD_STARS = 60_000_000
+"""Stars of all fields that are gone through at the most: they take some gigabytes."""
 
 MANY_FIELDS = 5
 """A camera that sees so many times more stars than the database holds should know the brightest."""
@@ -132,6 +137,9 @@ def starter_spec(
     faint_limit_mag: float | None = None,
     progress: Progress = no_progress,
     widest_fov_x_deg: float | None = None,
+    *,
+    sky: pa.Table | None = None,
+    most_field_stars: int = MOST_FIELD_STARS,
 ) -> Starter:
     """Return a spec for a camera, from the embedded sky.
 
@@ -150,6 +158,10 @@ def starter_spec(
         Field across the width that the database is to serve too, for cameras of which only a range
         is known; ``camera`` is the narrow end of it. Only products that find a focal length are
         made then.
+    sky : pyarrow.Table, optional
+        Star table of the embedded sky, where it was read already.
+    most_field_stars : int
+        Stars of all fields of the tiling that may be gone through.
 
     Returns
     -------
@@ -160,19 +172,35 @@ def starter_spec(
     ------
     ConfigError
         If the camera or the limit is out of range.
+    BuildError
+        If the limit leaves far more stars in the fields than a database is made of.
     """
     name = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:64] or "camera"
-    sky = ingest(SOURCE, locate(SOURCE, {}), progress=progress).stars
+    if sky is None:
+        sky = ingest(SOURCE, locate(SOURCE, {}), progress=progress).stars
     mag = np.sort(floats_of(sky, "mag"))
     spec_to = partial(_spec, name, camera, widest_fov_x_deg)
     shape = spec_to(float(mag[-1]))
     limit = faint_limit_mag
     if limit is None:
         limit = _enough(sky, shape)
+    check_tiling(int(np.searchsorted(mag, limit, side="right")), shape, None, most_field_stars)
     spec, thinned, cost = _affordable(sky, spec_to(limit))
     limits = sorted({round(limit + step, 2) for step in _STEPS_MAG} | {limit})
-    rows = [_row(sky, spec_to(one)) for one in limits if one <= mag[-1] or one == limit]
+    rows = [
+        _row(sky, spec_to(one))
+        for one in limits
+        if one == limit or (one <= mag[-1] and _is_quick(mag, one, shape, most_field_stars))
+    ]
     return Starter(spec, tuple(rows), float(mag[-1]), thinned, cost)
+
+
+def _is_quick(mag: NDArray[np.float64], limit: float, spec: BuildSpec, most: int) -> bool:
+    try:
+        check_tiling(int(np.searchsorted(mag, limit, side="right")), spec, None, most)
+    except BuildError:
+        return False
+    return True
 
 
 def write_starter(starter: Starter, path: Path, *, replace: bool) -> None:
@@ -266,8 +294,7 @@ def _for_a_range(narrowest: Camera, widest_fov_x_deg: float, boresights: int) ->
 def _affordable(sky: pa.Table, spec: BuildSpec) -> tuple[BuildSpec, LimitRow, Cost]:
     """Return a spec without the products that cost too much, what thinning leaves, and the cost."""
     selected = select_guide_stars(sky, spec.selection)
-    fields = tile_guide_stars(selected.guide_stars, spec)
-    _, brightest = fields.brightest(STARS_A_FIELD)
+    brightest = brightest_of_fields(selected.guide_stars, spec, STARS_A_FIELD)
     selected = reject_dense(selected, brightest)
     guide_stars = selected.guide_stars
     fields = tile_guide_stars(guide_stars, spec)
@@ -308,7 +335,9 @@ def _enough(sky: pa.Table, spec: BuildSpec) -> float:
 
 
 def _row(sky: pa.Table, spec: BuildSpec) -> LimitRow:
-    selected = select_guide_stars(sky, spec.selection)
+    # Fainter stars are rejected, and nobody's companions.
+    bright = floats_of(sky, "mag") <= spec.selection.faint_limit_mag
+    selected = select_guide_stars(sky.filter(pa.array(bright)), spec.selection)
     fields = tile_guide_stars(selected.guide_stars, spec)
     summary = summarise_coverage(field_coverage(fields, spec.boresights.brightest))
     limit = spec.selection.faint_limit_mag

@@ -69,6 +69,11 @@ class FieldStars:
         """Number of stars in each field, shape (F,)."""
         return np.diff(self.offsets)
 
+    @property
+    def nbytes(self) -> int:
+        """Memory that it takes."""
+        return int(self.boresights.nbytes + self.offsets.nbytes + self.star_index.nbytes)
+
     def brightest(self, most: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
         """Return the brightest stars of each field.
 

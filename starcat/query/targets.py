@@ -84,8 +84,8 @@ def open_targets(
     ----------
     given : sequence of str
         For each target the folder of an artifact or of a store (a HATS collection or catalog), a
-        folder of Parquet files, a Parquet file, an archive's file under its own name, ``SOURCE=PATH``, or the name of a source
-        that `locate` finds.
+        folder of Parquet files, a Parquet file, an archive's file under its own name,
+        ``SOURCE=PATH``, or the name of a source that `locate` finds.
     scratch : Path
         Folder for the star tables of archive files.
     engine : Engine

@@ -11,7 +11,16 @@ from fastapi import APIRouter, FastAPI
 from starlette.middleware import Middleware
 
 from starcat.service import pages
-from starcat.service.api import databases, identify, jobs, registry, releases, sql
+from starcat.service.api import (
+    catalogs,
+    databases,
+    identify,
+    jobs,
+    registry,
+    releases,
+    specs,
+    sql,
+)
 from starcat.service.guard import health, signing
 from starcat.service.guard.bodies import Bodies
 from starcat.service.guard.headers import SafeHeaders
@@ -24,6 +33,7 @@ from starcat.service.guard.retention import keep_removing
 from starcat.service.guard.shape import Shape
 from starcat.service.guard.who import Who
 from starcat.service.jobs.pool import WorkerPool
+from starcat.service.pages.rendering import add_missing_page
 from starcat.service.problems import REFUSALS, add_problem_handlers
 from starcat.service.service import Service, open_service
 from starcat.service.settings import Settings
@@ -33,6 +43,8 @@ from starcat.version import __version__
 API = "/api/v1"
 
 RESOURCES: tuple[APIRouter, ...] = (
+    specs.router,
+    catalogs.router,
     jobs.router,
     databases.router,
     releases.router,
@@ -92,6 +104,7 @@ def make_app(settings: Settings) -> FastAPI:
     app.state.service, app.state.metrics, app.state.identities = service, metrics, identities
     app.state.workers = WorkerPool(service)
     add_problem_handlers(app)
+    add_missing_page(app)
     for router in RESOURCES:
         app.include_router(router, prefix=API, responses=REFUSALS)
     for router in OTHERS:
@@ -116,6 +129,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         await to_thread.run_sync(pool.stop)
         service.queue.close()
         service.tap.close()
+        service.catalogs.close()
         service.sessions.close()
         service.confined.close()
         service.records.close()

@@ -1,7 +1,7 @@
 """The catalogs that a service offers, and estimates of specs from them.
 
-Reading takes seconds, so what was read is kept, on disk and in memory; so are the guide stars of the
-last specs, so that a slider that does not change them is answered at once.
+Reading takes seconds, so what was read is kept, on disk and in memory. So are the guide stars of
+the last specs, and a slider that does not change them is answered at once.
 """
 
 from __future__ import annotations
@@ -16,17 +16,19 @@ from pathlib import Path
 
 from starcat.catalog.blocks import CATALOGS
 from starcat.catalog.fetching.locate import locate
-from starcat.catalog.readers.files import find_files
 from starcat.catalog.source import DataSource, data_source
 from starcat.errors import SourceMissing
 from starcat.pipeline.estimate import Choice, Estimate, choose_stars, estimate
+from starcat.pipeline.guide_stars import MOST_FIELD_STARS
 from starcat.pipeline.stars_read import StarsRead, read_stars, what_is_read
+from starcat.pipeline.starter import Starter, starter_spec
+from starcat.service.jobs.keys import source_files
 from starcat.service.kept import Kept
 from starcat.service.problems import Problem
 from starcat.service.star_cache import CatalogRead, StarCache
-from starcat.specs.build_spec import BuildSpec
+from starcat.specs.build_spec import BuildSpec, CameraSpec
+from starcat.specs.reading import preset, preset_names
 from starcat.storage.digests import json_bytes
-from starcat.store.layout import is_store
 from starcat.version import __version__
 
 WAIT_S = 10.0
@@ -40,6 +42,9 @@ READ_BYTES, CHOICE_BYTES, ESTIMATE_BYTES = 1 << 30, 128 << 20, 64 << 20
 
 MOST_INPUT_BYTES = 2 << 30
 """Larger files are read for an estimate only down to ``catalog.read_limit_mag``."""
+
+MOST_WAITING = 8
+"""Catalogs that wait to be read; more are refused."""
 
 AT_ONCE = 2
 """Estimates that are made at the same time."""
@@ -71,18 +76,23 @@ class Catalogs:
     ----------
     folder : Path
         Where those that were read are kept.
+    max_memory_bytes : int, optional
+        What a build may take; by default what this machine has left.
     wait_s : float
         Seconds that a request waits.
     """
 
-    def __init__(self, folder: Path, wait_s: float = WAIT_S) -> None:
+    def __init__(
+        self, folder: Path, max_memory_bytes: int | None = None, wait_s: float = WAIT_S
+    ) -> None:
         self._cache = StarCache(folder)
+        self._max_memory_bytes = max_memory_bytes
         self._wait_s = wait_s
         self._read: Kept[StarsRead] = Kept(READ_BYTES)
         self._choices: Kept[Choice] = Kept(CHOICE_BYTES)
         self._estimates: Kept[Estimate] = Kept(ESTIMATE_BYTES)
         self._turns = threading.Semaphore(AT_ONCE)
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._underway: dict[str, Future[StarsRead]] = {}
         # One at a time: a catalog takes memory.
         self._reader = ThreadPoolExecutor(1, "catalog-reader")
@@ -102,15 +112,13 @@ class Catalogs:
             found.append(Offered(data_source(name), is_here(name), read))
         return sorted(found, key=lambda one: not one.is_here)
 
-    def estimate(self, spec: BuildSpec, max_memory_bytes: int | None = None) -> Estimate:
+    def estimate(self, spec: BuildSpec) -> Estimate:
         """Estimate what a spec will give.
 
         Parameters
         ----------
         spec : BuildSpec
             Checked.
-        max_memory_bytes : int, optional
-            What a build may take; by default what this machine has left.
 
         Returns
         -------
@@ -125,16 +133,54 @@ class Catalogs:
             With status 503, while a catalog is being read, or too many ask.
         """
         key = self._key(spec)
-        whole = (key, spec.model_dump_json(), max_memory_bytes)
+        whole = (key, spec.model_dump_json())
         found = self._estimates.get(whole)
         if found is not None:
             return found
         read = self.read(spec, key)
         with self._turn():
             choice = self._choice(read, key, spec)
-            found = estimate(read, choice, spec, max_memory_bytes)
-        self._estimates.put(whole, found, 16 * len(found.fields.offsets) + (1 << 15))
+            found = estimate(read, choice, spec, self._max_memory_bytes)
+        self._estimates.put(whole, found, found.fields.nbytes)
         return found
+
+    def starter(
+        self,
+        name: str,
+        camera: CameraSpec,
+        faint_limit_mag: float | None = None,
+        widest_fov_x_deg: float | None = None,
+    ) -> Starter:
+        """Return a first spec for a camera, from the embedded sky.
+
+        Parameters
+        ----------
+        name, camera, faint_limit_mag, widest_fov_x_deg
+            As `starcat.pipeline.starter.starter_spec` takes them.
+
+        Returns
+        -------
+        Starter
+            The spec, and what it gives.
+
+        Raises
+        ------
+        ConfigError, BuildError
+            If the camera or the limit is out of range.
+        Problem
+            With status 503, while the sky is being read, or too many ask.
+        """
+        # The default preset reads what a first spec is made from.
+        sky = self.read(preset(preset_names()[0])).stars
+        with self._turn():
+            return starter_spec(
+                name,
+                camera,
+                faint_limit_mag,
+                widest_fov_x_deg=widest_fov_x_deg,
+                sky=sky,
+                most_field_stars=MOST_FIELD_STARS,
+            )
 
     def read(self, spec: BuildSpec, key: str | None = None) -> StarsRead:
         """Return the catalogs of a spec; read them where that was not done yet.
@@ -166,6 +212,8 @@ class Catalogs:
         with self._lock:
             future = self._underway.get(key)
             if future is None:
+                if len(self._underway) >= MOST_WAITING:
+                    raise _busy("too many catalogs wait to be read", RETRY_S)
                 future = self._reader.submit(self._from_disk_or_files, key, spec)
                 self._underway[key] = future
                 future.add_done_callback(lambda _: self._forget(key))
@@ -174,12 +222,10 @@ class Catalogs:
         except TimeoutError:
             if future.done():
                 raise
-            raise Problem(
-                503,
-                f"{', '.join(spec.sources)}: being read for the first time, which takes longer "
-                f"than a request waits; ask again in {RETRY_S} s",
-                headers={"Retry-After": str(RETRY_S)},
-            ) from None
+            what = (
+                f"{', '.join(_sources_read(spec))}: being read, which takes longer than you waited"
+            )
+            raise _busy(what, RETRY_S) from None
 
     def close(self) -> None:
         """Begin no more reading; what is underway is not waited for."""
@@ -201,7 +247,7 @@ class Catalogs:
         content = spec.model_dump(mode="json")
         own = {name: content[name] for name in ("selection", "camera", "boresights")}
         own["levels"] = content["products"]["levels"]
-        part = (key, spec.name, json_bytes(own))
+        part = (key, json_bytes(own))
         found = self._choices.get(part)
         if found is None:
             found = choose_stars(read, spec)
@@ -211,11 +257,7 @@ class Catalogs:
     @contextmanager
     def _turn(self) -> Iterator[None]:
         if not self._turns.acquire(timeout=self._wait_s):
-            raise Problem(
-                503,
-                "too many estimates are being made; ask again in a second",
-                headers={"Retry-After": "1"},
-            )
+            raise _busy("too many estimates are being made", 1)
         try:
             yield
         finally:
@@ -227,6 +269,11 @@ class Catalogs:
         files = {name: _stamps(name) for name in _sources_read(spec)}
         content = {"starcat": __version__, "asked": what_is_read(spec), "files": files}
         return hashlib.sha256(json_bytes(content)).hexdigest()[:32]
+
+
+def _busy(what: str, again_s: int) -> Problem:
+    headers = {"Retry-After": str(again_s)}
+    return Problem(503, f"{what}; ask again in {again_s} s", headers=headers)
 
 
 def is_here(name: str) -> bool:
@@ -265,7 +312,8 @@ def check_size(spec: BuildSpec) -> None:
         limit = spec.catalog.read_limit_mag
         key = "catalog.read_limit_mag"
         if name in spec.catalog.motions:
-            limit, key = spec.products.crossmatch.read_limit_mag, "crossmatch.read_limit_mag"
+            limit = spec.products.crossmatch.read_limit_mag
+            key = "products.crossmatch.read_limit_mag"
         size = sum(stamp[1] for stamp in _stamps(name))
         if limit is None and size > MOST_INPUT_BYTES:
             raise Problem(
@@ -284,14 +332,8 @@ def _sources_read(spec: BuildSpec) -> tuple[str, ...]:
 
 def _stamps(name: str) -> list[tuple[str, int, int]]:
     """Return path, size and time of the files of a source."""
-    files: list[Path] = []
-    for path in locate(name, {}):
-        if path.is_dir() and is_store(path):
-            files += sorted(one for one in path.rglob("*") if one.is_file())
-        else:
-            files += [file.path for file in find_files(data_source(name), [path])]
     found = []
-    for path in files:
+    for path in source_files(name, locate(name, {})):
         stat = path.stat()
         found.append((str(path), stat.st_size, stat.st_mtime_ns))
     return found

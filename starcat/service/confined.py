@@ -18,8 +18,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from starcat import errors
-from starcat.errors import ConfigError, QueryLimitError, StarcatError
+from starcat.errors import QueryLimitError, error_of_kind
 from starcat.service import turns
 from starcat.service.problems import Problem
 from starcat.service.settings import Settings
@@ -65,7 +64,7 @@ class Confined:
 
         Parameters
         ----------
-        task : {"identify", "convert"}
+        task : {"identify", "convert", "upload"}
             What.
         arguments : mapping
             As JSON has them.
@@ -124,7 +123,12 @@ class Confined:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            env={**os.environ, "MPLCONFIGDIR": str(self._scratch / "matplotlib")},
+            # astropy tries out a temporary file where it writes FITS.
+            env={
+                **os.environ,
+                "MPLCONFIGDIR": str(self._scratch / "matplotlib"),
+                "TMPDIR": str(self._scratch),
+            },
         )
         with suppress(OSError):
             opening = {"scratch": str(self._scratch), "memory_bytes": self._memory_bytes}
@@ -174,12 +178,9 @@ def _write(process: subprocess.Popen[bytes], content: Mapping[str, Any]) -> None
 
 def _error_of(answer: Mapping[str, Any]) -> Exception:
     """Return the error that a process told of."""
-    kind = getattr(errors, str(answer["kind"]), None)
-    if isinstance(kind, type) and issubclass(kind, ConfigError):
-        return kind(answer["words"], key=answer.get("key"))
-    if isinstance(kind, type) and issubclass(kind, StarcatError):
-        with suppress(TypeError):
-            return kind(answer["words"])
+    told = error_of_kind(str(answer["kind"]), str(answer["words"]), key=answer.get("key"))
+    if told is not None:
+        return told
     return RuntimeError(f"{answer['kind']}: {answer['words']}")
 
 

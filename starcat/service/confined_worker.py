@@ -17,8 +17,13 @@ from typing import Any
 from starcat.query.confinement import forbid_writing, limit_memory, limit_time
 from starcat.service.converting import convert
 from starcat.service.identifying import identify
+from starcat.vo.uploads import upload_facts
 
-TASKS: dict[str, Callable[..., Any]] = {"identify": identify, "convert": convert}
+TASKS: dict[str, Callable[..., Any]] = {
+    "identify": identify,
+    "convert": convert,
+    "upload": upload_facts,
+}
 
 
 def serve() -> None:

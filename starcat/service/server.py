@@ -1,4 +1,4 @@
-"""The web server: one for each root, and what happens when it is to stop."""
+"""The web server: one for each root."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ import signal
 import socket
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from types import FrameType
+from contextlib import ExitStack, contextmanager
 
 import uvicorn
 from fastapi import FastAPI
@@ -50,31 +49,39 @@ def run_server(settings: Settings, announce: Announce) -> None:
     Raises
     ------
     ConfigError
-        If others than this machine are to reach it and nobody has a token, if the port is taken,
-        or if another server runs with the same root.
+        If another server runs with the same root, if others than this machine are to reach it and
+        nobody has a token, or if the port is taken.
     OutputError
         If the root cannot be written to.
     """
     places = Places(settings.root)
-    try:
-        make_folder(places.root)
-        with locked(places.lock, wait=False):
-            _serve(settings, places, announce)
-    except BlockingIOError:
-        raise ConfigError(
-            f"another server runs with --root {places.root}; stop it, or choose another root",
-            key="root",
-            value=str(places.root),
-        ) from None
-    except OSError as error:
-        raise OutputError(
-            f"{places.root}: cannot be used ({reason(error)}); choose another --root",
-            path=places.root,
-        ) from error
+    with _only_server(places):
+        shutil.rmtree(places.scratch, ignore_errors=True)
+        _serve(settings, announce)
 
 
-def _serve(settings: Settings, places: Places, announce: Announce) -> None:
-    shutil.rmtree(places.scratch, ignore_errors=True)
+@contextmanager
+def _only_server(places: Places) -> Iterator[None]:
+    """See that no other server uses a root."""
+    with ExitStack() as stack:
+        try:
+            make_folder(places.root)
+            stack.enter_context(locked(places.lock, wait=False))
+        except BlockingIOError:
+            raise ConfigError(
+                f"another server runs with --root {places.root}; stop it, or choose another root",
+                key="root",
+                value=str(places.root),
+            ) from None
+        except OSError as error:
+            raise OutputError(
+                f"{places.root}: cannot be used ({reason(error)}); choose another --root",
+                path=places.root,
+            ) from error
+        yield
+
+
+def _serve(settings: Settings, announce: Announce) -> None:
     app = make_app(settings)
     _see_to_tokens(app.state.identities.tokens, settings)
     listening = _listen(settings)
@@ -108,11 +115,11 @@ class _Server(uvicorn.Server):
         if self.started and sockets:
             self._announce(_address(self._service.settings, sockets[0].getsockname()[1]))
 
-    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Begin to stop: requests, streams of events and jobs end at the same time."""
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Stop: streams of events end at once, requests and jobs within the time that they have."""
         self._service.stopping.set()
         self._workers.begin_stop()
-        super().handle_exit(sig, frame)
+        await super().shutdown(sockets)
 
 
 def _address(settings: Settings, port: int) -> str:

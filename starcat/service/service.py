@@ -8,6 +8,7 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
+from starcat.service.catalogs import Catalogs
 from starcat.service.confined import Confined
 from starcat.service.jobs.job import JobStore
 from starcat.service.jobs.queue import JobQueue, open_queue
@@ -17,6 +18,11 @@ from starcat.service.sessions import Sessions
 from starcat.service.settings import Settings
 from starcat.service.shelf import Shelf
 from starcat.service.vo.tap_service import Tap
+
+READ = "read"
+"""Folder, among the catalogs, of what estimates start from."""
+
+GIB = 2**30
 
 
 @dataclass(frozen=True)
@@ -43,6 +49,8 @@ class Service:
         Processes that read uploads and make files.
     tap : Tap
         What TAP needs.
+    catalogs : Catalogs
+        The catalogs there are, and estimates from them.
     stopping : threading.Event
         Set when the service stops.
     """
@@ -56,6 +64,7 @@ class Service:
     confined: Confined
     tap: Tap
     queue: JobQueue
+    catalogs: Catalogs
     stopping: threading.Event = field(default_factory=threading.Event)
 
 
@@ -83,6 +92,8 @@ def open_service(settings: Settings) -> Service:
     places.make()
     records = Records(places.records)
     shelf, sessions = Shelf(places), Sessions(settings)
+    most = round(settings.job_memory_gib * GIB)
+    confined = Confined(settings, places.scratch)
     return Service(
         settings=settings,
         places=places,
@@ -90,9 +101,10 @@ def open_service(settings: Settings) -> Service:
         shelf=shelf,
         jobs=JobStore(records),
         sessions=sessions,
-        confined=Confined(settings, places.scratch),
-        tap=Tap(settings, places, records, shelf, sessions),
+        confined=confined,
+        tap=Tap(settings, places, records, shelf, sessions, confined),
         queue=open_queue(settings, places),
+        catalogs=Catalogs(places.catalogs / READ, most),
     )
 
 

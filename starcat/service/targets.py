@@ -10,6 +10,7 @@ from starcat.errors import TargetMissing
 from starcat.service.places import DATABASE_ID
 from starcat.service.problems import Problem
 from starcat.service.service import Service
+from starcat.service.shelf import Database
 
 CATALOG = re.compile(r"(?P<source>[a-z0-9_]{1,64})-[0-9a-f]{16}(\.parquet)?", re.ASCII)
 """How the files and folders of catalogs are called."""
@@ -61,15 +62,43 @@ def target_paths(service: Service, names: Sequence[str]) -> list[Path]:
     return [_target(service, name) for name in names]
 
 
+def database_of(service: Service, name: str) -> Database:
+    """Return a database by its id or its title.
+
+    Parameters
+    ----------
+    service : Service
+        The service.
+    name : str
+        Sixteen hexadecimal digits, or such as ``gaia-12deg-1.0.0``.
+
+    Returns
+    -------
+    Database
+        The database.
+
+    Raises
+    ------
+    TargetMissing
+        If there is none.
+    Problem
+        With status 409, if several have the title.
+    """
+    titled = [] if DATABASE_ID.fullmatch(name) else _titled(service, name)
+    return titled[0] if titled else service.shelf.database(name)
+
+
+def _titled(service: Service, name: str) -> list[Database]:
+    found = [one for one in service.shelf.databases() if one.title == name]
+    if len(found) > 1:
+        ids = ", ".join(one.id for one in found)
+        raise Problem(409, f"{len(found)} databases are called {name}; say which: {ids}")
+    return found
+
+
 def _target(service: Service, name: str) -> Path:
-    if DATABASE_ID.fullmatch(name):
-        return service.shelf.database(name).folder
-    titled = [one for one in service.shelf.databases() if one.title == name]
-    if len(titled) > 1:
-        ids = ", ".join(one.id for one in titled)
-        raise Problem(409, f"{len(titled)} databases are called {name}; say which: {ids}")
-    if titled:
-        return titled[0].folder
+    if DATABASE_ID.fullmatch(name) or _titled(service, name):
+        return database_of(service, name).folder
     found = [
         service.places.catalogs / one
         for one in catalog_names(service)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -86,6 +87,23 @@ class Rates:
             "least_share": least,
             "most_share": most,
         }
+
+
+def rates_of(content: Mapping[str, Any]) -> Rates:
+    """Return the rates that a report tells.
+
+    Parameters
+    ----------
+    content : mapping
+        What `Rates.as_dict` returned.
+
+    Returns
+    -------
+    Rates
+        Without the frames that were missed.
+    """
+    names = [field.name for field in fields(Rates) if field.name in content]
+    return Rates(**{name: content[name] for name in names})
 
 
 def self_test(

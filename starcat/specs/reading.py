@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import reprlib
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,24 @@ from pydantic import (
 from starcat.errors import ConfigError, quoted, suggest
 from starcat.resources import PathLike, resource_folder
 from starcat.specs.build_spec import BuildSpec
-from starcat.specs.toml_text import read_toml
 
-_SHOWN = reprlib.Repr()
-"""Shows what was found, however long or deep it is."""
+
+class _Shown(reprlib.Repr):
+    """Shows what was found, however long or deep it is."""
+
+    def repr_int(self, x: int, level: int) -> str:
+        """Return a number; Python refuses to write one of more than 4,300 digits."""
+        if x.bit_length() > 1000:
+            return f"a number of {x.bit_length():,} bits"
+        return super().repr_int(x, level)
+
+
+_SHOWN = _Shown()
 
 _SHOWN.maxstring = _SHOWN.maxlong = _SHOWN.maxother = 100
+
+MOST_CHARACTERS, MOST_POINTS = 100_000, 200
+"""Of the text of a spec, and of full stops in a line of it."""
 
 Changes = Mapping[str, str]
 """Values by dotted key, as somebody types them: ``{"camera.fov_x_deg": "16"}``."""
@@ -48,16 +61,82 @@ def read_spec(path: PathLike, changes: Changes | None = None) -> BuildSpec:
     """
     path = Path(path)
     try:
-        content = read_toml(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ConfigError(
             f"{path}: no such spec; 'starcat presets' lists those that ship with starcat"
         ) from None
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: not a readable TOML file: {error}") from error
-    for key, text in (changes or {}).items():
+    return spec_from_dict(changed(content_of_toml(text, str(path)), changes or {}), path.name)
+
+
+def content_of_toml(text: str, origin: str) -> dict[str, Any]:
+    """Read the text of a spec.
+
+    Parameters
+    ----------
+    text : str
+        TOML.
+    origin : str
+        Where it is from, for messages.
+
+    Returns
+    -------
+    dict
+        What it says, not checked yet.
+
+    Raises
+    ------
+    ConfigError
+        If it is not TOML, or no spec can be as long or as deep.
+
+    Notes
+    -----
+    The parser's time grows with the square of the parts of a dotted key: 40 kB of them take 8 s.
+    Such lines are refused before.
+    """
+    if len(text) > MOST_CHARACTERS:
+        raise ConfigError(
+            f"{origin}: {len(text):,} characters; at most {MOST_CHARACTERS:,} are read, and a spec "
+            "with every key explained has 12,000. Leave out what is no spec"
+        )
+    for number, line in enumerate(text.split("\n"), start=1):
+        if line.count(".") > MOST_POINTS:
+            raise ConfigError(
+                f"{origin}: line {number} has {line.count('.'):,} full stops; at most "
+                f"{MOST_POINTS} are read, and a key of a spec has two"
+            )
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        why = "nested too deep" if isinstance(error, RecursionError) else error
+        raise ConfigError(f"{origin}: not a readable TOML file: {why}") from error
+
+
+def changed(content: dict[str, Any], changes: Changes) -> dict[str, Any]:
+    """Change what a spec says, key by key.
+
+    Parameters
+    ----------
+    content : dict
+        Keys as in the TOML file; changed in place.
+    changes : mapping of str to str
+        As `read_spec` takes them.
+
+    Returns
+    -------
+    dict
+        The same.
+
+    Raises
+    ------
+    ConfigError
+        If a key leads through a value.
+    """
+    for key, text in changes.items():
         _change(content, key, text)
-    return spec_from_dict(content, path.name)
+    return content
 
 
 def _change(content: dict[str, Any], key: str, text: str) -> None:
@@ -74,8 +153,8 @@ def _change(content: dict[str, Any], key: str, text: str) -> None:
 
 def _value(text: str) -> Any:
     try:
-        return read_toml(f"value = {text}")["value"]
-    except ValueError:
+        return content_of_toml(f"value = {text}", "")["value"]
+    except ConfigError:
         return text
 
 

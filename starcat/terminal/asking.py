@@ -63,7 +63,7 @@ def answer(targets: Sequence[str], wish: Wish, limits: Limits, rows: int) -> Non
     ConfigError, OutputError
         If the answer cannot be written so, or there.
     """
-    form = _format(wish)
+    form = format_of_wish(wish)
     query, values = _query(wish, len(targets))
     with _opened(targets, limits) as session:
         if query is not None:
@@ -116,7 +116,24 @@ def _opened(targets: Sequence[str], limits: Limits) -> Iterator[Session]:
         yield session
 
 
-def _format(wish: Wish) -> str:
+def format_of_wish(wish: Wish) -> str:
+    """Return the format that an answer is wanted in.
+
+    Parameters
+    ----------
+    wish : Wish
+        The question.
+
+    Returns
+    -------
+    str
+        ``table``, or one of the formats of `starcat.exchange.formats`.
+
+    Raises
+    ------
+    QueryError
+        If there is no such format, or it does not go where the answer is to go.
+    """
     if wish.form in (None, "table") and wish.output is None:
         return "table"
     from starcat.exchange.formats import FORMATS, TEXT_FORMATS, format_of

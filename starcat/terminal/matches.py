@@ -114,6 +114,52 @@ def print_answers(
     return Told(count, identified, first, tuple(missing))
 
 
+def print_contents(
+    contents: Sequence[dict[str, Any]], database: str, *, as_json: bool, as_lines: bool = False
+) -> Told:
+    """Print the answers that a service gives to the frames of a file.
+
+    Parameters
+    ----------
+    contents : sequence of dict
+        What `answer_content` returned there.
+    database : str
+        Its name.
+    as_json : bool
+        Whether to print JSON: always a list, with an object a frame.
+    as_lines : bool, default False
+        Whether to print such an object on a line of its own.
+
+    Returns
+    -------
+    Told
+        How many were identified.
+    """
+    if as_lines:
+        for one in contents:
+            print_json_line(one)
+    elif as_json:
+        print_json(list(contents))
+    else:
+        for one in contents:
+            _print_content(one, database)
+    missing = [one for one in contents if one["status"] != "identified"]
+    named = tuple(f"{one['frame']}: {one['status']}" for one in missing[:NAMED])
+    return Told(len(contents), len(contents) - len(missing), None, named)
+
+
+def _print_content(content: dict[str, Any], database: str) -> None:
+    rows: list[tuple[str, Any]] = []
+    for name, value in content.items():
+        if name == "refusal":
+            rows += [("because", value["words"]), ("try", value["advice"])]
+        elif value is not None and not isinstance(value, list):
+            rows.append((name, f"{value:.9g}" if isinstance(value, float) else value))
+    print_table(f"{len(content['stars'])} centroids, {database}", ("", ""), rows)
+    if content["status"] == "identified":
+        _print_stars(content["stars"])
+
+
 def _content(
     frame: MeasuredFrame, result: MatchResult, observer: Observer | None
 ) -> dict[str, Any]:
@@ -137,16 +183,20 @@ def _print_one(frame: MeasuredFrame, result: MatchResult, database: Database) ->
         rows.append((f"dropped, {reason.replace('_', ' ')}", count))
     print_table(f"{len(frame.centroids_px)} centroids, {database.name}", ("", ""), rows)
     if result.ok:
-        heads = ("x px", "y px", "star", "mag", "RA deg", "Dec deg", "dx px", "dy px")
-        lines = [
-            (f"{s['x_px']:.2f}", f"{s['y_px']:.2f}", s["star"],
-             f"{s['mag']:.2f}", f"{s['ra_deg']:.5f}", f"{s['dec_deg']:+.5f}",
-             f"{s['dx_px']:+.3f}", f"{s['dy_px']:+.3f}")
-            if s["star"] else
-            (f"{_shown(s['x_px'])}", f"{_shown(s['y_px'])}", "-", *5 * ("",))
-            for s in answer_content(frame, result)["stars"]
-        ]  # fmt: skip
-        print_table("Stars", heads, lines, numbers=(0, 1, 3, 4, 5, 6, 7))
+        _print_stars(answer_content(frame, result)["stars"])
+
+
+def _print_stars(stars: Sequence[dict[str, Any]]) -> None:
+    heads = ("x px", "y px", "star", "mag", "RA deg", "Dec deg", "dx px", "dy px")
+    lines = [
+        (f"{s['x_px']:.2f}", f"{s['y_px']:.2f}", s["star"],
+         f"{s['mag']:.2f}", f"{s['ra_deg']:.5f}", f"{s['dec_deg']:+.5f}",
+         f"{s['dx_px']:+.3f}", f"{s['dy_px']:+.3f}")
+        if s["star"] else
+        (f"{_shown(s['x_px'])}", f"{_shown(s['y_px'])}", "-", *5 * ("",))
+        for s in stars
+    ]  # fmt: skip
+    print_table("Stars", heads, lines, numbers=(0, 1, 3, 4, 5, 6, 7))
 
 
 def _shown(value: float | None) -> str:

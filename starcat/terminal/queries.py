@@ -6,13 +6,13 @@ import re
 import sys
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Protocol
 
 from starcat.terminal.console import MAX_WIDTH, print_json, print_table, progress_bars, say
 
 if TYPE_CHECKING:
-    from starcat.query.running_query import RunningQuery
+    from starcat.query.columns import Facts
     from starcat.query.session import Session
     from starcat.query.targets import Target, View
 
@@ -42,14 +42,63 @@ def print_first_rows(session: Session, query: str, values: Mapping[str, Any], ro
     print_answer(answer, found, rows)
 
 
-def print_answer(answer: RunningQuery, found: Sequence[tuple[Any, ...]], rows: int) -> None:
+class Described(Protocol):
+    """What is known of an answer: names and types of its columns, their units and meanings."""
+
+    @property
+    def columns(self) -> Sequence[str]:
+        """Names."""
+        ...
+
+    @property
+    def types(self) -> Sequence[str]:
+        """DuckDB's names of their types."""
+        ...
+
+    @property
+    def facts(self) -> Sequence[Facts]:
+        """Unit and meaning of each."""
+        ...
+
+
+@dataclass(frozen=True)
+class Told:
+    """An answer as a service tells of it.
+
+    Attributes
+    ----------
+    described : sequence of mapping
+        ``name``, ``type``, ``unit`` and ``description`` of each column.
+    """
+
+    described: Sequence[Mapping[str, str]]
+
+    @property
+    def columns(self) -> list[str]:
+        """Names."""
+        return [one["name"] for one in self.described]
+
+    @property
+    def types(self) -> list[str]:
+        """DuckDB's names of their types."""
+        return [one["type"] for one in self.described]
+
+    @property
+    def facts(self) -> list[Facts]:
+        """Unit and meaning of each."""
+        from starcat.query.columns import Facts
+
+        return [Facts(one["unit"], one["description"]) for one in self.described]
+
+
+def print_answer(answer: Described, found: Sequence[Sequence[Any]], rows: int) -> None:
     """Print the first rows of an answer: as a table, or one below the other if that is too wide.
 
     Parameters
     ----------
-    answer : RunningQuery
+    answer : Described
         What a query finds.
-    found : sequence of tuple
+    found : sequence of sequence
         Its first rows, one more than to print where there are more.
     rows : int
         How many to print at most.

@@ -104,6 +104,8 @@ class _Translator:
         part.comments = None
         if isinstance(part, exp.Table):
             self._names.resolve(part)
+        elif isinstance(part, exp.Column):
+            self._names.shorten(part)
         elif isinstance(part, exp.Literal) and not part.is_string:
             part.replace(_raw(_number(part.name)))
         elif isinstance(part, exp.HexString):

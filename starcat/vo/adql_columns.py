@@ -70,10 +70,23 @@ class Names:
                 table,
                 self._text,
             )
-        if not table.alias and not table.db:
+        view = found.view or found.name
+        if not table.alias and (not table.db or view != found.name):
             table.set("alias", exp.TableAlias(this=exp.to_identifier(table.name, quoted=True)))
-        table.set("this", exp.to_identifier(found.name, quoted=True))
+        table.set("this", exp.to_identifier(view, quoted=True))
         table.set("db", exp.to_identifier(found.schema, quoted=True))
+
+    def shorten(self, column: exp.Column) -> None:
+        """Leave the schema out of the name of a column whose view has another name than its table.
+
+        Parameters
+        ----------
+        column : sqlglot.exp.Column
+            A part of the query.
+        """
+        found = self._tables.find(column.db, column.table) if column.db else None
+        if found is not None and found.view:
+            column.set("db", None)
 
     def columns(self, query: exp.Expr) -> Columns | None:
         """Return the columns that a query gives.

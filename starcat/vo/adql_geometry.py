@@ -13,8 +13,11 @@ ADQL 2.1, section 4.2. Todhunter 1886, Spherical Trigonometry, for the area.
 from __future__ import annotations
 
 import math
+import operator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import cached_property
+from itertools import pairwise
 
 Term = float | str
 """A number, or SQL that gives one."""
@@ -23,6 +26,10 @@ Vector = tuple[Term, Term, Term]
 
 MARGIN_DEG = 1e-9
 """By how much the band of declinations is wider that is looked at first."""
+
+_COMPARISONS: dict[str, Callable[[float, float], bool]] = {
+    "<": operator.lt, ">": operator.gt, "<=": operator.le, ">=": operator.ge, "=": operator.eq,
+}  # fmt: skip
 
 SQUARE_DEGREES = (180.0 / math.pi) ** 2
 
@@ -112,7 +119,7 @@ class Polygon:
         """The area in steradians; negative where the corners go clockwise as seen from inside."""
         first, *others = (corner.vector for corner in self.corners)
         parts: list[Term] = []
-        for a, b in zip(others, others[1:], strict=False):
+        for a, b in pairwise(others):
             whole = _sum(1.0, _dot(first, a), _dot(a, b), _dot(b, first))
             parts.append(_times(2.0, _arctan(_dot(first, _cross(a, b)), whole)))
         return _sum(*parts)
@@ -135,22 +142,23 @@ def contains(inner: Shape, outer: Shape) -> str:
         True, false, or null where a number is missing. The edge of a circle is within it.
     """
     if isinstance(outer, Point):
-        return f"({_apart(inner, outer)} = 0)" if isinstance(inner, Point) else "false"
+        return _compared(_apart(inner, outer), "=", 0.0) if isinstance(inner, Point) else "false"
     if isinstance(outer, Circle):
         if isinstance(inner, Point):
             return _in_circle(inner, outer)
         if isinstance(inner, Circle):
-            return f"({_apart(inner.centre, outer.centre)} + {inner.radius} <= {outer.radius})"
+            reach = _plus(_apart(inner.centre, outer.centre), _term(inner.radius))
+            return _compared(reach, "<=", _term(outer.radius))
         return _all(_in_circle(corner, outer) for corner in inner.corners)
     if isinstance(inner, Point):
         return _in_polygon(inner, outer)
     if isinstance(inner, Circle):
-        edge = " AND ".join(
-            f"{_from_side(inner.centre, a, b)} >= {inner.radius}" for a, b in outer.sides
-        )
-        return f"({_in_polygon(inner.centre, outer)} AND {edge})"
-    within = _all(_in_polygon(corner, outer) for corner in inner.corners)
-    return f"({within} AND NOT {_sides_cross(inner, outer)})"
+        centre, radius = inner.centre, _term(inner.radius)
+        edge = (_compared(_from_side(centre, a, b), ">=", radius) for a, b in outer.sides)
+        return _all([_in_polygon(centre, outer), *edge])
+    within = [_in_polygon(corner, outer) for corner in inner.corners]
+    crossing = _sides_cross(inner, outer)
+    return _all([*within, {"true": "false", "false": "true"}.get(crossing, f"NOT {crossing}")])
 
 
 def intersects(one: Shape, other: Shape) -> str:
@@ -171,21 +179,21 @@ def intersects(one: Shape, other: Shape) -> str:
     if isinstance(other, Point):
         return contains(other, one)
     if isinstance(one, Circle) and isinstance(other, Circle):
-        return f"({_apart(one.centre, other.centre)} <= {one.radius} + {other.radius})"
+        reach = _plus(_term(one.radius), _term(other.radius))
+        return _compared(_apart(one.centre, other.centre), "<=", reach)
     if isinstance(one, Circle) and isinstance(other, Polygon):
-        near = " OR ".join(
-            f"{_from_side(one.centre, a, b)} <= {one.radius}" for a, b in other.sides
-        )
-        return f"({_in_polygon(one.centre, other)} OR {near})"
+        centre, radius = one.centre, _term(one.radius)
+        near = (_compared(_from_side(centre, a, b), "<=", radius) for a, b in other.sides)
+        return _any([_in_polygon(centre, other), *near])
     if isinstance(one, Polygon) and isinstance(other, Polygon):
         inside = [_in_polygon(one.corners[0], other), _in_polygon(other.corners[0], one)]
-        return f"({' OR '.join(inside)} OR {_sides_cross(one, other)})"
+        return _any([*inside, _sides_cross(one, other)])
     return intersects(other, one)
 
 
 def distance(one: Point, other: Point) -> str:
     """Return SQL of the separation of two places, degrees."""
-    return _apart(one, other)
+    return _text(_apart(one, other))
 
 
 def area(shape: Shape) -> str:
@@ -255,13 +263,12 @@ def _folded(middle: str, sign: str, width: str) -> str:
 
 
 def _in_circle(place: Point, circle: Circle) -> str:
-    near = f"{_apart(place, circle.centre)} <= {circle.radius}"
-    lat, radius = _number(circle.centre.lat), _number(circle.radius)
-    if lat is None or radius is None:
-        low = f"{circle.centre.lat} - ({circle.radius}) - {MARGIN_DEG}"
-        high = f"{circle.centre.lat} + ({circle.radius}) + {MARGIN_DEG}"
-    else:
-        low, high = _text(lat - radius - MARGIN_DEG), _text(lat + radius + MARGIN_DEG)
+    near = _compared(_apart(place, circle.centre), "<=", _term(circle.radius))
+    if place.known:
+        return near
+    lat, radius = _term(circle.centre.lat), _term(circle.radius)
+    reach = _plus(radius, MARGIN_DEG)
+    low, high = _text(_plus(lat, _times(-1.0, reach))), _text(_plus(lat, reach))
     # Declinations are looked at first: files tell which they have.
     return f"({place.lat} BETWEEN {low} AND {high} AND {near})"
 
@@ -275,9 +282,9 @@ def _in_polygon(place: Point, polygon: Polygon) -> str:
         along = _sum(_dot(u, v), _times(-1.0, _times(_dot(p, u), _dot(p, v))))
         angles.append(_arctan(across, along))
     round_ = _times(_sign(polygon.turn), _sum(*angles))
-    inside = f"{_text(round_)} > pi()"
-    band = _band(polygon)
-    return f"({place.lat} BETWEEN {band[0]} AND {band[1]} AND {inside})" if band else f"({inside})"
+    inside = _compared(round_, ">", math.pi)
+    band = None if place.known else _band(polygon)
+    return f"({place.lat} BETWEEN {band[0]} AND {band[1]} AND {inside})" if band else inside
 
 
 def _band(polygon: Polygon) -> tuple[str, str] | None:
@@ -299,16 +306,20 @@ def _band(polygon: Polygon) -> tuple[str, str] | None:
     return _text(lat - reach - 1e-6), _text(lat + reach + 1e-6)
 
 
-def _from_side(place: Point, a: Point, b: Point) -> str:
-    """Return SQL of the separation of a place from the arc between two others, degrees."""
+def _from_side(place: Point, a: Point, b: Point) -> Term:
+    """Return the separation of a place from the arc between two others, degrees."""
     p, u, v = place.vector, a.vector, b.vector
     normal = _cross(u, v)
-    height = f"degrees({_text(_arctan(_dot(p, normal), _root(_dot(_cross(p, normal), _cross(p, normal)))))})"
-    beside = (
-        f"{_text(_dot(p, _cross(normal, u)))} >= 0 AND {_text(_dot(p, _cross(v, normal)))} >= 0"
-    )
-    ends = f"least({_apart(place, a)}, {_apart(place, b)})"
-    return f"(CASE WHEN {beside} THEN abs({height}) ELSE {ends} END)"
+    away = _cross(p, normal)
+    height = _arctan(_dot(p, normal), _root(_dot(away, away)))
+    beside = _dot(p, _cross(normal, u)), _dot(p, _cross(v, normal))
+    ends = _apart(place, a), _apart(place, b)
+    if isinstance(height, float) and place.known and a.known and b.known:
+        is_beside = min(map(float, beside)) >= 0.0
+        return math.degrees(abs(height)) if is_beside else min(map(float, ends))
+    asked = " AND ".join(_compared(one, ">=", 0.0) for one in beside)
+    nearest = f"least({_text(ends[0])}, {_text(ends[1])})"
+    return f"(CASE WHEN {asked} THEN abs(degrees({_text(height)})) ELSE {nearest} END)"
 
 
 def _sides_cross(one: Polygon, other: Polygon) -> str:
@@ -317,26 +328,52 @@ def _sides_cross(one: Polygon, other: Polygon) -> str:
     for a, b in one.sides:
         for c, d in other.sides:
             u, v, w, t = a.vector, b.vector, c.vector, d.vector
-            turns = [
-                _text(_dot(u, _cross(w, v))), _text(_dot(w, _cross(v, t))),
-                _text(_dot(v, _cross(t, u))), _text(_dot(t, _cross(u, w))),
-            ]  # fmt: skip
-            found.append(f"least({', '.join(turns)}) > 0 OR greatest({', '.join(turns)}) < 0")
-    return f"({' OR '.join(found)})"
+            turns = (
+                _dot(u, _cross(w, v)), _dot(w, _cross(v, t)),
+                _dot(v, _cross(t, u)), _dot(t, _cross(u, w)),
+            )  # fmt: skip
+            found += [_all(_compared(turn, sign, 0.0) for turn in turns) for sign in "<>"]
+    return _any(found)
 
 
-def _all(conditions: object) -> str:
-    return f"({' AND '.join(conditions)})"  # type: ignore[arg-type]
+def _compared(a: Term, sign: str, b: Term) -> str:
+    """Return SQL of a comparison, or its value where both numbers are known."""
+    if isinstance(a, float) and isinstance(b, float):
+        return "true" if _COMPARISONS[sign](a, b) else "false"
+    return f"({_text(a)} {sign} {_text(b)})"
 
 
-def _apart(one: Shape, other: Shape) -> str:
-    if not (isinstance(one, Point) and isinstance(other, Point)):
-        raise TypeError("separations are those of places")
+def _all(conditions: Iterable[str]) -> str:
+    left = [one for one in conditions if one != "true"]
+    return "false" if "false" in left else _joined(left, " AND ", "true")
+
+
+def _any(conditions: Iterable[str]) -> str:
+    left = [one for one in conditions if one != "false"]
+    return "true" if "true" in left else _joined(left, " OR ", "false")
+
+
+def _joined(conditions: list[str], word: str, nothing: str) -> str:
+    return f"({word.join(conditions)})" if conditions else nothing
+
+
+def _apart(one: Point, other: Point) -> Term:
+    """Return the separation of two places, degrees."""
+    if one.known and other.known:
+        across = _cross(one.vector, other.vector)
+        return math.degrees(
+            float(_arctan(_root(_dot(across, across)), _dot(one.vector, other.vector)))
+        )
     return f"separation({one.lon}, {one.lat}, {other.lon}, {other.lat})"
 
 
 def _list(*numbers: str) -> str:
     return f"[{', '.join(f'({number})::DOUBLE' for number in numbers)}]"
+
+
+def _term(text: str) -> Term:
+    found = _number(text)
+    return f"({text})" if found is None else found
 
 
 def _number(text: str) -> float | None:
@@ -369,7 +406,10 @@ def _plus(a: Term, b: Term) -> Term:
 
 
 def _sum(*terms: Term) -> Term:
-    return reduce(_plus, terms, 0.0)
+    total: Term = 0.0
+    for term in terms:
+        total = _plus(total, term)
+    return total
 
 
 def _over(a: Term, b: Term) -> Term:

@@ -15,7 +15,7 @@ import re
 from sqlglot import exp, parser, tokens
 from sqlglot.dialects.dialect import Dialect
 from sqlglot.errors import ParseError, TokenError
-from sqlglot.tokens import TokenType
+from sqlglot.tokenizer_core import TokenType
 
 from starcat.errors import QueryError, quoted
 
@@ -50,7 +50,10 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _ARGUMENTS: dict[type[exp.Expr], frozenset[str]] = {
     kind: frozenset(names.split())
     for kind, names in (
-        (exp.Select, "expressions distinct limit from_ joins where group having order offset with_"),
+        (
+            exp.Select,
+            "expressions distinct limit from_ joins where group having order offset with_",
+        ),
         (exp.Union, "this expression distinct order offset with_"),
         (exp.Except, "this expression distinct order offset with_"),
         (exp.Intersect, "this expression distinct order offset with_"),
@@ -69,11 +72,13 @@ _ARGUMENTS: dict[type[exp.Expr], frozenset[str]] = {
         (exp.LT, "this expression"), (exp.LTE, "this expression"),
         (exp.Between, "this low high"), (exp.In, "this expressions query"), (exp.Exists, "this"),
         (exp.Is, "this expression"), (exp.Like, "this expression negate"),
-        (exp.ILike, "this expression negate"), (exp.Concat, "expressions safe coalesce"), (exp.Add, "this expression"),
+        (exp.ILike, "this expression negate"), (exp.Concat, "expressions safe coalesce"),
+        (exp.Add, "this expression"),
         (exp.Sub, "this expression"), (exp.Mul, "this expression"),
         (exp.Div, "this expression typed safe"), (exp.Neg, "this"),
         (exp.DPipe, "this expression safe"), (exp.Anonymous, "this expressions"),
-        (exp.Cast, "this to"), (exp.DataType, "this expressions nested"), (exp.DataTypeParam, "this"),
+        (exp.Cast, "this to"), (exp.DataType, "this expressions nested"),
+        (exp.DataTypeParam, "this"),
     )
 }  # fmt: skip
 """Kinds of parts that a query may have, and what each of them may hold."""
@@ -88,7 +93,7 @@ _ADVICE = {
 }
 
 _TYPES = {
-    "CHAR": "VARCHAR", "VARCHAR": "VARCHAR", "SMALLINT": "SMALLINT", "INTEGER": "INTEGER",
+    "CHAR": "VARCHAR", "VARCHAR": "VARCHAR", "SMALLINT": "SMALLINT", "INTEGER": "INT",
     "BIGINT": "BIGINT", "REAL": "FLOAT", "DOUBLE PRECISION": "DOUBLE", "TIMESTAMP": "TIMESTAMP",
 }  # fmt: skip
 """What CAST may make, and how DuckDB calls it."""
@@ -109,6 +114,10 @@ class _Parser(parser.Parser):
     NO_PAREN_FUNCTION_PARSERS = {}  # noqa: RUF012
     STATEMENT_PARSERS = {}  # noqa: RUF012
     FUNCTION_PARSERS = {"CAST": lambda self: self.parse_adql_cast()}  # noqa: RUF012
+
+    def _parse_limit_options(self) -> exp.LimitOptions | None:
+        # Behind the number of TOP stands a column, which may be called row.
+        return None
 
     def parse_adql_cast(self) -> exp.Expr:
         """Return the cast whose parenthesis was just opened."""
@@ -178,8 +187,8 @@ def parse_adql(text: str) -> exp.Expr:
         first = next(iter(dialect.tokenize(text)), None)
         if first is not None and first.text.upper() not in ("SELECT", "WITH", "("):
             raise QueryError(
-                f"no ADQL: found {quoted(first.text)}; a query begins with SELECT or WITH, and only "
-                "reads"
+                f"no ADQL: found {quoted(first.text)}; a query begins with SELECT or WITH, and "
+                "only reads"
             )
         found = [tree for tree in dialect.parse(text) if tree is not None]
         if len(found) != 1:
@@ -305,8 +314,8 @@ def _is_whole(node: exp.Expr) -> bool:
 def _check_name(part: exp.Identifier, text: str) -> None:
     if not _NAME.fullmatch(part.name):
         raise refuse(
-            f"{quoted(part.name)} is no name: names have letters, digits and underscores and begin "
-            'with a letter; write others in double quotes, as "2mass"',
+            f"no ADQL: {quoted(part.name)} is no name: it has letters, digits and underscores "
+            'and begins with a letter; write others in double quotes, as "2mass"',
             part,
             text,
         )

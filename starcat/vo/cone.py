@@ -18,7 +18,7 @@ from starcat.query.names import quoted as sql_text
 from starcat.query.names import quoted_name
 from starcat.query.session import Session
 from starcat.query.targets import POSITION, View
-from starcat.vo.results import ResultFormat, result_format
+from starcat.vo.formats import Format, format_named
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -52,8 +52,10 @@ class ConeRequest:
         1 for identity and place, 2 for all columns with a UCD, 3 for all.
     maxrec : int, optional
         Rows at most; None where that is not said.
-    form : ResultFormat
+    form : Format
         How the answer is written.
+    media_type : str
+        What it is sent as.
     """
 
     ra_deg: float
@@ -61,7 +63,8 @@ class ConeRequest:
     radius_deg: float
     verbosity: int
     maxrec: int | None
-    form: ResultFormat
+    form: Format
+    media_type: str
 
 
 def cone_request(parameters: Iterable[tuple[str, str]]) -> ConeRequest:
@@ -98,7 +101,7 @@ def cone_request(parameters: Iterable[tuple[str, str]]) -> ConeRequest:
         radius_deg,
         _whole(given, "VERB", _USUAL, _BRIEF, _ALL) or _USUAL,
         _whole(given, "MAXREC", None, 0, None),
-        result_format(given.get("RESPONSEFORMAT"), "text/xml"),
+        *_form(given.get("RESPONSEFORMAT", "")),
     )
 
 
@@ -247,6 +250,14 @@ def _degrees(given: Mapping[str, str], key: str) -> float:
             value=given[key],
         )
     return value
+
+
+def _form(text: str) -> tuple[Format, str]:
+    """Return a format and its media type; by default what readers of all ages know."""
+    if text.strip().lower() in ("", "text/xml"):
+        return format_named("votable/td"), MEDIA_TYPE
+    form = format_named(text)
+    return form, form.media_type
 
 
 def _whole(

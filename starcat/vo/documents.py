@@ -11,10 +11,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import datetime
-from typing import TypeVar
+from typing import Any, Literal, TypeVar
 from xml.sax.saxutils import escape
 
-from pydantic import field_validator
+from pydantic import AnyUrl, field_validator
 from pydantic_xml import BaseXmlModel
 from vo_models.tapregext.models import (
     DataLimit,
@@ -28,7 +28,7 @@ from vo_models.tapregext.models import (
     UploadMethod,
     Version,
 )
-from vo_models.vodataservice.models import ForeignKey, TableParam, TableSchema
+from vo_models.vodataservice.models import DataType, ForeignKey, TableParam, TableSchema
 from vo_models.vodataservice.models import Table as TableElement
 from vo_models.voresource.models import AccessURL, Capability, Interface
 from vo_models.voresource.types import UTCTimestamp
@@ -39,7 +39,7 @@ from vo_models.vosi.tables.models import VOSITable, VOSITableSet
 from starcat.vo.adql import GEOMETRY
 from starcat.vo.adql_functions import USER_FUNCTIONS
 from starcat.vo.formats import FORMATS
-from starcat.vo.tables import Schema, Table, Tables, adql_name, full_name
+from starcat.vo.tables import Column, Schema, Table, Tables, adql_name, full_name
 from starcat.vo.uws import xml_text
 
 MEDIA_TYPE = "application/xml"
@@ -59,9 +59,9 @@ LANGUAGE_FEATURES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
     ("adql-type", (("CAST", ""),)),
     ("adql-unit", (("IN_UNIT", ""),)),
     ("adql-offset", (("OFFSET", ""),)),
-    ("adql-conditional", (("COALESCE", ""),)),
 )
-"""What ADQL leaves to services, and is there."""
+"""What ADQL leaves to services, and is there. COALESCE is there too, but clients that check what
+they read know no name for it yet."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,9 @@ def capabilities(base_url: str, limits: ServiceLimits) -> bytes:
         ("ivo://ivoa.net/std/DALI#examples", "examples", None),
     ]
     found: list[Capability] = [
-        Capability(standard_id=name, interface=[_interface(f"{base_url}/{path}", "full", version)])
+        Capability(
+            standard_id=AnyUrl(name), interface=[_interface(f"{base_url}/{path}", "full", version)]
+        )
         for name, path, version in others
     ]
     return _document(VOSICapabilities(capability=[_table_access(base_url, limits), *found]))
@@ -149,7 +151,10 @@ def _table_access(base_url: str, limits: ServiceLimits) -> TableAccess:
             )
             for one in FORMATS
         ],
-        upload_method=[UploadMethod(ivo_id="ivo://ivoa.net/std/TAPRegExt#upload-inline")],
+        upload_method=[
+            UploadMethod(ivo_id=f"ivo://ivoa.net/std/TAPRegExt#upload-{kind}")
+            for kind in ("inline", "http")
+        ],
         retention_period=TimeLimits(default=limits.keep_s, hard=limits.keep_s),
         execution_duration=TimeLimits(default=limits.run_s, hard=limits.run_s),
         output_limit=DataLimits(default=rows, hard=rows),
@@ -157,8 +162,10 @@ def _table_access(base_url: str, limits: ServiceLimits) -> TableAccess:
     )
 
 
-def _interface(url: str, use: str, version: str | None, role: str | None = None) -> Interface:
-    address = AccessURL(value=url, use=use)
+def _interface(
+    url: str, use: Literal["full", "base"], version: str | None, role: str | None = None
+) -> Interface:
+    address = AccessURL(value=AnyUrl(url), use=use)
     return Interface(type="vs:ParamHTTP", access_url=[address], version=version, role=role)
 
 
@@ -230,8 +237,8 @@ def _described(element: Element, text: str) -> Element:
     return element
 
 
-def _about(table: Table, with_columns: bool) -> dict[str, object]:
-    about: dict[str, object] = {
+def _about(table: Table, with_columns: bool) -> dict[str, Any]:
+    about: dict[str, Any] = {
         "table_type": "table",
         "table_name": full_name(table),
     }
@@ -244,11 +251,8 @@ def _about(table: Table, with_columns: bool) -> dict[str, object]:
             unit=one.unit or None,
             ucd=one.ucd or None,
             xtype=one.xtype or None,
-            datatype=one.datatype,
-            arraysize=one.arraysize or None,
-            principal=int(one.is_principal),
-            indexed=int(one.is_indexed),
-            std=int(one.is_standard),
+            datatype=DataType(value=one.datatype, arraysize=one.arraysize or None),
+            flag=[name for name, is_so in _flags(one) if is_so],
         )
         for one in table.columns
     ]
@@ -262,6 +266,14 @@ def _about(table: Table, with_columns: bool) -> dict[str, object]:
         for key in table.keys
     ]
     return {**about, "column": columns, "foreign_key": keys}
+
+
+def _flags(column: Column) -> tuple[tuple[str, bool], ...]:
+    return (
+        ("principal", column.is_principal),
+        ("indexed", column.is_indexed),
+        ("std", column.is_standard),
+    )
 
 
 def error_votable(message: str) -> bytes:

@@ -35,7 +35,9 @@ def examples(tables: Tables) -> list[tuple[str, str, str]]:
             f"SELECT table_name, description FROM {NAME}.tables ORDER BY table_name",
         )
     ]
-    stars = next((table for table in tables if _has(table, *POSITION, "mag")), None)
+    with_places = [table for table in tables if _has(table, *POSITION, "mag")]
+    # What was rejected has places too.
+    stars = min(with_places, key=lambda table: table.name != "stars", default=None)
     if stars is not None:
         name = full_name(stars)
         place = ", ".join(map(adql_name, POSITION))
@@ -43,21 +45,23 @@ def examples(tables: Tables) -> list[tuple[str, str, str]]:
             (
                 "cone",
                 "Stars within 10 degrees of a place, the brightest first",
-                f"SELECT *, DISTANCE(POINT({place}), POINT(83.6, -5.4)) AS separation_deg "
-                f"FROM {name} WHERE 1 = CONTAINS(POINT({place}), CIRCLE(83.6, -5.4, 10)) "
+                f"SELECT *, DISTANCE(POINT('ICRS', {place}), POINT('ICRS', 83.6, -5.4)) "
+                f"AS separation_deg FROM {name} "
+                f"WHERE 1 = CONTAINS(POINT('ICRS', {place}), CIRCLE('ICRS', 83.6, -5.4, 10)) "
                 "ORDER BY mag",
             ),
             (
                 "polygon",
                 "Stars within a polygon",
                 f"SELECT TOP 100 * FROM {name} "
-                f"WHERE 1 = CONTAINS(POINT({place}), POLYGON(70, -20, 110, -20, 90, 20))",
+                f"WHERE 1 = CONTAINS(POINT('ICRS', {place}), "
+                "POLYGON('ICRS', 70, -20, 110, -20, 90, 20))",
             ),
             (
                 "counts",
                 "Stars by whole magnitudes",
-                f"SELECT FLOOR(mag) AS magnitude, COUNT(*) AS stars FROM {name} "
-                "GROUP BY FLOOR(mag) ORDER BY magnitude",
+                f"SELECT magnitude, COUNT(*) AS stars FROM (SELECT FLOOR(mag) AS magnitude "
+                f"FROM {name}) AS m GROUP BY magnitude ORDER BY magnitude",
             ),
         ]
     return found

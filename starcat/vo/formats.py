@@ -31,6 +31,11 @@ class Format:
     suffix: str
     standard_id: str = ""
 
+    @property
+    def is_votable(self) -> bool:
+        """Whether it is a VOTable, which can say that rows were left out."""
+        return self.suffix == "vot"
+
 
 _OUTPUT = "ivo://ivoa.net/std/TAPRegExt#output-votable-"
 
@@ -52,6 +57,8 @@ FORMATS = (
     ),
     Format("fits", "application/fits", ("image/fits",), "fits"),
     Format("csv", "text/csv;header=present", ("text/csv",), "csv"),
+    Format("tsv", "text/tab-separated-values", (), "tsv"),
+    Format("json", "application/json", (), "json"),
     Format(
         "parquet", "application/vnd.apache.parquet",
         ("application/x-parquet", "application/parquet"), "parquet",
@@ -84,6 +91,8 @@ def format_named(text: str | None) -> Format:
     'csv'
     """
     wanted = "".join((text or "votable").lower().split()).replace('"', "")
+    # The plus of a media type that nobody has escaped in an address arrives as a blank.
+    wanted = wanted.replace("x-votablexml", "x-votable+xml")
     for one in FORMATS:
         if wanted in (one.name, one.media_type, *one.aliases):
             return one

@@ -12,12 +12,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from starcat.errors import ConfigError, quoted
-from starcat.query.names import identifier
 from starcat.vo.formats import Format, format_named
 
 LANGUAGES = ("ADQL", "ADQL-2.0", "ADQL-2.1")
 
 MAX_UPLOADS = 10
+
+_RESULT = re.compile(r"https?://[^/?#]+(?:/[^?#]*)?/tap/async/([0-9a-f]{32})/results/result")
+"""The address of an answer of the service, whatever name the client knows its host by."""
 
 _TABLE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}", re.ASCII)
 
@@ -31,11 +33,14 @@ class Upload:
     table : str
         Its name after ``TAP_UPLOAD.``
     part : str
-        Name of the part of the request that it is.
+        Name of the part of the request that it is; empty where it is an answer of the service.
+    job_id : str
+        The job whose answer it is; empty where it is a part of the request.
     """
 
     table: str
-    part: str
+    part: str = ""
+    job_id: str = ""
 
 
 @dataclass(frozen=True)
@@ -196,7 +201,8 @@ def uploads(given: list[str]) -> tuple[Upload, ...]:
     Parameters
     ----------
     given : list of str
-        Values of UPLOAD: ``name,param:part``, several with semicolons between them.
+        Values of UPLOAD: ``name,param:part`` or ``name,`` and the address of an answer of this
+        service; several with semicolons between them.
 
     Returns
     -------
@@ -218,23 +224,20 @@ def uploads(given: list[str]) -> tuple[Upload, ...]:
                 key="UPLOAD",
                 value=pair,
             )
-        if identifier(name) != name.lower():
+        scheme, _, part = place.partition(":")
+        result = _RESULT.fullmatch(place)
+        is_part = scheme.lower() == "param" and part
+        if not is_part and not result:
             raise ConfigError(
-                f"UPLOAD names a table {name}, which is a word of SQL; choose another",
-                key="UPLOAD",
-                value=name,
-            )
-        scheme, colon, part = place.partition(":")
-        if not colon or scheme.lower() != "param" or not part:
-            raise ConfigError(
-                f"UPLOAD of {name} is at {quoted(place)}; nothing is fetched from elsewhere here: "
-                f"send the table in the request and write {name},param:PART",
+                f"UPLOAD of {name} is at {quoted(place)}; nothing is fetched from elsewhere: send "
+                f"the table in the request and write {name},param:PART, or give the address of an "
+                "answer of this service",
                 key="UPLOAD",
                 value=place,
             )
         if name.lower() in [one.table.lower() for one in found]:
             raise ConfigError(f"UPLOAD has {name} twice; give each its own name", key="UPLOAD")
-        found.append(Upload(name, part))
+        found.append(Upload(name, part="" if result else part, job_id=result[1] if result else ""))
     if len(found) > MAX_UPLOADS:
         raise ConfigError(
             f"UPLOAD has {len(found)} tables; at most {MAX_UPLOADS} come with a query", key="UPLOAD"

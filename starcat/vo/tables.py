@@ -91,8 +91,8 @@ class Table:
         What a row is.
     keys : tuple of Key
         References to other tables.
-    rows : int, optional
-        Number of rows where it is known.
+    view : str
+        Name of its view in a session, where it has another; else empty.
     """
 
     schema: str
@@ -100,7 +100,7 @@ class Table:
     columns: tuple[Column, ...]
     description: str = ""
     keys: tuple[Key, ...] = ()
-    rows: int | None = None
+    view: str = ""
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from starcat.errors import SchemaError
+from starcat.exchange.units import unit_text
 from starcat.query.columns import Facts, column_facts
+from starcat.query.names import identifier
 from starcat.query.session import Session
 from starcat.query.targets import View
 from starcat.tables.parquet import write_parquet
 from starcat.vo.tables import Column, Key, Schema, Table, Tables, adql_name, full_name
-from starcat.vo.types import votable_type
+from starcat.vo.types import is_time, votable_type
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -24,7 +27,7 @@ if TYPE_CHECKING:
 NAME = "tap_schema"
 UPLOADS = "tap_upload"
 
-_TEXT = ("char", "*")
+_TEXT = ("unicodeChar", "*")
 _INT = ("int", "")
 
 _COLUMNS: dict[str, dict[str, tuple[tuple[str, str], str]]] = {
@@ -109,6 +112,7 @@ def own_schema() -> Schema:
             ),
             _ABOUT[name],
             _KEYS.get(name, ()),
+            view=identifier(name),
         )
         for name, columns in _COLUMNS.items()
     )
@@ -156,7 +160,8 @@ def _table(session: Session, schema: str, view: View) -> Table:
             Column(
                 name,
                 *votable_type(kind),
-                unit=facts.unit,
+                xtype="timestamp" if is_time(kind) else "",
+                unit=_unit(name, facts.unit),
                 ucd=facts.ucd,
                 description=facts.description,
                 is_indexed=name in first,
@@ -164,6 +169,14 @@ def _table(session: Session, schema: str, view: View) -> Table:
             )
         )
     return Table(schema, view.name, tuple(columns), view.schema.description if view.schema else "")
+
+
+def _unit(column: str, text: str) -> str:
+    """Return a unit as VOTable writes it, which clients compare with answers."""
+    try:
+        return unit_text(column, text, "vounit") or ""
+    except SchemaError:
+        return ""
 
 
 def write_tap_schema(tables: Tables, folder: Path) -> None:

@@ -1,7 +1,7 @@
 """Types of columns: those of DuckDB, and what VOTable and TAP_SCHEMA call them.
 
-An answer has only types that VOTable has; what is wider is brought to the nearest that it has, and
-times become texts as DALI writes them.
+An answer has only types that VOTable has, and times, which are written as text; what is wider is
+brought to the nearest that it has.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _SAME = {
     "BIGINT": "long",
     "FLOAT": "float",
     "DOUBLE": "double",
-    "VARCHAR": "char",
+    "VARCHAR": "unicodeChar",
 }
 """Types of DuckDB that VOTable has."""
 
@@ -33,7 +33,8 @@ _CASTS = {
 
 _LIST = re.compile(r"(.*)\[\d*\]")
 
-TIME_FORMAT = "%Y-%m-%dT%H:%M:%S.%f"
+_TIMES = ("DATE", "TIMESTAMP", "TIMESTAMP_S", "TIMESTAMP_MS", "TIMESTAMP_NS")
+"""What is written as a text of ISO 8601."""
 
 
 def votable_type(kind: str) -> tuple[str, str]:
@@ -57,9 +58,27 @@ def votable_type(kind: str) -> tuple[str, str]:
     found = _LIST.fullmatch(kind)
     if found:
         item = _plain(found[1])
-        return (_SAME[item], "*") if item in _SAME and item != "VARCHAR" else ("char", "*")
+        return ("unicodeChar" if item == "VARCHAR" else _SAME[item]), "*"
+    if kind in _TIMES:
+        return "char", "*"
     name = _SAME[_plain(kind)]
-    return name, "*" if name == "char" else ""
+    return name, "*" if kind == "VARCHAR" or name == "unicodeChar" else ""
+
+
+def is_time(kind: str) -> bool:
+    """Return whether a type of DuckDB is a time that is written as a text.
+
+    Parameters
+    ----------
+    kind : str
+        DuckDB's name.
+
+    Returns
+    -------
+    bool
+        False for times with a zone, and for times of day.
+    """
+    return kind in _TIMES
 
 
 def cast(value: str, kind: str) -> str:
@@ -82,9 +101,8 @@ def cast(value: str, kind: str) -> str:
         item = _plain(found[1])
         wanted = f"{item}[]" if item in _SAME and item != "VARCHAR" else "VARCHAR"
         return value if wanted == kind else f"CAST({value} AS {wanted})"
-    if kind in ("TIMESTAMP", "DATE") or kind.startswith("TIMESTAMP_"):
-        shown = "%Y-%m-%d" if kind == "DATE" else TIME_FORMAT
-        return f"strftime({value}, '{shown}')"
+    if kind in _TIMES:
+        return value
     plain = _plain(kind)
     return value if plain == kind else f"CAST({value} AS {plain})"
 

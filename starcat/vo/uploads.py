@@ -6,16 +6,17 @@ or take more memory than the size of the file explains.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from starcat.errors import ConfigError, quoted
-from starcat.tables.parquet import write_parquet
+from starcat.query.names import identifier
 from starcat.vo.tables import Column, Table
 from starcat.vo.tap_schema import UPLOADS
 
@@ -67,10 +68,12 @@ def read_upload(path: Path, name: str, folder: Path) -> Table:
     arrays, columns = [], []
     for field, column in zip(table.fields, _columns(table), strict=True):
         values = _arrow(column, field.name, name)
+        if field.xtype == "timestamp":
+            values = _times(values)
         kind = values.type
         is_list = pa.types.is_list(kind)
-        datatype = _NAMES[kind.value_type if is_list else kind]
-        size = "*" if is_list or datatype == "unicodeChar" else ""
+        datatype = _NAMES.get(kind.value_type if is_list else kind, "char")
+        size = "*" if is_list or datatype in ("char", "unicodeChar") else ""
         arrays.append(values)
         told = " ".join(str(field.description or "").split())
         unit = str(field.unit) if field.unit is not None else ""
@@ -79,8 +82,30 @@ def read_upload(path: Path, name: str, folder: Path) -> Table:
         )
     _check_names([column.name for column in columns], name)
     names = [column.name for column in columns]
-    write_parquet(pa.table(arrays, names=names), folder / f"{name}.parquet")
-    return Table(UPLOADS, name, tuple(columns), f"The uploaded table {name}")
+    pq.write_table(pa.table(arrays, names=names), folder / f"{name}.parquet")
+    return Table(UPLOADS, name, tuple(columns), f"The uploaded table {name}", view=identifier(name))
+
+
+def upload_facts(path: str, name: str, folder: str) -> dict[str, Any]:
+    """Write an uploaded table as `read_upload` does, where values have to be those of JSON.
+
+    Parameters
+    ----------
+    path, name, folder : str
+        As for `read_upload`.
+
+    Returns
+    -------
+    dict
+        The table as `table_of_facts` takes it.
+    """
+    return asdict(read_upload(Path(path), name, Path(folder)))
+
+
+def table_of_facts(facts: dict[str, Any]) -> Table:
+    """Return the table that `upload_facts` described."""
+    columns = tuple(Column(**column) for column in facts["columns"])
+    return Table(**{**facts, "columns": columns, "keys": ()})
 
 
 def _parsed(path: Path, name: str) -> Any:
@@ -127,6 +152,14 @@ def _arrow(values: Any, field: str, name: str) -> pa.Array:
         return pa.array([one.tolist() for one in lists], pa.list_(_item(item)))
     found = pa.array(np.ascontiguousarray(data.astype(data.dtype.newbyteorder("="))), mask=mask)
     return found.cast(_item(found.type))
+
+
+def _times(values: pa.Array) -> pa.Array:
+    """Return texts as times, if they are."""
+    try:
+        return values.cast(pa.timestamp("us"))
+    except pa.ArrowInvalid:
+        return values
 
 
 def _item(kind: pa.DataType) -> pa.DataType:

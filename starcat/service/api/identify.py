@@ -23,6 +23,7 @@ from starcat.service.file_answers import type_of
 from starcat.service.identifying import CAMERA_NAME, IdentifyOptions
 from starcat.service.problems import Problem
 from starcat.service.service import Service, TheService
+from starcat.service.targets import database_of
 from starcat.service.uploading import safe_name, scratch_folder
 
 router = APIRouter(prefix="/identify", tags=["identify"])
@@ -32,7 +33,8 @@ SUFFIXES = (*IMAGE_SUFFIXES, ".csv", ".json")
 Kind = Literal["png", "svg"]
 
 DatabaseId = Annotated[
-    str, PathParameter(description="Sixteen hexadecimal digits.", examples=["0123456789abcdef"])
+    str,
+    PathParameter(description="Id or title.", examples=["0123456789abcdef", "gaia-12deg-1.0.0"]),
 ]
 
 
@@ -217,7 +219,7 @@ def _options(content: Any) -> IdentifyOptions:
 def _identify(
     service: Service, database: str, asked: _Asked, kind: Kind | None
 ) -> tuple[dict[str, Any], bytes]:
-    artifact = service.shelf.database(database).folder
+    artifact = database_of(service, database).folder
     with scratch_folder(service.places) as folder:
         _keep(asked, folder)
         found = service.confined.call(

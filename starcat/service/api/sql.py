@@ -123,7 +123,7 @@ class ViewColumn(BaseModel):
 class ViewFacts(BaseModel):
     """A table that queries see."""
 
-    schema_name: str = Field(description="Name of the target.")
+    target: str = Field(description="Its schema, where there are several.")
     view: str
     description: str
     columns: list[ViewColumn]
@@ -215,7 +215,7 @@ def _views(service: Service, targets: list[str]) -> list[ViewFacts]:
     with service.sessions.session(target_paths(service, targets)) as session:
         return [
             ViewFacts(
-                schema_name=target.name,
+                target=target.name,
                 view=view.name,
                 description=view.schema.description if view.schema else "",
                 columns=[

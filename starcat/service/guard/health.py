@@ -12,7 +12,6 @@ from pydantic import BaseModel, Field
 
 from starcat.service.access import Reader
 from starcat.service.guard.bodies import free_gib
-from starcat.service.jobs.pool import WorkerPool
 from starcat.service.service import Service, TheService
 
 router = APIRouter(tags=["operations"])
@@ -44,10 +43,9 @@ def alive() -> Alive:
 )
 def ready(request: Request, service: TheService, who: Reader) -> Response:
     """Look at the records, the disk, the catalogs and the workers."""
-    workers: WorkerPool = request.app.state.workers
     reasons = [reason for check in CHECKS if (reason := check(service)) is not None]
-    if not workers.is_alive:
-        reasons.append("the worker does not run, so jobs wait; it is started again by itself")
+    if not request.app.state.workers.is_alive:
+        reasons.append("the process that has jobs done has ended; it is started again")
     content = Readiness(ready=not reasons, reasons=reasons)
     return JSONResponse(content.model_dump(), 503 if reasons else 200)
 

@@ -91,7 +91,7 @@ def source_digests(records: Records, name: str) -> list[str]:
     """
     paths = locate(name, {})
     try:
-        return file_digests(records, _files(name, paths))
+        return file_digests(records, source_files(name, paths))
     except OSError as error:
         raise SourceMissing(
             f"{name}: a file cannot be read ({reason(error)}); the operator has to look at "
@@ -100,7 +100,21 @@ def source_digests(records: Records, name: str) -> list[str]:
         ) from error
 
 
-def _files(name: str, paths: Iterable[Path]) -> list[Path]:
+def source_files(name: str, paths: Iterable[Path]) -> list[Path]:
+    """Return the files that a source is read from.
+
+    Parameters
+    ----------
+    name : str
+        A name of ``data_sources``.
+    paths : iterable of Path
+        Where it was located.
+
+    Returns
+    -------
+    list of Path
+        In reading order; of a store those that name its partitions.
+    """
     found: list[Path] = []
     for path in paths:
         if path.is_dir() and is_store(path):

@@ -43,10 +43,10 @@ class WorkerPool:
 
     @property
     def is_alive(self) -> bool:
-        """Whether jobs are taken; true too where the service wants no workers of its own."""
-        if not self._service.settings.workers:
+        """Whether jobs are taken; true too where no worker was to be started."""
+        if self._thread is None or self._process is None:
             return True
-        return self._process is not None and self._process.poll() is None
+        return self._process.poll() is None
 
     def start(self) -> None:
         """Take up the jobs that an earlier server has left, and have them done."""
@@ -59,6 +59,7 @@ class WorkerPool:
     def begin_stop(self) -> None:
         """Have the worker take no further job, and end when those that run have had their time."""
         self._stopping.set()
+        self._service.queue.is_used.set()
         process = self._process
         if process is not None and process.stdin is not None:
             with suppress(OSError, ValueError):
@@ -77,6 +78,7 @@ class WorkerPool:
         first_s, most_s = PAUSE_S
         pause_s = first_s
         try:
+            self._service.queue.is_used.wait()  # until then no memory is taken
             while not self._stopping.is_set():
                 began_s = time.monotonic()
                 self._run()

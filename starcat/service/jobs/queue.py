@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
+import threading
 from collections.abc import Callable, Iterable
 
 from huey import RedisHuey, SqliteHuey
@@ -41,10 +42,16 @@ class JobQueue:
     ----------
     huey : huey.Huey
         With its store; workers take from it what is sent.
+
+    Attributes
+    ----------
+    is_used : threading.Event
+        Set when this process has sent a message: only then a worker is needed.
     """
 
     def __init__(self, huey: Huey) -> None:
         self.huey = huey
+        self.is_used = threading.Event()
         self._run: Callable[[str], None] | None = None
 
         def run_job(job_id: str) -> None:
@@ -76,6 +83,7 @@ class JobQueue:
         bool
             Whether the message is on its way; where not, it is sent again later.
         """
+        self.is_used.set()
         try:
             self._send(job_id)
         except Exception:  # whatever the library of the store raises: the job is not lost

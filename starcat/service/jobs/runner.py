@@ -222,16 +222,18 @@ class _Run:
         if code == -signal.SIGTERM:  # the system goes down, and has told all processes
             self._attempt.wait_again()
             return
+        job, settings = self._attempt.job, self._slots.service.settings
         name = signal.Signals(-code).name if code < 0 else f"code {code}"
-        hint = ", as a system does that runs out of memory" if code == -signal.SIGKILL else ""
-        self._attempt.fail(
-            _problem(
-                "Ended",
-                500,
-                f"the process of the job ended by {name}{hint}; the operator finds more in "
-                f"jobs/{self._attempt.job.id}/stderr.txt under the root",
-            )
+        hint = {
+            -signal.SIGKILL: ", as a system does that runs out of memory",
+            -signal.SIGABRT: ", as a program does that is refused memory; it may take "
+            f"{settings.job_memory_gib:g} GiB (job_memory_gib)",
+        }.get(code, "")
+        detail = (
+            f"the process of the job ended by {name}{hint}; the operator finds more in "
+            f"jobs/{job.id}/stderr.txt under the root"
         )
+        self._attempt.fail(_problem("Ended", 500, detail))
 
 
 def lines_of(pipe: IO[bytes], tick_s: float) -> Iterator[bytes | None]:

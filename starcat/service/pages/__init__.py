@@ -7,9 +7,11 @@ from fastapi import APIRouter
 from starcat.service.pages import (
     console,
     databases,
+    home,
     identify,
     jobs,
     new,
+    releases,
     sign_in,
     static_files,
 )
@@ -17,10 +19,12 @@ from starcat.service.pages import (
 ROUTERS: tuple[APIRouter, ...] = (
     static_files.router,
     sign_in.router,
+    home.router,
     new.router,
     jobs.router,
     databases.router,
     console.router,
     identify.router,
+    releases.router,
 )
 """Routers of the page, in the order in which they are asked."""

@@ -1,4 +1,4 @@
-"""The SQL console: a question about a database, the first rows of its answer, all of it as a file."""
+"""The SQL console: a question about a database, the first rows of its answer, or all in a file."""
 
 from __future__ import annotations
 

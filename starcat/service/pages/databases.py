@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 from fastapi import Query, Request
-from fastapi.responses import JSONResponse, Response
+from fastapi.responses import JSONResponse, RedirectResponse, Response
 
 from starcat.artifact.diff import diff_artifacts
 from starcat.artifact.reader import Artifact
 from starcat.errors import TargetMissing
 from starcat.matcher.methods.table import METHODS
-from starcat.service.access import Reader
+from starcat.service.access import Builder, Reader
+from starcat.service.jobs.submission import submit_evaluation
 from starcat.service.pages import sky
 from starcat.service.pages.facts import (
     MANIFEST_DIGEST,
@@ -21,6 +22,7 @@ from starcat.service.pages.facts import (
     report_of,
 )
 from starcat.service.pages.rendering import page_router, render
+from starcat.service.pages.simulated import camera_of
 from starcat.service.service import Service, TheService
 from starcat.service.shelf import Database
 
@@ -158,6 +160,13 @@ def compare(
     )
 
 
+@router.post("/databases/{database_id}/evaluate")
+def evaluate(service: TheService, builder: Builder, database_id: str) -> Response:
+    """Have it measured how often frames are identified, and show the job."""
+    submitted = submit_evaluation(service, database_id, builder.name)
+    return RedirectResponse(f"/jobs/{submitted.job.id}", 303)
+
+
 def _head(service: Service, database: Database, tab: str) -> dict[str, Any]:
     """Return what the head of every page of a database needs."""
     return {"row": database_row(service, database), "database": database, "tab": tab}
@@ -165,7 +174,5 @@ def _head(service: Service, database: Database, tab: str) -> dict[str, Any]:
 
 def _field_of_view(database: Database) -> tuple[float, float]:
     """Return the full angles of the field across width and height, degrees."""
-    from starcat.specs.build_spec import CameraSpec
-
-    camera = CameraSpec.model_validate(database.manifest["spec"]["camera"]).camera()
+    camera = camera_of(database)
     return camera.fov_x_deg, camera.fov_y_deg

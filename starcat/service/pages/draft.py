@@ -16,9 +16,8 @@ from starcat.catalog.source import data_source, source_names
 from starcat.errors import ConfigError, StarcatError
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.keys import REQUIRED, SpecKey, spec_sections
-from starcat.specs.reading import spec_from_dict
+from starcat.specs.reading import content_of_toml, spec_from_dict
 from starcat.specs.spec_toml import toml_value
-from starcat.specs.toml_text import read_toml
 
 ORIGIN = "spec"
 """What messages call the text."""
@@ -27,9 +26,6 @@ TEXT = "toml"
 BEFORE = "toml-before"
 LENS = "lens"
 ENABLED = "enabled"
-
-MOST_CHARACTERS = 100_000
-"""A longer text is not read; every key of a spec with its explanation takes 12,000."""
 
 FIELDS = (
     "name",
@@ -116,6 +112,7 @@ class Draft:
         inside = [name for name in self.values if key and name.startswith(f"{key}.")]
         words = str(self.error).removeprefix(f"{ORIGIN}: ")
         told = [name for name in inside if name.rpartition(".")[2] in words]
+        told.sort(key=lambda name: words.index(name.rpartition(".")[2]))
         return {(named or told or [TEXT])[0]: words}
 
 
@@ -134,12 +131,9 @@ def draft_of_text(text: str) -> Draft:
     """
     text = text.replace("\r\n", "\n")
     try:
-        if len(text) > MOST_CHARACTERS:
-            raise ValueError(f"{len(text):,} characters; at most {MOST_CHARACTERS:,} are read")
-        return _checked(read_toml(text), text)
-    except ValueError as error:
-        wrong = ConfigError(f"{ORIGIN}: not a readable TOML file: {error}", key=TEXT)
-        return _draft({}, text, None, wrong)
+        return _checked(content_of_toml(text, ORIGIN), text)
+    except ConfigError as error:
+        return _draft({}, text, None, ConfigError(str(error), key=TEXT))
 
 
 def draft_of_form(form: Mapping[str, str]) -> Draft:
@@ -162,12 +156,13 @@ def draft_of_form(form: Mapping[str, str]) -> Draft:
     known = draft_of_text(before)
     if known.error is not None and known.error.key == TEXT:
         return known
-    content = read_toml(before)
+    content = content_of_toml(before, ORIGIN)
     try:
         _fill(content, form)
+        _prune(content)
     except ConfigError as error:
         return _draft(content, before, None, error)
-    return known if content == read_toml(before) else draft_of_content(content)
+    return known if content == content_of_toml(before, ORIGIN) else draft_of_content(content)
 
 
 def draft_of_content(content: Mapping[str, Any]) -> Draft:
@@ -197,7 +192,7 @@ def plain_toml(content: Mapping[str, Any]) -> str:
     Returns
     -------
     str
-        The values of a table before the tables in it; empty tables are left out.
+        The values of a table before the tables in it.
 
     Examples
     --------
@@ -213,7 +208,7 @@ def plain_toml(content: Mapping[str, Any]) -> str:
 def _tables(content: Mapping[str, Any], path: tuple[str, ...]) -> list[str]:
     lines = [f"{_key(k)} = {_inline(v)}\n" for k, v in content.items() if not isinstance(v, dict)]
     parts = []
-    if lines:
+    if lines or (path and not content):
         head = f"[{'.'.join(map(_key, path))}]\n" if path else ""
         parts.append(head + "".join(lines))
     for name, value in content.items():
@@ -235,7 +230,14 @@ def _inline(value: Any) -> str:
         )
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
+    if _is_huge(value):
+        return hex(value)
     return toml_value(value) if isinstance(value, bool | int | float | str) else f"{value}"
+
+
+def _is_huge(value: Any) -> bool:
+    """Return whether a number has more digits than Python writes; none is in any range."""
+    return isinstance(value, int) and value.bit_length() > 1000
 
 
 def without_defaults(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -300,6 +302,8 @@ def _shown(key: str, content: Mapping[str, Any]) -> str:
         value = "" if default is REQUIRED or default is None else default
     if key == "selection.bright_limit_mag" and value == _KEYS[key].default:
         return ""  # No star is that bright: there is no limit.
+    if _is_huge(value):
+        return hex(value)[:40]
     return f"{value:.12g}" if isinstance(value, float) else str(value)
 
 
@@ -368,6 +372,8 @@ def _at(content: Mapping[str, Any], path: str) -> Any:
 
 
 def _put(content: dict[str, Any], path: str, value: Any) -> None:
+    if value is None and _at(content, path) is None:
+        return
     *tables, name = path.split(".")
     for table in tables:
         content = content.setdefault(table, {})
@@ -380,3 +386,12 @@ def _put(content: dict[str, Any], path: str, value: Any) -> None:
         content.pop(name, None)
     else:
         content[name] = value
+
+
+def _prune(content: dict[str, Any]) -> None:
+    """Remove tables inside others that have become empty; those at the top are needed."""
+    for value in content.values():
+        if isinstance(value, dict):
+            _prune(value)
+            for name in [key for key, inner in value.items() if inner == {}]:
+                del value[name]

@@ -185,10 +185,18 @@ def _row(one: Database, released: Mapping[str, str], built: Mapping[str, float])
         camera=CameraSpec.model_validate(spec["camera"]).camera().in_words,
         stars=int(manifest["products"]["stars"]["rows"]),
         bytes=total_bytes(manifest),
-        rates=list(report_of(one).get("self_test", ())),
+        rates=_rates(one),
         is_released=one.title in released and released[one.title] == file_digest(itself),
         built_s=built.get(one.id) or itself.stat().st_mtime,
     )
+
+
+def _rates(database: Database) -> list[Mapping[str, Any]]:
+    """Return the rates of the self-test: a damaged report does not hide other databases."""
+    try:
+        return list(report_of(database).get("self_test", ()))
+    except ProductError:
+        return []
 
 
 def total_bytes(manifest: Mapping[str, Any]) -> int:

@@ -271,9 +271,10 @@ def _address(picture: bytes) -> str | None:
 
 def _errors(answer: dict[str, Any]) -> list[str] | None:
     """Return the standard deviations of the attitude about the three axes, arcseconds."""
-    rows = answer.get("covariance_arcsec2")
-    squares = [row[k] for k, row in enumerate(rows)] if rows else [None]
-    return None if None in squares else [f"{math.sqrt(one):.3g}" for one in squares]
+    rows: list[list[float | None]] = answer.get("covariance_arcsec2") or []
+    squares = [row[k] for k, row in enumerate(rows)]
+    known = [f"{math.sqrt(one):.3g}" for one in squares if one is not None]
+    return known if len(known) == 3 else None
 
 
 def _field_deg(answer: dict[str, Any], database: Database) -> float | None:

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import json
-from functools import lru_cache
 from typing import Annotated, Any
 
 from fastapi import Depends, Query, Request
 from fastapi.responses import JSONResponse, RedirectResponse, Response
 
-from starcat.catalog.fetching.locate import locate
-from starcat.catalog.source import data_source, source_names
-from starcat.errors import SourceError, StarcatError
-from starcat.pipeline.estimate import Estimate, choose_stars, estimate
-from starcat.pipeline.stars_read import StarsRead, read_stars, what_is_read
+from starcat.errors import StarcatError
 from starcat.service.access import Reader, Role, principal_of
 from starcat.service.jobs.submission import submit_build
 from starcat.service.pages.draft import (
@@ -32,21 +26,9 @@ from starcat.service.pages.rendering import (
     render,
     size_text,
 )
-from starcat.service.problems import Problem, problem_of
+from starcat.service.problems import Problem, ProblemDetails, problem_of
 from starcat.service.service import Service, TheService
-from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset, preset_names
-
-
-@lru_cache(maxsize=2)
-def _read(key: str, spec_json: str) -> StarsRead:
-    return read_stars(BuildSpec.model_validate_json(spec_json), {})
-
-
-def estimate_of(service: Service, spec: BuildSpec) -> Estimate:
-    read = _read(json.dumps(what_is_read(spec)), spec.model_dump_json())
-    return estimate(read, choose_stars(read, spec), spec)
-
 
 MOST_FIELDS = 100
 """Fields of a form; this one has 30."""
@@ -110,7 +92,9 @@ def preview(request: Request, service: TheService, form: Form, _: Reader) -> Res
     """Tell a script what the form has become, and what that would give."""
     draft = draft_of_form(form)
     seen, error = _preview(service, draft)
-    part = ENVIRONMENT.get_template("new_result.html").render(preview=seen, problem=error)
+    part = ENVIRONMENT.get_template("new_result.html").render(
+        preview=seen, problem=error and error.detail
+    )
     content: dict[str, Any] = {
         "toml": draft.text,
         "values": draft.values,
@@ -120,6 +104,7 @@ def preview(request: Request, service: TheService, form: Form, _: Reader) -> Res
         "errors": draft.errors,
         "result": part,
         "summary": summary(seen),
+        "is_busy": error is not None and error.status == 503,
         "stars": [] if seen is None else seen.estimate.fields.count.tolist(),
     }
     return JSONResponse(content, headers={"Cache-Control": "no-store"})
@@ -131,13 +116,13 @@ def tiling(count: Annotated[int, Query(ge=1, le=MOST_MAPPED)], _: Reader) -> Res
     return JSONResponse(tiling_content(count), headers={"Cache-Control": "private, max-age=86400"})
 
 
-def _preview(service: Service, draft: Draft) -> tuple[Preview | None, str | None]:
+def _preview(service: Service, draft: Draft) -> tuple[Preview | None, ProblemDetails | None]:
     if draft.spec is None:
         return None, None
     try:
-        return preview_of(estimate_of(service, draft.spec)), None
+        return preview_of(service.catalogs.estimate(draft.spec)), None
     except (StarcatError, Problem) as error:
-        return None, problem_of(error).detail
+        return None, problem_of(error)
 
 
 def _page(
@@ -156,12 +141,12 @@ def _page(
         status=status,
         draft=draft,
         preview=seen,
-        problem=error,
+        problem=error and error.detail,
         refused=problem and problem.detail,
         summary=summary(seen),
         presets=[(name, preset(name).description) for name in preset_names()],
         chosen=chosen,
-        sources=_sources(),
+        sources=_sources(service),
         may_build=principal_of(request).role >= Role.BUILDER,
         text_error=draft.errors.get(TEXT),
     )
@@ -180,15 +165,10 @@ def summary(seen: Preview | None) -> str:
     )
 
 
-def _sources() -> list[tuple[str, str]]:
+def _sources(service: Service) -> list[tuple[str, str]]:
     """Return the star catalogs there are, those whose files are here first."""
-    here, missing = [], []
-    for name in source_names():
-        if data_source(name).kind != "stars":
-            continue
-        try:
-            locate(name, {})
-            here.append((name, f"{name} – {data_source(name).identifier}"))
-        except SourceError:
-            missing.append((name, f"{name} – files not here"))
-    return here + missing
+    found = []
+    for one in service.catalogs.offered():
+        told = one.source.identifier if one.is_here else "its files are not here"
+        found.append((one.source.name, f"{one.source.name} – {told}"))
+    return found

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from typing import Any
 from urllib.parse import quote
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from fastapi.routing import APIRoute
@@ -17,7 +17,7 @@ from starlette.exceptions import HTTPException
 from starcat.errors import StarcatError
 from starcat.service.access import principal_of
 from starcat.service.pages.static_files import static_address
-from starcat.service.problems import Problem, ProblemDetails, problem_of
+from starcat.service.problems import Problem, ProblemDetails, problem_of, problem_response
 from starcat.terminal.failures import shown
 from starcat.version import __version__
 
@@ -215,6 +215,26 @@ def page_router() -> APIRouter:
         Without a route.
     """
     return APIRouter(route_class=_PageRoute, include_in_schema=False)
+
+
+def add_missing_page(app: FastAPI) -> None:
+    """Make an application tell a browser on a page that there is nothing at an address.
+
+    Parameters
+    ----------
+    app : FastAPI
+        The application; programs are told as before.
+    """
+
+    @app.exception_handler(404)
+    def tell_missing(request: Request, error: Exception) -> Response:
+        detail = "there is nothing at this address; the head of the page leads to all that there is"
+        problem = problem_of(Problem(404, detail))
+        is_for_people = "text/html" in request.headers.get("accept", "")
+        if is_for_people and request.method == "GET" and not request.url.path.startswith("/api/"):
+            return error_page(request, problem)
+        told = shown(str(getattr(error, "detail", "Not Found")), 500)
+        return problem_response(problem.model_copy(update={"detail": told}))
 
 
 def error_page(request: Request, problem: ProblemDetails) -> Response:

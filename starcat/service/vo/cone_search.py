@@ -15,6 +15,7 @@ from starcat.exchange.label import Label
 from starcat.service.access import Reader
 from starcat.service.problems import Problem, problem_of
 from starcat.service.service import Service, TheService
+from starcat.store.layout import is_store
 from starcat.vo.cone import (
     MEDIA_TYPE,
     ConeRequest,
@@ -24,11 +25,12 @@ from starcat.vo.cone import (
     star_view,
     with_ucds,
 )
-from starcat.vo.results import result
+from starcat.vo.results import result_chunks
 
 router = APIRouter(prefix="/scs", tags=["cone search"])
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}(\.[A-Za-z0-9_-]{1,99}){0,9}")
+_OF_A_JOB = re.compile(r"-[0-9a-f]{16}(\.parquet)?$")
 _VOTABLE = {"Content-Type": MEDIA_TYPE}
 _STARS = "stars.parquet"
 _HELD_BYTES = 4 << 20
@@ -80,9 +82,7 @@ async def search(catalog: str, request: Request, service: TheService, reader: Re
         told = problem_of(error)
         headers = error.headers if isinstance(error, Problem) else {}
         return Response(cone_error(told.detail), _status(error), {**headers, **_VOTABLE})
-    if asked.form.media_type == "text/xml":
-        return StreamingResponse(_chunks(found), headers=_VOTABLE)
-    return StreamingResponse(_chunks(found), media_type=asked.form.media_type)
+    return StreamingResponse(_chunks(found), headers={"Content-Type": asked.media_type})
 
 
 def target_of(service: Service, name: str) -> tuple[Path, Label]:
@@ -112,13 +112,20 @@ def target_of(service: Service, name: str) -> tuple[Path, Label]:
         newest = named[-1]
         return newest.folder, Label("stars", newest.name, newest.version)
     if _NAME.fullmatch(name):
-        kept = service.places.catalogs / name
-        for path in (kept / _STARS, kept.with_name(f"{name}.parquet"), kept):
-            if path.exists():
+        for path in _read_ones(service.places.catalogs, name):
+            if path.is_file() or (path.is_dir() and is_store(path)):
                 return path, Label(name)
     raise TargetMissing(
         f"no database and no catalog is called {name[:80]!r}; /api/v1/databases lists the databases"
     )
+
+
+def _read_ones(folder: Path, name: str) -> list[Path]:
+    """Return where a catalog that was read may lie: under its name, or as jobs name theirs."""
+    own = folder / name
+    of_jobs = [path for path in folder.glob(f"{name}-*") if _OF_A_JOB.match(path.name, len(name))]
+    newest_first = sorted(of_jobs, key=lambda path: (-path.stat().st_mtime_ns, path.name))
+    return [own / _STARS, folder / f"{name}.parquet", own, *newest_first]
 
 
 def _answer(service: Service, name: str, asked: ConeRequest) -> SpooledTemporaryFile[bytes]:
@@ -130,11 +137,12 @@ def _answer(service: Service, name: str, asked: ConeRequest) -> SpooledTemporary
         view = star_view(session)
         with session.ask(cone_query(view, asked, maxrec)) as running:
             rows = with_ucds(running.batches(), view)
-            found = result(rows, asked.form, service.places.scratch, label=label, maxrec=maxrec)
+            scratch = service.places.scratch
+            chunks = result_chunks(rows, asked.form, scratch, label=label, maxrec=maxrec)
             held: SpooledTemporaryFile[bytes]
-            held = SpooledTemporaryFile(_HELD_BYTES, dir=str(service.places.scratch))  # noqa: SIM115
+            held = SpooledTemporaryFile(_HELD_BYTES, dir=str(scratch))  # noqa: SIM115
             try:
-                held.writelines(found.chunks)
+                held.writelines(chunks)
             except BaseException:
                 held.close()
                 raise

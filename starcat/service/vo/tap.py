@@ -15,7 +15,7 @@ from starlette.types import Receive, Scope, Send
 from starcat.errors import TargetMissing, quoted
 from starcat.service.access import Reader
 from starcat.service.service import Service, TheService
-from starcat.service.vo.tap_request import PREFIX, TapRoute, TheRequest, base_url
+from starcat.service.vo.tap_request import PREFIX, TapRequest, TapRoute, TheRequest, base_url
 from starcat.vo.documents import (
     MEDIA_TYPE,
     availability,
@@ -57,9 +57,7 @@ class _Closing(StreamingResponse):
 async def sync(given: TheRequest, service: TheService, who: Reader) -> Response:
     """Answer a query; parameters as TAP 1.1 has them."""
     asked = question(given.parameters, service.settings.max_rows)
-    with tempfile.TemporaryDirectory(prefix="sync-", dir=service.places.scratch) as folder:
-        # What came is read before the first part of the answer is there.
-        first, rest = await service.sessions.run(_begun, service, asked, given.keep(Path(folder)))
+    first, rest = await service.sessions.run(_begun, service, asked, given, who.name)
     answer = _Closing(first, rest, asked.form.media_type)
     name = f"result.{asked.form.suffix}"
     answer.headers["Content-Disposition"] = f'inline; filename="{name}"'
@@ -67,11 +65,14 @@ async def sync(given: TheRequest, service: TheService, who: Reader) -> Response:
 
 
 def _begun(
-    service: Service, asked: Question, files: dict[str, Path]
+    service: Service, asked: Question, given: TapRequest, owner: str
 ) -> tuple[bytes, Iterator[bytes]]:
     """Return the first part of an answer, and what gives the others."""
-    parts = service.tap.queries.answer(asked, files)
-    return next(parts, b""), parts
+    with tempfile.TemporaryDirectory(prefix="sync-", dir=service.places.scratch) as folder:
+        files = given.keep(Path(folder)) | service.tap.jobs.answers(asked.uploads, owner)
+        parts = service.tap.queries.answer(asked, files)
+        # What came is read before the first part of the answer is there.
+        return next(parts, b""), parts
 
 
 @router.get("/capabilities", summary="What the service can do (VOSI)")

@@ -15,7 +15,7 @@ from starcat.errors import ConfigError, TargetMissing, quoted
 from starcat.service.access import Reader
 from starcat.service.service import Service, TheService
 from starcat.service.vo.tap_request import PREFIX, TapRoute, TheRequest, base_url
-from starcat.service.vo.tap_runner import RESULT
+from starcat.service.vo.tap_store import RESULT
 from starcat.vo.documents import MEDIA_TYPE, VOTABLE_TYPE, error_votable
 from starcat.vo.formats import FORMATS
 from starcat.vo.uws import (

@@ -9,17 +9,21 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from starcat.errors import ConfigError
+from starcat.exchange.label import Label
 from starcat.progress import Progress, no_progress
+from starcat.service.confined import Confined
 from starcat.service.places import Places
 from starcat.service.sessions import Sessions
-from starcat.service.vo.tap_answers import chunks
+from starcat.service.vo.tap_answers import Answers
 from starcat.service.vo.tap_tables import TapTables
 from starcat.vo.adql import translate
 from starcat.vo.answer import ask
 from starcat.vo.parameters import Question, Upload
-from starcat.vo.tables import Schema
+from starcat.vo.tables import Schema, Table
 from starcat.vo.tap_schema import UPLOADS
-from starcat.vo.uploads import read_upload
+from starcat.vo.uploads import table_of_facts
+
+_LABEL = Label("result")
 
 
 class TapQueries:
@@ -33,17 +37,26 @@ class TapQueries:
         What may be asked.
     sessions : Sessions
         What runs queries, in processes of their own.
+    confined : Confined
+        What reads uploads and makes files, in processes of their own.
     most_rows : int
         Rows of an answer at most.
     """
 
     def __init__(
-        self, places: Places, tables: TapTables, sessions: Sessions, most_rows: int
+        self,
+        places: Places,
+        tables: TapTables,
+        sessions: Sessions,
+        confined: Confined,
+        most_rows: int,
     ) -> None:
+        self._confined = confined
         self.most_rows = most_rows
         self._places = places
         self._tables = tables
         self._sessions = sessions
+        self._answers = Answers(places.scratch, confined)
 
     def answer(
         self,
@@ -85,7 +98,7 @@ class TapQueries:
             translated = translate(asked.query, tables)
             with self._sessions.session(targets, time_s) as session:
                 batches = ask(session, translated, asked.max_rows, progress)
-                yield from chunks(batches, asked.form, asked.max_rows, self._places.scratch)
+                yield from self._answers.chunks(batches, asked.form, asked.max_rows)
 
     @contextmanager
     def _uploaded(
@@ -96,7 +109,7 @@ class TapQueries:
             yield None, None
             return
         for one in uploads:
-            if one.part not in files:
+            if one.part and one.part not in files:
                 raise ConfigError(
                     f"UPLOAD of {one.table}: the request has no file {one.part!r}; send it as a "
                     "part of multipart/form-data with that name",
@@ -106,7 +119,13 @@ class TapQueries:
         try:
             folder = top / UPLOADS
             folder.mkdir()
-            tables = tuple(read_upload(files[one.part], one.table, folder) for one in uploads)
+            tables = tuple(
+                self._read(files[one.part or one.job_id], one, folder) for one in uploads
+            )
             yield folder, Schema(UPLOADS, "Tables that came with the query", tables)
         finally:
             shutil.rmtree(top, ignore_errors=True)
+
+    def _read(self, file: Path, upload: Upload, folder: Path) -> Table:
+        given = {"path": str(file), "name": upload.table, "folder": str(folder)}
+        return table_of_facts(self._confined.call("upload", given))

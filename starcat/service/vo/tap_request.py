@@ -156,6 +156,8 @@ async def _form(request: Request, service: Service) -> FormData:
             max_files=MAX_UPLOADS, max_fields=MAX_PARAMETERS, max_part_size=MAX_PARAMETER_BYTES
         )
     except HTTPException as error:
+        if error.status_code != 400:  # too large, or too slow
+            raise
         raise ConfigError(f"the form cannot be read: {error.detail}") from error
 
 

@@ -10,13 +10,10 @@ from concurrent.futures import ThreadPoolExecutor
 from starcat.errors import StarcatError
 from starcat.service.problems import Problem, problem_of
 from starcat.service.vo.tap_queries import TapQueries
-from starcat.service.vo.tap_store import TapJobs
+from starcat.service.vo.tap_store import RESULT, TapJobs
 from starcat.storage.atomic import whole_file
 from starcat.vo.parameters import Parameters, question
 from starcat.vo.uws import JobFacts
-
-RESULT = "result"
-"""Name of the file with the answer, in the folder of a job."""
 
 RETRY_S = 0.5
 """How long to wait before asking again for a session while all are in use."""
@@ -93,17 +90,17 @@ class TapRunner:
     def _answered(self, job: JobFacts) -> bool:
         """Answer a job; False where all sessions were in use for long."""
         asked = question(Parameters(job.parameters), self._queries.most_rows)
-        files = self._jobs.files(job.job_id)
+        files = self._jobs.files(job.job_id) | self._jobs.answers(asked.uploads, job.owner)
 
         def watch(*_: object) -> None:
             self._check(job.job_id)
 
         try:
-            with whole_file(self._jobs.folder(job.job_id) / RESULT) as path:
-                with path.open("wb") as stream:
-                    for part in self._queries.answer(asked, files, job.limit_s, watch):
-                        self._check(job.job_id)
-                        stream.write(part)
+            target = self._jobs.folder(job.job_id) / RESULT
+            with whole_file(target) as path, path.open("wb") as stream:
+                for part in self._queries.answer(asked, files, job.limit_s, watch):
+                    self._check(job.job_id)
+                    stream.write(part)
         except Problem as error:
             if error.status == 503:
                 return False

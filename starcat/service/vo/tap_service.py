@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from starcat.service.confined import Confined
 from starcat.service.places import Places
 from starcat.service.records import Records
 from starcat.service.sessions import Sessions
@@ -31,6 +32,8 @@ class Tap:
         The databases there are.
     sessions : Sessions
         What runs queries.
+    confined : Confined
+        What reads uploads and makes files.
 
     Attributes
     ----------
@@ -53,6 +56,7 @@ class Tap:
         records: Records,
         shelf: Shelf,
         sessions: Sessions,
+        confined: Confined,
     ) -> None:
         self.limits = ServiceLimits(
             run_s=int(settings.job_time_s),
@@ -61,7 +65,7 @@ class Tap:
             upload_bytes=int(settings.upload_mib * 2**20),
         )
         self.tables = TapTables(places, shelf, sessions)
-        self.queries = TapQueries(places, self.tables, sessions, settings.max_rows)
+        self.queries = TapQueries(places, self.tables, sessions, confined, settings.max_rows)
         self.jobs = TapJobs(records, places, self.limits)
         # One of the queries that run at the same time is left to those who wait for the answer.
         self.runner = TapRunner(self.jobs, self.queries, max(1, settings.queries - 1))

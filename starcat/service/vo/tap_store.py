@@ -15,7 +15,11 @@ from starcat.service.places import JOB_ID, Places, checked
 from starcat.service.records import Records
 from starcat.storage.atomic import make_folder
 from starcat.vo.documents import ServiceLimits
+from starcat.vo.parameters import Upload
 from starcat.vo.uws import ACTIVE, JobFacts
+
+RESULT = "result"
+"""Name of the file with the answer, in the folder of a job."""
 
 MAX_WAITING = 100
 """Jobs of one user that may be pending, queued or executing."""
@@ -142,6 +146,35 @@ class TapJobs:
             ).fetchone()
         folder = self.folder(job_id)
         return {part: folder / name for part, name in json.loads(row["files"]).items()}
+
+    def answers(self, uploads: Sequence[Upload], owner: str) -> dict[str, Path]:
+        """Return the answers of other jobs that a question is about, by the ids of these.
+
+        Parameters
+        ----------
+        uploads : sequence of Upload
+            Of a question.
+        owner : str
+            Who asks it.
+
+        Returns
+        -------
+        dict of str to Path
+            Files, only to be read.
+
+        Raises
+        ------
+        TargetMissing
+            If a job is not there, or has no answer.
+        """
+        found = {}
+        for one in uploads:
+            if one.job_id:
+                phase = self.job(one.job_id, owner).phase
+                found[one.job_id] = self.folder(one.job_id) / RESULT
+                if phase != "COMPLETED":
+                    raise TargetMissing(f"UPLOAD of {one.table}: the job is {phase}, no answer yet")
+        return found
 
     def set_parameters(
         self, job_id: str, given: Sequence[tuple[str, str]], files: dict[str, Path]

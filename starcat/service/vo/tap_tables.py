@@ -1,4 +1,4 @@
-"""The tables that TAP shows: those of all databases of the shelf, and of the catalogs that were read.
+"""The tables that TAP shows: those of all databases, and of the catalogs that were read.
 
 What is known of them is found out once for each state of the shelf, and written as TAP_SCHEMA's
 tables, which queries read like any others.
@@ -18,7 +18,7 @@ from starcat.service.places import Places
 from starcat.service.sessions import Sessions
 from starcat.service.shelf import Shelf
 from starcat.store.layout import is_store
-from starcat.vo.tables import Tables
+from starcat.vo.tables import Schema, Tables
 from starcat.vo.tap_schema import NAME, own_schema, session_schemas, write_tap_schema
 
 _logger = logging.getLogger(__name__)
@@ -72,9 +72,11 @@ class TapTables:
         about = self._found()
         key = _digest(list(about))
         with self._looking:
-            if self._state is None or self._state[0] != key:
-                self._state = key, self._looked_at(about, key)
-            return self._state[1]
+            known = self._state
+            # What lies in scratch for long is removed.
+            if known is None or known[0] != key or not any(known[1].targets[-1].glob("*.parquet")):
+                known = self._state = key, self._looked_at(about, key)
+            return known[1]
 
     def _found(self) -> dict[Path, str]:
         """Return what there is on disk, and what each is."""
@@ -107,7 +109,7 @@ class TapTables:
     def _opened(self, about: dict[Path, str], key: str) -> TapState:
         own = own_schema()
         folder = self._places.scratch / f"tap-{key}" / NAME
-        schemas = ()
+        schemas: tuple[Schema, ...] = ()
         if about:
             with self._sessions.session(list(about)) as session:
                 names = [target.name for target in session.targets]

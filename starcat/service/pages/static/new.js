@@ -10,6 +10,7 @@ const before = document.getElementById("toml-before");
 const summary = document.getElementById("summary");
 const FIELDS_AFTER_MS = 120;
 const TEXT_AFTER_MS = 450;
+const BUSY_AFTER_MS = 2500;
 
 let waiting = 0;
 let asked = null;
@@ -126,15 +127,23 @@ async function ask() {
       const problem = await answer.json().catch(() => null);
       throw new Error(problem?.detail ?? `the service answers ${answer.status}`);
     }
-    show(await answer.json());
+    const state = await answer.json();
+    show(state);
+    if (state.is_busy) {
+      clearTimeout(waiting);
+      waiting = setTimeout(ask, BUSY_AFTER_MS);
+      return;
+    }
   } catch (error) {
     if (error.name === "AbortError") return;
     summary.textContent = `No estimate: ${error.message}`;
   }
   result.setAttribute("aria-busy", "false");
+  form.dataset.state = "settled";
 }
 
 form.addEventListener("input", (event) => {
+  form.dataset.state = "changed";
   clearTimeout(waiting);
   const range = ranges.find((one) => one.dataset.of === event.target.id);
   if (range) follow(range);

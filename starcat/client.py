@@ -1,0 +1,441 @@
+"""The service from Python: build, ask, identify, download and publish over HTTP."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import requests
+
+from starcat.artifact.manifest import MANIFEST_NAME, parse_manifest
+from starcat.artifact.verify import check_artifact
+from starcat.errors import DownloadError, ServiceError, error_of_kind
+from starcat.progress import Progress, no_progress
+from starcat.releases.tree import Release, files_of
+from starcat.storage.atomic import move_into_place, whole_folder
+
+Content = dict[str, Any]
+
+CHUNK_BYTES = 1 << 18
+AGAIN_S = 0.2
+"""Seconds until a job is watched again, whose events ended before it did."""
+
+
+class Client:
+    """A service.
+
+    Parameters
+    ----------
+    url : str
+        Its address, such as ``http://127.0.0.1:8000``.
+    token : str, optional
+        Where the service asks for one.
+    timeout_s : float
+        Seconds without a byte after which it counts as gone.
+
+    Examples
+    --------
+    >>> Client("http://127.0.0.1:8000/").url
+    'http://127.0.0.1:8000'
+    """
+
+    def __init__(self, url: str, token: str | None = None, timeout_s: float = 120.0) -> None:
+        self.url = url.rstrip("/")
+        self._timeout_s = timeout_s
+        self._session = requests.Session()
+        if token:
+            self._session.headers["Authorization"] = f"Bearer {token}"
+
+    def build(self, spec: str | Mapping[str, Any], progress: Progress = no_progress) -> Content:
+        """Have a database built, and wait for it.
+
+        Parameters
+        ----------
+        spec : str or mapping
+            The text of a spec (TOML), or its keys as JSON has them.
+        progress : Progress
+            Called with stages as the service tells them.
+
+        Returns
+        -------
+        dict
+            The job when it is done; its ``result`` has the id of the ``database``.
+
+        Raises
+        ------
+        StarcatError
+            If the spec is refused, or the job fails: with its words and exit code.
+        """
+        job = self._json("POST", "jobs", json={"kind": "build", "spec": spec})
+        return self.wait(job["id"], progress)
+
+    def wait(self, job_id: str, progress: Progress = no_progress) -> Content:
+        """Wait for a job.
+
+        Parameters
+        ----------
+        job_id : str
+            Its id.
+        progress : Progress
+            Called with stages as the service tells them.
+
+        Returns
+        -------
+        dict
+            The job when it is done.
+
+        Raises
+        ------
+        StarcatError
+            If it failed or was cancelled.
+        """
+        seen = "0"
+        while True:
+            for number, kind, data in self._events(job_id, seen):
+                seen = number or seen
+                if kind == "stage":
+                    progress(data["stage"], data.get("done") or 0, data.get("total"))
+            job = self._json("GET", f"jobs/{job_id}")
+            if job["state"] == "done":
+                return job
+            if job["state"] in ("failed", "cancelled"):
+                told = job.get("error") or {"detail": f"the job {job_id} was {job['state']}"}
+                raise _error_of(told, None)
+            time.sleep(AGAIN_S)
+
+    def sql(
+        self,
+        targets: Sequence[str],
+        query: str | None = None,
+        values: Mapping[str, Any] | None = None,
+        *,
+        named: str | None = None,
+        max_rows: int | None = None,
+        time_limit_s: float | None = None,
+    ) -> Content:
+        """Ask a question in SQL.
+
+        Parameters
+        ----------
+        targets : sequence of str
+            Ids or titles of databases, names of catalogs.
+        query, named : str
+            SQL, or the name of a query of the gallery.
+        values : mapping of str to object, optional
+            The values of the ``$name`` in it.
+        max_rows : int, optional
+            Rows at most.
+        time_limit_s : float, optional
+            Seconds that it may take.
+
+        Returns
+        -------
+        dict
+            ``columns`` with name, type, unit and description; ``rows``; ``is_cut``.
+
+        Raises
+        ------
+        QueryError
+            If it cannot be answered.
+        """
+        return self._json(
+            "POST", "sql", json=_question(targets, query, values, named, max_rows, time_limit_s)
+        )
+
+    def sql_file(
+        self,
+        path: Path,
+        form: str,
+        targets: Sequence[str],
+        query: str | None = None,
+        values: Mapping[str, Any] | None = None,
+        *,
+        named: str | None = None,
+        time_limit_s: float | None = None,
+    ) -> int:
+        """Ask a question in SQL, and keep the answer in a file.
+
+        Parameters
+        ----------
+        path : Path
+            The file, replaced if it exists.
+        form : {"csv", "json", "parquet", "votable", "fits", "ecsv", "npz"}
+            Its format.
+        targets, query, values, named, time_limit_s
+            As for `sql`.
+
+        Returns
+        -------
+        int
+            Rows.
+
+        Raises
+        ------
+        QueryError
+            If it cannot be answered.
+        ServiceError
+            If the answer breaks off.
+        """
+        asked = _question(targets, query, values, named, None, time_limit_s) | {"format": form}
+        with closing(self._answer("POST", "sql", json=asked, stream=True)) as answer:
+            _receive(answer, path)
+        return int(answer.headers["X-Starcat-Rows"])
+
+    def identify(
+        self,
+        database: str,
+        frames: Path | Mapping[str, Any],
+        options: Mapping[str, Any] | None = None,
+    ) -> Content:
+        """Identify the stars of frames.
+
+        Parameters
+        ----------
+        database : str
+            Id or title of the database.
+        frames : Path or mapping
+            A file of centroids or an image; or ``centroids_px``, and perhaps ``mag``.
+        options : mapping, optional
+            As ``/api/v1/identify/options`` describes them.
+
+        Returns
+        -------
+        dict
+            ``frames`` as 'starcat identify --json' prints them, ``database``, ``method``,
+            ``notes``.
+
+        Raises
+        ------
+        ConfigError
+            If a frame or an option cannot be used.
+        """
+        return dict(self._of_frames(f"identify/{quote(database, safe='')}", frames, options).json())
+
+    def picture(
+        self,
+        database: str,
+        frames: Path | Mapping[str, Any],
+        options: Mapping[str, Any] | None = None,
+        form: str = "png",
+    ) -> bytes:
+        """Return a picture of the first frame, its stars named.
+
+        Parameters
+        ----------
+        database, frames, options
+            As for `identify`.
+        form : {"png", "svg"}
+            Its format.
+
+        Returns
+        -------
+        bytes
+            The file.
+        """
+        path = f"identify/{quote(database, safe='')}/picture?format={form}"
+        return self._of_frames(path, frames, options).content
+
+    def download(
+        self, database: str, folder: Path, progress: Progress = no_progress
+    ) -> tuple[Path, str]:
+        """Bring a database: every file checked on arrival, then the artifact as a whole.
+
+        Parameters
+        ----------
+        database : str
+            Its id.
+        folder : Path
+            Folder to put ``<name>-<version>/`` into.
+        progress : Progress
+            Called with ("download", bytes there are, bytes in all).
+
+        Returns
+        -------
+        path : Path
+            The artifact.
+        outcome : {"written", "unchanged"}
+            ``unchanged`` where the same was there.
+
+        Raises
+        ------
+        DownloadError, ProductError
+            If a file is not what the manifest says.
+        OutputError
+            If something else is there.
+        """
+        where = f"databases/{quote(database, safe='')}"
+        data = self._answer("GET", f"{where}/manifest").content
+        manifest = parse_manifest(data, f"{self.url}/api/v1/{where}/manifest", "try again")
+        # Before a name becomes part of a path it is checked, as is every file's.
+        files = files_of(manifest, where)
+        release = Release.model_validate(
+            {name: manifest[name] for name in ("name", "version")}
+            | {"manifest": {"sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data)}}
+        )
+        total, done = sum(blob.bytes for blob in files.values()), 0
+        final = folder / release.title
+        with whole_folder(final) as partial:
+            (partial / MANIFEST_NAME).write_bytes(data)
+            for name, blob in files.items():
+                progress("download", done, total)
+                (partial / name).parent.mkdir(parents=True, exist_ok=True)
+                with closing(self._answer("GET", f"{where}/files/{name}", stream=True)) as answer:
+                    digest = _receive(answer, partial / name)
+                if digest != blob.sha256:
+                    raise DownloadError(
+                        f"{answer.url}: its sha256 begins with {digest[:12]}; expected "
+                        f"{blob.sha256[:12]}. Try again"
+                    )
+                done += blob.bytes
+            progress("download", done, total)
+            check_artifact(partial)
+            outcome = move_into_place(partial, final, replace=False)
+        return final, outcome
+
+    def report(self, database: str) -> Content:
+        """Return the report of a build.
+
+        Parameters
+        ----------
+        database : str
+            Its id.
+
+        Returns
+        -------
+        dict
+            As ``report/report.json`` of the artifact has it.
+        """
+        return self._json("GET", f"databases/{database}/report")
+
+    def publish(self, database: str, note: str = "") -> Content:
+        """Publish a database.
+
+        Parameters
+        ----------
+        database : str
+            Its id.
+        note : str
+            What is to be known about it.
+
+        Returns
+        -------
+        dict
+            The release, and ``outcome``: ``published``, or ``unchanged``.
+
+        Raises
+        ------
+        OutputError
+            If the version is there with another content.
+        """
+        return self._json("POST", "releases", json={"database": database, "note": note})
+
+    def estimate(self, spec: str | Mapping[str, Any]) -> Content:
+        """Say what a build would give.
+
+        Parameters
+        ----------
+        spec : str or mapping
+            As for `build`.
+
+        Returns
+        -------
+        dict
+            Stars, sizes and time.
+
+        Raises
+        ------
+        ConfigError
+            If the spec is refused.
+        """
+        return self._json("POST", "specs/estimate", json={"spec": spec})
+
+    def _events(self, job_id: str, after: str) -> Iterator[tuple[str, str, Content]]:
+        """Give what happens to a job: number, kind, data."""
+        path = f"jobs/{job_id}/events?after={after}"
+        with closing(self._answer("GET", path, stream=True)) as answer:
+            event: dict[str, str] = {}
+            try:
+                for line in answer.iter_lines(decode_unicode=True):
+                    name, _, value = line.partition(":")
+                    if line:
+                        event[name] = value.removeprefix(" ")
+                    elif "data" in event:
+                        data = json.loads(event["data"])
+                        yield event.get("id", ""), event.get("event", ""), data
+                        event = {}
+            except requests.RequestException:
+                return  # the connection ended: the job is looked at, and watched again
+
+    def _of_frames(
+        self, path: str, frames: Path | Mapping[str, Any], options: Mapping[str, Any] | None
+    ) -> requests.Response:
+        if not isinstance(frames, Path):
+            return self._answer("POST", path, json={**frames, "options": dict(options or {})})
+        files = {"file": (frames.name, frames.read_bytes())}
+        return self._answer("POST", path, files=files, data={"options": json.dumps(options or {})})
+
+    def _json(self, method: str, path: str, **asked: Any) -> Content:
+        return dict(self._answer(method, path, **asked).json())
+
+    def _answer(self, method: str, path: str, **asked: Any) -> requests.Response:
+        url = f"{self.url}/api/v1/{path}"
+        try:
+            answer = self._session.request(method, url, timeout=self._timeout_s, **asked)
+        except (requests.RequestException, ValueError) as error:
+            raise ServiceError(
+                f"{self.url}: no answer ({str(error)[:200]}); is 'starcat serve' running there?"
+            ) from error
+        if answer.ok:
+            return answer
+        with closing(answer):
+            try:
+                told = dict(answer.json())
+            except ValueError:
+                told = {"detail": f"{url}: answered {answer.status_code} {answer.reason}"}
+            raise _error_of(told, answer.status_code)
+
+
+def _question(
+    targets: Sequence[str],
+    query: str | None,
+    values: Mapping[str, Any] | None,
+    named: str | None,
+    max_rows: int | None,
+    time_limit_s: float | None,
+) -> Content:
+    asked = {
+        "targets": list(targets),
+        "query": query,
+        "named": named,
+        "values": dict(values or {}),
+        "max_rows": max_rows,
+        "time_limit_s": time_limit_s,
+    }
+    return {key: value for key, value in asked.items() if value is not None}
+
+
+def _receive(answer: requests.Response, path: Path) -> str:
+    """Write an answer to a file, and return its digest."""
+    digest = hashlib.sha256()
+    try:
+        with path.open("wb") as file:
+            for chunk in answer.iter_content(CHUNK_BYTES):
+                digest.update(chunk)
+                file.write(chunk)
+    except requests.RequestException as error:
+        path.unlink(missing_ok=True)
+        raise ServiceError(f"{answer.url}: broke off ({str(error)[:200]}); try again") from error
+    return digest.hexdigest()
+
+
+def _error_of(told: Mapping[str, Any], status: int | None) -> Exception:
+    """Return the error that a service tells of, as the class that it was there."""
+    words, key = str(told.get("detail", "no words")), told.get("key")
+    error = error_of_kind(str(told.get("kind", "")), words, key=None if key is None else str(key))
+    return error or ServiceError(words, exit_code=int(told.get("code", 1)), status=status)

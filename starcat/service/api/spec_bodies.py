@@ -1,0 +1,159 @@
+"""Specs in requests: as TOML, as JSON, or a preset with changes."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import Depends, Request
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from starcat.errors import ConfigError
+from starcat.service.problems import Problem
+from starcat.specs.build_spec import BuildSpec
+from starcat.specs.reading import (
+    MOST_CHARACTERS,
+    changed,
+    content_of_toml,
+    preset,
+    spec_from_dict,
+)
+
+ORIGIN = "spec"
+"""What messages call the spec of a request."""
+
+TOML_TYPES = ("application/toml", "text/")
+
+MOST_BODY_BYTES = 4 * MOST_CHARACTERS
+"""Of a body: text of so many characters may be that long."""
+
+MOST_CHANGES = 200
+
+Change = Annotated[str, Field(max_length=2000)]
+Key = Annotated[str, Field(min_length=1, max_length=100)]
+
+
+class GivenSpec(BaseModel):
+    """A spec: as TOML, as JSON, or a preset that ships with starcat; with changes if wanted."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [
+                {"preset": "gaia-12deg", "changes": {"selection.faint_limit_mag": "5.5"}},
+            ]
+        },
+    )
+
+    toml: str | None = Field(None, description="The text of a spec.")
+    spec: dict[str, Any] | None = Field(None, description="The keys of a spec.")
+    preset: str | None = Field(None, description="Name of a preset.", max_length=100)
+    changes: dict[Key, Change] = Field(
+        {},
+        max_length=MOST_CHANGES,
+        description="Values by dotted key, as ``--set`` of 'starcat build' takes them; an empty "
+        "one removes the key.",
+    )
+
+    @model_validator(mode="after")
+    def _one_of_three(self) -> GivenSpec:
+        if [self.toml, self.spec, self.preset].count(None) != 2:
+            raise ValueError("give one of toml, spec and preset")
+        return self
+
+    def checked(self) -> BuildSpec:
+        """Return the spec.
+
+        Returns
+        -------
+        BuildSpec
+            Checked.
+
+        Raises
+        ------
+        ConfigError
+            In the words of the command line.
+        """
+        if self.preset is not None:
+            return preset(self.preset, self.changes)
+        content = self.spec if self.toml is None else content_of_toml(self.toml, ORIGIN)
+        return spec_from_dict(changed(dict(content or {}), self.changes), ORIGIN)
+
+
+async def _body_of(request: Request) -> bytes:
+    found = bytearray()
+    async for part in request.stream():
+        found += part
+        if len(found) > MOST_BODY_BYTES:
+            raise Problem(
+                413,
+                f"the request has more than {MOST_BODY_BYTES:,} bytes; a spec with every key "
+                "explained has 12,000. Leave out what is no spec",
+            )
+    return bytes(found)
+
+
+def _spec_of(request: Request, body: Annotated[bytes, Depends(_body_of)]) -> BuildSpec:
+    """Return the spec that a request brings, checked; in a thread of its own."""
+    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if kind.startswith(TOML_TYPES):
+        return GivenSpec(toml=_text(body)).checked()
+    if kind != "application/json":
+        raise Problem(
+            415,
+            f"the request is of type {kind[:80]!r}; send a spec as application/toml, or as "
+            "application/json as /api/openapi.json says",
+        )
+    try:
+        given = GivenSpec.model_validate_json(body)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        key = ".".join(str(part)[:100] for part in first["loc"][:5])
+        said = first["msg"].removeprefix("Value error, ")[:500]
+        where = f"{key}: " if key else ""
+        raise ConfigError(
+            f"body: {where}{said}; give one of toml, spec and preset, and changes if wanted",
+            key=key or None,
+        ) from error
+    return given.checked()
+
+
+def _text(body: bytes) -> str:
+    try:
+        return body.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{ORIGIN}: not a readable TOML file: {error.reason}") from error
+
+
+SpecOfRequest = Annotated[BuildSpec, Depends(_spec_of)]
+"""The spec of a request's body."""
+
+TOML_EXAMPLE = """\
+name = "mycam"
+version = "1.0.0"
+epoch_jyear = 2016.0
+catalog.source = "gaia"
+selection.faint_limit_mag = 6.0
+camera = { width_px = 1024, height_px = 1024, fov_x_deg = 12.0 }
+"""
+
+SPEC_BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "description": "A spec: TOML as it is, or JSON.",
+        "content": {
+            "application/json": {
+                "schema": {
+                    "type": "object",
+                    "title": "GivenSpec",
+                    **{
+                        key: value
+                        for key, value in GivenSpec.model_json_schema().items()
+                        if key not in ("type", "title")
+                    },
+                }
+            },
+            "application/toml": {"schema": {"type": "string"}, "example": TOML_EXAMPLE},
+        },
+    }
+}
+"""``openapi_extra=`` of an operation with `SpecOfRequest`."""

@@ -1,0 +1,233 @@
+"""What the REST interface says of specs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from starcat.pipeline.estimate import Estimate
+from starcat.pipeline.starter import Starter, advice
+from starcat.products.coverage import Spread
+from starcat.specs.build_spec import BuildSpec, CameraSpec
+from starcat.specs.reading import preset
+from starcat.specs.spec_toml import spec_toml
+
+
+class CheckedSpec(BaseModel):
+    """A spec that can be built."""
+
+    name: str = Field(examples=["gaia-12deg"])
+    version: str = Field(examples=["1.0.0"])
+    description: str = Field(description="What it is for.")
+    sources: list[str] = Field(description="Catalogs that it reads.", examples=[["gaia"]])
+    spec: dict[str, Any] = Field(description="All keys, with those that are as by default.")
+    toml: str = Field(description="The same as a file in which every key is explained.")
+
+
+class PresetFacts(BaseModel):
+    """A spec that ships with starcat."""
+
+    name: str = Field(examples=["gaia-12deg"])
+    version: str = Field(examples=["1.0.0"])
+    source: str = Field(description="Its catalog.", examples=["gaia"])
+    description: str = Field(description="What it is for.")
+
+
+class Presets(BaseModel):
+    """The specs that ship with starcat, the default first."""
+
+    presets: list[PresetFacts]
+
+
+class SpreadFacts(BaseModel):
+    """How a number is spread over the fields."""
+
+    minimum: int
+    one_percent: int = Field(description="1 % of the fields have no more.")
+    median: int
+    maximum: int
+    mean: float
+
+
+class WorstField(BaseModel):
+    """The field with the fewest stars."""
+
+    boresight: int
+    ra_deg: float
+    dec_deg: float
+    stars: int
+
+
+class FieldFigures(BaseModel):
+    """Guide stars in the fields of the tiling."""
+
+    count: int = Field(description="Boresights.")
+    stars: SpreadFacts
+    enough_share: float = Field(description="Share of the fields with at least 4 stars.")
+    full_share: float = Field(
+        description="Share with as many as ``boresights.brightest``, of which triangles are made."
+    )
+    worst: WorstField
+
+
+class FilterFigures(BaseModel):
+    """What a filter leaves."""
+
+    filter: str = Field(examples=["doubles"])
+    stars: int = Field(description="Stars of the whole sky that are left.")
+
+
+class EstimateAnswer(BaseModel):
+    """What a spec will give."""
+
+    guide_stars: int = Field(description="As many as the build will have.", examples=[6682])
+    fields: FieldFigures
+    filters: list[FilterFigures]
+    rejected: dict[str, int] = Field(description="All other records, by reason.")
+    rows: dict[str, int] = Field(description="Rows of each product that is made from them.")
+    files: dict[str, int] = Field(
+        description="Bytes of each file; ``report`` is that folder and the manifest."
+    )
+    total_bytes: int = Field(description="Of all files.")
+    memory_bytes: int = Field(description="Most memory that the build will hold.")
+    read_seconds: float = Field(description="Time to read the catalogs.")
+    build_seconds: float = Field(description="Time of the whole build, on one quiet processor.")
+    refusals: list[str] = Field(description="Why the build will be refused; empty if it will not.")
+    warnings: list[str] = Field(description="What is worth a second look.")
+    in_words: str = Field(description="The line that 'starcat build' prints.")
+
+
+class StarterRequest(BaseModel):
+    """A camera that a spec is wanted for."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [
+                {
+                    "name": "mycam",
+                    "camera": {
+                        "width_px": 1280,
+                        "height_px": 960,
+                        "focal_length_mm": 25.0,
+                        "pixel_um": 5.5,
+                    },
+                    "faint_limit_mag": 5.8,
+                }
+            ]
+        },
+    )
+
+    name: str = Field("mycam", max_length=100, description="Name of the database.")
+    camera: CameraSpec
+    faint_limit_mag: float | None = Field(
+        None, ge=-30.0, le=40.0, description="What the camera sees, Gaia's G; default: enough."
+    )
+    widest_fov_x_deg: float | None = Field(
+        None,
+        gt=0.0,
+        lt=120.0,
+        description="Field that the database is to serve too; the camera is the narrow end.",
+    )
+
+
+class LimitFigures(BaseModel):
+    """What a magnitude limit leaves in a field."""
+
+    faint_limit_mag: float
+    guide_stars: int
+    stars: SpreadFacts
+
+
+class StarterAnswer(BaseModel):
+    """A first spec for a camera, as 'starcat init' writes it."""
+
+    checked: CheckedSpec
+    limits: list[LimitFigures] = Field(description="Its own limit, and some around it.")
+    thinned: LimitFigures = Field(description="What is left of its own limit after thinning.")
+    advice: list[str] = Field(description="What to think of before the limit is kept.")
+    in_words: str = Field(description="What it will cost, in one line.")
+
+
+def checked_spec(spec: BuildSpec) -> CheckedSpec:
+    """Return what is said of a spec that was checked."""
+    return CheckedSpec(
+        name=spec.name,
+        version=spec.version,
+        description=spec.description,
+        sources=list(spec.sources),
+        spec=spec.model_dump(mode="json"),
+        toml=spec_toml(spec),
+    )
+
+
+def preset_facts(name: str) -> PresetFacts:
+    """Return what is said of a preset."""
+    spec = preset(name)
+    return PresetFacts(
+        name=spec.name,
+        version=spec.version,
+        source=spec.catalog.source,
+        description=spec.description,
+    )
+
+
+def estimate_answer(found: Estimate) -> EstimateAnswer:
+    """Return what is said of an estimate."""
+    cost, coverage = found.cost, found.coverage
+    return EstimateAnswer(
+        guide_stars=cost.stars,
+        fields=FieldFigures(
+            count=cost.fields,
+            stars=_spread(coverage.stars),
+            enough_share=round(found.enough_share, 6),
+            full_share=round(found.full_share, 6),
+            worst=WorstField(
+                boresight=coverage.worst_boresight,
+                ra_deg=round(coverage.worst_ra_deg, 6),
+                dec_deg=round(coverage.worst_dec_deg, 6),
+                stars=coverage.stars.minimum,
+            ),
+        ),
+        filters=[FilterFigures(filter=name, stars=stars) for name, stars in found.filters],
+        rejected=dict(found.rejected),
+        rows=dict(cost.rows),
+        files=dict(cost.files),
+        total_bytes=found.total_bytes,
+        memory_bytes=cost.memory_bytes,
+        read_seconds=round(found.read_seconds, 2),
+        build_seconds=round(found.build_seconds, 2),
+        refusals=list(found.refusals),
+        warnings=list(found.warnings),
+        in_words=cost.in_words,
+    )
+
+
+def starter_answer(starter: Starter) -> StarterAnswer:
+    """Return what is said of a first spec."""
+    rows = [
+        LimitFigures(
+            faint_limit_mag=row.faint_limit_mag,
+            guide_stars=row.guide_stars,
+            stars=_spread(row.stars),
+        )
+        for row in (*starter.limits, starter.thinned)
+    ]
+    return StarterAnswer(
+        checked=checked_spec(starter.spec),
+        limits=rows[:-1],
+        thinned=rows[-1],
+        advice=list(advice(starter)),
+        in_words=starter.cost.in_words,
+    )
+
+
+def _spread(spread: Spread) -> SpreadFacts:
+    return SpreadFacts(
+        minimum=spread.minimum,
+        one_percent=spread.one_percent,
+        median=spread.median,
+        maximum=spread.maximum,
+        mean=round(spread.mean, 3),
+    )

@@ -1,0 +1,98 @@
+"""The page *Releases*: what was published, how to get it, and publishing."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import Form, Query, Request
+from fastapi.responses import RedirectResponse, Response
+
+from starcat.errors import StarcatError
+from starcat.service.access import Publisher, Reader, Role
+from starcat.service.api import releases as api
+from starcat.service.pages.facts import database_rows
+from starcat.service.pages.rendering import page_router, render
+from starcat.service.problems import Problem, ProblemDetails, problem_of
+from starcat.service.service import Service, TheService
+
+router = page_router()
+
+
+def address_of(request: Request, service: Service) -> str:
+    """Return the address of the service as whoever asks reaches it.
+
+    Parameters
+    ----------
+    request : Request
+        What was asked; its name was checked by the guard.
+    service : Service
+        With the address that the operator set, where a proxy stands before it.
+
+    Returns
+    -------
+    str
+        Without a slash at the end.
+    """
+    return (service.settings.public_url or str(request.base_url)).rstrip("/")
+
+
+@router.get("/releases")
+def releases_page(
+    request: Request,
+    service: TheService,
+    reader: Reader,
+    database: Annotated[str, Query(max_length=64)] = "",
+    published: Annotated[str, Query(max_length=200)] = "",
+) -> Response:
+    """Show what was published, and the form to publish what was not."""
+    return _page(request, service, reader, database=database, published=published)
+
+
+@router.post("/releases")
+def publish(
+    request: Request,
+    service: TheService,
+    publisher: Publisher,
+    database: Annotated[str, Form(max_length=64)],
+    note: Annotated[str, Form(max_length=api.MAX_NOTE)] = "",
+) -> Response:
+    """Publish a database, and show the release."""
+    wanted = api.ToPublish(database=database, note=note.replace("\r\n", "\n").strip())
+    try:
+        released = api.publish(wanted, Response(), service, publisher)
+    except (StarcatError, Problem) as error:
+        problem = problem_of(error)
+        return _page(request, service, publisher, database=database, note=note, problem=problem)
+    return RedirectResponse(f"/releases?published={released.title}#{released.title}", 303)
+
+
+def _page(
+    request: Request,
+    service: Service,
+    principal: Reader,
+    *,
+    database: str = "",
+    note: str = "",
+    published: str = "",
+    problem: ProblemDetails | None = None,
+) -> Response:
+    listed = api.all_releases(service, principal).releases
+    newest_first = sorted(listed, key=lambda one: one.published_s or 0.0, reverse=True)
+    return render(
+        request,
+        "releases.html",
+        status=problem.status if problem else 200,
+        releases=newest_first,
+        address=address_of(request, service),
+        unreleased=[
+            (row.id, f"{row.name} {row.version}")
+            for row in database_rows(service)
+            if not row.is_released
+        ],
+        may_publish=principal.role >= Role.PUBLISHER,
+        most_note=api.MAX_NOTE,
+        database=database,
+        note=note,
+        published=published,
+        problem=problem,
+    )

@@ -1,0 +1,392 @@
+"""The pages of databases, their console, releases and the start, on a small artifact."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+import time
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+from shelved import DATABASE, shelve
+
+from starcat.errors import QueryError
+from starcat.query.gallery import gallery, named_query
+from starcat.query.session import open_session
+from starcat.report.sky_map import project
+from starcat.service.app import make_app
+from starcat.service.pages import sky
+from starcat.service.pages.rendering import time_text
+from starcat.service.settings import Settings
+
+LATER = "fedcba9876543210"
+LOCAL = "http://127.0.0.1:8000"
+PAGE = f"/databases/{DATABASE}"
+PAGES = [
+    "/",
+    "/databases",
+    PAGE,
+    f"{PAGE}/coverage",
+    f"{PAGE}/sql?query=FROM+stars+LIMIT+2",
+    f"{PAGE}/compare?other={LATER}",
+    "/identify",
+    "/releases",
+]
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path, artifact_version) -> Path:
+    folder = tmp_path_factory.mktemp("pages") / "service"
+    shelve(folder, small_artifact)
+    shelve(folder, artifact_version("1.1.0"), LATER)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def client(root: Path) -> Iterator[TestClient]:
+    settings = Settings(root=root, anonymous="publisher", workers=0)
+    with TestClient(make_app(settings), base_url=LOCAL) as client:
+        yield client
+
+
+@pytest.fixture
+def empty(tmp_path: Path) -> Iterator[TestClient]:
+    address = "https://stars.example.org"
+    settings = Settings(
+        root=tmp_path / "service", public_url=address, anonymous="reader", workers=0
+    )
+    with TestClient(make_app(settings), base_url=address) as client:
+        yield client
+
+
+def text_of(page: str) -> str:
+    """The words of a page, blanks made one."""
+    words: list[str] = []
+
+    class Words(HTMLParser):
+        def handle_data(self, data: str) -> None:
+            words.append(data)
+
+    Words().feed(page)
+    return re.sub(r"\s+", " ", " ".join(words))
+
+
+@pytest.mark.parametrize("path", PAGES)
+def test_a_page_holds_no_script_style_or_event_of_its_own(client, path):
+    answer = client.get(path)
+    assert answer.status_code == 200
+    assert answer.headers["content-type"] == "text/html; charset=utf-8"
+    found: list[str] = []
+
+    class Tags(HTMLParser):
+        def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+            names = dict(attrs)
+            if tag == "style" or (tag == "script" and not names.get("src")):
+                found.append(tag)
+            found.extend(name for name in names if name == "style" or name.startswith("on"))
+            for name in ("src", "href", "action", "formaction"):
+                address = names.get(name) or "/"
+                if not address.startswith(("/", "#", "?")):
+                    found.append(address)
+
+    Tags().feed(answer.text)
+    assert found == []
+
+
+def test_the_list_has_what_there_is(client, small_artifact):
+    words = text_of(client.get("/databases").text)
+    manifest = json.loads((small_artifact / "manifest.json").read_bytes())
+    assert "small 1.0.0" in words
+    assert "small 1.1.0" in words
+    assert f" {manifest['products']['stars']['rows']} " in words
+    assert "512 x 512 px, 40 x 40 deg" in words
+    assert "not released" in words
+
+
+def test_a_list_without_databases_says_what_to_do(empty):
+    assert "No database yet" in text_of(empty.get("/databases").text)
+    assert "No database to identify with" in text_of(empty.get("/identify").text)
+    assert "Nothing was published yet" in text_of(empty.get("/releases").text)
+
+
+def test_one_database_tells_filters_rates_products_and_columns(client, small_artifact):
+    words = text_of(client.get(PAGE).text)
+    report = json.loads((small_artifact / "report" / "report.json").read_bytes())
+    for step in report["filters"]:
+        assert f"{step['step']} {step['stars']} " in words
+    assert f"clean {report['self_test'][0]['noise_px']} " in words
+    assert "100.0" in words
+    for product in report["products"]:
+        assert product in words
+    assert "great-circle separation" in words.lower()
+    assert '<form method="post"' in client.get(PAGE).text
+
+
+def test_what_a_database_says_of_itself_is_escaped(tmp_path, small_artifact):
+    folder = shelve(tmp_path / "service", small_artifact)
+    path = folder / "manifest.json"
+    manifest = json.loads(path.read_bytes())
+    manifest["spec"]["description"] = "<script>alert(1)</script>"
+    manifest["spec"]["catalog"]["source"] = '"><img src=x onerror=alert(2)>'
+    manifest["sources"][0]["source"] = "<b>bold</b>"
+    path.unlink()
+    path.write_text(json.dumps(manifest))
+    settings = Settings(root=tmp_path / "service", anonymous="reader", workers=0)
+    with TestClient(make_app(settings), base_url=LOCAL) as client:
+        for page in ("/", "/databases", PAGE):
+            text = client.get(page).text
+            assert "<script>alert" not in text
+            assert "<img" not in text
+            assert "<b>" not in text
+        assert "&lt;script&gt;alert(1)&lt;/script&gt;" in client.get(PAGE).text
+
+
+@pytest.mark.parametrize("page", ["", "/coverage", "/coverage.png", "/sql", "/report", "/compare"])
+@pytest.mark.parametrize("database", ["0" * 16, "x" * 300])
+def test_a_page_of_no_database_is_a_page_that_says_so(client, page, database):
+    answer = client.get(f"/databases/{database}{page}")
+    assert answer.status_code == 404
+    assert "no database has the id" in text_of(answer.text)
+
+
+def rows_of_csv(artifact: Path) -> list[dict[str, str]]:
+    text = (artifact / "report" / "coverage.csv").read_text()
+    return list(csv.DictReader(text.splitlines()))
+
+
+def fields_of_table(page: str) -> list[int]:
+    return [int(number) for number in re.findall(r'<th scope="row"><a [^>]*>(\d+)</a>', page)]
+
+
+def test_all_fields_are_in_the_table_those_with_few_stars_first(client, small_artifact):
+    rows = rows_of_csv(small_artifact)
+    seen: list[int] = []
+    for page in range(1, 9):
+        seen += fields_of_table(client.get(f"{PAGE}/coverage?page={page}").text)
+    assert sorted(seen) == list(range(len(rows))) == list(range(200))
+    stars = [int(rows[number]["stars"]) for number in seen]
+    assert stars == sorted(stars)
+    beyond = client.get(f"{PAGE}/coverage?page=9999").text
+    assert fields_of_table(beyond) == seen[-25:]
+    most = fields_of_table(client.get(f"{PAGE}/coverage?order=most").text)
+    assert int(rows[most[0]]["stars"]) == max(stars)
+    assert client.get(f"{PAGE}/coverage?order=up").status_code == 422
+
+
+def test_the_map_has_the_colour_of_each_field_at_its_boresight(client, small_artifact):
+    rows = rows_of_csv(small_artifact)
+    content = client.get(f"{PAGE}/fields.json").json()
+    assert content["stars"] == [int(row["stars"]) for row in rows]
+    assert content["ra_deg"] == pytest.approx([float(row["ra_deg"]) for row in rows], abs=1e-4)
+    picture = Image.open(io.BytesIO(client.get(f"{PAGE}/coverage.png").content))
+    width, height = picture.size
+    pixels = np.asarray(picture.convert("RGBA"))
+    assert pixels[0, 0, 3] == 0  # outside of the ellipse
+    fields = sky.Fields(
+        *(np.array(content[name]) for name in ("ra_deg", "dec_deg", "stars", "stars", "stars"))
+    )
+    x, y = project(fields.ra_deg, fields.dec_deg)
+    column = ((x / sky.HALF_WIDTH + 1.0) * 0.5 * width).astype(int).clip(0, width - 1)
+    row = ((1.0 - y / sky.HALF_HEIGHT) * 0.5 * height).astype(int).clip(0, height - 1)
+    bins = sky.bins_of(fields)
+    inside = pixels[row, column, 3] > 0
+    assert inside.mean() > 0.95  # some lie in the last pixel of the edge
+    for number in np.flatnonzero(inside):
+        stars = content["stars"][number]
+        [one] = [b for b in bins if b.least <= stars and (b.most is None or stars <= b.most)]
+        expected = bytes.fromhex(sky.COLOURS[int(one.name[1:])])
+        assert bytes(pixels[row[number], column[number], :3].tolist()) == expected
+
+
+@given(st.lists(st.integers(0, 400), min_size=1, max_size=60))
+def test_every_number_of_stars_has_one_colour(stars):
+    nothing = np.zeros(len(stars))
+    bins = sky.bins_of(sky.Fields(nothing, nothing, *([np.array(stars)] * 3)))
+    assert len({one.name for one in bins}) == len(bins) <= 10
+    for count in range(min(stars), max(stars) + 1):
+        fitting = [b for b in bins if b.least <= count and (b.most is None or count <= b.most)]
+        assert len(fitting) == 1
+        assert (fitting[0].name == "m0") == (count < 4)
+
+
+def test_the_report_of_a_build_can_do_nothing(client, small_artifact):
+    answer = client.get(f"{PAGE}/report")
+    assert answer.content == (small_artifact / "report" / "index.html").read_bytes()
+    policy = answer.headers["content-security-policy"]
+    assert "sandbox" in policy
+    assert "allow" not in policy
+    assert "default-src 'none'" in policy
+    assert "script-src" not in policy
+
+
+def test_two_versions_are_compared(client):
+    words = text_of(client.get(f"{PAGE}/compare?other={LATER}").text)
+    assert "version 1.0.0 1.1.0" in words
+    assert "Stars that came (0)" in words
+    assert "the same" in words
+    assert client.get(f"{PAGE}/compare?other={'0' * 16}").status_code == 404
+    assert 'value="fedcba9876543210" selected' in client.get(f"{PAGE}/compare").text
+
+
+def asked(client: TestClient, query: str, **fields: str | int):
+    return client.get(f"{PAGE}/sql", params={"query": query, "part": "answer", **fields})
+
+
+def test_an_answer_has_units_and_rows(client):
+    answer = asked(client, "SELECT designation, mag, ra_deg FROM stars ORDER BY mag LIMIT 3")
+    assert "<html" not in answer.text
+    words = text_of(answer.text)
+    assert "3 rows" in words
+    assert "mag mag" in words
+    assert "ra_deg deg" in words
+    cut = text_of(asked(client, "FROM stars", rows=20).text)
+    assert "20 rows, and there are more" in cut
+
+
+def test_an_error_has_the_words_of_the_command(client, small_artifact):
+    for query in ("SELECT * FROM star", "COPY stars TO 'x.csv'", "SELECT", "FROM stars WHERE $x"):
+        with (
+            open_session([str(small_artifact)]) as session,
+            pytest.raises(QueryError) as raised,
+            session.ask(query) as running,
+        ):
+            running.rows(1)
+        answer = asked(client, query)
+        assert answer.status_code == 400
+        assert re.sub(r"\s+", " ", str(raised.value)).strip() in text_of(answer.text)
+
+
+def test_values_of_an_answer_are_escaped(client):
+    answer = asked(client, "SELECT '<script>alert(1)</script>' AS \"<i>x</i>\"")
+    assert answer.status_code == 200
+    assert "<script>" not in answer.text
+    assert "<i>" not in answer.text
+    whole = client.get(f"{PAGE}/sql", params={"query": "SELECT '</textarea><script>' AS x"})
+    assert whole.status_code == 200
+    assert "<script>'" not in whole.text
+    assert "</textarea><script>" not in whole.text
+
+
+@pytest.mark.parametrize("name", gallery())
+def test_a_named_query_stands_in_the_console_with_its_values(client, name):
+    query = named_query(name)
+    page = client.get(f"{PAGE}/sql", params={"named": name}).text
+    for value in query.values:
+        assert f'name="value.{value.name}"' in page
+    assert query.help in text_of(page)
+    assert ('name="other"' in page) == (query.targets == 2)
+
+
+def test_named_queries_are_answered_with_values_of_their_types(client):
+    query = named_query("emptiest-fields").text
+    named = {"named": "emptiest-fields", "value.count": "4"}
+    assert "4 rows" in text_of(asked(client, query, **named).text)
+    refused = asked(client, query, **{**named, "value.count": "many"})
+    assert refused.status_code == 400
+    assert "'many' is not a whole number" in text_of(refused.text)
+    changed = {"named": "changed-stars", "other": LATER}
+    assert "0 rows" in text_of(asked(client, named_query("changed-stars").text, **changed).text)
+    alone = asked(client, named_query("changed-stars").text, named="changed-stars")
+    assert "is about 2 targets" in text_of(alone.text)
+    own = asked(client, "SELECT $a + 1 AS b", **{"value.a": "2"})
+    assert "1 row" in text_of(own.text)
+
+
+@pytest.mark.parametrize("form", ["csv", "json", "parquet", "votable", "fits", "ecsv"])
+def test_an_answer_comes_as_a_file(client, form):
+    query = {"query": "SELECT designation, mag FROM stars ORDER BY mag LIMIT 5", "form": form}
+    answer = client.get(f"{PAGE}/sql/file", params=query)
+    assert answer.status_code == 200
+    assert answer.headers["content-disposition"].startswith('attachment; filename="small-1.0.0.')
+    begins = {"parquet": b"PAR1", "fits": b"SIMPLE", "ecsv": b"# %ECSV", "votable": b"<?xml"}
+    assert answer.content.startswith(begins.get(form, b""))
+    if form == "csv":
+        assert len(answer.text.splitlines()) == 6
+    if form == "json":
+        assert len(answer.json()) == 5
+
+
+def test_a_release_is_published_with_a_note(client, small_artifact, tmp_path):
+    form = {"database": DATABASE, "note": "For June.\r\n<script>alert(1)</script>"}
+    answer = client.post("/releases", data=form, follow_redirects=False)
+    assert answer.status_code == 303
+    page = client.get(answer.headers["location"].partition("#")[0]).text
+    words = text_of(page)
+    assert "small-1.0.0 is published." in words
+    assert "For June. <script>alert(1)</script>" in words
+    assert "<script>alert" not in page
+    assert f"starcat pull small@1.0.0 --registry {LOCAL}/registry" in words
+    assert f'value="{DATABASE}"' not in page
+    assert f'value="{LATER}"' in page
+    assert "released" in text_of(client.get(PAGE).text)
+    for link in re.findall(r'href="(/registry/[^"]+)"', page):
+        assert client.get(link).status_code == 200
+
+
+def test_another_content_of_a_release_is_refused_in_words(
+    tmp_path, small_artifact, artifact_version
+):
+    shelve(tmp_path / "service", small_artifact)
+    shelve(tmp_path / "service", artifact_version("1.0.0"), LATER)
+    settings = Settings(root=tmp_path / "service", anonymous="publisher", workers=0)
+    with TestClient(make_app(settings), base_url=LOCAL) as client:
+        assert client.post("/releases", data={"database": DATABASE}).status_code == 200
+        form = {"database": LATER, "note": "kept <b>"}
+        answer = client.post("/releases", data=form)
+        assert answer.status_code == 409
+        assert "has small-1.0.0 already, with another content" in text_of(answer.text)
+        assert "kept &lt;b&gt;</textarea>" in answer.text
+        page = client.get("/databases").text
+        assert (page.count(">released<"), page.count(">not released<")) == (1, 1)
+
+
+def test_who_only_reads_publishes_and_evaluates_nothing(root):
+    settings = Settings(root=root, anonymous="reader", workers=0)
+    with TestClient(make_app(settings), base_url=LOCAL) as client:
+        assert "needs a token with the role publisher" in text_of(client.get("/releases").text)
+        refused = client.post("/releases", data={"database": LATER})
+        assert refused.status_code == 401
+        assert client.post(f"{PAGE}/evaluate").status_code == 401
+
+
+def test_an_evaluation_is_a_job(client):
+    answer = client.post(f"{PAGE}/evaluate", follow_redirects=False)
+    assert answer.status_code == 303
+    page = client.get(answer.headers["location"])
+    assert page.status_code == 200
+    assert "small-1.0.0 self-test" in text_of(page.text)
+    assert "small-1.0.0 self-test" in text_of(client.get("/").text)
+
+
+def test_the_start_says_how_programs_reach_the_service(client, empty):
+    words = text_of(client.get("/").text)
+    assert f"{LOCAL}/tap" in words
+    assert f"starcat --server {LOCAL} sql small-1" in words
+    away = text_of(empty.get("/").text)
+    assert "https://stars.example.org/tap" in away
+    assert "Design a database" in away
+
+
+def test_the_time_of_a_build_is_that_of_its_job(tmp_path, small_artifact):
+    shelve(tmp_path / "service", small_artifact)
+    settings = Settings(root=tmp_path / "service", anonymous="reader", workers=0)
+    app = make_app(settings)
+    ended_s = time.time() - 86_400.0
+    with TestClient(app, base_url=LOCAL) as client:
+        service = app.state.service
+        job = service.jobs.add("build", {}, key=DATABASE + 48 * "0", title="t", owner="o")
+        with service.records.writing() as connection:
+            connection.execute(
+                "UPDATE jobs SET state = 'done', ended_s = ?, result = ? WHERE id = ?",
+                (ended_s, json.dumps({"database": DATABASE}), job.id),
+            )
+        assert time_text(ended_s)[:16] in text_of(client.get("/databases").text)

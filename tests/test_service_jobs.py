@@ -1,0 +1,639 @@
+"""Jobs: what is asked for once is done once, and what becomes of it is remembered."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sqlite3
+import threading
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("fastapi")
+
+from fastapi.testclient import TestClient
+
+from starcat.artifact.verify import verify_artifact
+from starcat.errors import ConfigError, SourceMissing, TargetMissing
+from starcat.service.access import Principal, Role
+from starcat.service.app import make_app
+from starcat.service.jobs import transitions
+from starcat.service.jobs.job import Job
+from starcat.service.jobs.keys import build_key, file_digests
+from starcat.service.jobs.pool import WorkerPool
+from starcat.service.jobs.queue import JsonMessages
+from starcat.service.jobs.recovery import recover
+from starcat.service.jobs.runner import Slots, lines_of
+from starcat.service.jobs.submission import (
+    cancel_job,
+    retry_job,
+    submit_build,
+    submit_evaluation,
+    submit_ingest,
+)
+from starcat.service.jobs.transitions import MAX_INTERRUPTED, Attempt, claim, interrupt
+from starcat.service.problems import Problem
+from starcat.service.server import run_server
+from starcat.service.service import Service, open_service
+from starcat.service.settings import Settings
+from starcat.specs.build_spec import BuildSpec
+from starcat.specs.reading import spec_from_dict
+from starcat.specs.spec_toml import spec_toml
+from starcat.storage.locks import locked
+
+LOCAL = "http://127.0.0.1:8000"
+JOBS = "/api/v1/jobs"
+ANNE, BOB = Principal("anne", Role.BUILDER), Principal("bob", Role.BUILDER)
+CHIEF = Principal("chief", Role.PUBLISHER)
+
+
+@pytest.fixture
+def archive(tmp_path: Path, sao_lines: list[bytes], monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with SAO's file, where it is looked for first."""
+    folder = tmp_path / "archive"
+    folder.mkdir()
+    (folder / "sao.dat").write_bytes(b"".join(sao_lines))
+    monkeypatch.setenv("STARCAT_CATALOGS", str(folder))
+    monkeypatch.setenv("STARCAT_CACHE", str(tmp_path / "no-cache"))
+    return folder
+
+
+@pytest.fixture
+def spec(archive: Path, small_spec: str) -> BuildSpec:
+    return spec_from_dict(tomllib.loads(small_spec), "small.toml")
+
+
+Open = Callable[..., Service]
+
+
+@pytest.fixture
+def opened(tmp_path: Path) -> Iterator[Open]:
+    """Services of one root, with settings; without workers."""
+    services = []
+
+    def make(**options: Any) -> Service:
+        service = open_service(Settings(root=tmp_path / "service", **options))
+        services.append(service)
+        return service
+
+    yield make
+    for service in services:
+        service.queue.close()
+        service.records.close()
+
+
+@pytest.fixture
+def service(opened: Open) -> Service:
+    return opened()
+
+
+def states(service: Service, job: Job) -> list[str]:
+    events = service.jobs.events(job.id)
+    return [event.data["state"] for event in events if event.kind == "state"]
+
+
+def messages(service: Service) -> list[str]:
+    """Return the jobs that workers are told of, in order."""
+    return [task.args[0] for task in service.queue.huey.pending()]
+
+
+def begin(service: Service, job: Job) -> Attempt:
+    found = claim(service.records, job.id)
+    assert found is not None
+    return Attempt(service.records, found)
+
+
+def end(service: Service, job: Job, how: str) -> None:
+    attempt = begin(service, job)
+    if how == "failed":
+        attempt.fail({"title": "x", "status": 422, "detail": "it went wrong"})
+    elif how == "cancelled":
+        attempt.be_cancelled()
+    else:
+        attempt.succeed({"database": job.key[:16]})
+
+
+def test_a_job_is_begun_once(service, spec):
+    job = submit_build(service, spec, "anne").job
+    begun: list[Job | None] = []
+
+    def try_it() -> None:
+        begun.append(claim(service.records, job.id))
+
+    threads = [threading.Thread(target=try_it) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    [found] = [one for one in begun if one is not None]
+    assert (found.state, found.attempt) == ("running", 1)
+    assert states(service, job) == ["queued", "running"]
+
+
+def test_an_attempt_that_is_over_is_not_heard(service, spec):
+    job = submit_build(service, spec, "anne").job
+    first = begin(service, job)
+    interrupt(service.records, job.id, 1)
+    second = begin(service, job)
+    assert first.wants_end()
+    first.tell_stage("read", 1, 2)
+    first.tell("info", "hello")
+    first.succeed({"database": "0" * 16})
+    first.fail({"detail": "no"})
+    interrupt(service.records, job.id, 1)
+    assert service.jobs.get(job.id) == second.job
+    assert {event.kind for event in service.jobs.events(job.id)} == {"state"}
+    assert not second.wants_end()
+    second.succeed({"database": "0" * 16})
+    assert service.jobs.get(job.id).state == "done"
+
+
+def test_a_key_is_of_what_the_result_depends_on(service, spec, archive, small_spec):
+    key = build_key(service.records, spec)
+    written = spec_from_dict(tomllib.loads(spec_toml(spec)), "all keys")
+    recorded = spec_from_dict(json.loads(json.dumps(spec.recorded())), "recorded")
+    assert {build_key(service.records, one) for one in (spec, written, recorded)} == {key}
+    others = ('version = "1.0.1"', "epoch_jyear = 2026.5", 'name = "smaller"')
+    for text in others:
+        name = text.split()[0]
+        lines = [text if line.startswith(f"{name} ") else line for line in small_spec.splitlines()]
+        other = spec_from_dict(tomllib.loads("\n".join(lines)), "other")
+        assert build_key(service.records, other) != key
+    (archive / "elsewhere").mkdir()
+    (archive / "sao.dat").rename(archive / "elsewhere" / "sao.dat")
+    with pytest.raises(SourceMissing):
+        build_key(service.records, spec)
+    (archive / "elsewhere" / "sao.dat").rename(archive / "sao.dat")
+    assert build_key(service.records, spec) == key
+    data = (archive / "sao.dat").read_bytes()
+    (archive / "sao.dat").write_bytes(data.replace(b"A0V", b"B0V", 1))
+    assert build_key(service.records, spec) != key
+
+
+def test_a_file_is_read_once_while_it_does_not_change(service, tmp_path, monkeypatch):
+    from starcat.service.jobs import keys
+
+    read = []
+    monkeypatch.setattr(keys, "file_sha256", lambda path: read.append(path) or f"{len(read)}")
+    path = tmp_path / "file"
+    path.write_bytes(b"abc")
+    assert file_digests(service.records, [path, path]) == ["1", "1"]
+    os.utime(path, ns=(1, 1))
+    assert file_digests(service.records, [path]) == ["2"]
+    path.write_bytes(b"abcd")
+    os.utime(path, ns=(1, 1))
+    assert file_digests(service.records, [path]) == ["3"]
+
+
+def test_the_same_request_is_the_same_job(service, spec):
+    first = submit_build(service, spec, "anne")
+    assert (first.is_new, first.job.state, first.job.title) == (True, "queued", "small 1.0.0")
+    again = submit_build(service, spec, "bob")
+    assert (again.is_new, again.job) == (False, first.job)
+    begin(service, first.job)
+    assert submit_build(service, spec, "bob").job.id == first.job.id
+    assert messages(service) == [first.job.id]
+
+
+@pytest.mark.parametrize("how", ["failed", "cancelled", "done"])
+def test_what_has_no_result_is_done_again(service, spec, how):
+    first = submit_build(service, spec, "anne").job
+    end(service, first, how)  # of what is done, the database is not on the shelf
+    second = submit_build(service, spec, "anne")
+    assert second.is_new
+    assert second.job.id != first.id
+
+
+def test_other_kinds_have_keys_too(service, spec, archive):
+    bare = submit_ingest(service, "sao", "anne")
+    assert bare.job.request["band"] == "V"
+    assert submit_ingest(service, "sao", "bob", band="V").job.id == bare.job.id
+    assert submit_ingest(service, "sao", "anne", to="hats").is_new
+    assert submit_ingest(service, "sao", "anne", read_limit_mag=5.0).is_new
+    with pytest.raises(ConfigError, match="band"):
+        submit_ingest(service, "sao", "anne", band="Q")
+    with pytest.raises(TargetMissing, match="no database"):
+        submit_evaluation(service, "0" * 16, "anne")
+
+
+def test_users_wait_in_moderation(opened, spec):
+    service = opened(jobs_waiting=2)
+    first = submit_ingest(service, "sao", "anne").job
+    submit_ingest(service, "sao", "anne", to="hats")
+    with pytest.raises(Problem, match="2 jobs of anne are waiting, and 2 may") as refused:
+        submit_build(service, spec, "anne")
+    assert refused.value.status == 429
+    assert submit_build(service, spec, "bob").is_new
+    begin(service, first)
+    assert submit_ingest(service, "sao", "anne", read_limit_mag=5.0).is_new
+
+
+def test_a_full_disk_takes_no_job(opened, spec):
+    with pytest.raises(Problem, match=r"GiB free, and 1e\+09 have to be left") as refused:
+        submit_build(opened(free_gib=1e9), spec, "anne")
+    assert refused.value.status == 507
+    service = opened()
+    job = submit_build(service, spec, "anne").job
+    Slots(opened(free_gib=1e9)).run_job(job.id)
+    found = service.jobs.get(job.id)
+    assert (found.state, found.error["status"]) == ("failed", 507)
+
+
+def test_a_user_has_so_much_of_the_disk(opened, spec, small_artifact):
+    service = opened(disk_gib=1e-5)
+    job = submit_build(service, spec, "anne").job
+    end(service, job, "done")
+    folder = service.places.database(job.key[:16])
+    folder.mkdir()
+    (folder / small_artifact.name).symlink_to(small_artifact)
+    with pytest.raises(Problem, match=r"the databases of anne take .* \(disk_gib\)") as refused:
+        submit_ingest(service, "sao", "anne")
+    assert refused.value.status == 409
+    assert submit_ingest(service, "sao", "bob").is_new
+
+
+def test_jobs_are_ended_and_tried_again_by_those_who_may(service, spec):
+    job = submit_build(service, spec, "anne").job
+    for change in (cancel_job, retry_job):
+        with pytest.raises(Problem, match="is of anne, and bob may not") as refused:
+            change(service, job.id, BOB)
+        assert refused.value.status == 403
+        with pytest.raises(TargetMissing):
+            change(service, "0" * 32, CHIEF)
+        with pytest.raises(TargetMissing):
+            change(service, "../../etc/passwd", CHIEF)
+    with pytest.raises(Problem, match="need not be tried again: it is queued"):
+        retry_job(service, job.id, ANNE)
+    assert cancel_job(service, job.id, ANNE).state == "cancelled"
+    assert cancel_job(service, job.id, CHIEF).state == "cancelled"
+    assert claim(service.records, job.id) is None
+    assert retry_job(service, job.id, CHIEF).state == "queued"
+    attempt = begin(service, job)
+    assert cancel_job(service, job.id, ANNE).state == "running"
+    assert attempt.wants_end()
+    attempt.be_cancelled()
+    other = submit_build(service, spec, "bob").job
+    with pytest.raises(Problem, match=f"job {other.id} does the same and is queued"):
+        retry_job(service, job.id, ANNE)
+    end(service, other, "failed")
+    with pytest.raises(Problem, match="has ended already; it is failed") as refused:
+        cancel_job(service, other.id, BOB)
+    assert refused.value.status == 409
+    assert retry_job(service, other.id, BOB).error is None
+    assert states(service, job)[-1] == "cancelled"
+
+
+def test_of_each_stage_the_last_event_is_kept(service, spec):
+    attempt = begin(service, submit_build(service, spec, "anne").job)
+    for done in range(50):
+        attempt.tell_stage("read", done, 50)
+    attempt.tell("info", "half")
+    attempt.tell_stage("self-test", 0, None)
+    attempt.tell_stage("self-test", 1, None)
+    events = service.jobs.events(attempt.job.id)
+    told = [(event.number, event.kind, event.data.get("done")) for event in events]
+    assert told == [
+        (1, "state", None), (2, "state", None), (52, "stage", 49), (53, "log", None),
+        (55, "stage", 1),
+    ]  # fmt: skip
+    assert service.jobs.events(attempt.job.id, after=53) == events[-1:]
+    found = service.jobs.get(attempt.job.id)
+    assert (found.stage, found.done, found.total) == ("self-test", 1, None)
+
+
+def test_a_log_has_an_end(service, spec, monkeypatch):
+    monkeypatch.setattr(transitions, "MAX_LOG_LINES", 3)
+    attempt = begin(service, submit_build(service, spec, "anne").job)
+    for number in range(9):
+        attempt.tell("info", f"line {number}")
+    lines = [e.data["text"] for e in service.jobs.events(attempt.job.id) if e.kind == "log"]
+    assert lines == ["line 0", "line 1", "line 2", "the log ends here, after 3 lines"]
+
+
+def test_a_job_that_loses_its_server_waits_again_but_not_for_ever(service, spec):
+    job = submit_build(service, spec, "anne").job
+    for attempt in range(1, MAX_INTERRUPTED + 1):
+        assert begin(service, job).job.attempt == attempt
+        interrupt(service.records, job.id, attempt)
+    found = service.jobs.get(job.id)
+    assert found.state == "failed"
+    assert "the service ended 8 times while this job ran" in found.error["detail"]
+    retry_job(service, job.id, ANNE)
+    begin(service, job)
+    interrupt(service.records, job.id, MAX_INTERRUPTED + 1)
+    assert service.jobs.get(job.id).state == "queued"
+    begin(service, job)
+    cancel_job(service, job.id, ANNE)
+    interrupt(service.records, job.id, MAX_INTERRUPTED + 2)
+    assert service.jobs.get(job.id).state == "cancelled"
+
+
+def test_a_server_takes_up_what_another_has_left(service, spec):
+    ran = submit_build(service, spec, "anne").job
+    begin(service, ran)
+    waits = submit_ingest(service, "sao", "anne").job
+    service.queue.huey.flush()  # the messages are lost
+    service.places.job_work(ran.id).mkdir(parents=True)
+    (service.places.job_work(ran.id) / "half").write_text("")
+    service.places.database("0" * 16).mkdir()
+    recover(service)
+    assert service.jobs.get(ran.id).state == "queued"
+    assert messages(service) == [ran.id, waits.id]
+    assert not service.places.job_work(ran.id).exists()
+    assert list(service.places.databases.iterdir()) == []
+
+
+def test_messages_that_are_lost_are_sent_again(service, spec):
+    job = submit_build(service, spec, "anne").job
+    service.queue.huey.flush()
+    WorkerPool(service)._look()
+    assert messages(service) == [job.id]
+    WorkerPool(service)._look()
+    assert messages(service) == [job.id]
+
+
+def test_a_queue_that_does_not_answer_loses_nothing(opened, spec):
+    service = opened(queue_url="redis://127.0.0.1:1/0")
+    job = submit_build(service, spec, "anne").job
+    assert service.jobs.get(job.id).state == "queued"
+    WorkerPool(service)._look()
+    with pytest.raises(ConfigError, match="expected redis://"):
+        opened(queue_url="nonsense")
+
+
+def test_messages_are_no_code(service):
+    with pytest.raises(ValueError, match="codec"):
+        JsonMessages().deserialize(b"\x80\x04\x95cos\nsystem\n")
+
+
+def test_two_servers_do_not_share_a_root(tmp_path):
+    settings = Settings(root=tmp_path / "service", port=0)
+    with (
+        locked(tmp_path / "service" / "server.lock"),
+        pytest.raises(ConfigError, match=r"another server runs with --root .*service"),
+    ):
+        run_server(settings, print)
+
+
+def test_lines_are_whole_however_they_come(tmp_path):
+    read, write = os.pipe()
+    found = []
+    with open(read, "rb", buffering=0) as pipe:
+        lines = lines_of(pipe, 0.01)
+        os.write(write, b"one\ntw")
+        found += [next(lines), next(lines)]
+        os.write(write, b"o\nthree")
+        os.close(write)
+        found += list(lines)
+    assert [line for line in found if line is not None] == [b"one", b"two"]
+
+
+def settled(service: Service, job_id: str, seconds: float = 50.0) -> Job:
+    until_s = time.monotonic() + seconds
+    while time.monotonic() < until_s:
+        job = service.jobs.get(job_id)
+        if job.has_ended:
+            return job
+        time.sleep(0.05)
+    raise AssertionError(f"{job} after {seconds} s; {service.jobs.events(job_id)}")
+
+
+def test_a_build_is_done_and_watched_over_http(archive, tmp_path, small_spec):
+    settings = Settings(root=tmp_path / "service", anonymous="publisher")
+    with TestClient(make_app(settings), base_url=LOCAL) as client:
+        answer = client.post(JOBS, json={"kind": "build", "spec": small_spec})
+        job = answer.json()
+        assert (answer.status_code, job["state"]) == (201, "queued")
+        assert answer.headers["location"] == f"{JOBS}/{job['id']}"
+        events = sent_events(client.get(f"{JOBS}/{job['id']}/events").text)
+        told = [data["state"] for kind, _, data in events if kind == "state"]
+        assert told == ["queued", "running", "done"]
+        stages = [data["stage"] for kind, _, data in events if kind == "stage"]
+        assert "self-test" in stages
+        assert "verify" in stages
+        database = events[-1][2]["result"]["database"]
+        again = client.post(JOBS, json={"kind": "build", "spec": tomllib.loads(small_spec)})
+        assert (again.status_code, again.json()["id"]) == (200, job["id"])
+        plain = client.get(f"{JOBS}/{job['id']}/events.json").json()
+        last = plain[-2]["number"]
+        resumed = client.get(f"{JOBS}/{job['id']}/events", headers={"Last-Event-ID": str(last)})
+        assert [number for _, number, _ in sent_events(resumed.text)] == [plain[-1]["number"]]
+        log = client.get(f"{JOBS}/{job['id']}/log").text
+        assert "info: estimate: " in log
+        assert log.endswith("Z done\n")
+        wish = {"kind": "evaluate", "database": database, "frames": 4, "seed": 1}
+        measured = client.post(JOBS, json=wish).json()["id"]
+        client.get(f"{JOBS}/{measured}/events")
+        rates = client.get(f"{JOBS}/{measured}").json()["result"]["rates"]
+        assert [rate["frames"] for rate in rates] == [4, 4, 4, 4]
+        listed = client.get(JOBS, params={"kind": "evaluate", "limit": 1}).json()
+        assert (listed["total"], listed["jobs"][0]["id"]) == (1, measured)
+        service = client.app.state.service
+        folder = service.shelf.database(database).folder
+        assert verify_artifact(folder).findings == ()
+        assert {path.stat().st_mode & 0o222 for path in folder.iterdir() if path.is_file()} == {0}
+        assert not list(service.places.jobs.glob("*/work"))
+
+
+def sent_events(text: str) -> list[tuple[str, int, dict[str, Any]]]:
+    """Return kind, number and data of server-sent events."""
+    found = []
+    for block in text.strip().split("\n\n"):
+        fields = dict(line.split(": ", 1) for line in block.splitlines() if line[0] != ":")
+        if fields:
+            found.append((fields["event"], int(fields["id"]), json.loads(fields["data"])))
+    return found
+
+
+@pytest.fixture
+def client(archive: Path, tmp_path: Path) -> Iterator[TestClient]:
+    settings = Settings(root=tmp_path / "service", anonymous="builder", workers=0)
+    with TestClient(make_app(settings), base_url=LOCAL) as client:
+        yield client
+
+
+REFUSED = {
+    "nothing": ({}, "kind"),
+    "no such kind": ({"kind": "destroy"}, "destroy"),
+    "neither spec nor preset": ({"kind": "build"}, "give either spec or preset"),
+    "both": ({"kind": "build", "spec": "", "preset": "gaia-12deg"}, "give either"),
+    "no TOML": ({"kind": "build", "spec": "= 3"}, "not readable as TOML"),
+    "an unknown key": ({"kind": "build", "spec": {"nmae": "x"}}, "nmae: unknown key"),
+    "an unknown preset": ({"kind": "build", "preset": "gaia-12"}, "known presets"),
+    "a key out of range": (
+        {"kind": "build", "preset": "gaia-12deg", "changes": {"self_test.frames": "0"}},
+        "self_test.frames",
+    ),
+    "changes of a spec": ({"kind": "build", "spec": {}, "changes": {"a": "1"}}, "changes"),
+    "a foreign key": ({"kind": "build", "preset": "gaia-12deg", "output": "/etc"}, "output"),
+    "an unknown catalog": ({"kind": "ingest", "source": "../sao"}, "sao"),
+    "too many frames": (
+        {"kind": "evaluate", "database": "0" * 16, "frames": 10**9},
+        "less than or equal",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_done_is_refused_at_once(client, name):
+    wish, words = REFUSED[name]
+    answer = client.post(JOBS, json=wish)
+    assert answer.status_code in (404, 422)
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert words in answer.json()["detail"]
+    assert client.get(JOBS).json() == {"jobs": [], "total": 0}
+
+
+def test_jobs_are_listed_by_what_they_are(client, small_spec):
+    made = [
+        client.post(JOBS, json=wish).json()["id"]
+        for wish in (
+            {"kind": "build", "spec": small_spec},
+            {"kind": "ingest", "source": "sao"},
+            {"kind": "ingest", "source": "sao", "to": "hats"},
+        )
+    ]
+    client.post(f"{JOBS}/{made[1]}/cancel")
+
+    def listed(**wanted: object) -> list[str]:
+        return [job["id"] for job in client.get(JOBS, params=wanted).json()["jobs"]]
+
+    assert listed() == made[::-1]
+    assert listed(kind="ingest") == [made[2], made[1]]
+    assert listed(state="cancelled") == [made[1]]
+    assert listed(limit=1, offset=1) == [made[1]]
+    assert listed(owner="nobody") == []
+    assert client.post(f"{JOBS}/{made[1]}/retry").json()["state"] == "queued"
+    assert client.get(f"{JOBS}/{'0' * 32}").status_code == 404
+    assert client.get(f"{JOBS}/{'0' * 32}/events").status_code == 404
+    assert client.get(f"{JOBS}/xyz/log").status_code == 404
+
+
+def test_readers_watch_and_do_nothing_else(archive, tmp_path):
+    settings = Settings(root=tmp_path / "service", anonymous="reader", workers=0)
+    with TestClient(make_app(settings), base_url=LOCAL) as client:
+        job = submit_ingest(client.app.state.service, "sao", "anne").job
+        for path in ("", f"/{job.id}", f"/{job.id}/events.json", f"/{job.id}/log"):
+            assert client.get(f"{JOBS}{path}").status_code == 200
+        for path in ("", f"/{job.id}/cancel", f"/{job.id}/retry"):
+            assert client.post(f"{JOBS}{path}", json={}).status_code == 401
+
+
+LONG = {"self_test": {"frames": 100_000, "min_identified": 0.0}}
+"""What makes a build of the small spec take minutes."""
+
+
+def long_build(service: Service, spec: BuildSpec) -> Job:
+    content = {**spec.recorded(), **LONG}
+    return submit_build(service, spec_from_dict(content, "long"), "anne").job
+
+
+def run_until(service: Service, slots: Slots, job: Job, then: Callable[[], None]) -> Job:
+    """Run a job, and do something as soon as it is under way."""
+    thread = threading.Thread(target=slots.run_job, args=(job.id,))
+    thread.start()
+    until_s = time.monotonic() + 40.0
+    while not service.jobs.get(job.id).stage and time.monotonic() < until_s:
+        time.sleep(0.02)
+    then()
+    thread.join(30.0)
+    assert not thread.is_alive()
+    assert not service.places.job_work(job.id).exists()
+    assert list(service.places.databases.iterdir()) == []
+    with locked(service.places.job_lock(job.id), wait=False):  # its process is gone
+        return service.jobs.get(job.id)
+
+
+@pytest.mark.slow
+def test_a_job_that_runs_is_cancelled(service, spec):
+    job = long_build(service, spec)
+    ended = run_until(service, Slots(service), job, lambda: cancel_job(service, job.id, ANNE))
+    assert (ended.state, ended.error, ended.result) == ("cancelled", None, None)
+
+
+@pytest.mark.slow
+def test_a_job_that_cannot_end_in_time_waits_for_the_next_start(service, spec):
+    slots = Slots(service)
+
+    def stop() -> None:
+        slots.stop_at_s = time.monotonic() + 0.3
+
+    job = long_build(service, spec)
+    assert run_until(service, slots, job, stop).state == "queued"
+    slots.run_job(job.id)  # it takes no further job
+    assert service.jobs.get(job.id).state == "queued"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("limits", "words"),
+    [
+        ({"job_time_s": 0.5}, "the job took more than 0.5 s (job_time_s)"),
+        ({"job_memory_gib": 0.2}, "GiB of memory"),
+    ],
+)
+def test_a_job_has_limits(opened, spec, limits, words):
+    service = opened(**limits)
+    job = long_build(service, spec)
+    Slots(service).run_job(job.id)
+    failed = service.jobs.get(job.id)
+    assert failed.state == "failed"
+    assert words in failed.error["detail"]
+    assert failed.error["status"] == 422
+
+
+@pytest.mark.slow
+def test_a_process_that_is_killed_is_told_of(service, spec):
+    slots = Slots(service)
+    job = long_build(service, spec)
+
+    def kill() -> None:
+        for group in slots._groups:
+            os.kill(group, signal.SIGKILL)
+
+    failed = run_until(service, slots, job, kill)
+    assert failed.state == "failed"
+    assert "ended by SIGKILL, as a system does that runs out of memory" in failed.error["detail"]
+
+
+@pytest.mark.slow
+def test_a_build_that_fails_says_why(service, spec, archive):
+    job = submit_build(service, spec, "anne").job
+    (archive / "sao.dat").write_bytes(b"no star\n" * 100)
+    Slots(service).run_job(job.id)
+    failed = service.jobs.get(job.id)
+    assert (failed.state, failed.error["kind"]) == ("failed", "ParseError")
+    assert "sao.dat" in failed.error["detail"]
+    assert service.places.job_stderr(job.id).read_text() == ""
+
+
+@pytest.mark.slow
+def test_a_catalog_is_read_either_way(service, archive):
+    for to in ("parquet", "hats"):
+        job = submit_ingest(service, "sao", "anne", to=to).job
+        Slots(service).run_job(job.id)
+        done = service.jobs.get(job.id)
+        assert done.state == "done", done.error
+        assert done.result["rows"] == 600
+        assert (service.places.catalogs / done.result["catalog"]).exists()
+        assert not submit_ingest(service, "sao", "bob", to=to).is_new
+
+
+@pytest.mark.slow
+def test_a_database_that_is_there_is_not_built_again(service, spec):
+    job = submit_build(service, spec, "anne").job
+    Slots(service).run_job(job.id)
+    database = service.shelf.database(job.key[:16])
+    with sqlite3.connect(service.places.records) as records:  # killed before that was written
+        records.execute("UPDATE jobs SET state = 'queued', result = NULL")
+    records.close()
+    before = database.folder.stat()
+    Slots(service).run_job(job.id)
+    assert service.jobs.get(job.id).result == {"database": database.id}
+    assert os.path.samestat(database.folder.stat(), before)
