@@ -514,3 +514,12 @@ def test_an_address_for_others_is_an_origin(tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match="public_url"):
             read_settings(tmp_path, public_url=wrong)
     assert Settings(root=tmp_path, public_url="https://x:8443").is_secure
+
+
+def test_the_page_of_the_interface_names_every_address(client: Make) -> None:
+    at = client()
+    page = at.get("/api/docs")
+    assert page.status_code == 200
+    for path, operations in at.get("/api/openapi.json").json()["paths"].items():
+        for method in operations:
+            assert f"<code>{method.upper()} {path}</code>" in page.text
