@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -230,6 +230,36 @@ def centroid(shape: Shape) -> Point:
     return Point(
         f"({lon} + CASE WHEN {lon} < 0 THEN 360 ELSE 0 END)", f"degrees({_text(_arctan(z, level))})"
     )
+
+
+def characters(shapes: Sequence[Shape]) -> int:
+    """Return how much SQL it takes, roughly, to find something out about shapes.
+
+    Parameters
+    ----------
+    shapes : sequence of Shape
+        One or two.
+
+    Returns
+    -------
+    int
+        Characters. What is known when the query is read takes few.
+    """
+    parts = [_parts(shape) for shape in shapes]
+    sides = [len(shape.corners) if isinstance(shape, Polygon) else 1 for shape in shapes]
+    unknown = [sum(len(text) for text in texts if _number(text) is None) for texts in parts]
+    both = sum(
+        length * math.prod(sides) // side for length, side in zip(unknown, sides, strict=True)
+    )
+    return 60 * (both + sum(unknown)) + 100 * math.prod(sides)
+
+
+def _parts(shape: Shape) -> tuple[str, ...]:
+    if isinstance(shape, Point):
+        return shape.lon, shape.lat
+    if isinstance(shape, Circle):
+        return (*_parts(shape.centre), shape.radius)
+    return tuple(text for corner in shape.corners for text in _parts(corner))
 
 
 def box(centre: Point, width: str, height: str) -> Polygon:
