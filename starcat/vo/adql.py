@@ -23,7 +23,7 @@ from starcat.vo.tables import Tables
 MAX_CORNERS = 400
 """Corners of a polygon at most."""
 
-MAX_CHARACTERS = 3_000_000
+MAX_CHARACTERS = 1_000_000
 """Length of the arithmetic that the geometry of a query may become, roughly."""
 
 FRAMES = ("", "ICRS", "UNKNOWNFRAME")
