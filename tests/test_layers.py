@@ -175,7 +175,7 @@ for room, *names in {rooms}:
         os._exit(0)
     if os.waitpid(child, 0)[1]:
         failed.append(room)
-sys.exit(", ".join(failed))
+sys.exit(", ".join(failed) or 0)
 """
 """Imports the rooms, each in a process that has other libraries but nothing of starcat."""
 

@@ -464,7 +464,8 @@ REFUSED = {
     "no such kind": ({"kind": "destroy"}, "destroy"),
     "neither spec nor preset": ({"kind": "build"}, "give either spec or preset"),
     "both": ({"kind": "build", "spec": "", "preset": "gaia-12deg"}, "give either"),
-    "no TOML": ({"kind": "build", "spec": "= 3"}, "not readable as TOML"),
+    "no TOML": ({"kind": "build", "spec": "= 3"}, "not a readable TOML file"),
+    "endless key": ({"kind": "build", "spec": "a." * 20_000 + "a = 1"}, "20,000 full stops"),
     "an unknown key": ({"kind": "build", "spec": {"nmae": "x"}}, "nmae: unknown key"),
     "an unknown preset": ({"kind": "build", "preset": "gaia-12"}, "known presets"),
     "a key out of range": (
