@@ -159,10 +159,10 @@ PATHS = [
     get("SQL as a job", "/api/v1/jobs/" + quote("' OR 1=1 --"), 404),
     get("dots as the table of a cone", f"/scs/{UP}etc?RA=0&DEC=0&SR=1", 400),
     get(
-        "a function as the table of a cone", "/scs/" + quote("glob('/*')") + "?RA=0&DEC=0&SR=1", 404
+        "a function as the table of a cone", "/scs/" + quote("glob('*')") + "?RA=0&DEC=0&SR=1", 404
     ),
     get("dots as a query of TAP", f"/tap/async/{UP}etc/results/result", 400),
-    get("a function as a table of TAP", "/tap/tables/" + quote("read_text('/etc/passwd')"), 404),
+    get("a function as a table of TAP", "/tap/tables/" + quote("read_text('x')"), 404),
     get("dots as a page", f"/databases/{UP}etc", 400),
     Hostile("dots to remove", "DELETE", "/api/v1/databases/..%2f..%2fregistry", 400),
     Hostile("a pattern to remove", "DELETE", "/api/v1/databases/*", 404),
@@ -236,11 +236,32 @@ SPECS = [
         422,
         {"kind": "build", "spec": ".".join("a" * 50_000) + " = 1"},
     ),
+    as_json(
+        "brackets within brackets as a value",
+        "/api/v1/jobs",
+        422,
+        {"kind": "build", "preset": "gaia-12deg", "changes": {"camera": "[" * 1_900}},
+    ),
+    as_json(
+        "values that take long, all of them",
+        "/api/v1/jobs",
+        422,
+        {
+            "kind": "build",
+            "preset": "gaia-12deg",
+            "changes": {f"x{k}": "{" + ".".join("a" * 950) + " = 1}" for k in range(190)},
+        },
+    ),
     as_json("brackets within brackets as JSON", "/api/v1/jobs", (400, 422), b"[" * 200_000),
     as_json(
-        "objects within objects", "/api/v1/jobs", (400, 422), b'{"a":' * 100_000 + b"1" + b"}" * 100_000
+        "objects within objects",
+        "/api/v1/jobs",
+        (400, 422),
+        b'{"a":' * 100_000 + b"1" + b"}" * 100_000,
     ),
-    as_json("a number of 10,000 digits", "/api/v1/jobs", (400, 422), b'{"kind": ' + b"9" * 10_000 + b"}"),
+    as_json(
+        "a number of 10,000 digits", "/api/v1/jobs", (400, 422), b'{"kind": ' + b"9" * 10_000 + b"}"
+    ),
     as_json("not a number", "/api/v1/jobs", 422, b'{"kind": "evaluate", "noise_px": NaN}'),
     as_json(
         "unknown keys",
@@ -296,14 +317,14 @@ QUERIES = [
     adql("a file as a name", 'SELECT * FROM "/etc/passwd"'),
     adql("a function of the engine", "SELECT getenv('HOME') FROM tap_schema.tables"),
     adql("two statements", "SELECT 1 FROM tap_schema.tables; DROP TABLE tap_schema.tables"),
-    adql("a comment to hide in", "SELECT * FROM tap_schema.tables -- */ ; COPY x TO '/tmp/x'\n;;"),
+    adql("a comment to hide in", "SELECT * FROM tap_schema.tables -- x\n; COPY x TO '/tmp/x'"),
     adql("brackets", "SELECT " + "(" * 50_000 + "1" + ")" * 50_000 + " FROM tap_schema.tables"),
     adql("writing", "CREATE TABLE x AS SELECT * FROM tap_schema.tables"),
-    as_form("TAP: a script as a language", "/tap/sync", 400, LANG=SCRIPT, QUERY="SELECT 1"),
+    as_form("TAP: a script as a language", "/tap/sync", (400, 422), LANG=SCRIPT, QUERY="SELECT 1"),
     as_form(
         "TAP: a table from a file of the machine",
         "/tap/sync",
-        400,
+        (400, 422),
         LANG="ADQL",
         QUERY="SELECT * FROM tap_upload.t",
         UPLOAD="t,file:///etc/passwd",
@@ -311,7 +332,7 @@ QUERIES = [
     as_form(
         "TAP: a table from another machine",
         "/tap/sync",
-        400,
+        (400, 422),
         LANG="ADQL",
         QUERY="SELECT * FROM tap_upload.t",
         UPLOAD="t,http://169.254.169.254/latest",
@@ -323,7 +344,7 @@ def table(name: str, content: bytes, file_name: str = "t.xml") -> Hostile:
     return as_files(
         f"upload of TAP: {name}",
         "/tap/sync",
-        400,
+        (400, 422),
         {"t": (file_name, content)},
         LANG="ADQL",
         QUERY="SELECT * FROM tap_upload.t",
@@ -350,7 +371,7 @@ UPLOADS = [
     table("a path as its file name", OUTSIDE, "../../../../tmp/starcat-hostile.xml"),
     image("a picture of 3.6 gigapixels", "f.png", huge_png(), 422),
     image("a FITS file of 10 ** 10 pixels", "f.fits", huge_fits(), 422),
-    image("a gigabyte of zeros in a megabyte", "f.fits.gz", bomb_gz(), 422),
+    image("a gigabyte of zeros in a megabyte", "f.fits.gz", bomb_gz(), (413, 422)),
     image("a path as its file name", "../../../../tmp/starcat-hostile.png", b"no picture", 422),
     image("a script as its file name", f"{SCRIPT}.png", b"no picture", 422),
     Hostile(
@@ -410,7 +431,13 @@ PEOPLE = [
     get("an empty token", "/api/v1/databases", 401, Authorization="Bearer "),
     get("a password that is no text", "/api/v1/databases", 401, Authorization="Basic /////w=="),
     Hostile(
-        "a made-up cookie", "POST", "/api/v1/jobs", 403, {"Cookie": "starcat=x"}, b"{}", is_signed=False
+        "a made-up cookie",
+        "POST",
+        "/api/v1/jobs",
+        403,
+        {"Cookie": "starcat=x"},
+        b"{}",
+        is_signed=False,
     ),
     Hostile("a form of another site", "POST", "/sign-in", 403, {"Origin": EVIL}, b"token=x"),
     Hostile("a form of no site", "POST", "/api/v1/jobs", 403, {"Origin": "null"}, b"{}"),
@@ -427,9 +454,9 @@ PEOPLE = [
     get("a name that begins like ours", "/api/v1/databases", 421, Host="127.0.0.1.evil.example:80"),
     get("no name at all", "/api/v1/databases", 400, Host=""),
     Hostile("a method that changes what is only read", "PUT", DB, 405, {}, b"x"),
-    Hostile("a method that shows headers", "TRACE", "/healthz", 501),
-    Hostile("a method that is made up", "BREW", "/healthz", 501),
-    Hostile("a connection to elsewhere", "CONNECT", "evil.example:443", (400, 501)),
+    Hostile("a method that shows headers", "TRACE", "/healthz", 405),
+    Hostile("a method that is made up", "BREW", "/healthz", 405),
+    Hostile("a connection to elsewhere", "CONNECT", "evil.example:443", (400, 405)),
 ]  # fmt: skip
 
 EVERY = [*PATHS, *FIELDS, *SPECS, *QUERIES, *UPLOADS, *SIZES, *PEOPLE]
@@ -517,18 +544,21 @@ def talk(served: Served, *parts: bytes, wait_s: float = 0.0) -> bytes:
         return found
 
 
+PART = b'--edge\r\nContent-Disposition: form-data; name="file"; filename="f.png"\r\n\r\n'
+
+
 def test_a_slow_upload_is_ended(target: Target) -> None:
     head = (
         f"POST {IDENTIFY} HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {target.token}"
-        "\r\nContent-Type: application/octet-stream\r\nContent-Length: 1000\r\n\r\n"
+        "\r\nContent-Type: multipart/form-data; boundary=edge\r\nContent-Length: 1000\r\n\r\n"
     )
     begun_s = time.monotonic()
-    found = talk(target.served, head.encode(), *[b"x"] * 8, wait_s=0.25)
+    found = talk(target.served, head.encode() + PART, *[b"x"] * 8, wait_s=0.25)
     assert found.startswith(b"HTTP/1.1 408 ")
     assert time.monotonic() - begun_s < 10.0
 
 
-@pytest.mark.timeout(60)
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [b"", b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\nX-A: "])
 def test_a_head_without_an_end_is_ended(target: Target, first: bytes) -> None:
     begun_s = time.monotonic()
@@ -542,9 +572,10 @@ def test_parts_without_an_end_are_ended(target: Target) -> None:
         f"POST {IDENTIFY} HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {target.token}"
         "\r\nContent-Type: multipart/form-data; boundary=edge\r\nTransfer-Encoding: chunked\r\n\r\n"
     )
+    first = b"%x\r\n" % len(PART) + PART + b"\r\n"
     part = b"%x\r\n" % (1 << 18) + b"x" * (1 << 18) + b"\r\n"
-    found = talk(target.served, head.encode(), *[part] * 12)
-    assert found.startswith((b"HTTP/1.1 413 ", b"HTTP/1.1 400 "))
+    found = talk(target.served, head.encode() + first, *[part] * 12)
+    assert found.startswith(b"HTTP/1.1 413 ")
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ The tool runs as a command of its own, since its plugin for pytest warns of what
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -19,13 +20,21 @@ from starcat.service.access import Role
 from starcat.service.guard.tokens import TokenStore
 from starcat.service.records import Records
 
-CHECKS = "not_a_server_error,status_code_conformance,content_type_conformance,"
-CHECKS += "response_headers_conformance,response_schema_conformance"
-
-UNTESTED = (
-    "/api/v1/jobs/{job_id}/events",  # has no end where a job waits
-    "/metrics",
+CHECKS = (
+    "status_code_conformance,content_type_conformance,response_headers_conformance,"
+    "response_schema_conformance"
 )
+
+MAY_BE_BUSY = (503,)
+"""With ``Retry-After``, and in the schema of the operations that read a catalog first."""
+
+HOOKS = """
+import schemathesis
+
+@schemathesis.serializer("application/toml")
+def as_text(context, value):
+    return value.encode() if isinstance(value, str) else str(value).encode()
+"""
 
 
 @pytest.fixture(scope="module")
@@ -51,11 +60,17 @@ def fuzz(attacked: tuple[Served, str], report: Path, examples: int, *options: st
         "--max-examples", str(examples), "--generation-deterministic", "--no-color",
         "--request-timeout", "20", "--exclude-path-regex", "/events$|^/metrics$", *options,
     ]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=report)
+    hooks = report / "hooks.py"
+    hooks.write_text(HOOKS)
+    environment = os.environ | {"SCHEMATHESIS_HOOKS": "hooks", "PYTHONPATH": str(report)}
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, cwd=report, env=environment
+    )
     said = f"{done.stdout[-8000:]}\n{done.stderr[-2000:]}"
     assert done.returncode == 0, said
     entries = [json.loads(line) for line in served.log.read_text().splitlines() if line[0] == "{"]
-    assert not [entry for entry in entries if entry.get("status", 0) >= 500]
+    broken = [entry for entry in entries if entry.get("status", 0) >= 500]
+    assert not [entry for entry in broken if entry["status"] not in MAY_BE_BUSY]
 
 
 def test_each_operation_is_described_with_an_example_of_how_it_refuses(

@@ -193,6 +193,7 @@ REFUSALS: dict[int | str, dict[str, Any]] = {
         (413, "Too large."),
         (422, "Something in the request is wrong."),
         (429, "Too many requests; ``Retry-After`` says when to ask again."),
+        (503, "Too much is done at the same time; ``Retry-After`` says when to ask again."),
     )
 }
 """For ``responses=`` of routers: how they refuse."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import AsyncIterator
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
@@ -28,7 +27,7 @@ from starcat.service.jobs.submission import (
 )
 from starcat.service.service import Service, TheService
 from starcat.specs.build_spec import BuildSpec
-from starcat.specs.reading import preset, spec_from_dict
+from starcat.specs.reading import content_of_toml, preset, spec_from_dict
 
 router = APIRouter(prefix="/jobs", tags=["jobs"])
 
@@ -229,10 +228,7 @@ def _spec_of(wish: BuildWish) -> BuildSpec:
         raise ConfigError("changes go with a preset; change the spec itself", key="changes")
     content = wish.spec
     if isinstance(content, str):
-        try:
-            content = tomllib.loads(content)
-        except (ValueError, RecursionError) as error:
-            raise ConfigError(f"spec: not readable as TOML: {error}", key="spec") from error
+        content = content_of_toml(content, "spec")
     return spec_from_dict(content or {}, "spec")
 
 

@@ -55,7 +55,10 @@ def misshapen(scope: Scope) -> Problem | None:
     headers: list[tuple[bytes, bytes]] = scope["headers"]
     path, query = scope["path"], scope["query_string"]
     if scope["method"] not in METHODS:
-        return Problem(501, f"the method is none of {', '.join(METHODS)}; use one of them")
+        allowed = ", ".join(METHODS)
+        return Problem(
+            405, f"the method is none of {allowed}; use one of them", headers={"Allow": allowed}
+        )
     if len(scope.get("raw_path") or b"") + len(query) > MOST_TARGET_BYTES:
         return Problem(
             414, f"the address has more than {MOST_TARGET_BYTES:,} bytes; send a long query by POST"

@@ -9,6 +9,7 @@ from starcat.service.pages import (
     databases,
     home,
     identify,
+    interface,
     jobs,
     new,
     releases,
@@ -25,6 +26,7 @@ ROUTERS: tuple[APIRouter, ...] = (
     databases.router,
     console.router,
     identify.router,
+    interface.router,
     releases.router,
 )
 """Routers of the page, in the order in which they are asked."""

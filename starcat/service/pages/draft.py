@@ -390,10 +390,7 @@ def _put(content: dict[str, Any], path: str, value: Any) -> None:
     for table in tables:
         content = content.setdefault(table, {})
         if not isinstance(content, dict):
-            raise ConfigError(
-                f"{ORIGIN}: {table}: found {str(content)[:60]!r}; expected a table, [{table}]",
-                key=TEXT,
-            )
+            raise ConfigError(f"{path}: {table} is a value, not a table of the spec", key=TEXT)
     if value is None:
         content.pop(name, None)
     else:

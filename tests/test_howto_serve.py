@@ -1,0 +1,125 @@
+"""The way of a newcomer in docs/howto-serve.md, walked; and the tables of the page, compared."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from urllib.error import URLError
+
+import pytest
+
+from starcat.service.guard.metrics import Metrics
+from starcat.service.service import open_service
+from starcat.service.settings import Settings, read_settings
+
+PAGE = Path(__file__).parents[1] / "docs" / "howto-serve.md"
+BLOCK = re.compile(r"```(console|python)\n(.*?)```", re.DOTALL)
+START = "starcat serve --root service"
+
+
+def steps(port: int) -> list[tuple[str, str]]:
+    """The blocks of the page that are run, with a port that is free in place of 8000."""
+    found = [(kind, text) for kind, text in BLOCK.findall(PAGE.read_text())]
+    assert found[0][1].strip() == f"$ {START}"
+    return [(kind, text.replace("127.0.0.1:8000", f"127.0.0.1:{port}")) for kind, text in found]
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+def script_of(blocks: list[tuple[str, str]]) -> str:
+    """The blocks as one script of bash that ends at the first error."""
+    lines = ["set -euo pipefail", 'starcat() { "$PYTHON" -m starcat "$@"; }']
+    for kind, text in blocks:
+        if kind == "python":
+            lines.append(f'"$PYTHON" -W error -c {shlex.quote(text)}')
+            continue
+        for command in re.sub(r"\\\n", " ", text).splitlines():
+            assert command.startswith("$ "), command
+            lines.append(command[2:])
+    return "\n".join(lines)
+
+
+@contextmanager
+def running(folder: Path, port: int) -> Iterator[None]:
+    """The server of the first block."""
+    command = [sys.executable, "-m", *shlex.split(START), "--port", str(port)]
+    with (folder / "log").open("w") as log:
+        server = subprocess.Popen(command, cwd=folder, stdout=log, stderr=log)
+    try:
+        for _ in range(240):
+            try:
+                urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=5).close()
+                break
+            except URLError:
+                assert server.poll() is None, (folder / "log").read_text()
+                time.sleep(0.25)
+        yield
+    finally:
+        server.terminate()
+        server.wait(60)
+    assert server.returncode == 0
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(540)
+def test_the_way_of_a_newcomer_runs_as_printed(tmp_path: Path) -> None:
+    port = free_port()
+    (tmp_path / "service").mkdir()
+    with running(tmp_path, port):
+        script = script_of(steps(port)[1:])
+        done = subprocess.run(
+            ["bash", "-c", script],
+            cwd=tmp_path,
+            env=os.environ | {"PYTHON": sys.executable},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    assert done.returncode == 0, f"{done.stdout[-3000:]}\n{done.stderr[-3000:]}"
+    for said in ('"guide_stars"', '"state": "done"', "mine-1.0.0", "HIP 26311", "identified"):
+        assert said in done.stdout, said
+    assert (tmp_path / "flight" / "mine-1.0.0" / "manifest.json").is_file()
+    assert (tmp_path / "backup" / "records.sqlite").stat().st_size > 0
+    assert (tmp_path / "backup" / "registry" / "index.json").is_file()
+
+
+def test_the_table_of_settings_is_that_of_the_program() -> None:
+    page = PAGE.read_text()
+    for name, field in Settings.model_fields.items():
+        if name != "root":
+            default = "" if field.default is None else f"`{json.dumps(field.default)}`"
+            assert f"| `{name}` | {default} | {field.description} |" in page
+    named = set(re.findall(r"^\| `(\w+)` \|[^|]*\|[^|]*\|$", page, re.MULTILINE))
+    assert named == set(Settings.model_fields) - {"root"}
+
+
+def test_the_table_of_figures_is_that_of_the_program(tmp_path: Path) -> None:
+    page = PAGE.read_text()
+    service = open_service(read_settings(tmp_path))
+    for one in Metrics(service).registry.collect():
+        name = f"{one.name}_total" if one.type == "counter" else one.name
+        assert f"| `{name}` | {one.documentation} |" in page
+    service.records.close()
+
+
+def test_the_settings_that_the_page_shows_are_read(tmp_path: Path) -> None:
+    [example] = re.findall(
+        r"```toml\n# service/service.toml\n(.*?)```", PAGE.read_text(), re.DOTALL
+    )
+    (tmp_path / "service.toml").write_text(example)
+    settings = read_settings(tmp_path)
+    assert (settings.workers, settings.is_secure) == (2, True)
