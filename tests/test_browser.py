@@ -379,7 +379,17 @@ def addresses(job: str, published: str, identified: str) -> list[str]:
     database = f"/databases/{identified}"
     of_database = ["", "/coverage", "/compare", "/sql?query=FROM+stars+LIMIT+3", "/sql?query=FROM"]
     return [
-        *("/", "/new", "/jobs", job, "/databases", "/identify", "/releases", "/sign-in"),
+        *(
+            "/",
+            "/new",
+            "/jobs",
+            job,
+            "/databases",
+            "/identify",
+            "/releases",
+            "/sign-in",
+            "/api/docs",
+        ),
         "/nowhere",
         *(database + one for one in of_database),
     ]
