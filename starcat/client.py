@@ -38,11 +38,6 @@ class Client:
         Where the service asks for one.
     timeout_s : float
         Seconds without a byte after which it counts as gone.
-
-    Examples
-    --------
-    >>> Client("http://127.0.0.1:8000/").url
-    'http://127.0.0.1:8000'
     """
 
     def __init__(self, url: str, token: str | None = None, timeout_s: float = 120.0) -> None:
@@ -72,8 +67,22 @@ class Client:
         StarcatError
             If the spec is refused, or the job fails: with its words and exit code.
         """
-        job = self._json("POST", "jobs", json={"kind": "build", "spec": spec})
-        return self.wait(job["id"], progress)
+        return self.wait(self.submit(spec), progress)
+
+    def submit(self, spec: str | Mapping[str, Any]) -> str:
+        """Have a database built, and do not wait for it.
+
+        Parameters
+        ----------
+        spec : str or mapping
+            As for `build`.
+
+        Returns
+        -------
+        str
+            Id of the job, which `wait` takes.
+        """
+        return str(self._json("POST", "jobs", json={"kind": "build", "spec": spec})["id"])
 
     def wait(self, job_id: str, progress: Progress = no_progress) -> Content:
         """Wait for a job.
@@ -144,9 +153,9 @@ class Client:
         QueryError
             If it cannot be answered.
         """
-        return self._json(
-            "POST", "sql", json=_question(targets, query, values, named, max_rows, time_limit_s)
-        )
+        given = _given(query=query, values=values, named=named, max_rows=max_rows)
+        asked = {"targets": list(targets), **given, **_given(time_limit_s=time_limit_s)}
+        return self._json("POST", "sql", json=asked)
 
     def sql_file(
         self,
@@ -182,7 +191,8 @@ class Client:
         ServiceError
             If the answer breaks off.
         """
-        asked = _question(targets, query, values, named, None, time_limit_s) | {"format": form}
+        given = _given(query=query, values=values, named=named, time_limit_s=time_limit_s)
+        asked = {"targets": list(targets), "format": form, **given}
         with closing(self._answer("POST", "sql", json=asked, stream=True)) as answer:
             _receive(answer, path)
         return int(answer.headers["X-Starcat-Rows"])
@@ -298,6 +308,21 @@ class Client:
             outcome = move_into_place(partial, final, replace=False)
         return final, outcome
 
+    def files(self, database: str) -> list[Content]:
+        """Return the files of a database.
+
+        Parameters
+        ----------
+        database : str
+            Its id.
+
+        Returns
+        -------
+        list of dict
+            ``path``, ``bytes``, ``sha256`` and ``content_type`` of each.
+        """
+        return list(self._answer("GET", f"databases/{database}/files").json())
+
     def report(self, database: str) -> Content:
         """Return the report of a build.
 
@@ -347,13 +372,9 @@ class Client:
         -------
         dict
             Stars, sizes and time.
-
-        Raises
-        ------
-        ConfigError
-            If the spec is refused.
         """
-        return self._json("POST", "specs/estimate", json={"spec": spec})
+        key = "toml" if isinstance(spec, str) else "spec"
+        return self._json("POST", "specs/estimate", json={key: spec})
 
     def _events(self, job_id: str, after: str) -> Iterator[tuple[str, str, Content]]:
         """Give what happens to a job: number, kind, data."""
@@ -401,23 +422,9 @@ class Client:
             raise _error_of(told, answer.status_code)
 
 
-def _question(
-    targets: Sequence[str],
-    query: str | None,
-    values: Mapping[str, Any] | None,
-    named: str | None,
-    max_rows: int | None,
-    time_limit_s: float | None,
-) -> Content:
-    asked = {
-        "targets": list(targets),
-        "query": query,
-        "named": named,
-        "values": dict(values or {}),
-        "max_rows": max_rows,
-        "time_limit_s": time_limit_s,
-    }
-    return {key: value for key, value in asked.items() if value is not None}
+def _given(**values: Any) -> Content:
+    """Return the values that are not None."""
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def _receive(answer: requests.Response, path: Path) -> str:

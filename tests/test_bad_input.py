@@ -426,6 +426,29 @@ def _(place: Place) -> Call:
     return place.build('name = "small"', "name: small")
 
 
+@case("spec with a key of endless parts", 2)
+def _(place: Place) -> Call:
+    return place.build('name = "small"', "a." * 300 + "a = 1")
+
+
+@case("spec of too many characters", 2)
+def _(place: Place) -> Call:
+    return place.build('name = "small"', 'name = "small"  ' + "#" * 100_000)
+
+
+@case("number of too many digits", 2)
+def _(place: Place) -> Call:
+    return place.build("boresights.count = 200", "boresights.count = 0x" + "f" * 5000)
+
+
+@case("doubles that are no doubles", 1)
+def _(place: Place) -> Call:
+    return [
+        *("build", "--preset", "gaia-12deg", "--set", "selection.faint_limit_mag=10"),
+        *("--set", "selection.doubles.min_separation_deg=10.0", "-o", place.out),
+    ]
+
+
 @case("spec not text", 2)
 def _(place: Place) -> Call:
     return ["build", place.write("spec.toml", b"name = \xff"), "-o", place.out]
@@ -1231,6 +1254,35 @@ def _(place: Place) -> Call:
 @case("named query unknown", 2)
 def _(place: Place) -> Call:
     return ["sql", place.artifact, "--named", "densest-feilds"]
+
+
+NOBODY = ("--server", "http://127.0.0.1:9")
+"""An address at which no service is."""
+
+
+@case("service at no address", 2)
+def _(place: Place) -> Call:
+    return ["--server", "localhost:8000", "sql", "small-1.0.0", "SELECT 1 AS one"]
+
+
+@case("service for a command that runs here", 2)
+def _(place: Place) -> Call:
+    return [*NOBODY, "releases", "registry"]
+
+
+@case("option that a service does not take", 2)
+def _(place: Place) -> Call:
+    return [*NOBODY, "sql", "small-1.0.0", "SELECT 1 AS one", "--memory-limit-gb", "1"]
+
+
+@case("service that does not answer", 1)
+def _(place: Place) -> Call:
+    return [*NOBODY, "sql", "small-1.0.0", "SELECT 1 AS one"]
+
+
+@case("question to a service without a query", 2)
+def _(place: Place) -> Call:
+    return [*NOBODY, "sql", "small-1.0.0"]
 
 
 @case("value of a named query of the wrong type", 2)

@@ -327,7 +327,9 @@ def test_a_release_is_published_with_a_note(client, small_artifact, tmp_path):
     assert f"starcat pull small@1.0.0 --registry {LOCAL}/registry" in words
     assert f'value="{DATABASE}"' not in page
     assert f'value="{LATER}"' in page
-    assert "released" in text_of(client.get(PAGE).text)
+    assert " released " in text_of(client.get(PAGE).text)
+    made_up = text_of(client.get("/releases?published=other-1.0.0").text)
+    assert "other-1.0.0" not in made_up
     for link in re.findall(r'href="(/registry/[^"]+)"', page):
         assert client.get(link).status_code == 200
 

@@ -463,7 +463,8 @@ REFUSED = {
     "no such kind": ({"kind": "destroy"}, "destroy"),
     "neither spec nor preset": ({"kind": "build"}, "give either spec or preset"),
     "both": ({"kind": "build", "spec": "", "preset": "gaia-12deg"}, "give either"),
-    "no TOML": ({"kind": "build", "spec": "= 3"}, "not readable as TOML"),
+    "no TOML": ({"kind": "build", "spec": "= 3"}, "not a readable TOML file"),
+    "endless key": ({"kind": "build", "spec": "a." * 20_000 + "a = 1"}, "20,000 full stops"),
     "an unknown key": ({"kind": "build", "spec": {"nmae": "x"}}, "nmae: unknown key"),
     "an unknown preset": ({"kind": "build", "preset": "gaia-12"}, "known presets"),
     "a key out of range": (
@@ -575,7 +576,7 @@ def test_a_job_that_cannot_end_in_time_waits_for_the_next_start(service, spec):
     ("limits", "words"),
     [
         ({"job_time_s": 0.5}, "the job took more than 0.5 s (job_time_s)"),
-        ({"job_memory_gib": 0.2}, "GiB of memory"),
+        ({"job_memory_gib": 0.01}, "the job took more than the 0.01 GiB of memory that it may"),
     ],
 )
 def test_a_job_has_limits(opened, spec, limits, words):

@@ -24,6 +24,7 @@ from starcat.service.app import make_app
 from starcat.service.settings import Settings
 
 SQL = "/api/v1/sql"
+LOCAL = "http://127.0.0.1"
 IDENTIFY = f"/api/v1/identify/{DATABASE}"
 CATALOG = "sao-00112233445566aa"
 
@@ -40,8 +41,10 @@ def root(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Path
 
 @pytest.fixture(scope="module")
 def client(root: Path) -> Iterator[TestClient]:
-    settings = Settings(root=root, query_time_s=20.0, max_rows=500, query_memory_gib=0.75)
-    with TestClient(make_app(settings)) as client:
+    settings = Settings(
+        root=root, workers=0, query_time_s=20.0, max_rows=500, query_memory_gib=0.75
+    )
+    with TestClient(make_app(settings), base_url=LOCAL) as client:
         yield client
 
 
@@ -306,7 +309,13 @@ def bombs() -> dict[str, bytes]:
     }
 
 
-@pytest.mark.parametrize("name", list(bombs()))
+LONG = ("bomb.fits.gz", "large.png")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] if name in LONG else []) for name in bombs()],
+)
 def test_bombs_are_refused_and_the_next_one_is_answered(client, frame, root, name):
     began = time.monotonic()
     answer = client.post(IDENTIFY, files={"file": (name, bombs()[name])})
@@ -318,6 +327,8 @@ def test_bombs_are_refused_and_the_next_one_is_answered(client, frame, root, nam
 
 
 def test_a_database_serves_whoever_may_read_only(root):
-    with TestClient(make_app(Settings(root=root, anonymous="none"))) as client:
+    with TestClient(
+        make_app(Settings(root=root, anonymous="none", workers=0)), base_url=LOCAL
+    ) as client:
         assert ask(client, "SELECT 1").status_code == 401
         assert client.post(IDENTIFY, json={"centroids_px": []}).status_code == 401

@@ -139,6 +139,22 @@ def test_parquet_files_of_others_are_tables_of_their_name(tmp_path):
         assert rows(session, "SELECT sum(a) FROM my_table") == [(3,)]
 
 
+def test_a_folder_of_parquet_files_is_a_schema(tmp_path):
+    folder = tmp_path / "My-tables"
+    folder.mkdir()
+    for name in ("first", "Group"):
+        pq.write_table(pa.table({"a": [1, 2]}), folder / f"{name}.parquet")
+    (folder / "notes.txt").write_text("not a table")
+    with open_session([str(folder)]) as opened:
+        assert [view.name for view in opened.views] == ["group_", "first"]
+        assert rows(opened, "SELECT sum(a) FROM my_tables.group_") == [(3,)]
+    elsewhere = tmp_path / "elsewhere.parquet"
+    pq.write_table(pa.table({"a": [1]}), elsewhere)
+    (folder / "third.parquet").symlink_to(elsewhere)
+    with pytest.raises(ProductError, match="a link to"), open_session([str(folder)]):
+        pass
+
+
 def test_hats_catalogs_are_one_table(starcat, small_artifact, session, tmp_path):
     exported = ["export", small_artifact, "--format", "hats", "--product", "stars", "-o", tmp_path]
     assert starcat(exported).code == 0

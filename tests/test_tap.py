@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import io
 import re
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -19,12 +20,16 @@ from fastapi.testclient import TestClient
 from httpx import Response
 from shelved import shelve
 
+from starcat.errors import QueryError
 from starcat.query.session import open_session
 from starcat.service.app import make_app
 from starcat.service.records import Records
 from starcat.service.settings import Settings
+from starcat.service.vo.tap_spool import ClientGone, Spool
 from starcat.service.vo.tap_store import ENDED_WITH_SERVER, TapJobs
 from starcat.vo.documents import ServiceLimits
+from starcat.vo.formats import format_named
+from starcat.vo.parameters import Question
 
 LOCAL = "http://127.0.0.1:8000"
 BRIGHT = "SELECT star_id, ra_deg, mag FROM small.stars WHERE mag < 2.5 ORDER BY star_id"
@@ -149,6 +154,56 @@ def test_what_is_wrong_is_told_as_dali_has_it(client, parameters, status, told):
     assert told in error_of(answer)
 
 
+def test_who_reads_slowly_keeps_nobody_waiting(root):
+    """More clients than places begin to read large answers and stop; the next is answered."""
+    settings = Settings(root=root, queries=2)
+    with TestClient(make_app(settings), base_url=LOCAL) as client:
+        service = client.app.state.service
+        asked = Question("SELECT * FROM small.pairs", format_named("csv"), 1_000_000)
+        spools = []
+        for _ in range(4):
+            parts = service.tap.queries.answer(asked, {})
+            next(parts)
+            spools.append(Spool(parts, service.places.scratch, threading.Event()))
+            next(iter(spools[-1]))
+        assert len(table_of(client.get("/tap/sync", params={"QUERY": BRIGHT}))) > 0
+        whole = [b"".join(spool) for spool in spools]
+        assert whole[0].count(b"\n") > 1000
+        assert len(set(whole)) == 1
+        for spool in spools:
+            spool.close()
+
+
+def test_what_fails_halfway_is_raised_behind_what_was_made(tmp_path):
+    def parts() -> Generator[bytes, None, None]:
+        yield b"a"
+        raise QueryError("no more")
+
+    spool = Spool(parts(), tmp_path, threading.Event())
+    found = iter(spool)
+    assert next(found) == b"a"
+    with pytest.raises(QueryError, match="no more"):
+        next(found)
+    spool.close()
+
+
+def test_a_query_ends_when_its_client_goes(root):
+    settings = Settings(root=root, queries=1)
+    with TestClient(make_app(settings), base_url=LOCAL) as client:
+        service = client.app.state.service
+        gone = threading.Event()
+
+        def watch(*_: object) -> None:
+            if gone.is_set():
+                raise ClientGone
+
+        asked = Question(SLOW, format_named("csv"), 10)
+        spool = Spool(service.tap.queries.answer(asked, {}, progress=watch), root, gone)
+        time.sleep(0.5)
+        spool.close()
+        assert len(table_of(client.get("/tap/sync", params={"QUERY": BRIGHT}))) > 0
+
+
 # TAP_SCHEMA and VOSI.
 
 
@@ -209,6 +264,16 @@ def test_tables_are_told_with_and_without_columns(client):
     one = ElementTree.fromstring(client.get("/tap/tables/small.stars").content)
     assert one.findtext("name") == "small.stars"
     assert client.get("/tap/tables/small.nothing").status_code == 404
+
+
+def test_tables_are_told_as_tap_plus_reads_them(client):
+    one = client.get("/tap/tables", params={"tables": "small.stars"}).text
+    assert re.findall(r"<table .*?<name>(.*?)</name>", one) == ["small.stars"]
+    assert one.count('<column esatapplus:flags="0">') == one.count("</column>") > 20
+    assert "esatapplus" not in client.get("/tap/tables").text
+    short = client.get("/tap/tables", params={"only_tables": "true"}).text
+    assert "small.stars" in short
+    assert "<column" not in short
 
 
 def test_texts_in_documents_are_escaped_once(client):

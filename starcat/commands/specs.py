@@ -7,7 +7,14 @@ from typing import Annotated
 
 import typer
 
-from starcat.commands.shared import Json, camera_of_options, field_range
+from starcat.commands.shared import (
+    Input,
+    Json,
+    camera_of_options,
+    chosen_spec,
+    field_range,
+    inputs_by_source,
+)
 from starcat.errors import ConfigError
 
 app = typer.Typer()
@@ -37,6 +44,35 @@ def presets(
         print_preset(preset(name), as_json=json)
     else:
         print_presets(as_json=json)
+
+
+@app.command()
+def estimate(
+    spec: Annotated[Path | None, typer.Argument(help="A build spec (TOML).")] = None,
+    preset: Annotated[str | None, typer.Option(help="A spec that ships with starcat.")] = None,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="A key of the spec, such as camera.fov_x_deg=16. Repeatable.",
+        ),
+    ] = None,
+    inputs: Input = None,
+    json: Json = False,
+) -> None:
+    """Say what a spec will give without building it: guide stars, fields, files, time, memory.
+
+    Example: starcat estimate --preset gaia-12deg --set selection.faint_limit_mag=5.5
+    """
+    from starcat.pipeline.estimate import estimate_spec
+    from starcat.terminal.console import progress_bars
+    from starcat.terminal.estimates import print_estimate
+
+    given, chosen = inputs_by_source(inputs), chosen_spec(spec, preset, changes)
+    with progress_bars() as progress:
+        found = estimate_spec(chosen, given, progress=progress)
+    print_estimate(found, as_json=json)
 
 
 @app.command()

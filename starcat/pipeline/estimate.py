@@ -14,8 +14,10 @@ import numpy as np
 import pyarrow as pa
 
 from starcat.artifact.writer import Product
+from starcat.catalog.blocks import reject_rows
 from starcat.catalog.ingest import count_by_reason
 from starcat.catalog.selection import Selected
+from starcat.catalog.stars import floats_of, sort_rows
 from starcat.catalog.verdict import Reason
 from starcat.errors import BuildError
 from starcat.geometry.sphere import saff_kuijlaars
@@ -31,7 +33,7 @@ from starcat.pipeline.guide_stars import (
 from starcat.pipeline.motions import motions_of
 from starcat.pipeline.recipes import field_size, tile_guide_stars
 from starcat.pipeline.sizes import table_bytes
-from starcat.pipeline.stars_read import StarsRead, read_stars
+from starcat.pipeline.stars_read import SAMPLE_ROWS, StarsRead, read_stars
 from starcat.products.boresights import FieldStars
 from starcat.products.coverage import (
     CoverageSummary,
@@ -44,6 +46,7 @@ from starcat.products.levels import boresights_of_level, level_fields
 from starcat.progress import Progress, no_progress
 from starcat.report.coverage_report import holes_warning
 from starcat.specs.build_spec import BuildSpec, Selection
+from starcat.tables.schema import product_schema
 
 MOST_FOR_GAPS = 50_000
 """Of more boresights than these the widest gap is not looked for."""
@@ -225,7 +228,7 @@ def estimate(
         guide_stars,
         fields,
         spec,
-        _rejected_bytes(read, choice),
+        _rejected_bytes(read, choice, spec),
         _motion_product(read, guide_stars),
         base_memory(read.held_bytes),
     )
@@ -256,12 +259,16 @@ def estimate(
     )
 
 
-def _rejected_bytes(read: StarsRead, choice: Choice) -> int:
+def _rejected_bytes(read: StarsRead, choice: Choice, spec: BuildSpec) -> int:
     """Return the size of the file of rejected records, of which only some are at hand."""
-    seen = choice.selected.rejected
-    unseen = len(read.stars) - len(choice.selected.guide_stars) - len(seen)
-    more = unseen * read.faint_bytes + read.rejected_rows * read.rejected_bytes
-    return round(table_bytes(seen) + more)
+    seen, mag = choice.selected.rejected, floats_of(read.stars, "mag")
+    faint = np.flatnonzero(~(mag <= _faintest(spec.selection)))  # or of no magnitude
+    first = max(0, (len(faint) - SAMPLE_ROWS) // 2)
+    some = read.stars.take(pa.array(faint[first : first + SAMPLE_ROWS]))
+    some = reject_rows(some, pa.repeat(Reason.too_faint.name, len(some)))
+    listed = sort_rows(pa.concat_tables([seen, some]), product_schema("rejected").order)
+    size = table_bytes(listed, len(seen) + len(faint))
+    return size + round(read.rejected_rows * read.rejected_bytes)
 
 
 def _motion_product(read: StarsRead, guide_stars: pa.Table) -> Sequence[Product]:

@@ -80,8 +80,8 @@ RING_OF_SHARE: Curve = (
 """An occupied ring, by the share of all rings that a pattern occupies."""
 
 TRIANGLE_OF_LEVEL: Curve = (
-    (1.0, 3.0, 5.7, 17.0, 25.6, 60.0, 300.0),
-    (4.5, 2.9, 2.1, 1.34, 1.07, 0.85, 0.6),
+    (1.0, 3.3, 5.7, 8.8, 17.0, 22.0, 30.0, 45.0, 80.0, 300.0),
+    (3.0, 2.15, 2.0, 1.67, 1.34, 1.28, 1.15, 1.05, 0.9, 0.65),
 )
 """The three stars of a triangle in order of these, by the triangles of a star."""
 
@@ -100,8 +100,11 @@ FOOTER: Mapping[str, tuple[float, float]] = {
 DATASET_BYTES = 835.0
 """A dataset of the database, beside its values: its name, place and attributes."""
 
-REPORT_BYTES, REPORT_BYTES_PER_FIELD = 730e3, 34.5
-"""The report: its page and pictures, and its list of fields."""
+REPORT_BYTES: Curve = ((200.0, 3e3, 1e4, 3e4), (610e3, 754e3, 1.09e6, 1.78e6))
+"""The report, its page, pictures and list of fields, by the number of these."""
+
+REPORT_BYTES_PER_FIELD = 34.5
+"""A line of that list, which is all that grows beyond."""
 
 MANIFEST_BYTES = 9.5e3
 
@@ -130,11 +133,11 @@ def table_bytes(table: pa.Table, rows: int | None = None) -> int:
     count = len(table) if rows is None else rows
     if len(table) <= PART_ROWS * PARTS and count == len(table):
         return parquet_bytes(table)
-    empty = parquet_bytes(table.slice(0, 0))
+    one = parquet_bytes(table.slice(0, 1))
     starts = np.linspace(0, max(0, len(table) - PART_ROWS), PARTS).astype(int).tolist()
     parts = [table.slice(start, PART_ROWS) for start in dict.fromkeys(starts)]
-    some = sum(parquet_bytes(part) - empty for part in parts)
-    return round(empty + some * count / max(1, sum(map(len, parts))))
+    some = sum(parquet_bytes(part) - one for part in parts)
+    return round(one + some * max(0, count - 1) / max(1, sum(len(part) - 1 for part in parts)))
 
 
 def product_files(
@@ -308,4 +311,5 @@ def other_bytes(fields: int) -> int:
     int
         Bytes of all their files together.
     """
-    return round(REPORT_BYTES + REPORT_BYTES_PER_FIELD * fields + MANIFEST_BYTES)
+    beyond = max(0.0, fields - REPORT_BYTES[0][-1])
+    return round(_at(REPORT_BYTES, fields) + REPORT_BYTES_PER_FIELD * beyond + MANIFEST_BYTES)

@@ -11,9 +11,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from starcat.catalog.blocks import reject_rows
 from starcat.catalog.stars import floats_of
-from starcat.catalog.verdict import Reason
 from starcat.pipeline.build import Inputs, join_all, read_sources
 from starcat.pipeline.motions import join_motions
 from starcat.pipeline.sizes import table_bytes
@@ -41,8 +39,8 @@ class StarsRead:
         Records that reading rejected, by reason.
     rejected_rows : int
         Those of them that the product ``rejected`` lists.
-    rejected_bytes, faint_bytes : float
-        Bytes that one of them takes in its file, and one that the selection finds too faint.
+    rejected_bytes : float
+        Bytes that one of them takes in its file.
     held_bytes : int
         Memory that the tables of the catalog take.
     records : int
@@ -56,7 +54,6 @@ class StarsRead:
     rejected: Mapping[str, int]
     rejected_rows: int
     rejected_bytes: float
-    faint_bytes: float
     held_bytes: int
     records: int
     notes: tuple[str, ...]
@@ -120,15 +117,12 @@ def read_stars(
     joined = join_motions(catalog, spec, inputs, workers, progress)
     stars, _ = join_all(joined.catalog.stars, amplitudes)
     catalog = joined.catalog
-    middle = stars.slice(max(0, (len(stars) - SAMPLE_ROWS) // 2), SAMPLE_ROWS)
-    faint = reject_rows(middle, pa.repeat(Reason.too_faint.name, len(middle)))
     return StarsRead(
         stars.combine_chunks(),
         joined.table,
         catalog.rejected_by_reason,
         len(catalog.rejected),
         _bytes_of_a_row(catalog.rejected.slice(0, SAMPLE_ROWS)),
-        _bytes_of_a_row(faint),
         catalog.stars.nbytes + catalog.rejected.nbytes,
         catalog.rows_read,
         catalog.notes,
@@ -161,5 +155,4 @@ def what_is_read(spec: BuildSpec) -> dict[str, Any]:
 
 
 def _bytes_of_a_row(table: pa.Table) -> float:
-    empty = table_bytes(table.slice(0, 0))
-    return (table_bytes(table) - empty) / max(1, len(table))
+    return (table_bytes(table) - table_bytes(table.slice(0, 1))) / max(1, len(table) - 1)

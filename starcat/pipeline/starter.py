@@ -62,8 +62,11 @@ OVERLAP = 4
 MEMORY_BYTES, SECONDS = 1.6e9, 15.0
 """A spec leaves out products, but never the triangles, of which the estimate is higher."""
 
-MOST_FIELD_STARS = 60_000_000
+MOST_LOOKED_AT = 60_000_000
 """Stars of all fields that are gone through at the most: they take some gigabytes."""
+
+MOST_BORESIGHTS = 200_000
+"""Of more boresights only the limit of the spec itself is looked at."""
 
 MANY_FIELDS = 5
 """A camera that sees so many times more stars than the database holds should know the brightest."""
@@ -139,7 +142,7 @@ def starter_spec(
     widest_fov_x_deg: float | None = None,
     *,
     sky: pa.Table | None = None,
-    most_field_stars: int = MOST_FIELD_STARS,
+    most_field_stars: int = MOST_LOOKED_AT,
 ) -> Starter:
     """Return a spec for a camera, from the embedded sky.
 
@@ -196,6 +199,9 @@ def starter_spec(
 
 
 def _is_quick(mag: NDArray[np.float64], limit: float, spec: BuildSpec, most: int) -> bool:
+    """Return whether what a limit leaves is counted in a moment."""
+    if spec.boresights.count > MOST_BORESIGHTS:
+        return False
     try:
         check_tiling(int(np.searchsorted(mag, limit, side="right")), spec, None, most)
     except BuildError:

@@ -20,6 +20,7 @@ from starcat.service.api import (
     releases,
     specs,
     sql,
+    work,
 )
 from starcat.service.guard import health, signing
 from starcat.service.guard.bodies import Bodies
@@ -50,6 +51,7 @@ RESOURCES: tuple[APIRouter, ...] = (
     releases.router,
     identify.router,
     sql.router,
+    work.router,
 )
 """Routers of the REST interface, under `API`."""
 

@@ -31,7 +31,7 @@ from starcat.specs.reading import preset, preset_names
 from starcat.storage.digests import json_bytes
 from starcat.version import __version__
 
-WAIT_S = 10.0
+WAIT_S = 25.0
 """Seconds that a request waits for a catalog to be read, or for its turn."""
 
 RETRY_S = 5

@@ -9,19 +9,23 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 from fastapi import Request
 from fastapi.responses import FileResponse, Response
 from starlette.types import Receive, Scope, Send
 
 from starcat.errors import TargetMissing
-from starcat.service.problems import Problem
+from starcat.service.problems import MEDIA_TYPE, Problem, ProblemDetails
 
 IMMUTABLE = "private, max-age=31536000, immutable"
 """What lies under its digest never changes."""
 
 REVALIDATED = "private, no-cache"
 """What may change is asked for anew each time, and not sent again where it did not."""
+
+SMALL_BYTES = 1 << 20
+"""Files that are sent as a whole, and not bit by bit."""
 
 TYPES = {
     ".parquet": "application/vnd.apache.parquet",
@@ -37,6 +41,25 @@ TYPES = {
     ".toml": "application/toml",
 }
 """Content types by suffix; all else are bytes."""
+
+BYTES = "application/octet-stream"
+
+CONTENTS: dict[str, dict[str, object]] = {
+    kind: {} for kind in sorted({BYTES, *(kind.partition(";")[0] for kind in TYPES.values())})
+}
+"""All of them, as OpenAPI has them."""
+
+FILE: dict[int | str, dict[str, Any]] = {
+    200: {"content": CONTENTS, "description": "The file."},
+    206: {"content": CONTENTS, "description": "The range that was asked for."},
+    304: {"description": "The same as you have (``If-None-Match``)."},
+    416: {
+        "model": ProblemDetails,
+        "content": {MEDIA_TYPE: {}},
+        "description": "The range lies outside of the file.",
+    },
+}
+"""For ``responses=`` of what answers with files."""
 
 _RANGE = re.compile(r"\s*bytes\s*=\s*([0-9]{0,18})-([0-9]{0,18})\s*", re.IGNORECASE | re.ASCII)
 
@@ -101,8 +124,22 @@ def file_answer(
         return Response(status_code=304, headers=headers)
     kind = content_type or type_of(file_name)
     answer = _Part(path, headers=headers, media_type=kind, filename=file_name, stat_result=found)
-    answer.may_be_part = _wants_part(request, found.st_size, answer.headers)
-    return answer
+    part = _part(request, found.st_size, answer.headers)
+    answer.may_be_part = part is not None
+    if request.method == "HEAD" or found.st_size > SMALL_BYTES:
+        return answer
+    return _at_once(path.read_bytes(), part, dict(answer.headers))
+
+
+def _at_once(content: bytes, part: tuple[int, int] | None, headers: dict[str, str]) -> Response:
+    """Answer with a small file: to open, read and close it in other threads takes longer."""
+    status = 200
+    if part is not None:
+        status, (start, end) = 206, part
+        headers["content-range"] = f"bytes {start}-{end - 1}/{len(content)}"
+        content = content[start:end]
+    del headers["content-length"]
+    return Response(content, status_code=status, headers=headers)
 
 
 def has_already(request: Request, sha256: str) -> bool:
@@ -143,24 +180,25 @@ def type_of(file_name: str) -> str:
     >>> type_of("stars.parquet")
     'application/vnd.apache.parquet'
     """
-    return TYPES.get(PurePosixPath(file_name).suffix.lower(), "application/octet-stream")
+    return TYPES.get(PurePosixPath(file_name).suffix.lower(), BYTES)
 
 
-def _wants_part(request: Request, size: int, headers: Mapping[str, str]) -> bool:
-    """Return whether a range is to be sent; refuse one that lies outside of the file."""
+def _part(request: Request, size: int, headers: Mapping[str, str]) -> tuple[int, int] | None:
+    """Return which bytes are to be sent, if not all; refuse what lies outside of the file."""
     found = _RANGE.fullmatch(request.headers.get("range", ""))
     if request.method != "GET" or found is None or found[1] == found[2] == "":
-        return False
+        return None
     known = request.headers.get("if-range")
     if known is not None and known not in (headers["etag"], headers["last-modified"]):
-        return False
+        return None
     start = int(found[1]) if found[1] else max(size - int(found[2]), 0)
+    end = min(int(found[2]) + 1, size) if found[1] and found[2] else size
     if found[1] and found[2] and int(found[2]) < start:
-        return False
+        return None
     if start >= size:
         raise Problem(
             416,
             f"the range begins at byte {start:,}, and the file has {size:,}; ask for less",
             headers={"Content-Range": f"bytes */{size}"},
         )
-    return True
+    return start, end

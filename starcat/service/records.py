@@ -38,6 +38,7 @@ MIGRATIONS: tuple[str, ...] = (
         attempt INTEGER NOT NULL DEFAULT 0,
         interrupted INTEGER NOT NULL DEFAULT 0,
         wants_end INTEGER NOT NULL DEFAULT 0,
+        heard_s REAL,
         stage TEXT,
         done INTEGER,
         total INTEGER,

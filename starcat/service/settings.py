@@ -52,6 +52,9 @@ class Settings(BaseModel):
     free_gib: float = Field(1.0, ge=0, description="Disk that is left free: below, no job begins.")
     query_time_s: float = Field(60.0, gt=0, description="Seconds that a query may take.")
     query_memory_gib: float = Field(1.0, gt=0, description="Memory that a query may take, GiB.")
+    worker_silence_s: float = Field(
+        60.0, gt=0, description="Seconds until a worker on another machine that is silent is lost."
+    )
     queries: int = Field(2, ge=1, le=64, description="Queries that run at the same time.")
     max_rows: int = Field(10_000_000, ge=1, description="Rows of an answer at most.")
     upload_mib: float = Field(64.0, gt=0, description="Size of an upload at most, MiB.")

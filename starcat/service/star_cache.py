@@ -33,7 +33,6 @@ FIGURES = (
     "rejected",
     "rejected_rows",
     "rejected_bytes",
-    "faint_bytes",
     "held_bytes",
     "records",
     "notes",

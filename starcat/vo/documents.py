@@ -206,6 +206,25 @@ def tableset(tables: Tables, with_columns: bool = True) -> bytes:
     return _document(VOSITableSet(tableset_schema=schemas))
 
 
+def for_tap_plus(document: bytes) -> bytes:
+    """Return a document of tables as TapPlus of astroquery reads it.
+
+    Parameters
+    ----------
+    document : bytes
+        What `tableset` gave.
+
+    Returns
+    -------
+    bytes
+        The same, with an attribute at every column that the schema of VOSI does not allow and that
+        TapPlus does not read a column without.
+    """
+    space = b'<vosi:tableset xmlns:esatapplus="http://esa.int/xml/EsaTapPlus" '
+    named = document.replace(b"<vosi:tableset ", space, 1)
+    return named.replace(b"<column>", b'<column esatapplus:flags="0">')
+
+
 def table_document(table: Table) -> bytes:
     """Return a table with its columns.
 

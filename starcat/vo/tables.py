@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from starcat.query.columns import column_facts
@@ -143,6 +143,27 @@ class Tables:
     def with_schema(self, schema: Schema) -> Tables:
         """Return these tables, and those of another schema."""
         return Tables((*self.schemas, schema))
+
+    def chosen(self, names: Sequence[str]) -> Tables:
+        """Return some of the tables.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Full names, with or without quotes, in any case; those of no table are left out.
+
+        Returns
+        -------
+        Tables
+            In the order of all.
+        """
+        wanted = {name.strip().replace('"', "").lower() for name in names}
+        schemas = []
+        for schema in self.schemas:
+            kept = tuple(t for t in schema.tables if f"{t.schema}.{t.name}".lower() in wanted)
+            if kept:
+                schemas.append(replace(schema, tables=kept))
+        return Tables(tuple(schemas))
 
     def find(self, schema: str, name: str) -> Table | None:
         """Return a table.

@@ -20,7 +20,7 @@ from starcat.service.api.database_models import (
     facts_of,
 )
 from starcat.service.archive import archive_bytes, archive_chunks
-from starcat.service.file_answers import REVALIDATED, TYPES, file_answer, has_already, type_of
+from starcat.service.file_answers import FILE, REVALIDATED, file_answer, has_already, type_of
 from starcat.service.problems import Problem
 from starcat.service.removal import remove_database
 from starcat.service.service import Service, TheService
@@ -35,17 +35,6 @@ DatabaseId = Annotated[
 
 REPORT, COVERAGE, FIELDS = "report/report.json", "report/coverage.json", "report/coverage.csv"
 
-FILE: dict[int | str, dict[str, Any]] = {
-    200: {
-        "content": {
-            kind: {} for kind in (*sorted(set(TYPES.values())), "application/octet-stream")
-        },
-        "description": "The file.",
-    },
-    206: {"description": "The range that was asked for."},
-    304: {"description": "The same as you have (``If-None-Match``)."},
-    416: {"description": "The range lies outside of the file."},
-}
 SAME: dict[int | str, dict[str, Any]] = {304: FILE[304]}
 
 
@@ -133,7 +122,9 @@ def files(database: DatabaseId, service: TheService, reader: Reader) -> list[Dat
     ]
 
 
-@router.get("/{database}/files/{path:path}", summary="A file", responses=FILE)
+@router.get(
+    "/{database}/files/{path:path}", summary="A file", response_class=Response, responses=FILE
+)
 def file(
     database: DatabaseId,
     path: Annotated[str, Path(examples=["stars.parquet"])],

@@ -21,12 +21,20 @@ from starcat.images.identification import IMAGE_SUFFIXES
 from starcat.service.access import Reader
 from starcat.service.file_answers import type_of
 from starcat.service.identifying import CAMERA_NAME, IdentifyOptions
-from starcat.service.problems import Problem
+from starcat.service.problems import MEDIA_TYPE, Problem, ProblemDetails
 from starcat.service.service import Service, TheService
 from starcat.service.targets import database_of
 from starcat.service.uploading import safe_name, scratch_folder
 
-router = APIRouter(prefix="/identify", tags=["identify"])
+UNKNOWN_TYPE: dict[int | str, dict[str, Any]] = {
+    415: {
+        "model": ProblemDetails,
+        "content": {MEDIA_TYPE: {}},
+        "description": "The content is of another type.",
+    }
+}
+
+router = APIRouter(prefix="/identify", tags=["identify"], responses=UNKNOWN_TYPE)
 
 MIB = 2**20
 SUFFIXES = (*IMAGE_SUFFIXES, ".csv", ".json")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Path, Request
 from fastapi.responses import Response
@@ -12,7 +12,7 @@ from fastapi.responses import Response
 from starcat.errors import TargetMissing
 from starcat.releases.tree import INDEX_NAME
 from starcat.service.access import Reader
-from starcat.service.file_answers import IMMUTABLE, REVALIDATED, file_answer, has_already
+from starcat.service.file_answers import FILE, IMMUTABLE, REVALIDATED, file_answer, has_already
 from starcat.service.problems import REFUSALS
 from starcat.service.service import TheService
 from starcat.specs.version import NAME_PATTERN, VERSION_PATTERN
@@ -25,15 +25,10 @@ RELEASE = re.compile(
     re.ASCII,
 )
 
-TREE: dict[int | str, dict[str, Any]] = {
-    200: {"content": {"application/octet-stream": {}}, "description": "The file."},
-    206: {"description": "The range that was asked for."},
-    304: {"description": "The same as you have (``If-None-Match``)."},
-    416: {"description": "The range lies outside of the file."},
-}
 
-
-@router.get("/{path:path}", summary="A file of the registry", responses=TREE)
+@router.get(
+    "/{path:path}", summary="A file of the registry", response_class=Response, responses=FILE
+)
 def registry_file(
     path: Annotated[str, Path(examples=[INDEX_NAME])],
     request: Request,

@@ -25,6 +25,9 @@ Form = Literal["rows", "csv", "json", "parquet", "votable", "fits", "ecsv", "npz
 SUFFIXES = {"votable": ".vot"}
 """Suffixes of files that are not the name of the format."""
 
+OTHERS = (".csv", ".parquet", ".vot", ".fits", ".ecsv", ".npz")
+"""Suffixes of all but JSON."""
+
 MAX_SHOWN = 100_000
 """Rows of an answer that is no file."""
 
@@ -137,7 +140,7 @@ class ViewFacts(BaseModel):
         200: {
             "description": "Rows, or a file; ``X-Starcat-Rows`` says how many rows it has, and "
             "``X-Starcat-Cut`` whether there are more.",
-            "content": {"application/octet-stream": {}},
+            "content": {type_of(f"answer{suffix}").partition(";")[0]: {} for suffix in OTHERS},
         }
     },
 )

@@ -6,18 +6,18 @@ import shutil
 from pathlib import Path
 
 from starcat.errors import ProductError, TargetMissing
+from starcat.service.jobs.ground import Ground
 from starcat.service.problems import Problem
-from starcat.service.service import Service
 
 GIB = 2**30
 
 
-def check_room(service: Service, owner: str) -> None:
+def check_room(service: Ground, owner: str) -> None:
     """Check that there is room for what a user wants to have made.
 
     Parameters
     ----------
-    service : Service
+    service : Ground
         Its settings say how much there has to be.
     owner : str
         The user.
@@ -36,12 +36,12 @@ def check_room(service: Service, owner: str) -> None:
         raise Problem(409, full)
 
 
-def disk_shortage(service: Service) -> str | None:
+def disk_shortage(service: Ground) -> str | None:
     """Return what to say where the disk is nearly full.
 
     Parameters
     ----------
-    service : Service
+    service : Ground
         Its settings say what has to be free.
 
     Returns
@@ -58,12 +58,12 @@ def disk_shortage(service: Service) -> str | None:
     )
 
 
-def owner_excess(service: Service, owner: str, more_bytes: int = 0) -> str | None:
+def owner_excess(service: Ground, owner: str, more_bytes: int = 0) -> str | None:
     """Return what to say where a user's databases take more of the disk than they may.
 
     Parameters
     ----------
-    service : Service
+    service : Ground
         Its settings say how much that is.
     owner : str
         The user.
@@ -84,12 +84,12 @@ def owner_excess(service: Service, owner: str, more_bytes: int = 0) -> str | Non
     )
 
 
-def owned_bytes(service: Service, owner: str) -> int:
+def owned_bytes(service: Ground, owner: str) -> int:
     """Return how much of the disk the databases of a user take.
 
     Parameters
     ----------
-    service : Service
+    service : Ground
         Where they are.
     owner : str
         Whose builds are counted.

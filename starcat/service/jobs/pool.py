@@ -10,9 +10,9 @@ import threading
 import time
 from contextlib import suppress
 
-from starcat.service.jobs.recovery import recover, send_waiting
+from starcat.service.jobs.ground import Ground
+from starcat.service.jobs.recovery import give_up_silent, recover, send_waiting
 from starcat.service.jobs.worker import PROGRAM
-from starcat.service.service import Service
 
 LOOK_S = 5.0
 """How often it is looked whether jobs wait that nobody was told of."""
@@ -31,11 +31,11 @@ class WorkerPool:
 
     Parameters
     ----------
-    service : Service
+    service : Ground
         Whose jobs it does.
     """
 
-    def __init__(self, service: Service) -> None:
+    def __init__(self, service: Ground) -> None:
         self._service = service
         self._stopping = threading.Event()
         self._process: subprocess.Popen[bytes] | None = None
@@ -51,7 +51,9 @@ class WorkerPool:
     def start(self) -> None:
         """Take up the jobs that an earlier server has left, and have them done."""
         recover(self._service)
-        if self._service.settings.workers:
+        if self._service.settings.queue_url is not None:
+            self._service.queue.is_used.set()  # by workers on other machines, for all we know
+        if self._service.settings.workers or self._service.settings.queue_url is not None:
             # The system ends the worker with the thread that started it, which lasts as long.
             self._thread = threading.Thread(target=self._watch, name="worker", daemon=True)
             self._thread.start()
@@ -79,6 +81,8 @@ class WorkerPool:
         pause_s = first_s
         try:
             self._service.queue.is_used.wait()  # until then no memory is taken
+            while not self._service.settings.workers and not self._stopping.wait(LOOK_S):
+                self._look()
             while not self._stopping.is_set():
                 began_s = time.monotonic()
                 self._run()
@@ -122,9 +126,10 @@ class WorkerPool:
             _logger.error("the worker ended with code %s; it is started again", process.returncode)
 
     def _look(self) -> None:
-        """Send messages again where jobs wait and the queue is empty, as after a loss."""
+        """Give up workers that are lost, and send messages again that are."""
         service = self._service
         try:
+            give_up_silent(service)
             if service.jobs.count(state="queued") and service.queue.is_empty():
                 send_waiting(service)
         except Exception:  # the disk is full, for one: it is looked again later

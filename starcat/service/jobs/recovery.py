@@ -7,10 +7,10 @@ import shutil
 import time
 from contextlib import suppress
 
+from starcat.service.jobs.ground import Ground
 from starcat.service.jobs.job import Job
-from starcat.service.jobs.transitions import interrupt
+from starcat.service.jobs.transitions import interrupt, running_here, silent_since
 from starcat.service.places import JOB_ID, Places
-from starcat.service.service import Service
 from starcat.storage.locks import locked
 
 WAIT_S = 10.0
@@ -19,36 +19,50 @@ WAIT_S = 10.0
 _logger = logging.getLogger(__name__)
 
 
-def recover(service: Service) -> None:
-    """Take up the jobs of a service where nobody runs any.
+def recover(service: Ground) -> None:
+    """Take up the jobs of a service where nobody runs any on this machine.
 
     Parameters
     ----------
-    service : Service
+    service : Ground
         Jobs that ran wait again, and those that wait get a message each, in their order. Folders
         of what was not finished are removed.
     """
-    for job in _all(service, "running"):
-        _wait_for_end(service.places, job.id)
-        _logger.warning("job %s was interrupted in attempt %d", job.id, job.attempt)
-        interrupt(service.records, job.id, job.attempt)
+    for job_id, attempt in running_here(service.records):
+        _wait_for_end(service.places, job_id)
+        _logger.warning("job %s was interrupted in attempt %d", job_id, attempt)
+        interrupt(service.records, job_id, attempt)
     _remove_halves(service)
     send_waiting(service)
 
 
-def send_waiting(service: Service) -> None:
+def give_up_silent(service: Ground) -> None:
+    """Have jobs wait again whose workers, on other machines, have been silent for long.
+
+    Parameters
+    ----------
+    service : Ground
+        Its settings say how long that is.
+    """
+    then_s = time.time() - service.settings.worker_silence_s
+    for job_id, attempt in silent_since(service.records, then_s):
+        _logger.warning("job %s: nobody hears of its worker; attempt %d is over", job_id, attempt)
+        interrupt(service.records, job_id, attempt)
+
+
+def send_waiting(service: Ground) -> None:
     """Send a message for each job that waits, and forget all others.
 
     Parameters
     ----------
-    service : Service
+    service : Ground
         Whose jobs they are.
     """
     waiting = _all(service, "queued")
     service.queue.send_again(job.id for job in reversed(waiting))
 
 
-def _all(service: Service, state: str) -> list[Job]:
+def _all(service: Ground, state: str) -> list[Job]:
     return service.jobs.all(state=state, most=1_000_000)  # type: ignore[arg-type]
 
 
@@ -65,7 +79,7 @@ def _wait_for_end(places: Places, job_id: str) -> None:
     _logger.error("job %s: its process does not end", job_id)
 
 
-def _remove_halves(service: Service) -> None:
+def _remove_halves(service: Ground) -> None:
     places = service.places
     running = {job.id for job in _all(service, "running")}
     for folder in places.jobs.iterdir():

@@ -15,17 +15,18 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from typing import IO, Any
+from pathlib import Path
+from typing import IO, Any, Protocol
 
+from starcat.service.jobs.ground import Ground
 from starcat.service.jobs.job import Job
 from starcat.service.jobs.limits import disk_shortage, folder_bytes, owner_excess
-from starcat.service.jobs.task import PROGRAM
+from starcat.service.jobs.task import PROGRAM, memory_problem
 from starcat.service.jobs.transitions import Attempt, claim
 from starcat.service.jobs.work import threads_of
-from starcat.service.service import Service
 from starcat.storage.atomic import make_folder
 
 TICK_S = 0.2
@@ -34,7 +35,39 @@ TICK_S = 0.2
 DISK_TICK_S = 2.0
 """How often the disk that it takes is counted."""
 
+TAIL_BYTES = 4096
+
+NO_MEMORY = ("bad_alloc", "out of memory", "memory allocation", "cannot allocate memory")
+"""What libraries say, in small letters, that end a process which is refused memory."""
+
 STOPPED = "the service stops"
+
+
+class Told(Protocol):
+    """Who remembers what becomes of an attempt; as `starcat.service.jobs.transitions.Attempt`."""
+
+    job: Job
+
+    def wants_end(self) -> bool:
+        """Return whether the job is to end."""
+
+    def tell_stage(self, stage: str, done: int, total: int | None) -> None:
+        """Say how far it is."""
+
+    def tell(self, level: str, text: str) -> None:
+        """Say a line of the log."""
+
+    def succeed(self, result: Mapping[str, Any]) -> None:
+        """Say that it is done."""
+
+    def fail(self, error: Mapping[str, Any]) -> None:
+        """Say that it has failed."""
+
+    def be_cancelled(self) -> None:
+        """Say that it was cancelled."""
+
+    def wait_again(self) -> None:
+        """Say that it is to be begun again."""
 
 
 @dataclass
@@ -43,13 +76,13 @@ class Slots:
 
     Attributes
     ----------
-    service : Service
+    service : Ground
         Whose jobs they are.
     stop_at_s : float, optional
         When jobs that still run are ended, `time.monotonic`; None while nobody wants to stop.
     """
 
-    service: Service
+    service: Ground
     stop_at_s: float | None = None
     _groups: set[int] = field(default_factory=set)
     _lock: threading.Lock = field(default_factory=threading.Lock)
@@ -73,7 +106,7 @@ class Slots:
             attempt.fail(_problem("Insufficient storage", 507, short))
             return
         try:
-            _Run(self, attempt).run()
+            Run(self, attempt).run()
         finally:
             shutil.rmtree(self.service.places.job_work(job.id), ignore_errors=True)
 
@@ -93,7 +126,7 @@ class Slots:
         """
         places = self.service.places
         make_folder(places.job(job.id))
-        with places.job_stderr(job.id).open("ab") as stderr:
+        with places.job_stderr(job.id).open("wb") as stderr:
             process = subprocess.Popen(
                 [sys.executable, "-c", PROGRAM, *sys.path],
                 stdin=subprocess.PIPE,
@@ -149,16 +182,25 @@ def end_group(group: int) -> None:
         os.killpg(group, signal.SIGKILL)
 
 
-class _Run:
-    """An attempt that runs."""
+class Run:
+    """An attempt that runs.
 
-    def __init__(self, slots: Slots, attempt: Attempt) -> None:
+    Parameters
+    ----------
+    slots : Slots
+        Of the worker that it runs in.
+    attempt : Attempt
+        Who remembers what becomes of it.
+    """
+
+    def __init__(self, slots: Slots, attempt: Told) -> None:
         self._slots, self._attempt = slots, attempt
         self._began_s = self._disk_at_s = time.monotonic()
         self._result: dict[str, Any] | None = None
         self._error: dict[str, Any] | None = None
 
     def run(self) -> None:
+        """See it to its end."""
         with self._slots.process(self._attempt.job) as process:
             why = self._follow(process)
         if self._result is not None:  # it was faster than whoever wanted its end
@@ -222,18 +264,26 @@ class _Run:
         if code == -signal.SIGTERM:  # the system goes down, and has told all processes
             self._attempt.wait_again()
             return
-        job, settings = self._attempt.job, self._slots.service.settings
+        service, job = self._slots.service, self._attempt.job
+        last_words = _tail(service.places.job_stderr(job.id)).lower()
+        if any(word in last_words for word in NO_MEMORY):
+            problem = memory_problem(int(service.settings.job_memory_gib * 2**30))
+            self._attempt.fail(problem)
+            return
         name = signal.Signals(-code).name if code < 0 else f"code {code}"
-        hint = {
-            -signal.SIGKILL: ", as a system does that runs out of memory",
-            -signal.SIGABRT: ", as a program does that is refused memory; it may take "
-            f"{settings.job_memory_gib:g} GiB (job_memory_gib)",
-        }.get(code, "")
+        hint = ", as a system does that runs out of memory" if code == -signal.SIGKILL else ""
         detail = (
             f"the process of the job ended by {name}{hint}; the operator finds more in "
             f"jobs/{job.id}/stderr.txt under the root"
         )
         self._attempt.fail(_problem("Ended", 500, detail))
+
+
+def _tail(path: Path) -> str:
+    """Return the end of what a process said of its troubles."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - TAIL_BYTES))
+        return file.read().decode(errors="replace")
 
 
 def lines_of(pipe: IO[bytes], tick_s: float) -> Iterator[bytes | None]:

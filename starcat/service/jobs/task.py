@@ -22,7 +22,7 @@ from typing import IO, Any
 
 from starcat.errors import StarcatError
 from starcat.query.confinement import limit_memory
-from starcat.service.jobs.work import Order, do_job
+from starcat.service.jobs.work import Order, do_job, prepare
 from starcat.service.places import Places
 from starcat.storage.locks import locked
 
@@ -33,6 +33,9 @@ STAGES_A_SECOND = 4.0
 
 MAX_LINE = 2000
 """Characters of a line of the log that are kept."""
+
+NO_THREAD = "can't start new thread"
+"""What Python says where there is no memory for the stack of a thread."""
 
 _SET_PARENT_DEATH_SIGNAL = 1
 
@@ -107,6 +110,7 @@ def main() -> None:
     logger.setLevel(logging.INFO)
     logger.addHandler(_Lines(teller))
     with locked(order.places.job_lock(order.job_id)):
+        prepare(order.kind)
         limit_memory(order.memory_bytes)
         try:
             teller.say({"result": do_job(order, teller.tell_stage, teller.tell)})
@@ -141,15 +145,9 @@ def _told(error: Exception, order: Order) -> dict[str, Any]:
     from starcat.service.problems import ProblemDetails, problem_of
     from starcat.terminal.failures import failure_of
 
-    if isinstance(error, MemoryError):
-        detail = (
-            f"the job took more than the {order.memory_bytes / 2**30:g} GiB of memory that it may "
-            "(job_memory_gib); ask for less, or ask the operator for more"
-        )
-        problem = ProblemDetails(
-            title="Out of memory", status=422, detail=detail, kind="MemoryError"
-        )
-    elif isinstance(error, OSError) and not isinstance(error, StarcatError):
+    if isinstance(error, MemoryError) or NO_THREAD in str(error):
+        return memory_problem(order.memory_bytes)
+    if isinstance(error, OSError) and not isinstance(error, StarcatError):
         failure = failure_of(error, "the job")
         problem = ProblemDetails(
             title="The system refused", status=500, detail=failure.message, kind=failure.kind
@@ -159,3 +157,23 @@ def _told(error: Exception, order: Order) -> dict[str, Any]:
     if problem.status == 500:
         traceback.print_exception(error)
     return problem.model_dump(exclude_none=True)
+
+
+def memory_problem(memory_bytes: int) -> dict[str, Any]:
+    """Return what to say of a job that wanted more memory than it may take.
+
+    Parameters
+    ----------
+    memory_bytes : int
+        How much that is.
+
+    Returns
+    -------
+    dict
+        Problem details.
+    """
+    detail = (
+        f"the job took more than the {memory_bytes / 2**30:.3g} GiB of memory that it may "
+        "(job_memory_gib); ask for less, or ask the operator for more"
+    )
+    return {"type": "about:blank", "title": "Out of memory", "status": 422, "detail": detail}

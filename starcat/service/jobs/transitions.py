@@ -94,7 +94,7 @@ def _check_waiting(connection: sqlite3.Connection, owner: str, most: int) -> Non
         )
 
 
-def claim(records: Records, job_id: str) -> Job | None:
+def claim(records: Records, job_id: str, *, is_away: bool = False) -> Job | None:
     """Begin a job.
 
     Parameters
@@ -103,6 +103,8 @@ def claim(records: Records, job_id: str) -> Job | None:
         Where jobs are kept.
     job_id : str
         Its id, as a message had it.
+    is_away : bool, default False
+        Whether it runs on another machine, which has to be heard of from time to time.
 
     Returns
     -------
@@ -111,16 +113,59 @@ def claim(records: Records, job_id: str) -> Job | None:
     """
     with records.writing() as connection:
         row = connection.execute(
-            "UPDATE jobs SET state = 'running', started_s = ?, attempt = attempt + 1, "
-            "wants_end = 0, stage = NULL, done = NULL, total = NULL, error = NULL "
-            "WHERE id = ? AND state = 'queued' RETURNING *",
-            (time.time(), job_id),
+            "UPDATE jobs SET state = 'running', started_s = ?, heard_s = ?, "
+            "attempt = attempt + 1, wants_end = 0, stage = NULL, done = NULL, total = NULL, "
+            "error = NULL WHERE id = ? AND state = 'queued' RETURNING *",
+            (time.time(), time.time() if is_away else None, job_id),
         ).fetchone()
         if row is None:
             return None
         job = job_of(row)
         add_event(connection, job_id, "state", {"state": "running", "attempt": job.attempt})
     return job
+
+
+def running_here(records: Records) -> list[tuple[str, int]]:
+    """Return the jobs that run on this machine.
+
+    Parameters
+    ----------
+    records : Records
+        Where jobs are kept.
+
+    Returns
+    -------
+    list of (str, int)
+        Ids and attempts.
+    """
+    with records.reading() as connection:
+        rows = connection.execute(
+            "SELECT id, attempt FROM jobs WHERE state = 'running' AND heard_s IS NULL "
+            "ORDER BY created_s"
+        ).fetchall()
+    return [(row["id"], row["attempt"]) for row in rows]
+
+
+def silent_since(records: Records, then_s: float) -> list[tuple[str, int]]:
+    """Return the jobs on other machines that nobody has heard of.
+
+    Parameters
+    ----------
+    records : Records
+        Where jobs are kept.
+    then_s : float
+        Since then, seconds since 1970.
+
+    Returns
+    -------
+    list of (str, int)
+        Ids and attempts.
+    """
+    with records.reading() as connection:
+        rows = connection.execute(
+            "SELECT id, attempt FROM jobs WHERE state = 'running' AND heard_s < ?", (then_s,)
+        ).fetchall()
+    return [(row["id"], row["attempt"]) for row in rows]
 
 
 def cancel(records: Records, job_id: str) -> None:
@@ -245,6 +290,11 @@ class Attempt:
                 (self.job.id, self.job.attempt),
             ).fetchone()
         return row is None or bool(row["wants_end"])
+
+    def be_heard(self) -> bool:
+        """Say that its worker, on another machine, is there; return whether the job is its own."""
+        with self._records.writing() as connection:
+            return self._update(connection, "heard_s = ?", time.time())
 
     def tell_stage(self, stage: str, done: int, total: int | None) -> None:
         """Say how far it is; of each stage the last event is kept.

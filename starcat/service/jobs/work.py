@@ -10,6 +10,7 @@ import os
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,18 @@ class Order:
     def work(self) -> Path:
         """The folder that it makes things in."""
         return self.places.job_work(self.job_id)
+
+
+def prepare(kind: Kind) -> None:
+    """Load what a kind of job needs: programs do not count as memory that a job takes.
+
+    Parameters
+    ----------
+    kind : {"build", "ingest", "evaluate"}
+        What is going to be done.
+    """
+    for name in _NEEDS[kind]:
+        import_module(name)
 
 
 def do_job(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
@@ -119,12 +132,20 @@ def _build(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
         f"{clean.identified} of {clean.identifiable} clean frames were identified, "
         f"{clean.wrong} wrongly",
     )
-    _place(made, order.places.database(database_id))
+    place_database(made, order.places.database(database_id))
     return result
 
 
-def _place(made: Path, final: Path) -> None:
-    """Give a folder its name; one that is empty, or holds no database, makes way."""
+def place_database(made: Path, final: Path) -> None:
+    """Give the folder of a database its name, in one step.
+
+    Parameters
+    ----------
+    made : Path
+        The folder that the artifact's own folder is in, whole and checked.
+    final : Path
+        Its name among the databases; a folder that holds no database makes way.
+    """
     if final.is_dir():
         aside = made.with_name("aside")
         final.rename(aside)
@@ -197,6 +218,13 @@ _DOES: Mapping[Kind, Callable[[Order, Progress, Tell], dict[str, Any]]] = {
     "build": _build,
     "ingest": _ingest,
     "evaluate": _evaluate,
+}
+
+
+_NEEDS: Mapping[Kind, tuple[str, ...]] = {
+    "build": ("starcat.pipeline.build", "matplotlib.backends.backend_agg"),
+    "ingest": ("starcat.catalog.star_files", "starcat.store.ingest"),
+    "evaluate": ("starcat.simulation.selftest",),
 }
 
 

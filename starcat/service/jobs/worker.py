@@ -17,9 +17,9 @@ import time
 from huey.consumer import Consumer
 
 from starcat.service.guard.logs import log_settings
+from starcat.service.jobs.ground import open_ground
 from starcat.service.jobs.runner import Slots
 from starcat.service.jobs.task import end_with_parent
-from starcat.service.service import open_service
 from starcat.service.settings import Settings
 
 PROGRAM = (
@@ -35,7 +35,21 @@ def main() -> None:
     end_with_parent()
     logging.config.dictConfig(log_settings())
     settings = Settings.model_validate_json(sys.stdin.buffer.readline())
-    slots = Slots(open_service(settings))
+    slots = Slots(open_ground(settings))
+    threading.Thread(target=_listen, args=(slots, settings.shutdown_s), daemon=True).start()
+    serve_queue(slots)
+    os._exit(0)
+
+
+def serve_queue(slots: Slots) -> None:
+    """Take jobs from the queue until somebody wants to stop, and see those that run to their end.
+
+    Parameters
+    ----------
+    slots : Slots
+        What is done with each.
+    """
+    settings = slots.service.settings
     slots.service.queue.on_job(slots.run_job)
     first_s, most_s = POLL_S
     consumer = Consumer(
@@ -48,7 +62,6 @@ def main() -> None:
         scheduler_interval=60,
         health_check_interval=5,
     )
-    threading.Thread(target=_listen, args=(slots, settings.shutdown_s), daemon=True).start()
     consumer.start()
     # A system that goes down tells all processes: jobs have their time, as when the server asks.
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -57,7 +70,6 @@ def main() -> None:
         time.sleep(0.1)
         consumer.check_worker_health()
     consumer.stop(graceful=True)
-    os._exit(0)
 
 
 def _stop(slots: Slots, more_s: float) -> None:

@@ -9,8 +9,9 @@ from typing import Annotated, Any, Literal
 
 from fastapi import Depends, Query, Request
 from fastapi.responses import Response, StreamingResponse
+from starlette.concurrency import run_in_threadpool
 
-from starcat.errors import QueryError, StarcatError
+from starcat.errors import QueryError, StarcatError, TargetMissing
 from starcat.query.gallery import NamedQuery, gallery, guessed, named_query
 from starcat.query.macros import macros
 from starcat.service.access import Reader
@@ -99,6 +100,16 @@ class Cells:
     is_cut: bool
 
 
+@dataclass(frozen=True)
+class _Shown:
+    """What the console shows, or its answer alone."""
+
+    asked: Asked
+    answer: Cells | None
+    problem: ProblemDetails | None
+    is_part: bool
+
+
 def asked_of(
     request: Request,
     query: Annotated[str, Query(max_length=MAX_TEXT)] = "",
@@ -128,43 +139,18 @@ async def console(
     part: Annotated[Literal["", "answer"], Query()] = "",
 ) -> Response:
     """Show the console with the answer to what was asked; the script wants the answer alone."""
-    database = service.shelf.database(database_id)
     answer: Cells | None = None
     problem: ProblemDetails | None = None
     if asked.query:
         try:
-            found = await service.sessions.run(_rows, service, database.id, asked)
+            found = await service.sessions.run(_rows, service, database_id, asked)
             answer = cells_of(found)
+        except TargetMissing:
+            raise  # the page itself is not there
         except (StarcatError, Problem) as error:
             problem = problem_of(error)
-    chosen = _chosen(asked.named)
-    content = {
-        "row": database_row(service, database),
-        "asked": asked,
-        "answer": answer,
-        "problem": problem,
-        "formats": FORMATS,
-    }
-    status = 200 if problem is None else problem.status
-    if part:
-        return render(request, "console_answer.html", status=status, **content)
-    text = asked.query or (chosen.text if chosen else FIRST)
-    return render(
-        request,
-        "console.html",
-        status=status,
-        **content,
-        tab="sql",
-        text=text,
-        chosen=chosen,
-        values=values_in(text, chosen, asked.values),
-        others=[(one.id, one.title) for one in service.shelf.databases() if one.id != database.id],
-        queries=list(gallery().values()),
-        macros=sorted(macros(), key=lambda macro: (not macro.is_table, macro.name)),
-        products=products_of(database.manifest),
-        row_choices=ROWS,
-        max_text=MAX_TEXT,
-    )
+    shown = _Shown(asked, answer, problem, is_part=bool(part))
+    return await run_in_threadpool(_page, request, service, database_id, shown)
 
 
 @router.get("/databases/{database_id}/sql/file")
@@ -225,6 +211,39 @@ def question_of(service: Service, database_id: str, asked: Asked, most: int) -> 
 def _rows(service: Service, database_id: str, asked: Asked) -> Rows:
     most = min(asked.rows, service.settings.max_rows)
     return rows_of(service, question_of(service, database_id, asked, most))
+
+
+def _page(request: Request, service: Service, database_id: str, shown: _Shown) -> Response:
+    database = service.shelf.database(database_id)
+    asked, problem = shown.asked, shown.problem
+    content = {
+        "row": database_row(service, database),
+        "asked": asked,
+        "answer": shown.answer,
+        "problem": problem,
+        "formats": FORMATS,
+    }
+    status = 200 if problem is None else problem.status
+    if shown.is_part:
+        return render(request, "console_answer.html", status=status, **content)
+    chosen = _chosen(asked.named)
+    text = asked.query or (chosen.text if chosen else FIRST)
+    return render(
+        request,
+        "console.html",
+        status=status,
+        **content,
+        tab="sql",
+        text=text,
+        chosen=chosen,
+        values=values_in(text, chosen, asked.values),
+        others=[(one.id, one.title) for one in service.shelf.databases() if one.id != database.id],
+        queries=list(gallery().values()),
+        macros=sorted(macros(), key=lambda macro: (not macro.is_table, macro.name)),
+        products=products_of(database.manifest),
+        row_choices=ROWS,
+        max_text=MAX_TEXT,
+    )
 
 
 def _chosen(name: str) -> NamedQuery | None:

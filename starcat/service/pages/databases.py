@@ -6,8 +6,9 @@ from typing import Annotated, Any, Literal
 
 from fastapi import Query, Request
 from fastapi.responses import JSONResponse, RedirectResponse, Response
+from starlette.concurrency import run_in_threadpool
 
-from starcat.artifact.diff import diff_artifacts
+from starcat.artifact.diff import Difference, diff_artifacts
 from starcat.artifact.reader import Artifact
 from starcat.errors import TargetMissing
 from starcat.matcher.methods.table import METHODS
@@ -133,7 +134,7 @@ def build_report(service: TheService, _: Reader, database_id: str) -> Response:
 
 
 @router.get("/databases/{database_id}/compare")
-def compare(
+async def compare(
     request: Request,
     service: TheService,
     _: Reader,
@@ -141,22 +142,37 @@ def compare(
     other: Annotated[str, Query(max_length=64)] = "",
 ) -> Response:
     """Show what differs between this database and a later or other one."""
+    difference = None
+    if other:
+        # In its turn among the queries: it reads whole tables.
+        difference = await service.sessions.run(_difference, service, database_id, other)
+    return await run_in_threadpool(_comparison, request, service, database_id, other, difference)
+
+
+def _difference(service: Service, database_id: str, other: str) -> Difference:
+    sides = (service.shelf.database(one) for one in (database_id, other))
+    return diff_artifacts(*(Artifact(one.folder, one.manifest) for one in sides))
+
+
+def _comparison(
+    request: Request,
+    service: Service,
+    database_id: str,
+    other: str,
+    difference: Difference | None,
+) -> Response:
     database = service.shelf.database(database_id)
     others = [one for one in service.shelf.databases() if one.id != database.id]
-    content: dict[str, Any] = {"others": others, "later": None, "difference": None}
-    if other:
-        later = service.shelf.database(other)
-        sides = (Artifact(one.folder, one.manifest) for one in (database, later))
-        content |= {"later": later, "difference": diff_artifacts(*sides)}
-    else:
-        same_name = [one for one in others if one.name == database.name]
-        content["suggested"] = same_name[-1].id if same_name else ""
+    versions = [one.id for one in others if one.name == database.name]
     return render(
         request,
         "compare.html",
         **_head(service, database, "compare"),
+        others=others,
+        suggested=other or (versions[-1] if versions else ""),
+        later=service.shelf.database(other) if other else None,
+        difference=difference,
         most=DIFFERENCES_SHOWN,
-        **{"suggested": other, **content},
     )
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from starcat.catalog.source import data_source, source_names
@@ -151,10 +151,11 @@ def draft_of_form(form: Mapping[str, str]) -> Draft:
     """
     text = form.get(TEXT, "").replace("\r\n", "\n")
     before = form.get(BEFORE, "").replace("\r\n", "\n")
-    if text.strip() != before.strip():
-        return draft_of_text(text)
-    known = draft_of_text(before)
+    is_edited = text.strip() != before.strip()
+    known = draft_of_text(text if is_edited else before)
     if known.error is not None and known.error.key == TEXT:
+        return _with_fields_of(form, known)
+    if is_edited:
         return known
     content = content_of_toml(before, ORIGIN)
     try:
@@ -163,6 +164,17 @@ def draft_of_form(form: Mapping[str, str]) -> Draft:
     except ConfigError as error:
         return _draft(content, before, None, error)
     return known if content == content_of_toml(before, ORIGIN) else draft_of_content(content)
+
+
+def _with_fields_of(form: Mapping[str, str], draft: Draft) -> Draft:
+    """Return a draft whose text cannot be read with the fields as they were."""
+    return replace(
+        draft,
+        values={key: form.get(key, value) for key, value in draft.values.items()},
+        lens="focal" if form.get(LENS) == "focal" else "field",
+        products={name: f"products.{name}.{ENABLED}" in form for name in PRODUCTS},
+        bands=bands_of(form.get("catalog.source", "")),
+    )
 
 
 def draft_of_content(content: Mapping[str, Any]) -> Draft:
@@ -378,10 +390,7 @@ def _put(content: dict[str, Any], path: str, value: Any) -> None:
     for table in tables:
         content = content.setdefault(table, {})
         if not isinstance(content, dict):
-            raise ConfigError(
-                f"{ORIGIN}: {table}: found {str(content)[:60]!r}; expected a table, [{table}]",
-                key=TEXT,
-            )
+            raise ConfigError(f"{path}: {table} is a value, not a table of the spec", key=TEXT)
     if value is None:
         content.pop(name, None)
     else:

@@ -14,6 +14,7 @@ from typing import Annotated, Any, BinaryIO
 from fastapi import Query, Request
 from fastapi.responses import Response
 from pydantic import ValidationError
+from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData, UploadFile
 
 from starcat.errors import StarcatError
@@ -74,24 +75,24 @@ async def identify(request: Request, service: TheService, _: Reader) -> Response
     async with request.form(max_files=1, max_fields=20) as form:
         given = {name: str(form.get(name) or "")[:MIB] for name in FIELDS}
         try:
-            database = service.shelf.database(given["database"])
-            frame, options = frame_of(form, given, database, service), options_of(given)
-            found, picture = await service.confined.run(
-                identified, service, database, frame, options
-            )
+            answer = await service.confined.run(_answer, service, form, given)
         except (StarcatError, Problem) as error:
-            problem = problem_of(error)
-            return _page(request, service, given, status=problem.status, problem=problem)
+            answer = {"problem": problem_of(error)}
+    return await run_in_threadpool(_page, request, service, given, **answer)
+
+
+def _answer(service: Service, form: FormData, given: dict[str, str]) -> dict[str, Any]:
+    """Return what the page shows of an answer."""
+    database = service.shelf.database(given["database"])
+    frame, options = frame_of(form, given, database, service), options_of(given)
+    found, picture = identified(service, database, frame, options)
     first = found["frames"][0]
-    return _page(
-        request,
-        service,
-        given,
-        found=found,
-        picture=_address(picture),
-        errors=_errors(first),
-        field_deg=_field_deg(first, database),
-    )
+    return {
+        "found": found,
+        "picture": _address(picture),
+        "errors": _errors(first),
+        "field_deg": _field_deg(first, database),
+    }
 
 
 @router.get("/identify/frame/{database_id}")
@@ -110,15 +111,14 @@ async def simulated_frame(
     return Response(content, media_type=kind, headers=headers)
 
 
-def _page(
-    request: Request, service: Service, given: dict[str, str], status: int = 200, **answer: Any
-) -> Response:
+def _page(request: Request, service: Service, given: dict[str, str], **answer: Any) -> Response:
     databases = service.shelf.databases()
+    problem = answer.get("problem")
     nothing = dict.fromkeys(("found", "picture", "problem", "errors", "field_deg"))
     return render(
         request,
         "identify.html",
-        status=status,
+        status=problem.status if problem else 200,
         databases=[(one.id, one.title) for one in databases],
         methods=[(name, f"{name}: {one.description}") for name, one in METHODS.items()],
         given={**dict.fromkeys(FIELDS, ""), **given},

@@ -64,7 +64,10 @@ def new_page(
         spec = preset(chosen).recorded()
     if spec is None:
         raise Problem(404, f"job {job} builds nothing; choose one that does")
-    return _page(request, service, draft_of_content(without_defaults(spec)), chosen or "")
+    # A page that waits for no catalog is there at once; its script asks for the estimate.
+    return _page(
+        request, service, draft_of_content(without_defaults(spec)), chosen or "", is_first=True
+    )
 
 
 @router.post("/new")
@@ -92,9 +95,7 @@ def preview(request: Request, service: TheService, form: Form, _: Reader) -> Res
     """Tell a script what the form has become, and what that would give."""
     draft = draft_of_form(form)
     seen, error = _preview(service, draft)
-    part = ENVIRONMENT.get_template("new_result.html").render(
-        preview=seen, problem=error and error.detail
-    )
+    told = {"problem": error and error.detail, "errors": draft.errors}
     content: dict[str, Any] = {
         "toml": draft.text,
         "values": draft.values,
@@ -102,10 +103,12 @@ def preview(request: Request, service: TheService, form: Form, _: Reader) -> Res
         "products": draft.products,
         "bands": draft.bands,
         "errors": draft.errors,
-        "result": part,
+        "wrong": ENVIRONMENT.get_template("new_wrong.html").render(told),
+        "result": ENVIRONMENT.get_template("new_result.html").render(preview=seen),
         "summary": summary(seen),
         "is_busy": error is not None and error.status == 503,
-        "stars": [] if seen is None else seen.estimate.fields.count.tolist(),
+        "is_known": seen is not None,
+        "stars": [] if seen is None or seen.map is None else seen.estimate.fields.count.tolist(),
     }
     return JSONResponse(content, headers={"Cache-Control": "no-store"})
 
@@ -131,8 +134,10 @@ def _page(
     draft: Draft,
     chosen: str,
     refused: StarcatError | Problem | None = None,
+    *,
+    is_first: bool = False,
 ) -> Response:
-    seen, error = _preview(service, draft)
+    seen, error = (None, None) if is_first else _preview(service, draft)
     problem = None if refused is None else problem_of(refused)
     status = problem.status if problem else 422 if draft.errors else 200
     return render(
@@ -142,8 +147,10 @@ def _page(
         draft=draft,
         preview=seen,
         problem=error and error.detail,
+        errors=draft.errors,
         refused=problem and problem.detail,
         summary=summary(seen),
+        is_first=is_first,
         presets=[(name, preset(name).description) for name in preset_names()],
         chosen=chosen,
         sources=_sources(service),
@@ -155,7 +162,7 @@ def _page(
 def summary(seen: Preview | None) -> str:
     """Return what a spec would give in one line."""
     if seen is None:
-        return "No estimate: see what is wrong above."
+        return "No estimate: something in the spec is not right yet."
     found = seen.estimate
     stars = found.coverage.stars
     return (

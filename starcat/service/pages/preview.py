@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from starcat.geometry.sphere import radec_from_directions, saff_kuijlaars
 from starcat.pipeline.estimate import Estimate
 from starcat.report.sky_map import nearest_raster
-from starcat.service.pages.sky import COLOURS, Bin, Fields, SkyMap, bins_of, sky_map
+from starcat.service.pages.sky import Bin, Fields, SkyMap, bins_of, coloured_png, sky_map
 
 Counts = NDArray[np.int64]
 
@@ -200,15 +199,7 @@ def _nearest(count: int) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
 
 
 def _picture(counts: Counts, bins: tuple[Bin, ...]) -> str:
-    from PIL import Image
-
     inside, nearest = _nearest(len(counts))
-    colours = np.array([0] + [int(one.name[1:]) + 1 for one in bins], dtype=np.uint8)
-    of_field = colours[np.searchsorted([one.least for one in bins], counts, side="right")]
-    pixels = np.zeros(inside.shape, dtype=np.uint8)
-    pixels[inside] = of_field[nearest]
-    image = Image.fromarray(pixels)
-    image.putpalette(bytes(3) + bytes.fromhex("".join(COLOURS)))
-    file = io.BytesIO()
-    image.save(file, "PNG", transparency=0, optimize=False)
-    return f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"
+    raster = np.full(inside.shape, np.nan)
+    raster[inside] = counts[nearest]
+    return f"data:image/png;base64,{base64.b64encode(coloured_png(raster, bins)).decode()}"

@@ -93,6 +93,6 @@ def _page(
         most_note=api.MAX_NOTE,
         database=database,
         note=note,
-        published=published,
+        published=published if published in {one.title for one in listed} else "",
         problem=problem,
     )

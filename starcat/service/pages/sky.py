@@ -215,16 +215,32 @@ def map_png(database_id: str, fields: Fields, width: int = RASTER_WIDTH) -> byte
     bytes
         PNG, north at the top; nothing outside of the ellipse.
     """
-    from PIL import Image
-
-    bins = bins_of(fields)
     raster = nearest_raster(
         directions_from_radec(fields.ra_deg, fields.dec_deg), fields.stars, width
     )
+    return coloured_png(raster, bins_of(fields))
+
+
+def coloured_png(raster: Array, bins: tuple[Bin, ...]) -> bytes:
+    """Return a raster of numbers of stars as a picture.
+
+    Parameters
+    ----------
+    raster : ndarray of float64, shape (rows, columns)
+        Stars of a field; NaN outside of the map.
+    bins : tuple of Bin
+        What the colours mean.
+
+    Returns
+    -------
+    bytes
+        PNG; nothing where there is no number.
+    """
+    from PIL import Image
+
     found = np.searchsorted([one.least for one in bins], np.nan_to_num(raster), side="right")
     colours = np.array([0] + [int(one.name[1:]) + 1 for one in bins], dtype=np.uint8)
-    pixels = np.where(np.isnan(raster), 0, colours[found]).astype(np.uint8)
-    image = Image.fromarray(pixels)
+    image = Image.fromarray(np.where(np.isnan(raster), 0, colours[found]).astype(np.uint8))
     image.putpalette(bytes(3) + bytes.fromhex("".join(COLOURS)))
     file = io.BytesIO()
     image.save(file, "PNG", transparency=0, optimize=False)
@@ -355,5 +371,8 @@ def ordered(fields: Fields, order: str) -> list[int]:
 def field_at(fields: Fields, number: int) -> Field:
     """Return one of the fields with its place on the map."""
     ra_deg, dec_deg = float(fields.ra_deg[number]), float(fields.dec_deg[number])
-    counts = (int(one[number]) for one in (fields.stars, fields.pairs, fields.triangles))
-    return Field(number, ra_deg, dec_deg, *counts, *place(ra_deg, dec_deg))
+    stars, pairs, triangles = (
+        int(one[number]) for one in (fields.stars, fields.pairs, fields.triangles)
+    )
+    x, y = place(ra_deg, dec_deg)
+    return Field(number, ra_deg, dec_deg, stars, pairs, triangles, x, y)

@@ -60,7 +60,7 @@ PARAMETERS = {
 
 
 @router.get(
-    "/{catalog}",
+    "/{catalog:path}",
     summary="Stars in a circle (Simple Cone Search 1.03)",
     response_class=Response,
     responses={

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+import threading
 from datetime import UTC, datetime
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Literal
 
+from anyio import CancelScope, to_thread
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
@@ -16,16 +18,17 @@ from starcat.errors import TargetMissing, quoted
 from starcat.service.access import Reader
 from starcat.service.service import Service, TheService
 from starcat.service.vo.tap_request import PREFIX, TapRequest, TapRoute, TheRequest, base_url
+from starcat.service.vo.tap_spool import ClientGone, Spool
 from starcat.vo.documents import (
     MEDIA_TYPE,
     availability,
     capabilities,
+    for_tap_plus,
     table_document,
     tableset,
 )
 from starcat.vo.examples import examples_page
 from starcat.vo.parameters import Question, question
-from starcat.vo.tables import full_name
 
 router = APIRouter(prefix=PREFIX, tags=["TAP"], route_class=TapRoute)
 
@@ -35,21 +38,16 @@ _STARTED = datetime.now(UTC)
 class _Closing(StreamingResponse):
     """A stream that is let go when it ends, also where the client went away."""
 
-    def __init__(self, first: bytes, rest: Iterator[bytes], media_type: str) -> None:
-        def parts() -> Iterator[bytes]:
-            yield first
-            yield from rest
-
-        super().__init__(parts(), media_type=media_type)
+    def __init__(self, first: bytes, rest: Spool, media_type: str) -> None:
+        super().__init__(chain([first], rest), media_type=media_type)
         self._rest = rest
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         try:
             await super().__call__(scope, receive, send)
         finally:
-            close = getattr(self._rest, "close", None)
-            if close is not None:
-                close()
+            with CancelScope(shield=True):
+                await to_thread.run_sync(self._rest.close)
 
 
 @router.get("/sync", summary="Answer a query in ADQL")
@@ -64,15 +62,21 @@ async def sync(given: TheRequest, service: TheService, who: Reader) -> Response:
     return answer
 
 
-def _begun(
-    service: Service, asked: Question, given: TapRequest, owner: str
-) -> tuple[bytes, Iterator[bytes]]:
+def _begun(service: Service, asked: Question, given: TapRequest, owner: str) -> tuple[bytes, Spool]:
     """Return the first part of an answer, and what gives the others."""
-    with tempfile.TemporaryDirectory(prefix="sync-", dir=service.places.scratch) as folder:
+    gone = threading.Event()
+
+    def watch(*_: object) -> None:
+        if gone.is_set():
+            raise ClientGone
+
+    scratch = service.places.scratch
+    with tempfile.TemporaryDirectory(prefix="sync-", dir=scratch) as folder:
         files = given.keep(Path(folder)) | service.tap.jobs.answers(asked.uploads, owner)
-        parts = service.tap.queries.answer(asked, files)
+        parts = service.tap.queries.answer(asked, files, progress=watch)
         # What came is read before the first part of the answer is there.
-        return next(parts, b""), parts
+        first = next(parts, b"")
+    return first, Spool(parts, scratch, gone)
 
 
 @router.get("/capabilities", summary="What the service can do (VOSI)")
@@ -87,23 +91,34 @@ def get_availability() -> Response:
     return Response(availability(_STARTED), media_type=MEDIA_TYPE)
 
 
+TAP_PLUS = ("tables", "only_tables", "share_accessible")
+"""Parameters that TapPlus of astroquery asks for tables with, beside those of VOSI."""
+
+
 @router.get("/tables", summary="All tables (VOSI)")
 def get_tables(
+    request: Request,
     service: TheService,
     who: Reader,
     detail: Annotated[Literal["min", "max"], Query(description="min without columns")] = "max",
 ) -> Response:
     """Return schemas, tables and columns."""
+    given = request.query_params
     found = service.tap.tables.state().tables
-    return Response(tableset(found, detail == "max"), media_type=MEDIA_TYPE)
+    if "tables" in given:
+        found = found.chosen(given["tables"].split(","))
+    content = tableset(found, detail == "max" and given.get("only_tables") != "true")
+    # TapPlus is the one client that does not say its name.
+    if any(name in given for name in TAP_PLUS) or "user-agent" not in request.headers:
+        content = for_tap_plus(content)
+    return Response(content, headers={"Vary": "User-Agent"}, media_type=MEDIA_TYPE)
 
 
 @router.get("/tables/{name}", summary="A table (VOSI)")
 def get_table(name: str, service: TheService, who: Reader) -> Response:
     """Return a table with its columns."""
-    for table in service.tap.tables.state().tables:
-        if name.lower() in (full_name(table).lower(), f"{table.schema}.{table.name}".lower()):
-            return Response(table_document(table), media_type=MEDIA_TYPE)
+    for table in service.tap.tables.state().tables.chosen([name]):
+        return Response(table_document(table), media_type=MEDIA_TYPE)
     raise TargetMissing(f"no table {quoted(name)}; /tap/tables lists those that there are")
 
 

@@ -5,6 +5,8 @@ import { startMap } from "./sky.js";
 
 const form = document.getElementById("design");
 const result = document.getElementById("result");
+const wrong = document.getElementById("wrong");
+const body = document.getElementById("body");
 const text = document.getElementById("toml");
 const before = document.getElementById("toml-before");
 const summary = document.getElementById("summary");
@@ -103,15 +105,18 @@ function showMap(stars) {
 }
 
 function show(state) {
-  const isReadable = state.errors.toml === undefined || state.toml !== text.value;
   if (document.activeElement !== text && text.value !== state.toml) text.value = state.toml;
   before.value = state.toml;
-  if (isReadable || Object.values(state.values).some(Boolean)) showValues(state);
+  showValues(state);
   showErrors(state.errors);
-  const hadFocus = result.querySelector(".sky svg") === document.activeElement;
-  result.innerHTML = state.result;
-  showMap(state.stars);
-  if (hadFocus) result.querySelector(".sky svg")?.focus();
+  wrong.innerHTML = state.wrong;
+  body.classList.toggle("stale", !state.is_known);
+  if (state.is_known) {  // else the last estimate stays, pale
+    const hadFocus = body.querySelector(".sky svg") === document.activeElement;
+    body.innerHTML = state.result;
+    showMap(state.stars);
+    if (hadFocus) body.querySelector(".sky svg")?.focus();
+  }
   if (summary.textContent !== state.summary) summary.textContent = state.summary;
 }
 

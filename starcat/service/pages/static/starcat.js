@@ -73,3 +73,9 @@ export function announce(text) {
 
 startTheme();
 startCopying();
+
+// On a narrow screen, the place where one is may lie beside it.
+for (const here of document.querySelectorAll(".nav [aria-current], .tabs [aria-current]")) {
+  const list = here.closest("nav, ul");
+  if (list.scrollWidth > list.clientWidth) list.scrollLeft = here.offsetLeft - 24;
+}

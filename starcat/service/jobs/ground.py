@@ -1,0 +1,73 @@
+"""What jobs need of a service: a worker opens this much, and nothing that answers requests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from starcat.service.jobs.job import JobStore
+from starcat.service.jobs.queue import JobQueue, open_queue
+from starcat.service.places import Places
+from starcat.service.records import Records
+from starcat.service.settings import Settings
+from starcat.service.shelf import Shelf
+
+
+class Ground(Protocol):
+    """A service, or the part of one that jobs need; attributes as those of `Service`."""
+
+    @property
+    def settings(self) -> Settings:
+        """What the operator set."""
+
+    @property
+    def places(self) -> Places:
+        """What lies where."""
+
+    @property
+    def records(self) -> Records:
+        """What is remembered."""
+
+    @property
+    def shelf(self) -> Shelf:
+        """The databases there are."""
+
+    @property
+    def jobs(self) -> JobStore:
+        """The jobs there are."""
+
+    @property
+    def queue(self) -> JobQueue:
+        """What tells the workers that a job waits."""
+
+
+@dataclass(frozen=True)
+class WorkerGround:
+    """The part of a service that a worker has; attributes as those of `Ground`."""
+
+    settings: Settings
+    places: Places
+    records: Records
+    shelf: Shelf
+    jobs: JobStore
+    queue: JobQueue
+
+
+def open_ground(settings: Settings) -> WorkerGround:
+    """Open what a worker needs.
+
+    Parameters
+    ----------
+    settings : Settings
+        What the operator set.
+
+    Returns
+    -------
+    WorkerGround
+        Of the same root as the service that started the worker.
+    """
+    places = Places(settings.root)
+    places.make()
+    records = Records(places.records)
+    queue = open_queue(settings, places)
+    return WorkerGround(settings, places, records, Shelf(places), JobStore(records), queue)

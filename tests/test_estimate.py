@@ -1,0 +1,338 @@
+"""What a spec will give, by estimate, against what its build gives."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from starcat.artifact.manifest import DATABASE_NAME, MANIFEST_NAME
+from starcat.errors import BuildError, ConfigError
+from starcat.pipeline.build import Inputs, build
+from starcat.pipeline.counts import triple_of_rank
+from starcat.pipeline.estimate import Estimate, choose_stars, estimate, estimate_spec
+from starcat.pipeline.guide_stars import brightest_of_fields, select_stars
+from starcat.pipeline.recipes import tile_guide_stars
+from starcat.pipeline.sizes import PART_ROWS, PARTS, table_bytes
+from starcat.pipeline.stars_read import StarsRead, read_stars, what_is_read
+from starcat.products.boresights import NominalField, stars_in_fields
+from starcat.specs.build_spec import BuildSpec
+from starcat.specs.reading import content_of_toml, preset, preset_names, spec_from_dict
+from starcat.tables.parquet import parquet_bytes, read_parquet, write_parquet
+
+FILES = {"2mass-8x6": {"2mass": "psc_estimated.gz"}}
+"""Inputs that are not found by the names of their files."""
+
+
+@pytest.fixture(scope="module")
+def small(
+    tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]
+) -> tuple[Path, dict[str, list[Path]]]:
+    folder = tmp_path_factory.mktemp("sao")
+    (folder / "sao.dat").write_bytes(b"".join(sao_lines))
+    return folder, {"sao": [folder / "sao.dat"]}
+
+
+def spec_of(text: str, **sections: Any) -> BuildSpec:
+    return spec_from_dict({**tomllib.loads(text), **sections}, "small.toml")
+
+
+@pytest.fixture(scope="module")
+def read(small, small_spec: str) -> StarsRead:
+    return read_stars(spec_of(small_spec), small[1])
+
+
+def check(found: Estimate, folder: Path, least_bytes: int = 0) -> None:
+    """Compare an estimate with an artifact: stars to the last one, files within 10 %."""
+    manifest = json.loads((folder / MANIFEST_NAME).read_bytes())
+    [stars, *_] = manifest["sources"]
+    assert found.cost.stars == stars["kept"] == manifest["products"]["stars"]["rows"]
+    assert found.rejected == stars["rejected"]
+    assert set(found.cost.files) == {
+        *(facts["parquet"] for facts in manifest["products"].values()), DATABASE_NAME, "report",
+    }  # fmt: skip
+    report = sum(path.stat().st_size for path in (folder / "report").iterdir())
+    for name, size in found.cost.files.items():
+        real = (folder / name).stat().st_size
+        if name == "report":
+            real = report + (folder / MANIFEST_NAME).stat().st_size
+        assert size == pytest.approx(real, rel=0.1, abs=least_bytes), name
+    for name, rows in found.cost.rows.items():
+        assert rows == pytest.approx(manifest["products"][name]["rows"], rel=0.06), name
+
+
+# --- Against builds
+
+
+@pytest.mark.parametrize(
+    "sections",
+    [
+        {},
+        {"boresights": {"count": 300, "brightest": 5}, "products": {"pairs": {"enabled": False}}},
+        {
+            "selection": {
+                "faint_limit_mag": 5.5,
+                "max_stars_per_field": 6,
+                "doubles": {"min_separation_deg": 2.0, "action": "merge"},
+            }
+        },
+    ],
+    ids=["plain", "fewer", "thinned and merged"],
+)
+def test_a_small_build_is_as_estimated(small, small_spec, sections, tmp_path):
+    spec = spec_of(small_spec, **sections)
+    built = build(spec, small[1], tmp_path)
+    # Of a few hundred rows a file is mostly its footer; the report has pictures of their own size.
+    check_small(estimate_spec(spec, small[1]), built.folder)
+
+
+def check_small(found: Estimate, folder: Path) -> None:
+    small_files = {**found.cost.files}
+    del small_files["report"]
+    manifest = json.loads((folder / MANIFEST_NAME).read_bytes())
+    assert found.cost.stars == manifest["products"]["stars"]["rows"]
+    assert found.rejected == manifest["sources"][0]["rejected"]
+    for name, size in small_files.items():
+        assert size == pytest.approx((folder / name).stat().st_size, rel=0.1), name
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(240)
+@pytest.mark.parametrize("name", preset_names())
+def test_every_preset_is_as_estimated(name, catalogs, has_excerpts, tmp_path, monkeypatch):
+    monkeypatch.setenv("STARCAT_CATALOGS", str(catalogs))
+    inputs: Inputs = {source: [catalogs / file] for source, file in FILES.get(name, {}).items()}
+    spec = preset(name)
+    try:
+        built = build(spec, inputs, tmp_path)
+    except BuildError:
+        if has_excerpts:
+            raise
+        pytest.skip("the made-up catalogs have too few stars for this preset")
+    check(estimate_spec(spec, inputs), built.folder)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(240)
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"camera.fov_x_deg": "6", "boresights.count": "30000", "selection.faint_limit_mag": "6.5"},
+        {"camera.fov_x_deg": "25", "selection.faint_limit_mag": "5", "boresights.count": "3000"},
+        {
+            "selection.faint_limit_mag": "7",
+            "selection.max_stars_per_field": "12",
+            "boresights.brightest": "10",
+            "products.grid.cells_per_side": "100",
+            "products.grid.buffer_deg": "2.0",
+            "products.radial.rings": "200",
+            "products.pairs.min_separation_deg": "10.0",
+            "products.levels.enabled": "true",
+            "products.levels.widest_fov_x_deg": "40.0",
+        },
+    ],
+    ids=["narrow", "wide", "thinned, with levels"],
+)
+def test_other_specs_are_as_estimated(changes, tmp_path):
+    spec = preset("gaia-12deg", {**changes, "self_test.frames": "20"})
+    built = build(spec, {}, tmp_path)
+    check(estimate_spec(spec, {}), built.folder, least_bytes=2000)
+
+
+# --- Stars
+
+
+@pytest.mark.parametrize("action", ["remove", "merge", "keep"])
+@pytest.mark.parametrize("companions", [None, 4.0, 6.3])
+@pytest.mark.parametrize("most", [None, 5])
+def test_stars_are_chosen_as_in_a_build(read, small_spec, action, companions, most):
+    """An estimate looks only at stars that are bright enough; that must not show."""
+    spec = spec_of(
+        small_spec,
+        selection={
+            "faint_limit_mag": 5.0,
+            "max_stars_per_field": most,
+            "doubles": {
+                "min_separation_deg": 3.0,
+                "max_delta_mag": 1.0,
+                "companion_limit_mag": companions,
+                "action": action,
+            },
+        },
+    )
+    selected, fields = select_stars(read.stars, spec)
+    found = choose_stars(read, spec)
+    assert found.selected.guide_stars.equals(selected.guide_stars)
+    assert np.array_equal(found.fields.star_index, fields.star_index)
+    assert sum(found.rejected.values()) == len(selected.rejected) + sum(read.rejected.values())
+
+
+def test_stars_without_a_magnitude_are_counted(read, small_spec):
+    mag = read.stars["mag"].to_numpy().copy()
+    known = pa.array(mag, mask=np.arange(len(mag)) < 7)
+    place = read.stars.schema.get_field_index("mag")
+    stars = read.stars.set_column(place, read.stars.schema.field("mag").with_nullable(True), known)
+    found = choose_stars(replace(read, stars=stars), spec_of(small_spec))
+    assert found.rejected["no_magnitude"] == 7
+
+
+@given(
+    mags=st.lists(st.sampled_from([3.0, 4.0, 4.5, 5.0]), min_size=1, max_size=60),
+    most=st.integers(1, 6),
+    seed=st.integers(0, 1000),
+    count=st.integers(1, 40),
+)
+def test_the_brightest_of_fields_are_those_of_the_whole_tiling(read, mags, most, seed, count):
+    stars = read.stars.take(
+        pa.array(np.sort(np.random.default_rng(seed).permutation(len(read.stars))[: len(mags)]))
+    )
+    place = stars.schema.get_field_index("mag")
+    stars = stars.set_column(place, stars.schema.field("mag"), pa.array(mags))
+    spec = preset("gaia-12deg", {"camera.fov_x_deg": "60", "boresights.count": str(count)})
+    whole = np.unique(tile_guide_stars(stars, spec).brightest(most)[1])
+    assert np.array_equal(brightest_of_fields(stars, spec, most), whole)
+
+
+def test_equal_magnitudes_go_by_row():
+    u = np.tile([[1.0, 0.0, 0.0]], (5, 1))
+    mag = np.array([4.0, 3.0, 4.0, 3.0, 4.0])
+    found = stars_in_fields(u[:1], u, mag, NominalField(10.0, 10.0))
+    assert found.star_index.tolist() == [1, 3, 0, 2, 4]
+
+
+def test_too_few_stars_are_told_in_the_words_of_the_build(read, small_spec):
+    spec = spec_of(small_spec, selection={"faint_limit_mag": -2.0})
+    with pytest.raises(BuildError) as built:
+        select_stars(read.stars, spec)
+    with pytest.raises(BuildError) as estimated:
+        choose_stars(read, spec)
+    assert str(estimated.value) == str(built.value)
+
+
+def test_fields_that_fall_short_and_memory_are_refusals(read, small_spec):
+    spec = spec_of(small_spec, boresights={"count": 200, "min_stars_per_field": 10_000})
+    found = estimate(read, choose_stars(read, spec), spec, max_memory_bytes=1)
+    assert "(boresights.min_stars_per_field)" in found.refusals[0]
+    assert "more than the limit that was given" in found.refusals[1]
+
+
+def test_what_is_read_depends_on_the_catalog_alone(small_spec):
+    one = spec_of(small_spec)
+    other = spec_of(small_spec, name="other", selection={"faint_limit_mag": 3.0})
+    assert what_is_read(one) == what_is_read(other)
+    joined = {"faint_limit_mag": 6.0, "variables": {"join": ["gcvs"]}}
+    assert what_is_read(one) != what_is_read(spec_of(small_spec, selection=joined))
+    assert what_is_read(one) != what_is_read(spec_of(small_spec, epoch_jyear=2000.0))
+
+
+# --- Sizes and counts
+
+
+def test_the_size_of_a_table_is_that_of_its_file(read, tmp_path):
+    write_parquet(read.stars, tmp_path / "stars.parquet")
+    assert parquet_bytes(read.stars) == (tmp_path / "stars.parquet").stat().st_size
+    assert table_bytes(read.stars) == parquet_bytes(read.stars)
+
+
+def test_the_size_of_a_large_table_is_known_from_parts():
+    count = 5 * PART_ROWS * PARTS
+    table = pa.table({"mag": np.random.default_rng(5).normal(size=count)})
+    assert table_bytes(table) == pytest.approx(parquet_bytes(table), rel=0.05)
+
+
+@pytest.mark.parametrize("n", [3, 8, 20])
+def test_every_triple_has_its_rank(n):
+    found = triple_of_rank(np.arange(n * (n - 1) * (n - 2) // 6))
+    assert len(np.unique(found, axis=0)) == len(found)
+    assert (np.diff(found, axis=1) > 0).all()
+    assert found.min() == 0
+    assert found.max() == n - 1
+
+
+# --- What would take too long, or too much
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (
+            {"boresights.count": "1000000", "camera.fov_x_deg": "30"},
+            "fields of the tiling have about",
+        ),
+        (
+            {
+                "boresights.count": "1000000",
+                "camera.fov_x_deg": "30",
+                "selection.max_stars_per_field": "10000",
+            },
+            "more than the 4,000,000 that an estimate goes through",
+        ),
+        (
+            {
+                "boresights.count": "1000000",
+                "camera.fov_x_deg": "0.1",
+                "products.levels.enabled": "true",
+                "products.levels.max_ratio": "1.1",
+            },
+            "fields of all levels",
+        ),
+    ],
+)
+def test_a_tiling_that_is_too_large_is_refused(read, changes, words):
+    spec = preset("sao-12deg", {**changes, "selection.variables.join": "[]"})
+    with pytest.raises(BuildError, match=words):
+        choose_stars(read, spec)
+
+
+def test_doubles_that_are_no_doubles_are_refused(read):
+    spec = preset("sao-12deg", {"selection.doubles.min_separation_deg": "10.0"})
+    stars = pa.concat_tables([read.stars] * 300).combine_chunks()
+    with pytest.raises(BuildError, match=r"min_separation_deg = 10 makes about .* doubles"):
+        select_stars(stars, spec)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a." * 20_000 + "a = 1", "line 1 has 20,000 full stops"),
+        ("\nx = {" + "a." * 300 + "a = 1}", "line 2 has 300 full stops"),
+        ("#" * 100_001, "100,001 characters"),
+        ("a = " + "[" * 50_000, "nested too deep"),
+    ],
+)
+@pytest.mark.timeout(5)
+def test_a_text_that_no_spec_is_costs_nothing(text, words):
+    with pytest.raises(ConfigError, match=words):
+        content_of_toml(text, "spec")
+
+
+def test_a_number_that_python_does_not_write_is_told(small_spec):
+    content = tomllib.loads(small_spec) | {"boresights": {"count": 16**5000}}
+    with pytest.raises(ConfigError, match="found a number of 20,001 bits"):
+        spec_from_dict(content, "spec")
+
+
+# --- The command
+
+
+def test_the_command_says_what_a_spec_gives(starcat, small, small_spec, tmp_path):
+    (tmp_path / "small.toml").write_text(small_spec)
+    arguments = ["estimate", tmp_path / "small.toml", "--input", f"sao={small[1]['sao'][0]}"]
+    run = starcat(arguments)
+    assert run.code == 0
+    assert "triangles.parquet" in run.out
+    assert "the stars are as the build will have them" in run.err
+    said = json.loads(starcat([*arguments, "--json"]).out)
+    built = starcat(["build", *arguments[1:], "-o", tmp_path / "dist"])
+    assert built.code == 0
+    stars = read_parquet(tmp_path / "dist" / "small-1.0.0" / "stars.parquet")
+    assert said["stars"] == len(stars)
+    assert said["total_bytes"] == sum(said["files"].values())
