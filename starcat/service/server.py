@@ -55,6 +55,8 @@ def run_server(settings: Settings, announce: Announce) -> None:
         If the root cannot be written to.
     """
     places = Places(settings.root)
+    if not settings.is_private and not places.records.exists():
+        raise _without_token(settings)  # before anything is made
     with _only_server(places):
         shutil.rmtree(places.scratch, ignore_errors=True)
         _serve(settings, announce)
@@ -161,21 +163,29 @@ def _see_to_tokens(tokens: TokenStore, settings: Settings) -> None:
     """See that somebody can do more than read: make the first token, or say how."""
     if tokens.has_valid():
         return
-    command = f"starcat token create NAME --role publisher --root {settings.root}"
     if not settings.is_private:
-        raise ConfigError(
-            f"others are to reach {settings.public_url or settings.host}, and nobody has a token; "
-            f"make one first: {command}",
-            key="host",
-            value=settings.host,
-        )
+        raise _without_token(settings)
     if Role.named(settings.anonymous_role) >= Role.PUBLISHER:
         return
     if not sys.stderr.isatty():  # a log keeps what is written to it; a terminal is only seen
-        _say(f"nobody has a token, so nobody can build or publish yet; make one: {command}")
+        how = _how_to_make_one(settings)
+        _say(f"nobody has a token, so nobody can build or publish yet; make one: {how}")
         return
     _, text = tokens.create(FIRST, Role.PUBLISHER)
     _say(f"the first token, shown once: {text}\nuse it to sign in on the page, or with curl")
+
+
+def _without_token(settings: Settings) -> ConfigError:
+    return ConfigError(
+        f"others are to reach {settings.public_url or settings.host}, and nobody has a token; "
+        f"make one first: {_how_to_make_one(settings)}",
+        key="host",
+        value=settings.host,
+    )
+
+
+def _how_to_make_one(settings: Settings) -> str:
+    return f"starcat token create NAME --role publisher --root {settings.root}"
 
 
 def _say(text: str) -> None:
