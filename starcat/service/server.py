@@ -86,7 +86,7 @@ def _only_server(places: Places) -> Iterator[None]:
 def _serve(settings: Settings, announce: Announce) -> None:
     app = make_app(settings)
     _see_to_tokens(app.state.identities.tokens, settings)
-    listening = _listen(settings)
+    listening = listen(settings)
     config = uvicorn.Config(
         app,
         http=Patience,
@@ -129,7 +129,7 @@ def _address(settings: Settings, port: int) -> str:
     return f"{(settings.public_url or f'http://{host}:{port}').rstrip('/')}/"
 
 
-def _listen(settings: Settings) -> socket.socket:
+def listen(settings: Settings) -> socket.socket:
     """Return the socket that the server listens at."""
     try:
         [(family, _, _, _, address), *_] = socket.getaddrinfo(
