@@ -463,7 +463,7 @@ def test_ready_says_what_is_wrong(client: Make, monkeypatch: pytest.MonkeyPatch)
     at = client()
     app: Any = at.app
     monkeypatch.setattr(type(app.state.workers), "is_alive", False)
-    assert "the worker does not run" in " ".join(at.get("/readyz").json()["reasons"])
+    assert "has jobs done has ended" in " ".join(at.get("/readyz").json()["reasons"])
     monkeypatch.setattr(type(app.state.workers), "is_alive", True)
     found = at.get("/readyz")
     assert (found.status_code, found.json()) == (200, {"ready": True, "reasons": []})
