@@ -67,7 +67,7 @@ frames = 20
 """
 """What the path begins with: fainter stars are not needed, and take time."""
 
-READY_S = 40.0
+READY_S = 90.0
 
 BUILD_MS = 90_000.0
 """A build of the path takes 5 s on a machine that does nothing else."""
