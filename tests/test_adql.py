@@ -492,7 +492,13 @@ REFUSED = [
     ("SELECT TOP x row FROM places", "something is missing"),
     ("SELECT row FROM places WHERE name LIKE 'a' ESCAPE 'b'", "ESCAPE is not ADQL"),
     ("SELECT " + "(" * 3000 + "1" + ")" * 3000 + " FROM places", "nested too deeply"),
-    ("SELECT row FROM places WHERE name = '" + "x" * 200_000 + "'", "at most 200,000"),
+    ("SELECT row FROM places WHERE name = '" + "x" * 50_000 + "'", "at most 50,000"),
+    ("SELECT INTERSECTS(POLYGON(" + "1, 2, " * 199 + "3, 4), POLYGON(" + "5, 6, " * 199 + "7, 8)) "
+     "FROM places", "too much arithmetic"),
+    ("SELECT INTERSECTS(POLYGON(" + "ra_deg, dec_deg, " * 39 + "7, 8), POLYGON(" + "5, 6, " * 39
+     + "7, 8)) FROM places", "too much arithmetic"),
+    ("SELECT CONTAINS(CENTROID(POLYGON(ra_deg, 0, ra_deg, 1, ra_deg, 2)), POLYGON("
+     + "5, 6, " * 199 + "7, 8)) FROM places", "too much arithmetic"),
 ]  # fmt: skip
 
 
@@ -501,6 +507,21 @@ def test_refusals_say_what_and_where(tables, text, told):
     with pytest.raises(QueryError) as caught:
         translate(text, tables)
     assert told in str(caught.value)
+
+
+@pytest.mark.timeout(30)
+@pytest.mark.parametrize(
+    "text",
+    [
+        "SELECT row FROM places WHERE " + " OR ".join(f"row={k}" for k in range(4000)),
+        "SELECT row FROM places WHERE row IN (" + ", ".join(f"{k}.5" for k in range(6000)) + ")",
+        "SELECT row FROM places WHERE "
+        + " OR ".join("row IN (SELECT row FROM places)" for _ in range(1200)),
+    ],
+)
+def test_long_queries_take_no_longer_than_they_are(tables, text):
+    """What looks upwards from every part would take the square of that: minutes."""
+    assert len(translate(text, tables).sql) >= len(text)
 
 
 def test_a_refusal_points_to_the_place(tables):

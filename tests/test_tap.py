@@ -540,7 +540,11 @@ def test_times_of_a_job_are_set_within_what_is_granted(client, make):
     assert client.get(f"{job}/destruction").text == granted
     client.post(f"{job}/executionduration", data={"EXECUTIONDURATION": "99999999"})
     assert client.get(f"{job}/executionduration").text == "3600"
-    assert client.post(f"{job}/destruction", data={"DESTRUCTION": "soon"}).status_code == 422
+    for text, status in (("soon", 422), ("", 422), ("9999-12-31T23:59:59-23:59", 200)):
+        answer = client.post(f"{job}/destruction", data={"DESTRUCTION": text})
+        assert answer.status_code == status
+    assert client.get(f"{job}/destruction").text == granted
+    assert client.get(job, params={"WAIT": "9" * 400, "PHASE": "QUEUED"}).status_code == 200
     assert client.post(f"{job}/phase", data={"PHASE": "STOP"}).status_code == 422
     assert client.get(f"{job}/owner").text == "anonymous"
     assert client.get(f"{job}/quote").text == ""

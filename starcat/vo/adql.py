@@ -23,6 +23,9 @@ from starcat.vo.tables import Tables
 MAX_CORNERS = 400
 """Corners of a polygon at most."""
 
+MAX_CHARACTERS = 1_000_000
+"""Length of the arithmetic that the geometry of a query may become, roughly."""
+
 FRAMES = ("", "ICRS", "UNKNOWNFRAME")
 """Frames of coordinates; those behind a space, as in ``ICRS GEOCENTER``, make no difference."""
 
@@ -68,7 +71,7 @@ def translate(text: str, tables: Tables) -> Translation:
     """
     tree = parse_adql(text)
     try:
-        return _Translator(text, tables).translation(tree)
+        return _Translator(text, tables, tree).translation()
     except RecursionError as error:
         raise QueryError(
             "the query is nested too deeply; write it with fewer parentheses within each other"
@@ -78,15 +81,18 @@ def translate(text: str, tables: Tables) -> Translation:
 class _Translator:
     """The work of `translate`: parts of the tree are replaced from the leaves on."""
 
-    def __init__(self, text: str, tables: Tables) -> None:
+    def __init__(self, text: str, tables: Tables, tree: exp.Expr) -> None:
         self._text = text
-        self._names = Names(tables, text)
+        self._tree = tree
+        self._names = Names(tables, text, tree)
+        self._characters = 0
         self._shapes: dict[int, Shape] = {}
         self._conditions: dict[int, str] = {}
         # Numbers of objects are theirs only as long as the objects live.
         self._kept: list[exp.Expr] = []
 
-    def translation(self, tree: exp.Expr) -> Translation:
+    def translation(self) -> Translation:
+        tree = self._tree
         parts = list(tree.walk())
         for part in parts:
             if isinstance(part, exp.Column):
@@ -107,7 +113,8 @@ class _Translator:
         elif isinstance(part, exp.Column):
             self._names.shorten(part)
         elif isinstance(part, exp.Literal) and not part.is_string:
-            part.replace(_raw(_number(part.name)))
+            # In its place: to put another part there takes as long as the list is that it is in.
+            part.set("this", _number(part.name))
         elif isinstance(part, exp.HexString):
             part.replace(_raw(_number(str(int(part.name, 16)))))
         elif isinstance(part, exp.Cast) and part.to.expressions:
@@ -127,7 +134,7 @@ class _Translator:
         """Write ``1 = CONTAINS(...)`` as what CONTAINS asks, which DuckDB can look ahead with."""
         for one, other in ((part.this, part.expression), (part.expression, part.this)):
             asked = self._conditions.get(id(one))
-            number = _sql(other)
+            number = "" if asked is None else _sql(other)
             if asked is not None and number in ("0", "1"):
                 is_asked = (number == "1") == isinstance(part, exp.EQ)
                 part.replace(_raw(asked if is_asked else f"NOT {asked}"))
@@ -295,6 +302,13 @@ class _Translator:
             raise self._refusal(
                 f"{name} takes {count} of POINT, CIRCLE, BOX, POLYGON, REGION, CENTROID, written "
                 "out as its arguments",
+                part,
+            )
+        self._characters += geometry.characters(shapes)
+        if self._characters > MAX_CHARACTERS:
+            raise self._refusal(
+                f"{name} takes too much arithmetic; give polygons fewer corners, or numbers "
+                "instead of columns, and work middles out in a query in parentheses",
                 part,
             )
         return shapes

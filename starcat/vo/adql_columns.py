@@ -39,11 +39,19 @@ class Names:
         The tables that may be named.
     text : str
         The query, for messages.
+    tree : sqlglot.exp.Expr
+        Its syntax tree, as it was read.
     """
 
-    def __init__(self, tables: Tables, text: str) -> None:
+    def __init__(self, tables: Tables, text: str, tree: exp.Expr) -> None:
         self._tables = tables
         self._text = text
+        self._select: dict[int, exp.Select | None] = {}
+        self._sources_of: dict[int, list[Source]] = {}
+        # From the root on, so that no part has to look upwards through many others.
+        for part in tree.walk():
+            above = self._select.get(id(part.parent))
+            self._select[id(part)] = part if isinstance(part, exp.Select) else above
 
     def resolve(self, table: exp.Table) -> None:
         """Write the full name of a table, as the session has it, in its place.
@@ -126,12 +134,10 @@ class Names:
         Column or None
             None where that is not known.
         """
-        select = column.find_ancestor(exp.Select)
-        while select is not None:
+        for select in self._around(column):
             found = self._in(select, column)
             if found is not None:
                 return found
-            select = select.find_ancestor(exp.Select)
         return None
 
     def check(self, column: exp.Column) -> None:
@@ -150,17 +156,16 @@ class Names:
         if isinstance(column.this, exp.Star) or self.column(column) is not None:
             return
         known: set[str] = set()
-        select = column.find_ancestor(exp.Select)
-        if select is None:
+        around = self._around(column)
+        if not around:
             return  # the ORDER BY of several queries names columns of the answer
-        while select is not None:
+        for select in around:
             known |= {part.alias.lower() for part in select.expressions if part.alias}
             for source in self.sources(select):
                 if source.columns is None:
                     return
                 if not column.table or column.table.lower() == source.name:
                     known |= {one.name.lower() for one in source.columns}
-            select = select.find_ancestor(exp.Select)
         if column.name.lower() in known:
             return
         where = f" in {quoted(column.table)}" if column.table else ""
@@ -170,6 +175,15 @@ class Names:
             column,
             self._text,
         )
+
+    def _around(self, part: exp.Expr) -> list[exp.Select]:
+        """Return the queries that a part stands in, from the innermost out."""
+        found: list[exp.Select] = []
+        select = self._select.get(id(part))
+        while select is not None:
+            found.append(select)
+            select = self._select.get(id(select.parent)) if select.parent else None
+        return found
 
     def sources(self, select: exp.Select) -> list[Source]:
         """Return what stands after FROM in a query.
@@ -184,8 +198,11 @@ class Names:
         list of Source
             In order.
         """
-        parts = [select.args["from_"], *select.args.get("joins", ())]
-        return [source for part in parts for source in self._sources(part.this)]
+        if id(select) not in self._sources_of:
+            parts = [select.args["from_"], *select.args.get("joins", ())]
+            found = [source for part in parts for source in self._sources(part.this)]
+            self._sources_of[id(select)] = found
+        return self._sources_of[id(select)]
 
     def _sources(self, part: exp.Expr) -> Iterator[Source]:
         if isinstance(part, exp.Table):

@@ -13,23 +13,33 @@ ADQL 2.1, section 4.2. Todhunter 1886, Spherical Trigonometry, for the area.
 from __future__ import annotations
 
 import math
-import operator
-from collections.abc import Callable, Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
-Term = float | str
-"""A number, or SQL that gives one."""
-
-Vector = tuple[Term, Term, Term]
+from starcat.vo.adql_terms import (
+    Term,
+    Vector,
+    added,
+    all_of,
+    any_of,
+    arctan,
+    compared,
+    cross,
+    dot,
+    number_in,
+    over,
+    plus,
+    root,
+    sign_of,
+    sql_of,
+    term_of,
+    times,
+)
 
 MARGIN_DEG = 1e-9
 """By how much the band of declinations is wider that is looked at first."""
-
-_COMPARISONS: dict[str, Callable[[float, float], bool]] = {
-    "<": operator.lt, ">": operator.gt, "<=": operator.le, ">=": operator.ge, "=": operator.eq,
-}  # fmt: skip
 
 SQUARE_DEGREES = (180.0 / math.pi) ** 2
 
@@ -50,7 +60,7 @@ class Point:
     @cached_property
     def known(self) -> tuple[float, float] | None:
         """The place in degrees, if it does not depend on a row."""
-        lon, lat = _number(self.lon), _number(self.lat)
+        lon, lat = number_in(self.lon), number_in(self.lat)
         return (lon, lat) if lon is not None and lat is not None else None
 
     @cached_property
@@ -120,9 +130,9 @@ class Polygon:
         first, *others = (corner.vector for corner in self.corners)
         parts: list[Term] = []
         for a, b in pairwise(others):
-            whole = _sum(1.0, _dot(first, a), _dot(a, b), _dot(b, first))
-            parts.append(_times(2.0, _arctan(_dot(first, _cross(a, b)), whole)))
-        return _sum(*parts)
+            whole = added(1.0, dot(first, a), dot(a, b), dot(b, first))
+            parts.append(times(2.0, arctan(dot(first, cross(a, b)), whole)))
+        return added(*parts)
 
 
 Shape = Point | Circle | Polygon
@@ -142,23 +152,23 @@ def contains(inner: Shape, outer: Shape) -> str:
         True, false, or null where a number is missing. The edge of a circle is within it.
     """
     if isinstance(outer, Point):
-        return _compared(_apart(inner, outer), "=", 0.0) if isinstance(inner, Point) else "false"
+        return compared(_apart(inner, outer), "=", 0.0) if isinstance(inner, Point) else "false"
     if isinstance(outer, Circle):
         if isinstance(inner, Point):
             return _in_circle(inner, outer)
         if isinstance(inner, Circle):
-            reach = _plus(_apart(inner.centre, outer.centre), _term(inner.radius))
-            return _compared(reach, "<=", _term(outer.radius))
-        return _all(_in_circle(corner, outer) for corner in inner.corners)
+            reach = plus(_apart(inner.centre, outer.centre), term_of(inner.radius))
+            return compared(reach, "<=", term_of(outer.radius))
+        return all_of(_in_circle(corner, outer) for corner in inner.corners)
     if isinstance(inner, Point):
         return _in_polygon(inner, outer)
     if isinstance(inner, Circle):
-        centre, radius = inner.centre, _term(inner.radius)
-        edge = (_compared(_from_side(centre, a, b), ">=", radius) for a, b in outer.sides)
-        return _all([_in_polygon(centre, outer), *edge])
+        centre, radius = inner.centre, term_of(inner.radius)
+        edge = (compared(_from_side(centre, a, b), ">=", radius) for a, b in outer.sides)
+        return all_of([_in_polygon(centre, outer), *edge])
     within = [_in_polygon(corner, outer) for corner in inner.corners]
     crossing = _sides_cross(inner, outer)
-    return _all([*within, {"true": "false", "false": "true"}.get(crossing, f"NOT {crossing}")])
+    return all_of([*within, {"true": "false", "false": "true"}.get(crossing, f"NOT {crossing}")])
 
 
 def intersects(one: Shape, other: Shape) -> str:
@@ -179,21 +189,21 @@ def intersects(one: Shape, other: Shape) -> str:
     if isinstance(other, Point):
         return contains(other, one)
     if isinstance(one, Circle) and isinstance(other, Circle):
-        reach = _plus(_term(one.radius), _term(other.radius))
-        return _compared(_apart(one.centre, other.centre), "<=", reach)
+        reach = plus(term_of(one.radius), term_of(other.radius))
+        return compared(_apart(one.centre, other.centre), "<=", reach)
     if isinstance(one, Circle) and isinstance(other, Polygon):
-        centre, radius = one.centre, _term(one.radius)
-        near = (_compared(_from_side(centre, a, b), "<=", radius) for a, b in other.sides)
-        return _any([_in_polygon(centre, other), *near])
+        centre, radius = one.centre, term_of(one.radius)
+        near = (compared(_from_side(centre, a, b), "<=", radius) for a, b in other.sides)
+        return any_of([_in_polygon(centre, other), *near])
     if isinstance(one, Polygon) and isinstance(other, Polygon):
         inside = [_in_polygon(one.corners[0], other), _in_polygon(other.corners[0], one)]
-        return _any([*inside, _sides_cross(one, other)])
+        return any_of([*inside, _sides_cross(one, other)])
     return intersects(other, one)
 
 
 def distance(one: Point, other: Point) -> str:
     """Return SQL of the separation of two places, degrees."""
-    return _text(_apart(one, other))
+    return sql_of(_apart(one, other))
 
 
 def area(shape: Shape) -> str:
@@ -204,7 +214,7 @@ def area(shape: Shape) -> str:
         # 1 - cos r with all its digits for small circles.
         half = f"sind(least({shape.radius}, 180) / 2e0)"
         return f"({4.0 * math.pi * SQUARE_DEGREES!r} * {half} * {half})"
-    return f"({SQUARE_DEGREES!r} * abs({_text(shape.turn)}))"
+    return f"({SQUARE_DEGREES!r} * abs({sql_of(shape.turn)}))"
 
 
 def centroid(shape: Shape) -> Point:
@@ -218,18 +228,48 @@ def centroid(shape: Shape) -> Point:
     # The mean is half the sum of the normals of the sides, each as long as its side.
     total: Vector = (0.0, 0.0, 0.0)
     for a, b in shape.sides:
-        normal = _cross(a.vector, b.vector)
-        length = _root(_dot(normal, normal))
-        factor = _over(_arctan(length, _dot(a.vector, b.vector)), length)
-        x, y, z = (_sum(t, _times(factor, n)) for t, n in zip(total, normal, strict=True))
+        normal = cross(a.vector, b.vector)
+        length = root(dot(normal, normal))
+        factor = over(arctan(length, dot(a.vector, b.vector)), length)
+        x, y, z = (added(t, times(factor, n)) for t, n in zip(total, normal, strict=True))
         total = (x, y, z)
-    sign = _sign(shape.turn)
-    x, y, z = (_times(sign, part) for part in total)
-    level = _root(_sum(_times(x, x), _times(y, y)))
-    lon = f"degrees({_text(_arctan(y, x))})"
+    sign = sign_of(shape.turn)
+    x, y, z = (times(sign, part) for part in total)
+    level = root(added(times(x, x), times(y, y)))
+    lon = f"degrees({sql_of(arctan(y, x))})"
     return Point(
-        f"({lon} + CASE WHEN {lon} < 0 THEN 360 ELSE 0 END)", f"degrees({_text(_arctan(z, level))})"
+        f"({lon} + CASE WHEN {lon} < 0 THEN 360 ELSE 0 END)", f"degrees({sql_of(arctan(z, level))})"
     )
+
+
+def characters(shapes: Sequence[Shape]) -> int:
+    """Return how much SQL it takes, roughly, to find something out about shapes.
+
+    Parameters
+    ----------
+    shapes : sequence of Shape
+        One or two.
+
+    Returns
+    -------
+    int
+        Characters. What is known when the query is read takes few.
+    """
+    parts = [_parts(shape) for shape in shapes]
+    sides = [len(shape.corners) if isinstance(shape, Polygon) else 1 for shape in shapes]
+    unknown = [sum(len(text) for text in texts if number_in(text) is None) for texts in parts]
+    both = sum(
+        length * math.prod(sides) // side for length, side in zip(unknown, sides, strict=True)
+    )
+    return 60 * (both + sum(unknown)) + 100 * math.prod(sides)
+
+
+def _parts(shape: Shape) -> tuple[str, ...]:
+    if isinstance(shape, Point):
+        return shape.lon, shape.lat
+    if isinstance(shape, Circle):
+        return (*_parts(shape.centre), shape.radius)
+    return tuple(text for corner in shape.corners for text in _parts(corner))
 
 
 def box(centre: Point, width: str, height: str) -> Polygon:
@@ -255,20 +295,20 @@ def box(centre: Point, width: str, height: str) -> Polygon:
 
 
 def _folded(middle: str, sign: str, width: str) -> str:
-    known = _number(middle), _number(width)
+    known = number_in(middle), number_in(width)
     if known[0] is not None and known[1] is not None:
         half = known[1] / 2.0
-        return _text(known[0] + half if sign == "+" else known[0] - half)
+        return sql_of(known[0] + half if sign == "+" else known[0] - half)
     return f"({middle} {sign} ({width}) / 2e0)"
 
 
 def _in_circle(place: Point, circle: Circle) -> str:
-    near = _compared(_apart(place, circle.centre), "<=", _term(circle.radius))
+    near = compared(_apart(place, circle.centre), "<=", term_of(circle.radius))
     if place.known:
         return near
-    lat, radius = _term(circle.centre.lat), _term(circle.radius)
-    reach = _plus(radius, MARGIN_DEG)
-    low, high = _text(_plus(lat, _times(-1.0, reach))), _text(_plus(lat, reach))
+    lat, radius = term_of(circle.centre.lat), term_of(circle.radius)
+    reach = plus(radius, MARGIN_DEG)
+    low, high = sql_of(plus(lat, times(-1.0, reach))), sql_of(plus(lat, reach))
     # Declinations are looked at first: files tell which they have.
     return f"({place.lat} BETWEEN {low} AND {high} AND {near})"
 
@@ -278,11 +318,11 @@ def _in_polygon(place: Point, polygon: Polygon) -> str:
     angles = []
     for a, b in polygon.sides:
         u, v = a.vector, b.vector
-        across = _dot(p, _cross(u, v))
-        along = _sum(_dot(u, v), _times(-1.0, _times(_dot(p, u), _dot(p, v))))
-        angles.append(_arctan(across, along))
-    round_ = _times(_sign(polygon.turn), _sum(*angles))
-    inside = _compared(round_, ">", math.pi)
+        across = dot(p, cross(u, v))
+        along = added(dot(u, v), times(-1.0, times(dot(p, u), dot(p, v))))
+        angles.append(arctan(across, along))
+    round_ = times(sign_of(polygon.turn), added(*angles))
+    inside = compared(round_, ">", math.pi)
     band = None if place.known else _band(polygon)
     return f"({place.lat} BETWEEN {band[0]} AND {band[1]} AND {inside})" if band else inside
 
@@ -303,23 +343,23 @@ def _band(polygon: Polygon) -> tuple[str, str] | None:
     if reach >= 90.0:
         return None
     lat = math.degrees(math.asin(max(-1.0, min(1.0, middle[2]))))
-    return _text(lat - reach - 1e-6), _text(lat + reach + 1e-6)
+    return sql_of(lat - reach - 1e-6), sql_of(lat + reach + 1e-6)
 
 
 def _from_side(place: Point, a: Point, b: Point) -> Term:
     """Return the separation of a place from the arc between two others, degrees."""
     p, u, v = place.vector, a.vector, b.vector
-    normal = _cross(u, v)
-    away = _cross(p, normal)
-    height = _arctan(_dot(p, normal), _root(_dot(away, away)))
-    beside = _dot(p, _cross(normal, u)), _dot(p, _cross(v, normal))
+    normal = cross(u, v)
+    away = cross(p, normal)
+    height = arctan(dot(p, normal), root(dot(away, away)))
+    beside = dot(p, cross(normal, u)), dot(p, cross(v, normal))
     ends = _apart(place, a), _apart(place, b)
     if isinstance(height, float) and place.known and a.known and b.known:
         is_beside = min(map(float, beside)) >= 0.0
         return math.degrees(abs(height)) if is_beside else min(map(float, ends))
-    asked = " AND ".join(_compared(one, ">=", 0.0) for one in beside)
-    nearest = f"least({_text(ends[0])}, {_text(ends[1])})"
-    return f"(CASE WHEN {asked} THEN abs(degrees({_text(height)})) ELSE {nearest} END)"
+    asked = " AND ".join(compared(one, ">=", 0.0) for one in beside)
+    nearest = f"least({sql_of(ends[0])}, {sql_of(ends[1])})"
+    return f"(CASE WHEN {asked} THEN abs(degrees({sql_of(height)})) ELSE {nearest} END)"
 
 
 def _sides_cross(one: Polygon, other: Polygon) -> str:
@@ -329,119 +369,20 @@ def _sides_cross(one: Polygon, other: Polygon) -> str:
         for c, d in other.sides:
             u, v, w, t = a.vector, b.vector, c.vector, d.vector
             turns = (
-                _dot(u, _cross(w, v)), _dot(w, _cross(v, t)),
-                _dot(v, _cross(t, u)), _dot(t, _cross(u, w)),
+                dot(u, cross(w, v)), dot(w, cross(v, t)),
+                dot(v, cross(t, u)), dot(t, cross(u, w)),
             )  # fmt: skip
-            found += [_all(_compared(turn, sign, 0.0) for turn in turns) for sign in "<>"]
-    return _any(found)
-
-
-def _compared(a: Term, sign: str, b: Term) -> str:
-    """Return SQL of a comparison, or its value where both numbers are known."""
-    if isinstance(a, float) and isinstance(b, float):
-        return "true" if _COMPARISONS[sign](a, b) else "false"
-    return f"({_text(a)} {sign} {_text(b)})"
-
-
-def _all(conditions: Iterable[str]) -> str:
-    left = [one for one in conditions if one != "true"]
-    return "false" if "false" in left else _joined(left, " AND ", "true")
-
-
-def _any(conditions: Iterable[str]) -> str:
-    left = [one for one in conditions if one != "false"]
-    return "true" if "true" in left else _joined(left, " OR ", "false")
-
-
-def _joined(conditions: list[str], word: str, nothing: str) -> str:
-    return f"({word.join(conditions)})" if conditions else nothing
+            found += [all_of(compared(turn, sign, 0.0) for turn in turns) for sign in "<>"]
+    return any_of(found)
 
 
 def _apart(one: Point, other: Point) -> Term:
     """Return the separation of two places, degrees."""
     if one.known and other.known:
-        across = _cross(one.vector, other.vector)
-        return math.degrees(
-            float(_arctan(_root(_dot(across, across)), _dot(one.vector, other.vector)))
-        )
+        across = cross(one.vector, other.vector)
+        return math.degrees(float(arctan(root(dot(across, across)), dot(one.vector, other.vector))))
     return f"separation({one.lon}, {one.lat}, {other.lon}, {other.lat})"
 
 
 def _list(*numbers: str) -> str:
     return f"[{', '.join(f'({number})::DOUBLE' for number in numbers)}]"
-
-
-def _term(text: str) -> Term:
-    found = _number(text)
-    return f"({text})" if found is None else found
-
-
-def _number(text: str) -> float | None:
-    """Return the number that SQL says, if it is one."""
-    try:
-        found = float(text.strip("() ").replace("- ", "-"))
-    except ValueError:
-        return None
-    return found if math.isfinite(found) else None
-
-
-def _text(term: Term) -> str:
-    return term if isinstance(term, str) else f"({term!r}::DOUBLE)"
-
-
-def _times(a: Term, b: Term) -> Term:
-    if isinstance(a, float) and isinstance(b, float):
-        return a * b
-    if a == 1.0 or b == 1.0:
-        return b if a == 1.0 else a
-    return f"({_text(a)} * {_text(b)})"
-
-
-def _plus(a: Term, b: Term) -> Term:
-    if isinstance(a, float) and isinstance(b, float):
-        return a + b
-    if a == 0.0 or b == 0.0:
-        return b if a == 0.0 else a
-    return f"({_text(a)} + {_text(b)})"
-
-
-def _sum(*terms: Term) -> Term:
-    total: Term = 0.0
-    for term in terms:
-        total = _plus(total, term)
-    return total
-
-
-def _over(a: Term, b: Term) -> Term:
-    if isinstance(a, float) and isinstance(b, float):
-        return a / b if b else 1.0
-    return f"({_text(a)} / {_text(b)})"
-
-
-def _arctan(y: Term, x: Term) -> Term:
-    if isinstance(y, float) and isinstance(x, float):
-        return math.atan2(y, x)
-    return f"atan2({_text(y)}, {_text(x)})"
-
-
-def _root(a: Term) -> Term:
-    return math.sqrt(a) if isinstance(a, float) else f"sqrt({a})"
-
-
-def _sign(a: Term) -> Term:
-    return math.copysign(1.0, a) if isinstance(a, float) else f"sign({a})"
-
-
-def _dot(a: Vector, b: Vector) -> Term:
-    return _sum(*(_times(x, y) for x, y in zip(a, b, strict=True)))
-
-
-def _cross(a: Vector, b: Vector) -> Vector:
-    def minus(p: Term, q: Term, r: Term, s: Term) -> Term:
-        return _plus(_times(p, q), _times(-1.0, _times(r, s)))
-
-    return (
-        minus(a[1], b[2], a[2], b[1]),
-        minus(a[2], b[0], a[0], b[2]),
-        minus(a[0], b[1], a[1], b[0]),
-    )

@@ -19,7 +19,7 @@ from sqlglot.tokenizer_core import TokenType
 
 from starcat.errors import QueryError, quoted
 
-MAX_CHARACTERS = 200_000
+MAX_CHARACTERS = 50_000
 """Length of the longest query that is read."""
 
 POINTED_CHARACTERS = 160

@@ -17,7 +17,15 @@ from starlette.types import Receive, Scope, Send
 from starcat.errors import TargetMissing, quoted
 from starcat.service.access import Reader
 from starcat.service.service import Service, TheService
-from starcat.service.vo.tap_request import PREFIX, TapRequest, TapRoute, TheRequest, base_url
+from starcat.service.vo.tap_request import (
+    FORM,
+    IN_ADDRESS,
+    PREFIX,
+    TapRequest,
+    TapRoute,
+    TheRequest,
+    base_url,
+)
 from starcat.service.vo.tap_spool import ClientGone, Spool
 from starcat.vo.documents import (
     MEDIA_TYPE,
@@ -50,8 +58,10 @@ class _Closing(StreamingResponse):
                 await to_thread.run_sync(self._rest.close)
 
 
-@router.get("/sync", summary="Answer a query in ADQL")
-@router.post("/sync", summary="Answer a query in ADQL, perhaps about uploaded tables")
+@router.get("/sync", summary="Answer a query in ADQL", openapi_extra=IN_ADDRESS)
+@router.post(
+    "/sync", summary="Answer a query in ADQL, perhaps about uploaded tables", openapi_extra=FORM
+)
 async def sync(given: TheRequest, service: TheService, who: Reader) -> Response:
     """Answer a query; parameters as TAP 1.1 has them."""
     asked = question(given.parameters, service.settings.max_rows)

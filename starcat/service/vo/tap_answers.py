@@ -7,17 +7,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starcat.exchange.formats import write_batches
+from starcat.exchange.first_rows import FirstRows
 from starcat.exchange.label import Label
-from starcat.exchange.text import csv_chunks
-from starcat.exchange.votable_stream import Serialization, votable_chunks
 from starcat.service.confined import Confined
 from starcat.vo.formats import Format
+from starcat.vo.results import result_chunks
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-_SERIALIZATIONS: dict[str, Serialization] = {"votable": "binary2", "votable/td": "tabledata"}
 
 _FILE_BYTES = 1 << 18
 
@@ -63,25 +60,18 @@ class Answers:
         QueryLimitError
             If the query takes too long; also while reading.
         """
-        if form.name in _SERIALIZATIONS:
-            kind = _SERIALIZATIONS[form.name]
-            yield from votable_chunks(batches, serialization=kind, label=_LABEL, maxrec=max_rows)
-        elif form.name == "csv":
-            for text, _ in csv_chunks(_cut(batches, max_rows)):
-                yield text
+        if form.name == "fits":
+            yield from self._fits(FirstRows(batches, max_rows).reader())
         else:
-            yield from self._file(_cut(batches, max_rows), form)
+            yield from result_chunks(batches, form, self._scratch, label=_LABEL, maxrec=max_rows)
 
-    def _file(self, batches: pa.RecordBatchReader, form: Format) -> Iterator[bytes]:
+    def _fits(self, batches: pa.RecordBatchReader) -> Iterator[bytes]:
+        """Have a FITS file made, which is held in memory as a whole, by another process."""
         with tempfile.TemporaryDirectory(prefix="answer-", dir=self._scratch) as folder:
-            path = Path(folder) / f"answer.{form.suffix}"
-            if form.name == "parquet":
-                write_batches(batches, path, form.name, _LABEL)
-            else:
-                rows = Path(folder) / "rows"
-                _write_rows(batches, rows)
-                given = {"source": str(rows), "target": str(path), "form": form.name}
-                self._confined.call("convert", given)
+            rows, path = Path(folder) / "rows", Path(folder) / "answer.fits"
+            _write_rows(batches, rows)
+            given = {"source": str(rows), "target": str(path), "form": "fits"}
+            self._confined.call("convert", given)
             with path.open("rb") as stream:
                 while part := stream.read(_FILE_BYTES):
                     yield part
@@ -93,17 +83,3 @@ def _write_rows(batches: pa.RecordBatchReader, path: Path) -> None:
     with pa.OSFile(str(path), "wb") as sink, pa.ipc.new_stream(sink, batches.schema) as stream:
         for batch in batches:
             stream.write_batch(batch)
-
-
-def _cut(batches: pa.RecordBatchReader, rows: int) -> pa.RecordBatchReader:
-    import pyarrow as pa
-
-    def first() -> Iterator[pa.RecordBatch]:
-        left = rows
-        for batch in batches:
-            if left <= 0:
-                return
-            yield batch.slice(0, left)
-            left -= batch.num_rows
-
-    return pa.RecordBatchReader.from_batches(batches.schema, first())

@@ -14,7 +14,7 @@ from fastapi.responses import FileResponse, PlainTextResponse, RedirectResponse,
 from starcat.errors import ConfigError, TargetMissing, quoted
 from starcat.service.access import Reader
 from starcat.service.service import Service, TheService
-from starcat.service.vo.tap_request import PREFIX, TapRoute, TheRequest, base_url
+from starcat.service.vo.tap_request import FORM, PREFIX, TapRoute, TheRequest, base_url
 from starcat.service.vo.tap_store import RESULT
 from starcat.vo.documents import MEDIA_TYPE, VOTABLE_TYPE, error_votable
 from starcat.vo.formats import FORMATS
@@ -70,7 +70,7 @@ def list_jobs(
     return _xml(jobs_document(found[:last], f"{base_url(request)}/async"))
 
 
-@router.post("", summary="Make a job (UWS)")
+@router.post("", summary="Make a job (UWS)", openapi_extra=FORM)
 def make_job(given: TheRequest, request: Request, service: TheService, who: Reader) -> Response:
     """Make a job of the parameters of TAP; with PHASE=RUN it is run."""
     phase = given.parameters.one("PHASE")
@@ -95,8 +95,8 @@ async def get_job(
 ) -> Response:
     """Return all that is known of a job; with WAIT after its phase has changed."""
     if wait is not None and phase in (None, job.phase):
-        most = MAX_WAIT_S if wait < 0 else min(float(wait), MAX_WAIT_S)
-        job = await _changed(service, job, most)
+        most_s = MAX_WAIT_S if wait < 0 else min(wait, MAX_WAIT_S)
+        job = await _changed(service, job, most_s)
     return _xml(job_document(job, _address(request, job)))
 
 
@@ -269,8 +269,8 @@ def _seconds(name: str, text: str) -> float:
     """Return a time that a request has, in seconds since 1970."""
     try:
         moment = datetime.fromisoformat(text.strip())
-    except ValueError:
+        return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+    except (ValueError, OverflowError):
         raise ConfigError(
             f"{name} is {quoted(text)}; it is a time such as 2026-01-31T12:00:00Z", key=name
         ) from None
-    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()

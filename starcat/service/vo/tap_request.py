@@ -25,9 +25,52 @@ PREFIX = "/tap"
 MAX_PARAMETERS = 100
 MAX_PARAMETER_BYTES = 1 << 20
 
-_COPIED_BYTES = 1 << 20
-
 _FORMS = ("application/x-www-form-urlencoded", "multipart/form-data")
+
+_PARAMETERS: tuple[tuple[str, str, object, str], ...] = (
+    ("QUERY", "string", "SELECT TOP 5 * FROM tap_schema.tables", "The query, in ADQL 2.1."),
+    ("LANG", "string", "ADQL", "ADQL, ADQL-2.0 or ADQL-2.1."),
+    ("RESPONSEFORMAT", "string", "csv", "A format of the capabilities; VOTable by default."),
+    ("MAXREC", "integer", 1000, "Rows at most; VOTable says where there were more."),
+    ("RUNID", "string", "mine", "What the client calls it."),
+    ("UPLOAD", "string", "mine,param:file1", "Tables that come along, as parts of the form."),
+)
+
+IN_ADDRESS: dict[str, Any] = {
+    "parameters": [
+        {
+            "name": name,
+            "in": "query",
+            "required": name == "QUERY",
+            "description": told,
+            "schema": {"type": kind},
+            "example": example,
+        }
+        for name, kind, example, told in _PARAMETERS
+        if name != "UPLOAD"
+    ]
+}
+"""For ``openapi_extra=``: the parameters of TAP in the address."""
+
+FORM: dict[str, Any] = {
+    "requestBody": {
+        "content": {
+            kind: {
+                "schema": {
+                    "type": "object",
+                    "properties": {
+                        name: {"type": type_, "description": told, "example": example}
+                        for name, type_, example, told in _PARAMETERS
+                    },
+                }
+            }
+            for kind in _FORMS
+        }
+    }
+}
+"""For ``openapi_extra=``: the parameters of TAP in a form."""
+
+_COPIED_BYTES = 1 << 20
 
 _logger = logging.getLogger(__name__)
 
