@@ -118,6 +118,7 @@ def test_rows_that_are_left_out_are_told(ask, bright):
     assert len(table_of(whole)) == len(bright)
     assert "OVERFLOW" not in whole.text
     assert ask(BRIGHT, MAXREC="2", FORMAT="csv").text.count("\n") == 3
+    assert "OVERFLOW" not in ask(BRIGHT, MAXREC="9" * 50).text
 
 
 def test_without_rows_there_are_columns(ask):
