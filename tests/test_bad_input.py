@@ -43,6 +43,10 @@ from starcat.onboard.blocks import check_blocks
 from starcat.onboard.image import Contents, make_image
 from starcat.onboard.reading import read_image
 from starcat.releases.publishing import publish_artifact
+from starcat.service.access import Role
+from starcat.service.guard.tokens import TokenStore
+from starcat.service.places import Places
+from starcat.service.records import Records
 from starcat.sky.observer import Observer
 from starcat.store.pixels import Pixel
 
@@ -1945,6 +1949,53 @@ def _(place: Place) -> Call:
 @case("artifact held against an artifact", 2)
 def _(place: Place) -> Call:
     return ["verify", place.artifact, "--against", place.artifact]
+
+
+# The service -------------------------------------------------------------------------------
+
+
+def service_with_a_token(place: Place) -> Path:
+    """A root with the token of anna."""
+    root = place.folder / "service"
+    records = Records(Places(root).records) if root.exists() else None
+    if records is None:
+        root.mkdir()
+        records = Records(Places(root).records)
+        TokenStore(records).create("anna", Role.READER)
+        Places(root).make()
+    records.close()
+    return root
+
+
+@case("service for others without a token", 2)
+def _(place: Place) -> Call:
+    return ["serve", "--root", place.folder / "service", "--host", "0.0.0.0"]
+
+
+@case("service with an unknown setting", 2)
+def _(place: Place) -> Call:
+    return ["serve", "--root", place.write("service/service.toml", "portt = 8000").parent]
+
+
+@case("token with a name that none can have", 2)
+def _(place: Place) -> Call:
+    return ["token", "create", "a b", "--role", "reader", "--root", place.folder / "service"]
+
+
+@case("token with the name of another", 2)
+def _(place: Place) -> Call:
+    root = service_with_a_token(place)
+    return ["token", "create", "anna", "--role", "reader", "--root", root]
+
+
+@case("token that is not there", 3)
+def _(place: Place) -> Call:
+    return ["token", "revoke", "bert", "--root", service_with_a_token(place)]
+
+
+@case("tokens of no service", 3)
+def _(place: Place) -> Call:
+    return ["token", "list", "--root", place.folder / "service"]
 
 
 # The tests ---------------------------------------------------------------------------------

@@ -358,6 +358,7 @@ def test_who_only_reads_publishes_and_evaluates_nothing(root):
         refused = client.post("/releases", data={"database": LATER})
         assert refused.status_code == 401
         assert client.post(f"{PAGE}/evaluate").status_code == 401
+        assert "Evaluate" not in client.get(PAGE).text
 
 
 def test_an_evaluation_is_a_job(client):

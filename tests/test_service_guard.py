@@ -258,11 +258,11 @@ def test_the_server_does_not_begin_where_others_could_not_get_in(
 
 
 def test_requests_of_one_address_or_token_are_limited(client: Make) -> None:
-    at = client(requests_per_minute=5)
+    at = client(requests_per_minute=1)
     _, text = tokens_of(at).create("anna", Role.READER)
-    found = [at.get("/probe/who") for _ in range(7)]
-    assert [one.status_code for one in found] == [200] * 5 + [429] * 2
-    assert int(found[-1].headers["retry-after"]) == 12
+    found = [at.get("/probe/who") for _ in range(3)]
+    assert [one.status_code for one in found] == [200, 429, 429]
+    assert 1 <= int(found[-1].headers["retry-after"]) <= 60
     assert at.get("/healthz").status_code == 200
     assert at.get("/probe/who", headers=bearer(text)).status_code == 200
 
@@ -462,7 +462,8 @@ def test_metrics_count_by_template_and_say_what_there_is(client: Make) -> None:
 def test_ready_says_what_is_wrong(client: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     at = client()
     app: Any = at.app
-    assert "the worker does not run" in " ".join(at.get("/readyz").json()["reasons"])
+    monkeypatch.setattr(type(app.state.workers), "is_alive", False)
+    assert "has jobs done has ended" in " ".join(at.get("/readyz").json()["reasons"])
     monkeypatch.setattr(type(app.state.workers), "is_alive", True)
     found = at.get("/readyz")
     assert (found.status_code, found.json()) == (200, {"ready": True, "reasons": []})

@@ -255,6 +255,7 @@ def test_a_user_has_so_much_of_the_disk(opened, spec, small_artifact):
     with pytest.raises(Problem, match=r"the databases of anne take .* \(disk_gib\)") as refused:
         submit_ingest(service, "sao", "anne")
     assert refused.value.status == 409
+    assert submit_build(service, spec, "anne").job.id == job.id  # which takes nothing more
     assert submit_ingest(service, "sao", "bob").is_new
 
 

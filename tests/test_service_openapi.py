@@ -51,14 +51,24 @@ def attacked(
         yield served, token
 
 
-def fuzz(attacked: tuple[Served, str], report: Path, examples: int, *options: str) -> None:
-    """Run schemathesis with the same examples each time."""
+def fuzz(attacked: tuple[Served, str], report: Path, examples: int, phases: str) -> None:
+    """Run schemathesis with the same examples each time.
+
+    TAP and cone searches describe themselves in documents of the Virtual Observatory; of what
+    they answer OpenAPI says little, so of them it is looked for defects only.
+    """
+    rest = ("--exclude-path-regex", "/events$|^/metrics$|^/tap|^/scs", "--checks", CHECKS)
+    vo = ("--include-path-regex", "^/tap|^/scs", "--checks", "not_a_server_error")
+    for options in (rest, vo):
+        run_tool(attacked, report, "--max-examples", str(examples), "--phases", phases, *options)
+
+
+def run_tool(attacked: tuple[Served, str], report: Path, *options: str) -> None:
     served, token = attacked
     command = [
         sys.executable, "-m", "schemathesis.cli", "run", f"{served.address}/api/openapi.json",
-        "--header", f"Authorization: Bearer {token}", "--checks", CHECKS, "--seed", "1",
-        "--max-examples", str(examples), "--generation-deterministic", "--no-color",
-        "--request-timeout", "20", "--exclude-path-regex", "/events$|^/metrics$", *options,
+        "--header", f"Authorization: Bearer {token}", "--seed", "1", "--generation-deterministic",
+        "--no-color", "--request-timeout", "20", *options,
     ]  # fmt: skip
     hooks = report / "hooks.py"
     hooks.write_text(HOOKS)
@@ -94,11 +104,11 @@ def test_each_operation_is_described_with_an_example_of_how_it_refuses(
 def test_no_request_that_the_schema_allows_or_forbids_breaks_it(
     attacked: tuple[Served, str], tmp_path: Path
 ) -> None:
-    fuzz(attacked, tmp_path, 25, "--phases", "examples,coverage,fuzzing")
+    fuzz(attacked, tmp_path, 12, "examples,coverage,fuzzing")
 
 
 @pytest.mark.timeout(120)
 def test_the_examples_of_the_schema_are_answered(
     attacked: tuple[Served, str], tmp_path: Path
 ) -> None:
-    fuzz(attacked, tmp_path, 2, "--phases", "examples")
+    fuzz(attacked, tmp_path, 2, "examples")

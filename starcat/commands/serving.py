@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -113,11 +114,12 @@ def create(
 
     Example: starcat token create anna --role builder --expires 365 --root service
     """
-    store = _tokens_of(root)
-    from starcat.service.access import Role
+    with _tokens_of(root, name) as store:
+        from starcat.service.access import Role
+
+        token, text = store.create(name, Role.named(role), expires)
     from starcat.terminal.console import print_json, say
 
-    token, text = store.create(name, Role.named(role), expires)
     if json:
         print_json({**token.as_dict(), "token": text})
         return
@@ -131,8 +133,8 @@ def list_tokens(root: Root = Path("service"), json: Json = False) -> None:
 
     Example: starcat token list --root service
     """
-    store = _tokens_of(root, is_new=False)
-    _print_tokens(store.all(), as_json=json)
+    with _tokens_of(root) as store:
+        _print_tokens(store.all(), as_json=json)
 
 
 @tokens.command()
@@ -145,8 +147,8 @@ def revoke(
 
     Example: starcat token revoke anna --root service
     """
-    store = _tokens_of(root, is_new=False)
-    _print_tokens(store.revoke(name), as_json=json)
+    with _tokens_of(root) as store:
+        _print_tokens(store.revoke(name), as_json=json)
 
 
 def _print_tokens(found: Sequence[Token], *, as_json: bool) -> None:
@@ -160,9 +162,11 @@ def _print_tokens(found: Sequence[Token], *, as_json: bool) -> None:
     print_table("", columns, [[row[column] or "never" for column in columns] for row in rows])
 
 
-def _tokens_of(root: Path, *, is_new: bool = True) -> TokenStore:
+@contextmanager
+def _tokens_of(root: Path, new: str | None = None) -> Iterator[TokenStore]:
+    """Return the tokens of a service, which is made where a new one is to be its first."""
     try:
-        from starcat.service.guard.tokens import TokenStore
+        from starcat.service.guard.tokens import TokenStore, check_name
         from starcat.service.places import Places
         from starcat.service.records import Records
     except ModuleNotFoundError as error:
@@ -170,10 +174,16 @@ def _tokens_of(root: Path, *, is_new: bool = True) -> TokenStore:
     from starcat.service.settings import read_settings
 
     places = Places(read_settings(root).root)
-    if not is_new and not places.records.exists():
+    if new is not None:
+        check_name(new)
+    elif not places.records.exists():
         raise TargetMissing(f"{root}: no service has kept anything here; give its --root")
     places.make()
-    return TokenStore(Records(places.records))
+    records = Records(places.records)
+    try:
+        yield TokenStore(records)
+    finally:
+        records.close()
 
 
 def _not_installed(error: ModuleNotFoundError) -> ConfigError:

@@ -191,6 +191,7 @@ REFUSALS: dict[int | str, dict[str, Any]] = {
         (404, "There is no such thing."),
         (409, "It contradicts what is there."),
         (413, "Too large."),
+        (415, "The content is of a type that is not taken here."),
         (422, "Something in the request is wrong."),
         (429, "Too many requests; ``Retry-After`` says when to ask again."),
         (503, "Too much is done at the same time; ``Retry-After`` says when to ask again."),

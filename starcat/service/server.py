@@ -55,6 +55,8 @@ def run_server(settings: Settings, announce: Announce) -> None:
         If the root cannot be written to.
     """
     places = Places(settings.root)
+    if not settings.is_private and not places.records.exists():
+        raise _without_token(settings)  # before anything is made
     with _only_server(places):
         shutil.rmtree(places.scratch, ignore_errors=True)
         _serve(settings, announce)
@@ -84,7 +86,7 @@ def _only_server(places: Places) -> Iterator[None]:
 def _serve(settings: Settings, announce: Announce) -> None:
     app = make_app(settings)
     _see_to_tokens(app.state.identities.tokens, settings)
-    listening = _listen(settings)
+    listening = listen(settings)
     config = uvicorn.Config(
         app,
         http=Patience,
@@ -127,13 +129,16 @@ def _address(settings: Settings, port: int) -> str:
     return f"{(settings.public_url or f'http://{host}:{port}').rstrip('/')}/"
 
 
-def _listen(settings: Settings) -> socket.socket:
+def listen(settings: Settings) -> socket.socket:
     """Return the socket that the server listens at."""
     try:
         [(family, _, _, _, address), *_] = socket.getaddrinfo(
             settings.host, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         )
         listening = socket.create_server(address[:2], family=family, backlog=2048)
+        # asyncio sets it only for sockets that name their protocol, as this one does not. Without
+        # it, the end of a short answer waits 40 ms for the acknowledgement of its head.
+        listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     except OSError as error:
         raise ConfigError(
             f"cannot listen at {settings.host}, port {settings.port}: {reason(error)}; choose "
@@ -161,21 +166,29 @@ def _see_to_tokens(tokens: TokenStore, settings: Settings) -> None:
     """See that somebody can do more than read: make the first token, or say how."""
     if tokens.has_valid():
         return
-    command = f"starcat token create NAME --role publisher --root {settings.root}"
     if not settings.is_private:
-        raise ConfigError(
-            f"others are to reach {settings.public_url or settings.host}, and nobody has a token; "
-            f"make one first: {command}",
-            key="host",
-            value=settings.host,
-        )
+        raise _without_token(settings)
     if Role.named(settings.anonymous_role) >= Role.PUBLISHER:
         return
     if not sys.stderr.isatty():  # a log keeps what is written to it; a terminal is only seen
-        _say(f"nobody has a token, so nobody can build or publish yet; make one: {command}")
+        how = _how_to_make_one(settings)
+        _say(f"nobody has a token, so nobody can build or publish yet; make one: {how}")
         return
     _, text = tokens.create(FIRST, Role.PUBLISHER)
     _say(f"the first token, shown once: {text}\nuse it to sign in on the page, or with curl")
+
+
+def _without_token(settings: Settings) -> ConfigError:
+    return ConfigError(
+        f"others are to reach {settings.public_url or settings.host}, and nobody has a token; "
+        f"make one first: {_how_to_make_one(settings)}",
+        key="host",
+        value=settings.host,
+    )
+
+
+def _how_to_make_one(settings: Settings) -> str:
+    return f"starcat token create NAME --role publisher --root {settings.root}"
 
 
 def _say(text: str) -> None:

@@ -42,7 +42,7 @@ def alive() -> Alive:
     responses={503: {"model": Readiness, "description": "Something is wrong."}},
 )
 def ready(request: Request, service: TheService, who: Reader) -> Response:
-    """Look at the records, the disk, the catalogs and the workers."""
+    """Look at the records, the disk and the process that has jobs done."""
     reasons = [reason for check in CHECKS if (reason := check(service)) is not None]
     if not request.app.state.workers.is_alive:
         reasons.append("the process that has jobs done has ended; it is started again")

@@ -104,13 +104,7 @@ class TokenStore:
         ConfigError
             If the name is of another form, or that of a valid token.
         """
-        if not NAME.fullmatch(name) or name in RESERVED:
-            raise ConfigError(
-                f"{name[:80]!r} cannot be the name of a token; expected 1 to 64 letters, digits "
-                "and '.', '_', '@', '-', not 'anonymous'. Choose another",
-                key="name",
-                value=name,
-            )
+        check_name(name)
         text = PREFIX + secrets.token_urlsafe(32)
         now_s = time.time()
         expires_s = None if expires_days is None else now_s + expires_days * DAY_S
@@ -200,6 +194,28 @@ class TokenStore:
             ).fetchone()
         token = None if row is None else token_of(row)
         return token if token is not None and token.state(time.time()) == "valid" else None
+
+
+def check_name(name: str) -> None:
+    """Check the name of a token.
+
+    Parameters
+    ----------
+    name : str
+        As somebody typed it.
+
+    Raises
+    ------
+    ConfigError
+        If no token can be called so.
+    """
+    if not NAME.fullmatch(name) or name in RESERVED:
+        raise ConfigError(
+            f"{name[:80]!r} cannot be the name of a token; expected 1 to 64 letters, digits and "
+            "'.', '_', '@', '-', not 'anonymous'. Choose another",
+            key="name",
+            value=name,
+        )
 
 
 def digest_of(secret: str) -> str:

@@ -180,7 +180,6 @@ def submit_evaluation(
 def _submit(
     service: Service, kind: Kind, request: Mapping[str, Any], key: str, title: str, owner: str
 ) -> Submitted:
-    check_room(service, owner)
     job_id, is_new = add_once(
         service.records,
         kind,
@@ -190,6 +189,7 @@ def _submit(
         owner=owner,
         most_waiting=service.settings.jobs_waiting,
         has_result=lambda job: has_result(service, job),
+        check=lambda: check_room(service, owner),
     )
     if is_new:
         service.queue.send(job_id)

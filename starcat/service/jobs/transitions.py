@@ -34,6 +34,7 @@ def add_once(
     owner: str,
     most_waiting: int,
     has_result: Callable[[Job], bool],
+    check: Callable[[], None],
 ) -> tuple[str, bool]:
     """Remember a job, unless one is there that does the same.
 
@@ -47,6 +48,8 @@ def add_once(
         Jobs that the owner may have waiting.
     has_result : callable
         Whether what a job that is done has made is still there.
+    check : callable
+        Raises if there is no room for a new job.
 
     Returns
     -------
@@ -64,6 +67,7 @@ def add_once(
         there = _same(connection, key, has_result)
         if there is not None:
             return there.id, False
+        check()
         _check_waiting(connection, owner, most_waiting)
         return insert_job(connection, kind, request, key=key, title=title, owner=owner), True
 

@@ -12,7 +12,7 @@ from starcat.artifact.diff import Difference, diff_artifacts
 from starcat.artifact.reader import Artifact
 from starcat.errors import TargetMissing
 from starcat.matcher.methods.table import METHODS
-from starcat.service.access import Builder, Reader
+from starcat.service.access import Builder, Reader, Role
 from starcat.service.jobs.submission import submit_evaluation
 from starcat.service.pages import sky
 from starcat.service.pages.facts import (
@@ -52,7 +52,9 @@ def list_of_databases(request: Request, service: TheService, _: Reader) -> Respo
 
 
 @router.get("/databases/{database_id}")
-def one_database(request: Request, service: TheService, _: Reader, database_id: str) -> Response:
+def one_database(
+    request: Request, service: TheService, reader: Reader, database_id: str
+) -> Response:
     """Show what is known of a database."""
     database = service.shelf.database(database_id)
     manifest = database.manifest
@@ -69,6 +71,7 @@ def one_database(request: Request, service: TheService, _: Reader, database_id: 
         ],
         files=sorted(manifest["files"].items()),
         digest=manifest[MANIFEST_DIGEST],
+        may_evaluate=reader.role >= Role.BUILDER,
     )
 
 

@@ -65,7 +65,14 @@ PARAMETERS = {
     response_class=Response,
     responses={
         200: {"content": {MEDIA_TYPE: {}}, "description": "The stars, nearest first."},
-        400: {"content": {MEDIA_TYPE: {}}, "description": "A VOTable with an INFO named Error."},
+        **{
+            status: {"content": {MEDIA_TYPE: {}}, "description": text}
+            for status, text in (
+                (400, "A VOTable with an INFO named Error."),
+                (404, "The same: there is no such database or catalog."),
+                (503, "The same: the service is busy."),
+            )
+        },
     },
     openapi_extra=PARAMETERS,
 )

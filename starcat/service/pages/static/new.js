@@ -111,6 +111,7 @@ function show(state) {
   showErrors(state.errors);
   wrong.innerHTML = state.wrong;
   body.classList.toggle("stale", !state.is_known);
+  body.inert = !state.is_known;
   if (state.is_known) {  // else the last estimate stays, pale
     const hadFocus = body.querySelector(".sky svg") === document.activeElement;
     body.innerHTML = state.result;
