@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import shutil
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator
@@ -118,6 +119,7 @@ def test_rows_that_are_left_out_are_told(ask, bright):
     assert len(table_of(whole)) == len(bright)
     assert "OVERFLOW" not in whole.text
     assert ask(BRIGHT, MAXREC="2", FORMAT="csv").text.count("\n") == 3
+    assert "OVERFLOW" not in ask(BRIGHT, MAXREC="9" * 50).text
 
 
 def test_without_rows_there_are_columns(ask):
@@ -578,13 +580,32 @@ def test_jobs_outlive_the_server(tmp_path, small_artifact, bright):
         assert phase_of(client, addresses[2]) == "PENDING"
 
 
-def test_a_new_database_is_seen_at_once(tmp_path, small_artifact):
+def test_databases_and_catalogs_are_seen_as_they_come(tmp_path, small_artifact):
     root = tmp_path / "service"
+    stars = small_artifact / "stars.parquet"
     with TestClient(make_app(Settings(root=root)), base_url=LOCAL) as client:
-        names = "/tap/sync?QUERY=SELECT schema_name FROM tap_schema.schemas"
-        assert list(table_of(client.get(names))["schema_name"]) == ["tap_schema"]
+
+        def names() -> list[str]:
+            query = "SELECT schema_name FROM tap_schema.schemas ORDER BY schema_index"
+            return list(table_of(client.get("/tap/sync", params={"QUERY": query}))["schema_name"])
+
+        assert names() == ["tap_schema"]
         shelve(root, small_artifact)
-        assert list(table_of(client.get(names))["schema_name"]) == ["small", "tap_schema"]
+        assert names() == ["small", "tap_schema"]
+        other = shelve(root, small_artifact, "fedcba9876543210")
+        catalog = f"2mass-{'0' * 16}.parquet"
+        shutil.copyfile(stars, root / "catalogs" / catalog)
+        quoted = f'"_2mass_{"0" * 16}"'
+        assert names() == ["small_1_0_0", "small_1_0_0_2", quoted, "tap_schema"]
+        query = f"SELECT COUNT(*) AS n FROM {quoted}.stars"
+        found = table_of(client.get("/tap/sync", params={"QUERY": query}))
+        assert list(found["n"]) == [pq.read_metadata(stars).num_rows]
+        # What cannot be opened is left out, and the rest is there.
+        (other / "stars.parquet").write_bytes(b"PAR1 no table PAR1")
+        (other / "manifest.json").touch()
+        catalogs = root / "catalogs"
+        (catalogs / catalog).rename(catalogs / f"2mass-{'1' * 16}.parquet")
+        assert names() == ["small", quoted.replace("0", "1"), "tap_schema"]
 
 
 def test_without_a_role_nothing_is_told(tmp_path):

@@ -188,11 +188,11 @@ def max_rows(text: str | None, most: int) -> int:
     """
     if text is None:
         return most
-    if not (text.isascii() and text.isdigit() and len(text) < 20):
+    if not (text.isascii() and text.isdigit()):
         raise ConfigError(
             f"MAXREC is {quoted(text)}; it is a whole number from 0 on", key="MAXREC", value=text
         )
-    return min(int(text), most)
+    return most if len(text) > len(str(most)) + 10 else min(int(text), most)
 
 
 def uploads(given: list[str]) -> tuple[Upload, ...]:
