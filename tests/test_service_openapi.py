@@ -31,7 +31,7 @@ MAY_BE_BUSY = (503,)
 HOOKS = """
 import schemathesis
 
-@schemathesis.serializer("application/toml")
+@schemathesis.serializer("application/toml", "application/x-tar")
 def as_text(context, value):
     return value.encode() if isinstance(value, str) else str(value).encode()
 """
