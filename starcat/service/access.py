@@ -6,7 +6,7 @@ middleware of `starcat.service.guard` finds it out; handlers say which role they
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Annotated
@@ -65,7 +65,7 @@ def principal_of(request: Request) -> Principal:
     return Principal("anonymous", Role.named(request.app.state.service.settings.anonymous_role))
 
 
-def needs(role: Role) -> Callable[[Request], Principal]:
+def needs(role: Role) -> Callable[[Request], Awaitable[Principal]]:
     """Return a dependency that refuses whoever has not a role.
 
     Parameters
@@ -79,7 +79,7 @@ def needs(role: Role) -> Callable[[Request], Principal]:
         Gives the principal; raises a `Problem` with status 401 or 403.
     """
 
-    def check(request: Request) -> Principal:
+    async def check(request: Request) -> Principal:  # plain functions are sent to a thread
         principal = principal_of(request)
         if principal.role >= role:
             return principal

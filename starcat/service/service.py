@@ -114,4 +114,8 @@ def service_of(request: Request) -> Service:
     return service
 
 
-TheService = Annotated[Service, Depends(service_of)]
+async def _service_of(request: Request) -> Service:
+    return service_of(request)  # in the event loop: FastAPI sends plain functions to a thread
+
+
+TheService = Annotated[Service, Depends(_service_of)]

@@ -105,6 +105,8 @@ def main() -> None:
     threading.Thread(target=_end_with_input, daemon=True).start()
     with suppress(OSError, AttributeError):
         os.nice(NICENESS)
+        # What answers somebody who waits gets a processor at once, where Linux can do that.
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     teller = Teller(output)
     logger = logging.getLogger("starcat")
     logger.setLevel(logging.INFO)
