@@ -43,16 +43,16 @@ format: $(READY) ## rewrite the code in the house format
 	$(BIN)/ruff check --quiet --fix .
 
 test: $(READY) ## the fast tests and the docstrings' examples
-	$(BIN)/python -m pytest -q -n 2 -m 'not slow'
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'not slow'
 
 test-all: $(READY) ## the fast tests and the sky-scale ones
-	$(BIN)/python -m pytest -q -n 2
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 BASE ?= HEAD~1
 test-changed: $(READY) ## the slow tests in the test files that changed since BASE (HEAD~1)
 	@changed=$$(git diff --name-only --diff-filter=d $(BASE) -- 'tests/test_*.py' || true); \
 	if [ -z "$$changed" ]; then echo "no test file changed since $(BASE)"; exit 0; fi; \
-	$(BIN)/python -m pytest -q -n 2 -m slow $$changed || [ $$? -eq 5 ]
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m slow $$changed || [ $$? -eq 5 ]
 
 demo: $(RUNS) ## build a database from the embedded sky, check it, identify simulated fields
 	$(BIN)/starcat build --preset gaia-12deg --output dist --replace

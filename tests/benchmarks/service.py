@@ -256,11 +256,11 @@ def main() -> None:
         ends_at = time.monotonic() + options.seconds
         load = Load(served, database, job["id"], files, options.pause_s, ends_at)
         found = asyncio.run(run(load, options.clients, meanwhile))
-        after = memory_mib(served.process.pid)
         is_right = report(found, options.seconds)
-        print(f"memory of the server and its processes: {before:.0f} MiB before, {after:.0f} after")
         for one in queued:
             print(f"build {one}: {client.wait(one)['state']}")
+        after = memory_mib(served.process.pid)
+        print(f"memory of the server and its processes: {before:.0f} MiB before, {after:.0f} after")
     sys.exit(not is_right)
 
 
