@@ -214,6 +214,7 @@ catalogs = ["tycho2", "hipparcos", "2mass"]
 """
 
 
+@pytest.mark.slow
 def test_an_artifact_with_three_catalogs(catalogs, tmp_path):
     spec = spec_from_dict(tomllib.loads(SPEC), "bright.toml")
     inputs = {name: [catalogs / file] for name, file in FILES.items()}

@@ -64,6 +64,7 @@ def check_fields(fov_deg: float, folder: Path) -> None:
             assert made.manifest["products"][name]["rows"] == pytest.approx(count, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_camera_of_50_deg_identifies_its_frames(tmp_path):
     check_fields(50.0, tmp_path)
 

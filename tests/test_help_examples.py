@@ -86,7 +86,7 @@ def here(workplace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 def run_example(name: str, starcat: Run) -> Any:
     words = shlex.split(examples()[name])
-    assert " ".join(words).startswith(f"starcat {name} ")
+    assert f"{' '.join(words)} ".startswith(f"starcat {name} ")
     return starcat(words[1:])
 
 

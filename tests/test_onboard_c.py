@@ -102,7 +102,8 @@ def made(tmp_path_factory: pytest.TempPathFactory, random_directions) -> dict[st
 
 
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("cc", ["gcc", pytest.param("clang", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("cc", ["gcc", "clang"])
 def test_the_unit_test_passes_where_the_folder_stands_alone(folder: Path, cc: str) -> None:
     if shutil.which(cc) is None:
         pytest.skip(f"{cc} is missing")

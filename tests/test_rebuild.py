@@ -159,6 +159,7 @@ def test_columns_that_came_out_differently_are_named(copy: Path, stars: Path) ->
     }
 
 
+@pytest.mark.slow
 def test_the_command(
     copy: Path, stars: Path, starcat: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:

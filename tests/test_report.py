@@ -98,6 +98,7 @@ def test_all_files_are_there_and_in_the_manifest(artifact: Artifact) -> None:
     assert {f"report/{name}" for name in FILES} <= set(artifact.manifest["files"])
 
 
+@pytest.mark.slow
 def test_a_second_build_elsewhere_has_the_same_bytes(
     artifact: Artifact, spec: BuildSpec, catalogs: Path, tmp_path: Path
 ) -> None:

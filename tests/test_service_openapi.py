@@ -108,6 +108,7 @@ def test_no_request_that_the_schema_allows_or_forbids_breaks_it(
 
 
 @pytest.mark.timeout(120)
+@pytest.mark.slow
 def test_the_examples_of_the_schema_are_answered(
     attacked: tuple[Served, str], tmp_path: Path
 ) -> None:

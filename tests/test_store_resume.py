@@ -133,6 +133,7 @@ def _fail(*_):
     raise BuildError("stopped by the test")
 
 
+@pytest.mark.slow
 def test_an_input_that_has_changed_since_is_read_again(parts, whole, tmp_path, monkeypatch):
     copies = [Path(shutil.copy(part, tmp_path)) for part in parts]
     lines = gzip.decompress(copies[0].read_bytes()).splitlines(keepends=True)
@@ -203,6 +204,7 @@ def small_disk(tmp_path):
     subprocess.run(["umount", str(folder)], check=True)
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_told_and_the_run_goes_on_when_there_is_room(parts, whole, small_disk):
     folder, make_room = small_disk
     with pytest.raises(OutputError, match=r"No space left on device.*make room.*--resume"):

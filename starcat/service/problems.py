@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Any
@@ -113,16 +114,42 @@ def problem_of(error: Exception) -> ProblemDetails:
         detail = "this is a defect of starcat; the log of the server says more"
         return ProblemDetails(title=title, status=500, detail=detail, code=DEFECT)
     failure = failure_of(error, "starcat serve")
+    hint = None if failure.hint is None else without_folders(failure.hint)
     key = getattr(error, "key", None)
     return ProblemDetails(
         title=title,
         status=status,
-        detail=failure.message,
+        detail=without_folders(failure.message),
         code=failure.code,
         kind=failure.kind,
-        hint=failure.hint,
+        hint=hint,
         key=str(key) if key else None,
     )
+
+
+_FOLDERS = re.compile(r"(?<![\w.:/])/(?:[^\s/:;,'\"()]+/)+")
+"""The folders of a full path; an address has a colon and a second slash before them."""
+
+
+def without_folders(message: str) -> str:
+    """Return a message in which files have their names only: where they lie is the operator's.
+
+    Parameters
+    ----------
+    message : str
+        Words of an error.
+
+    Returns
+    -------
+    str
+        The same, without the folders of full paths.
+
+    Examples
+    --------
+    >>> without_folders("/srv/starcat/catalogs/sao.dat: line 3; see http://host/docs/errors.html")
+    'sao.dat: line 3; see http://host/docs/errors.html'
+    """
+    return _FOLDERS.sub("", message)
 
 
 def problem_response(problem: ProblemDetails, headers: Mapping[str, str] | None = None) -> Response:

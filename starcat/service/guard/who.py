@@ -20,7 +20,10 @@ from starcat.service.guard.tokens import Token
 from starcat.service.problems import Problem
 from starcat.service.settings import Settings
 
-OPEN_PATHS = ("/healthz", "/sign-in", "/sign-out", "/static/")
+VOSI = ("/tap/availability", "/tap/capabilities")
+"""What clients look at before they know that a token is needed (VOSI 1.1)."""
+
+OPEN_PATHS = ("/healthz", "/sign-in", "/sign-out", "/static/", *VOSI)
 """What everybody may see, also where a token is needed for all else."""
 
 CHALLENGED = ("/tap", "/scs", "/registry")

@@ -144,7 +144,7 @@ def _order(content: dict[str, Any]) -> Order:
 
 def _told(error: Exception, order: Order) -> dict[str, Any]:
     """Return what to say of an exception: details for whoever asked, the rest for the operator."""
-    from starcat.service.problems import ProblemDetails, problem_of
+    from starcat.service.problems import ProblemDetails, problem_of, without_folders
     from starcat.terminal.failures import failure_of
 
     if isinstance(error, MemoryError) or NO_THREAD in str(error):
@@ -152,7 +152,10 @@ def _told(error: Exception, order: Order) -> dict[str, Any]:
     if isinstance(error, OSError) and not isinstance(error, StarcatError):
         failure = failure_of(error, "the job")
         problem = ProblemDetails(
-            title="The system refused", status=500, detail=failure.message, kind=failure.kind
+            title="The system refused",
+            status=500,
+            detail=without_folders(failure.message),
+            kind=failure.kind,
         )
     else:
         problem = problem_of(error)
