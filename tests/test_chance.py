@@ -360,7 +360,9 @@ def magnitudes(count: int) -> np.ndarray:
     return 6.0 + np.log10(1.0 - np.random.default_rng(count).random(count)) / 0.5
 
 
-@pytest.mark.parametrize(("noise_mag", "reach_px"), [(0.05, 180.0), (0.6, 60.0)])
+@pytest.mark.parametrize(
+    ("noise_mag", "reach_px"), [(0.05, 180.0), pytest.param(0.6, 60.0, marks=pytest.mark.slow)]
+)
 def test_no_more_random_frames_agree_with_the_magnitudes_of_stars(
     random_directions, noise_mag, reach_px
 ):

@@ -49,7 +49,7 @@ def test_a_store_holds_what_ingest_returns(source, name, max_rows, catalogs, tmp
     assert len(made.manifest["partitions"]) > 3
 
 
-@pytest.mark.parametrize("limit", [None, 9.0])
+@pytest.mark.parametrize("limit", [None, pytest.param(9.0, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("source", "name", "max_rows"), CASES)
 def test_a_build_reads_from_a_store_what_it_reads_from_files(
     source, name, max_rows, limit, catalogs, tmp_path

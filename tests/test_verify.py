@@ -152,7 +152,7 @@ def test_200_flipped_bytes_are_all_found(copy: Path, files: Sequence[str]) -> No
     assert verify_artifact(copy).findings == ()
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5])
+@pytest.mark.parametrize("share", [pytest.param(0.0, marks=pytest.mark.slow), 0.5])
 def test_every_truncated_file_is_found(share: float, copy: Path, files: Sequence[str]) -> None:
     for name in files:
         whole = (copy / name).read_bytes()

@@ -41,7 +41,7 @@ def centroid_file(text: str, brightness: Brightness = "light") -> tuple[str, str
     Examples
     --------
     >>> centroid_file("10.5 20 3000\n30, 40, 1200")
-    ('.csv', 'x_px,y_px,flux\\n10.5,20,3000\n30,40,1200\\n')
+    ('.csv', 'x_px,y_px,flux\n10.5,20,3000\n30,40,1200\n')
     """
     stripped = text.strip()
     if stripped[:1] in ("{", "["):
