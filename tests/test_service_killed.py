@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import os
 import random
+import shutil
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +22,12 @@ import pytest
 pytest.importorskip("fastapi")
 
 import requests
+from shelved import DATABASE, shelve
 
 from starcat.artifact.verify import verify_artifact
+from starcat.errors import SourceMissing
+from starcat.releases.pulling import pull_release
+from starcat.releases.registry import FolderRegistry
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 
@@ -155,6 +162,48 @@ def assert_all_whole(root: Path) -> list[Path]:
         assert verify_artifact(artifact).findings == ()
         folders.append(artifact)
     return folders
+
+
+def test_a_server_that_is_killed_while_it_publishes_shows_no_half_release(
+    service, small_artifact, tmp_path
+):
+    shelve(service.root, small_artifact)
+    generator = random.Random(16)
+    address = service.address.replace("/jobs", "/releases")
+
+    def publish() -> None:
+        with suppress(requests.ConnectionError):
+            requests.post(address, json={"database": DATABASE, "note": "first"}, timeout=20)
+
+    for number in range(KILLS):
+        service.start()
+        asking = threading.Thread(target=publish)
+        asking.start()
+        time.sleep(generator.uniform(0.0, 0.3))
+        assert service.end(signal.SIGKILL) == -signal.SIGKILL
+        asking.join()
+        assert pulled(service.root, tmp_path / f"killed-{number}") in ([], ["small-1.0.0"])
+        service.start()
+        again = requests.post(address, json={"database": DATABASE, "note": "again"}, timeout=20)
+        assert again.status_code in (200, 201)
+        [release] = requests.get(address, timeout=20).json()["releases"]
+        assert (release["name"], release["version"]) == ("small", "1.0.0")
+        assert pulled(service.root, tmp_path / f"again-{number}") == ["small-1.0.0"]
+        assert service.end(signal.SIGTERM) == 0
+        shutil.rmtree(service.root / "registry")
+
+
+def pulled(root: Path, output: Path) -> list[str]:
+    """Return the releases that are seen, each of which is whole when it is pulled."""
+    registry = FolderRegistry(root / "registry")
+    try:
+        releases = registry.releases()
+    except SourceMissing:  # nothing is published yet
+        return []
+    for release in releases:
+        pull_release(registry, release, output)
+        assert verify_artifact(output / release.title).findings == ()
+    return [release.title for release in releases]
 
 
 def test_a_server_that_stops_leaves_its_jobs_to_the_next(service, small_spec):
