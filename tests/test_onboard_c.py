@@ -112,6 +112,7 @@ def test_the_unit_test_passes_where_the_folder_stands_alone(folder: Path, cc: st
     assert said.count(" 0 failed") == 2  # in double and in single precision
 
 
+@pytest.mark.slow
 def test_the_example_prints_the_attitude(folder: Path) -> None:
     said = make(folder, "all", "example")
     assert "status 0 after" in said

@@ -235,6 +235,7 @@ def test_the_map_of_many_fields_is_small_and_shows_the_poorest(client, small_spe
 
 
 @pytest.mark.timeout(120)
+@pytest.mark.slow
 def test_a_first_spec_is_that_of_init(client):
     camera = {"width_px": 640, "height_px": 480, "fov_x_deg": 50.0}
     wish = {"name": "My cam", "camera": camera}

@@ -18,7 +18,7 @@ from astropy.io import fits
 from astropy.io.votable import from_table, parse_single_table
 from astropy.table import MaskedColumn, Table
 from fastapi.testclient import TestClient
-from httpx import Response
+from httpx2 import Response
 from shelved import shelve
 
 from starcat.errors import QueryError
@@ -580,6 +580,7 @@ def test_jobs_outlive_the_server(tmp_path, small_artifact, bright):
         assert phase_of(client, addresses[2]) == "PENDING"
 
 
+@pytest.mark.slow
 def test_databases_and_catalogs_are_seen_as_they_come(tmp_path, small_artifact):
     root = tmp_path / "service"
     stars = small_artifact / "stars.parquet"
