@@ -7,7 +7,15 @@ from typing import Annotated
 
 import typer
 
-from starcat.commands.shared import Input, Json, chosen_spec, inputs_by_source
+from starcat.commands.shared import (
+    Changes,
+    Input,
+    Json,
+    PresetName,
+    SpecFile,
+    chosen_spec,
+    inputs_by_source,
+)
 from starcat.errors import BuildError, ConfigError, ProductError
 
 app = typer.Typer()
@@ -16,16 +24,9 @@ app = typer.Typer()
 @app.command()
 def build(
     context: typer.Context,
-    spec: Annotated[Path | None, typer.Argument(help="A build spec (TOML).")] = None,
-    preset: Annotated[str | None, typer.Option(help="A spec that ships with starcat.")] = None,
-    changes: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="A key of the spec, such as camera.fov_x_deg=16. Repeatable.",
-        ),
-    ] = None,
+    spec: SpecFile = None,
+    preset: PresetName = None,
+    changes: Changes = None,
     inputs: Input = None,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder to put <name>-<version>/ into.")

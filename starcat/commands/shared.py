@@ -20,6 +20,16 @@ Input = Annotated[
     list[str] | None,
     typer.Option("--input", metavar="SOURCE=PATH", help="File or folder of a source. Repeatable."),
 ]
+SpecFile = Annotated[Path | None, typer.Argument(help="A build spec (TOML).")]
+PresetName = Annotated[str | None, typer.Option(help="A spec that ships with starcat.")]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="A key of the spec, such as camera.fov_x_deg=16. Repeatable.",
+    ),
+]
 MethodName = Annotated[
     str | None, typer.Option(help="See 'starcat methods'; default: the best there is.")
 ]

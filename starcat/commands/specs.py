@@ -8,8 +8,11 @@ from typing import Annotated
 import typer
 
 from starcat.commands.shared import (
+    Changes,
     Input,
     Json,
+    PresetName,
+    SpecFile,
     camera_of_options,
     chosen_spec,
     field_range,
@@ -48,16 +51,9 @@ def presets(
 
 @app.command()
 def estimate(
-    spec: Annotated[Path | None, typer.Argument(help="A build spec (TOML).")] = None,
-    preset: Annotated[str | None, typer.Option(help="A spec that ships with starcat.")] = None,
-    changes: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="A key of the spec, such as camera.fov_x_deg=16. Repeatable.",
-        ),
-    ] = None,
+    spec: SpecFile = None,
+    preset: PresetName = None,
+    changes: Changes = None,
     inputs: Input = None,
     json: Json = False,
 ) -> None:

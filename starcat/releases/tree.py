@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 
 from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.errors import ConfigError, ProductError, SchemaVersionError, SourceMissing
-from starcat.specs.version import NAME_PATTERN, VERSION_PATTERN
+from starcat.specs.version import NAME_PATTERN, VERSION_PATTERN, version_numbers
 from starcat.storage.digests import json_bytes
 
 INDEX_NAME = "index.json"
@@ -81,8 +81,7 @@ class Release(_Model):
     @property
     def order(self) -> tuple[str, int, int, int]:
         """Sorts by name, then as semantic versions go: 1.10.0 after 1.9.0."""
-        major, minor, patch = (int(number) for number in self.version.split("."))
-        return self.name, major, minor, patch
+        return self.name, *version_numbers(self.version)
 
 
 class Listed(Release):

@@ -7,20 +7,14 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from starcat.errors import QueryError, QueryLimitError
+from starcat.errors import QueryError
 from starcat.query.gallery import named_query
+from starcat.service.answer_files import file_of_rows, keep_rows
 from starcat.service.service import Service
 from starcat.service.targets import target_paths
-from starcat.service.uploading import scratch_folder, sent_once
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-MAX_BYTES = 4 << 30
-"""Size of an answer that is kept until it is sent."""
+from starcat.service.uploading import scratch_folder
 
 LARGEST_WHOLE = 2**53 - 1
 """The largest whole number that every reader of JSON keeps."""
@@ -189,30 +183,9 @@ def file_of(service: Service, question: Question, form: str) -> Answered:
             service.sessions.session(paths, question.time_s) as session,
             session.ask(question.text, question.values) as running,
         ):
-            count, is_cut = _keep(running.batches(), source, question.max_rows)
-        arguments = {"source": str(source), "target": str(target), "form": form}
-        service.confined.call("convert", arguments)
-        chunks, size = sent_once(target)
+            count, is_cut = keep_rows(running.batches(), source, question.max_rows)
+        chunks, size = file_of_rows(service.confined, source, target, form)
     return Answered(chunks, size, count, is_cut)
-
-
-def _keep(batches: pa.RecordBatchReader, path: Path, most: int) -> tuple[int, bool]:
-    """Write the first rows to a file; return how many, and whether there are more."""
-    import pyarrow as pa
-
-    count = size = 0
-    with pa.OSFile(str(path), "wb") as file, pa.ipc.new_stream(file, batches.schema) as stream:
-        for batch in batches:
-            part = batch.slice(0, most - count)
-            stream.write_batch(part)
-            count, size = count + part.num_rows, size + part.nbytes
-            if part.num_rows < batch.num_rows:
-                return count, True
-            if size > MAX_BYTES:
-                raise QueryLimitError(
-                    f"the answer is larger than {MAX_BYTES >> 30} GiB; ask for fewer rows"
-                )
-    return count, False
 
 
 def plain(value: Any) -> Any:

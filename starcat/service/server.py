@@ -135,7 +135,23 @@ def _address(settings: Settings, port: int) -> str:
 
 
 def listen(settings: Settings) -> socket.socket:
-    """Return the socket that the server listens at."""
+    """Return the socket that the server listens at.
+
+    Parameters
+    ----------
+    settings : Settings
+        What the operator set.
+
+    Returns
+    -------
+    socket.socket
+        It listens, and nobody answers yet.
+
+    Raises
+    ------
+    ConfigError
+        If the port is taken, or the address is not one of this machine.
+    """
     try:
         [(family, _, _, _, address), *_] = socket.getaddrinfo(
             settings.host, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
 from starcat.errors import ProductError, TargetMissing
+from starcat.releases.tree import Blob, files_of
 from starcat.service.places import DATABASE_ID, Places
+from starcat.specs.version import version_numbers
+from starcat.storage.digests import file_sha256
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,20 @@ class Database:
         """Name and version, as the folder has them."""
         return f"{self.name}-{self.version}"
 
+    @cached_property
+    def manifest_blob(self) -> Blob:
+        """Digest and size of the file of its manifest, by which releases name it."""
+        path = self.folder / MANIFEST_NAME
+        return Blob(sha256=file_sha256(path), bytes=path.stat().st_size)
+
+    @cached_property
+    def files(self) -> dict[str, Blob]:
+        """Its files by path within its folder, none of which leads out of it; the manifest first.
+
+        Raises `ProductError` if the manifest lists what is no plain path.
+        """
+        return {MANIFEST_NAME: self.manifest_blob, **files_of(self.manifest, self.title)}
+
 
 class Shelf:
     """All databases there are.
@@ -74,7 +92,7 @@ class Shelf:
                 found.append(self._at(path))
             except (ProductError, OSError):
                 continue
-        return sorted(found, key=lambda one: (one.name, _numbers(one.version), one.id))
+        return sorted(found, key=lambda one: (one.name, version_numbers(one.version), one.id))
 
     def database(self, database_id: str) -> Database:
         """Return a database.
@@ -108,7 +126,3 @@ class Shelf:
             known = changed_ns, Database(folder.parent.name, folder, read_manifest(folder))
             self._known[path] = known
         return known[1]
-
-
-def _numbers(version: str) -> tuple[int, ...]:
-    return tuple(map(int, version.split(".")))

@@ -10,7 +10,7 @@ from fastapi.responses import JSONResponse, Response, StreamingResponse
 
 from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.errors import TargetMissing
-from starcat.releases.tree import Blob, files_of
+from starcat.releases.tree import Blob
 from starcat.service.access import Publisher, Reader
 from starcat.service.api.database_models import (
     CoverageAnswer,
@@ -25,7 +25,6 @@ from starcat.service.problems import Problem
 from starcat.service.removal import remove_database
 from starcat.service.service import Service, TheService
 from starcat.service.shelf import Database
-from starcat.storage.digests import file_sha256
 
 router = APIRouter(prefix="/databases", tags=["databases"])
 
@@ -55,10 +54,7 @@ def manifest(
     database: DatabaseId, request: Request, service: TheService, reader: Reader
 ) -> Response:
     """Return the manifest as its file has it; its SHA-256 is the ETag."""
-    path = service.shelf.database(database).folder / MANIFEST_NAME
-    return file_answer(
-        *(request, path, file_sha256(path)), file_name=MANIFEST_NAME, cache=REVALIDATED
-    )
+    return _file(service, database, MANIFEST_NAME, request, REVALIDATED)
 
 
 @router.get("/{database}/report", summary="Report", responses=SAME)
@@ -118,7 +114,7 @@ def files(database: DatabaseId, service: TheService, reader: Reader) -> list[Dat
     found = service.shelf.database(database)
     return [
         DatabaseFile(path=name, content_type=type_of(name), **blob.model_dump())
-        for name, blob in listed_files(found).items()
+        for name, blob in found.files.items()
     ]
 
 
@@ -148,7 +144,7 @@ router.head("/{database}/files/{path:path}", include_in_schema=False)(file)
 def archive(database: DatabaseId, service: TheService, reader: Reader) -> StreamingResponse:
     """Return the folder of a database as a tar archive, the same bytes each time."""
     found = service.shelf.database(database)
-    contents = listed_files(found)
+    contents = found.files
     return StreamingResponse(
         archive_chunks(found.folder, contents),
         media_type="application/x-tar",
@@ -165,32 +161,9 @@ def remove(database: DatabaseId, service: TheService, publisher: Publisher) -> N
     remove_database(service, database)
 
 
-def listed_files(database: Database) -> dict[str, Blob]:
-    """Return the files of a database.
-
-    Parameters
-    ----------
-    database : Database
-        The database.
-
-    Returns
-    -------
-    dict of str to Blob
-        By path within its folder, none of which leads out of it; the manifest first.
-
-    Raises
-    ------
-    ProductError
-        If the manifest lists what is no plain path.
-    """
-    path = database.folder / MANIFEST_NAME
-    itself = Blob(sha256=file_sha256(path), bytes=path.stat().st_size)
-    return {MANIFEST_NAME: itself, **files_of(database.manifest, database.title)}
-
-
 def _listed(database: Database, name: str) -> Blob:
     """Return what the manifest says of a file."""
-    found = listed_files(database).get(name)
+    found = database.files.get(name)
     if found is None:
         raise TargetMissing(
             f"{database.title} has no file {name[:80]!r}; "

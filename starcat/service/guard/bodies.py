@@ -10,6 +10,7 @@ from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from starcat.service.guard.guard import Guard
 from starcat.service.guard.refusing import refuse
 from starcat.service.problems import Problem
 from starcat.service.settings import Settings
@@ -24,7 +25,7 @@ FILLING = ("/tap/async",)
 """Where a POST makes something that stays on the disk; jobs see to their room themselves."""
 
 
-class Bodies:
+class Bodies(Guard):
     """Refuses bodies that are too large, too slow, or for which the disk has no room.
 
     Parameters
@@ -36,12 +37,12 @@ class Bodies:
     """
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
-        self._app = app
+        super().__init__(app)
         self._settings = settings
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
-        if scope["type"] != "http" or scope["method"] in ("GET", "HEAD", "OPTIONS"):
+        if scope["method"] in ("GET", "HEAD", "OPTIONS"):
             await self._app(scope, receive, send)
             return
         headers = Headers(scope=scope)

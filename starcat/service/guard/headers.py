@@ -5,6 +5,7 @@ from __future__ import annotations
 from starlette.datastructures import MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from starcat.service.guard.guard import Guard
 from starcat.service.settings import Settings
 
 POLICY = (
@@ -25,7 +26,7 @@ ALWAYS = {
 A_YEAR = "max-age=31536000"
 
 
-class SafeHeaders:
+class SafeHeaders(Guard):
     """Adds what browsers keep to. A handler's own policy stays as it is.
 
     Parameters
@@ -37,16 +38,13 @@ class SafeHeaders:
     """
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
-        self._app = app
+        super().__init__(app)
         self._headers = dict(ALWAYS)
         if settings.is_secure:
             self._headers["Strict-Transport-Security"] = A_YEAR
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
 
         async def send_safe(message: Message) -> None:
             if message["type"] == "http.response.start":

@@ -13,8 +13,9 @@ import time
 from datetime import UTC, datetime
 from typing import Any
 
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import Message, Receive, Scope, Send
 
+from starcat.service.guard.guard import Guard
 from starcat.service.guard.refusing import address_of
 from starcat.service.guard.request_id import request_id
 from starcat.service.problems import problem_of, problem_response
@@ -75,7 +76,7 @@ def log_settings(level: str = "INFO") -> dict[str, Any]:
     }
 
 
-class RequestLog:
+class RequestLog(Guard):
     """Writes a line for each request when it has been answered.
 
     Parameters
@@ -84,14 +85,8 @@ class RequestLog:
         What comes behind.
     """
 
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
         begun_s, status, sent = time.perf_counter(), 0, 0
 
         async def send_counted(message: Message) -> None:
@@ -123,7 +118,7 @@ def _write(scope: Scope, status: int, sent: int, taken_s: float) -> None:
     _logger.log(level, "request", extra={"facts": facts})
 
 
-class Defects:
+class Defects(Guard):
     """Answers what no handler foresaw: the log gets the traceback, the client gets none.
 
     Parameters
@@ -132,14 +127,8 @@ class Defects:
         What comes behind.
     """
 
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
         is_begun = False
 
         async def send_noted(message: Message) -> None:

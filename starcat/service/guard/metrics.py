@@ -11,6 +11,7 @@ from prometheus_client.registry import Collector
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from starcat.service.guard.bodies import GIB, free_gib
+from starcat.service.guard.guard import Guard
 from starcat.service.guard.sessions import SessionStore
 from starcat.service.service import Service
 from starcat.version import __version__
@@ -92,7 +93,7 @@ class _State(Collector):
         yield build
 
 
-class Counted:
+class Counted(Guard):
     """Counts requests and their time, by the route that answered.
 
     Parameters
@@ -104,14 +105,11 @@ class Counted:
     """
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
-        self._app = app
+        super().__init__(app)
         self._metrics = metrics
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
         begun_s, status, is_endless = time.perf_counter(), 0, False
 
         async def send_noted(message: Message) -> None:

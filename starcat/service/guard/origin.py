@@ -14,6 +14,7 @@ from urllib.parse import urlsplit
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from starcat.service.guard.guard import Guard
 from starcat.service.guard.refusing import refuse
 from starcat.service.guard.sessions import session_in
 from starcat.service.problems import Problem
@@ -23,7 +24,7 @@ SAFE = ("GET", "HEAD", "OPTIONS")
 HOST = re.compile(r"(?P<name>\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9._-]{1,253})(:(?P<port>\d{1,5}))?")
 
 
-class Origin:
+class Origin(Guard):
     """Refuses requests to other names, and those that other sites have made a browser send.
 
     Parameters
@@ -35,15 +36,12 @@ class Origin:
     """
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
-        self._app = app
+        super().__init__(app)
         self._settings = settings
         self._names = known_names(settings)
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
         headers = Headers(scope=scope)
         problem = self._misdirected(headers)
         if problem is None and scope["method"] not in SAFE:

@@ -6,8 +6,9 @@ import re
 from collections.abc import Iterable
 from urllib.parse import unquote_to_bytes
 
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import Receive, Scope, Send
 
+from starcat.service.guard.guard import Guard
 from starcat.service.guard.refusing import refuse
 from starcat.service.problems import Problem
 
@@ -18,7 +19,7 @@ UPWARDS = re.compile(r"(^|[/\\])\.{1,2}($|[/\\])")
 METHODS = ("GET", "HEAD", "OPTIONS", "POST", "PUT", "PATCH", "DELETE")
 
 
-class Shape:
+class Shape(Guard):
     """Refuses requests that are too long, hold control characters, or climb out of folders.
 
     Parameters
@@ -27,12 +28,9 @@ class Shape:
         What comes behind.
     """
 
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
-        problem = misshapen(scope) if scope["type"] == "http" else None
+        problem = misshapen(scope)
         if problem is not None:
             await refuse(scope, receive, send, problem)
             return

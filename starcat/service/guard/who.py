@@ -13,6 +13,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from starcat.service.access import Principal, Role
 from starcat.service.guard.buckets import Buckets
+from starcat.service.guard.guard import Guard
 from starcat.service.guard.identities import Identities
 from starcat.service.guard.refusing import address_of, later, refuse
 from starcat.service.guard.sessions import session_in
@@ -32,7 +33,7 @@ CHALLENGED = ("/tap", "/scs", "/registry")
 BEARER, BASIC = 'Bearer realm="starcat"', 'Basic realm="starcat", charset="UTF-8"'
 
 
-class Who:
+class Who(Guard):
     """Finds the principal of each request, and refuses those who may not ask, or not so often.
 
     Parameters
@@ -46,17 +47,14 @@ class Who:
     """
 
     def __init__(self, app: ASGIApp, settings: Settings, identities: Identities) -> None:
-        self._app = app
+        super().__init__(app)
         self._settings = settings
         self._identities = identities
         self._anonymous = Principal("anonymous", Role.named(settings.anonymous_role))
         self._asked = Buckets(settings.requests_per_minute)
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+    async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
         try:
             principal = self._principal(scope)
         except Problem as problem:

@@ -17,7 +17,6 @@ from starcat.service.places import Places
 from starcat.service.service import Service
 from starcat.service.shelf import Database
 from starcat.specs.build_spec import CameraSpec
-from starcat.storage.digests import file_sha256
 from starcat.tables.schema import product_schema
 
 REPORT = "report/report.json"
@@ -186,7 +185,7 @@ def _row(one: Database, released: Mapping[str, str], built: Mapping[str, float])
         stars=int(manifest["products"]["stars"]["rows"]),
         bytes=total_bytes(manifest),
         rates=_rates(one),
-        is_released=one.title in released and released[one.title] == file_digest(itself),
+        is_released=one.title in released and released[one.title] == one.manifest_blob.sha256,
         built_s=built.get(one.id) or itself.stat().st_mtime,
     )
 
@@ -272,13 +271,3 @@ def report_of(database: Database) -> dict[str, Any]:
 def _read_json(path: Path, changed_ns: int) -> dict[str, Any]:
     content: dict[str, Any] = json.loads(path.read_bytes())
     return content
-
-
-def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file, read again only when it has changed."""
-    return _digest(path, path.stat().st_mtime_ns)
-
-
-@lru_cache(maxsize=256)
-def _digest(path: Path, changed_ns: int) -> str:
-    return file_sha256(path)

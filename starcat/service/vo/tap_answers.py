@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starcat.exchange.first_rows import FirstRows
 from starcat.exchange.label import Label
+from starcat.service.answer_files import file_of_rows, keep_rows
 from starcat.service.confined import Confined
+from starcat.service.places import Places
+from starcat.service.uploading import scratch_folder
 from starcat.vo.formats import Format
 from starcat.vo.results import result_chunks
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-_FILE_BYTES = 1 << 18
 
 _LABEL = Label("result")
 
@@ -26,14 +24,14 @@ class Answers:
 
     Parameters
     ----------
-    scratch : Path
-        Folder for what has to be a file before it can be sent.
+    places : Places
+        Where what has to be a file is kept before it is sent.
     confined : Confined
         What makes files that are held in memory as a whole, in processes of their own.
     """
 
-    def __init__(self, scratch: Path, confined: Confined) -> None:
-        self._scratch = scratch
+    def __init__(self, places: Places, confined: Confined) -> None:
+        self._places = places
         self._confined = confined
 
     def chunks(self, batches: pa.RecordBatchReader, form: Format, max_rows: int) -> Iterator[bytes]:
@@ -61,25 +59,15 @@ class Answers:
             If the query takes too long; also while reading.
         """
         if form.name == "fits":
-            yield from self._fits(FirstRows(batches, max_rows).reader())
+            yield from self._fits(batches, max_rows)
         else:
-            yield from result_chunks(batches, form, self._scratch, label=_LABEL, maxrec=max_rows)
+            scratch = self._places.scratch
+            yield from result_chunks(batches, form, scratch, label=_LABEL, maxrec=max_rows)
 
-    def _fits(self, batches: pa.RecordBatchReader) -> Iterator[bytes]:
+    def _fits(self, batches: pa.RecordBatchReader, max_rows: int) -> Iterator[bytes]:
         """Have a FITS file made, which is held in memory as a whole, by another process."""
-        with tempfile.TemporaryDirectory(prefix="answer-", dir=self._scratch) as folder:
-            rows, path = Path(folder) / "rows", Path(folder) / "answer.fits"
-            _write_rows(batches, rows)
-            given = {"source": str(rows), "target": str(path), "form": "fits"}
-            self._confined.call("convert", given)
-            with path.open("rb") as stream:
-                while part := stream.read(_FILE_BYTES):
-                    yield part
-
-
-def _write_rows(batches: pa.RecordBatchReader, path: Path) -> None:
-    import pyarrow as pa
-
-    with pa.OSFile(str(path), "wb") as sink, pa.ipc.new_stream(sink, batches.schema) as stream:
-        for batch in batches:
-            stream.write_batch(batch)
+        with scratch_folder(self._places) as folder:
+            rows = folder / "rows.arrow"
+            keep_rows(batches, rows, max_rows)
+            chunks, _ = file_of_rows(self._confined, rows, folder / "answer.fits", "fits")
+        yield from chunks

@@ -56,7 +56,7 @@ class TapQueries:
         self._places = places
         self._tables = tables
         self._sessions = sessions
-        self._answers = Answers(places.scratch, confined)
+        self._answers = Answers(places, confined)
 
     def answer(
         self,
