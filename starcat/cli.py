@@ -41,15 +41,7 @@ class WholeSummaries(TyperGroup):
     """The commands in the help, each with its first sentence and no dots for the rest."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write a line or more a command.
-
-        Parameters
-        ----------
-        ctx : click.Context
-            Context of the help.
-        formatter : click.HelpFormatter
-            Wraps the lines.
-        """
+        """Write a line or more a command."""
         rows = [(name, one.get_short_help_str(limit=1000)) for name, one in self.commands.items()]
         with formatter.section("Commands"):
             formatter.write_dl(rows)

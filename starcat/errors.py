@@ -15,16 +15,6 @@ from pathlib import Path
 def reason(error: OSError) -> str:
     """Return why the operating system refused, without the path that a message names itself.
 
-    Parameters
-    ----------
-    error : OSError
-        The error, of Python or of a library, which often puts more before the system's words.
-
-    Returns
-    -------
-    str
-        The system's words where it has a number for the error, else the library's.
-
     Examples
     --------
     >>> reason(OSError(28, "Error writing bytes to file. Detail: [errno 28] ..."))
@@ -35,18 +25,6 @@ def reason(error: OSError) -> str:
 
 def suggest(word: str, known: Iterable[str]) -> str:
     """Return the start of a hint where a word is nearly one of those that are known.
-
-    Parameters
-    ----------
-    word : str
-        As somebody wrote it.
-    known : iterable of str
-        What it may be.
-
-    Returns
-    -------
-    str
-        ``did you mean '...'? `` with a space behind it; empty where nothing is near.
 
     Examples
     --------
@@ -59,19 +37,6 @@ def suggest(word: str, known: Iterable[str]) -> str:
 
 def quoted(text: bytes | str, most: int = 60) -> str:
     """Return a text of an input as a message quotes it: what is too long is cut.
-
-    Parameters
-    ----------
-    text : bytes or str
-        Any length, with any characters.
-    most : int, default 60
-        Characters to quote at most.
-
-    Returns
-    -------
-    str
-        In quotation marks, with escapes for what cannot be printed, and the length of the whole
-        where only its beginning is there.
 
     Examples
     --------
@@ -88,20 +53,6 @@ def quoted(text: bytes | str, most: int = 60) -> str:
 
 def error_of_kind(kind: str, words: str, *, key: str | None = None) -> StarcatError | None:
     """Return an error that another process told of.
-
-    Parameters
-    ----------
-    kind : str
-        Name of its class.
-    words : str
-        Its message.
-    key : str, optional
-        The offending key, where it is one that has one.
-
-    Returns
-    -------
-    StarcatError or None
-        None where starcat has no such class, or one that needs more than words.
 
     Examples
     --------
@@ -125,17 +76,7 @@ class StarcatError(Exception):
 
 
 class ConfigError(StarcatError, ValueError):
-    """A build spec, preset, option or data-source file that cannot be used.
-
-    Parameters
-    ----------
-    message : str
-        What was found, what is allowed, what to do.
-    key : str, optional
-        Dotted name of the offending key.
-    value : object, optional
-        The value found.
-    """
+    """A build spec, preset, option or data-source file that cannot be used."""
 
     exit_code = 2
 
@@ -146,17 +87,7 @@ class ConfigError(StarcatError, ValueError):
 
 
 class SourceError(StarcatError):
-    """A catalog file that is missing, damaged or not what it should be.
-
-    Parameters
-    ----------
-    message : str
-        What was found, what was expected, what to do.
-    source : str, optional
-        Name of the data source, as in ``data_sources/<source>.toml``.
-    path : Path, optional
-        The file or folder.
-    """
+    """A catalog file that is missing, damaged or not what it should be."""
 
     exit_code = 3
 
@@ -177,23 +108,7 @@ class ChecksumMismatch(SourceError):  # noqa: N818
 
 
 class ParseError(SourceError):
-    """A file whose content does not follow the source's record layout.
-
-    Parameters
-    ----------
-    message : str
-        What was found, what was expected, what to do.
-    source : str, optional
-        Name of the data source.
-    path : Path, optional
-        The file.
-    line : int, optional
-        1-based line in the file.
-    byte_range : tuple of int, optional
-        First and last byte of the field in its record, 1-based inclusive.
-    field : str, optional
-        Name of the column.
-    """
+    """A file whose content does not follow the source's record layout."""
 
     def __init__(
         self,
@@ -238,17 +153,7 @@ class NotIdentifiedError(StarcatError):
 
 
 class ServiceError(StarcatError):
-    """A service that cannot be reached, or that refuses what is asked of it.
-
-    Parameters
-    ----------
-    message : str
-        What was found, what was expected, what to do.
-    exit_code : int, default 1
-        As the service says.
-    status : int, optional
-        Of its answer.
-    """
+    """A service that cannot be reached, or that refuses what is asked of it."""
 
     def __init__(self, message: str, *, exit_code: int = 1, status: int | None = None) -> None:
         super().__init__(message)
@@ -265,19 +170,7 @@ class OutputError(StarcatError):
 
 
 class SchemaError(StarcatError):
-    """A table or artifact that does not follow the schema of its product.
-
-    Parameters
-    ----------
-    message : str
-        What was found, what was expected, what to do.
-    product : str, optional
-        Name of the product.
-    field : str, optional
-        Name of the column.
-    found, expected : object, optional
-        The two sides of the disagreement.
-    """
+    """A table or artifact that does not follow the schema of its product."""
 
     exit_code = 4
 
@@ -321,17 +214,7 @@ class ArtifactMissing(ProductError):  # noqa: N818 - the name reads as the fact
 
 
 class OnboardImageError(ProductError):
-    """An onboard image that is damaged, cut short, or another file.
-
-    Parameters
-    ----------
-    message : str
-        What was found, what was expected, what to do.
-    path : Path, optional
-        The file.
-    bad_blocks : sequence of int
-        Numbers of the damaged blocks of 4096 bytes, where they are known.
-    """
+    """An onboard image that is damaged, cut short, or another file."""
 
     def __init__(
         self, message: str, *, path: Path | None = None, bad_blocks: Sequence[int] = ()
@@ -341,15 +224,7 @@ class OnboardImageError(ProductError):
 
 
 class OnboardSizeError(StarcatError):
-    """An onboard image that cannot be made as small as was asked for.
-
-    Parameters
-    ----------
-    message : str
-        What was asked for, what it would take.
-    max_bytes, smallest_bytes : int
-        The size that was asked for, and the smallest one that is possible.
-    """
+    """An onboard image that cannot be made as small as was asked for."""
 
     def __init__(self, message: str, *, max_bytes: int, smallest_bytes: int) -> None:
         super().__init__(message)

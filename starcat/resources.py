@@ -16,21 +16,6 @@ def resource_folder(name: str) -> Path:
 
     A wheel carries the folders inside the package; a checkout has the first two beside it.
 
-    Parameters
-    ----------
-    name : {"schemas", "data_sources", "presets"}
-        Which folder.
-
-    Returns
-    -------
-    Path
-        An existing folder.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the installation is incomplete.
-
     Examples
     --------
     >>> resource_folder("schemas").name

@@ -9,16 +9,6 @@ DISTRIBUTION = "starcat-guide-stars"
 def install_command(extra: str) -> str:
     """Return what to type to have the libraries of an optional part.
 
-    Parameters
-    ----------
-    extra : str
-        ``images`` or ``hats``.
-
-    Returns
-    -------
-    str
-        A shell command.
-
     Examples
     --------
     >>> install_command("images")

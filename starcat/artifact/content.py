@@ -16,20 +16,7 @@ from starcat.tables.schema import ProductSchema
 
 
 def content_sha256(table: pa.Table, schema: ProductSchema) -> str:
-    """Return the content digest of a product.
-
-    Parameters
-    ----------
-    table : pyarrow.Table
-        The product.
-    schema : ProductSchema
-        Its contract; says the order of the columns.
-
-    Returns
-    -------
-    str
-        SHA-256, hexadecimal, over name, dtype, row count, nulls and values of each column.
-    """
+    """Return the content digest of a product."""
     digest = hashlib.sha256(f"{schema.name} {len(table)}\n".encode())
     for column in schema.columns:
         digest.update(f"{column.name} {column.dtype} {column.unit}\n".encode())

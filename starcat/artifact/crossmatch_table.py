@@ -43,19 +43,7 @@ PROBABILITY_TOLERANCE = 1e-9
 
 
 def moving_stars(table: pa.Table) -> MovingStars:
-    """Return the stars of a table as moving stars.
-
-    Parameters
-    ----------
-    table : pyarrow.Table
-        With ``ra_deg``, ``dec_deg``, ``epoch_jyear``, the proper motions and ``mag``, as star
-        tables and the crossmatch product have them.
-
-    Returns
-    -------
-    MovingStars
-        Each at its own epoch.
-    """
+    """Return the stars of a table as moving stars."""
     ra_deg, dec_deg = floats_of(table, "ra_deg"), floats_of(table, "dec_deg")
     pm_ra, pm_dec = floats_of(table, "pm_ra_cosdec_mas_yr"), floats_of(table, "pm_dec_mas_yr")
     known = ~(np.isnan(pm_ra) | np.isnan(pm_dec))
@@ -73,20 +61,7 @@ def moving_stars(table: pa.Table) -> MovingStars:
 
 
 def table_from_matches(found: Matches, counterparts: pa.Table) -> pa.Table:
-    """Return matches as rows of the crossmatch product.
-
-    Parameters
-    ----------
-    found : Matches
-        The matches in one catalog.
-    counterparts : pyarrow.Table
-        The star table that the rows of ``found.counterpart`` are of.
-
-    Returns
-    -------
-    pyarrow.Table
-        Rows of the crossmatch schema.
-    """
+    """Return matches as rows of the crossmatch product."""
     other = counterparts.select(NEEDED).take(pa.array(found.counterpart)).combine_chunks()
     columns = {
         **{name: other[name] for name in NEEDED if name != "star_id"},
@@ -119,56 +94,18 @@ def _as_type(
 
 
 def matched_stars(table: pa.Table) -> NDArray[np.intp]:
-    """Return the rows that name the counterpart of a star, be it ambiguous.
-
-    Parameters
-    ----------
-    table : pyarrow.Table
-        The crossmatch product.
-
-    Returns
-    -------
-    ndarray of int, shape (M,)
-        Rows of rank 1 whose verdict is unique, best or ambiguous; at most one a star and
-        catalog.
-    """
+    """Return the rows that name the counterpart of a star, be it ambiguous."""
     named = pc.is_in(table["verdict"], pa.array(["unique", "best", "ambiguous"]))
     return np.flatnonzero(named.to_numpy() & (table["rank"].to_numpy() == 1))
 
 
 def counterparts_of(table: pa.Table, catalog: str) -> int:
-    """Return how many stars have a counterpart in a catalog.
-
-    Parameters
-    ----------
-    table : pyarrow.Table
-        The crossmatch product.
-    catalog : str
-        A name of ``data_sources``.
-
-    Returns
-    -------
-    int
-        Stars.
-    """
+    """Return how many stars have a counterpart in a catalog."""
     return len(matched_stars(table.filter(pc.equal(table["catalog"], catalog))))
 
 
 def counterpart_problems(table: pa.Table, stars: pa.Table) -> Iterator[str]:
-    """Yield where the crossmatch product contradicts itself or the stars.
-
-    Parameters
-    ----------
-    table : pyarrow.Table
-        The product.
-    stars : pyarrow.Table
-        The artifact's stars; the rows of ``star`` exist.
-
-    Yields
-    ------
-    str
-        The problem.
-    """
+    """Yield where the crossmatch product contradicts itself or the stars."""
     yield from _separation_problems(table, stars)
     yield from _rank_problems(table)
     unknown = set(pc.unique(table["verdict"]).to_pylist()) - set(VERDICTS)

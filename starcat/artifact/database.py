@@ -39,15 +39,7 @@ INDICES: dict[str, tuple[str, ...]] = {
 
 
 def write_root(file: h5py.File, facts: Mapping[str, str | float]) -> None:
-    """Write the attributes that say what the database is.
-
-    Parameters
-    ----------
-    file : h5py.File
-        Open for writing.
-    facts : mapping of str to str or float
-        Name, version, frame, epoch, camera and spec.
-    """
+    """Write the attributes that say what the database is."""
     file.attrs["layout_version"] = LAYOUT_VERSION
     for name in sorted(facts):
         file.attrs[name] = facts[name]
@@ -60,26 +52,7 @@ def write_product(
     index: Index,
     star_count: int,
 ) -> None:
-    """Write a product as a group of contiguous datasets.
-
-    Parameters
-    ----------
-    file : h5py.File
-        Open for writing.
-    table : pyarrow.Table
-        The product.
-    schema : ProductSchema
-        Its contract.
-    index : Index
-        Arrays and numbers beside the columns.
-    star_count : int
-        Stars of the artifact; says how wide their row numbers have to be.
-
-    Raises
-    ------
-    SchemaError
-        If the indices are not those that `INDICES` names.
-    """
+    """Write a product as a group of contiguous datasets."""
     expected = INDICES.get(schema.product, ())
     if set(index.datasets) != set(expected):
         raise SchemaError(
@@ -107,20 +80,7 @@ def write_product(
 
 
 def stored_dtype(column: SchemaColumn, star_count: int) -> str:
-    """Return the dtype that a column's values have in the database.
-
-    Parameters
-    ----------
-    column : SchemaColumn
-        The column.
-    star_count : int
-        Stars of the artifact.
-
-    Returns
-    -------
-    str
-        The dtype of the dataset: the schema's own, but ``uint16`` for rows of at most 65,536 stars.
-    """
+    """Return the dtype that a column's values have in the database."""
     if column.refers_to == "stars" and star_count <= 1 << 16:
         return "uint16"
     return column.item_dtype
@@ -129,22 +89,7 @@ def stored_dtype(column: SchemaColumn, star_count: int) -> str:
 def column_datasets(
     column: SchemaColumn, values: pa.Array, star_count: int
 ) -> dict[str, NDArray[Any]]:
-    """Return the datasets that hold a column.
-
-    Parameters
-    ----------
-    column : SchemaColumn
-        The column.
-    values : pyarrow.Array
-        Its values.
-    star_count : int
-        Stars of the artifact.
-
-    Returns
-    -------
-    dict of str to ndarray
-        Little-endian; of a list column the offsets and the values, else one dataset.
-    """
+    """Return the datasets that hold a column."""
     dtype = stored_dtype(column, star_count)
     if not column.is_list:
         return {column.name: _as_numpy(values, dtype)}
@@ -156,20 +101,7 @@ def column_datasets(
 
 
 def dataset_attributes(column: SchemaColumn, dataset: str) -> dict[str, str]:
-    """Return the attributes of a column's dataset.
-
-    Parameters
-    ----------
-    column : SchemaColumn
-        The column.
-    dataset : str
-        A name that `column_datasets` gives.
-
-    Returns
-    -------
-    dict of str to str
-        Description, and units and ucd where the schema has them.
-    """
+    """Return the attributes of a column's dataset."""
     if column.is_list and dataset.endswith("_offsets"):
         return {"description": f"where the {column.name} of each row begin"}
     facts = {"description": column.description, "units": column.unit, "ucd": column.ucd}
@@ -188,23 +120,7 @@ def _as_numpy(values: pa.Array, dtype: str) -> NDArray[Any]:
 
 @contextmanager
 def open_for_writing(path: Path) -> Iterator[h5py.File]:
-    """Open a new HDF5 file whose bytes depend on its content alone, and close it afterwards.
-
-    Parameters
-    ----------
-    path : Path
-        Overwritten if it exists.
-
-    Yields
-    ------
-    h5py.File
-        Object times are never stored.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written, with the system's number for the reason.
-    """
+    """Open a new HDF5 file whose bytes depend on its content alone, and close it afterwards."""
     # Aligned, so that a matcher can map any dataset as an array.
     file = h5py.File(
         path, "w", libver=("earliest", "v110"), alignment_threshold=1, alignment_interval=8

@@ -20,20 +20,7 @@ from starcat.tables.schema import ProductSchema
 
 
 def root_problems(file: h5py.File, manifest: Mapping[str, Any]) -> Iterator[str]:
-    """Yield where the database as a whole is not that of the manifest.
-
-    Parameters
-    ----------
-    file : h5py.File
-        Open for reading.
-    manifest : mapping
-        The manifest of the artifact.
-
-    Yields
-    ------
-    str
-        The problem.
-    """
+    """Yield where the database as a whole is not that of the manifest."""
     facts = {name: manifest[name] for name in ("name", "version", "frame", "epoch_jyear")}
     yield from _attribute_problems(file, {"layout_version": LAYOUT_VERSION, **facts})
     expected = {name for name, facts in manifest["products"].items() if facts["in_database"]}
@@ -44,24 +31,7 @@ def root_problems(file: h5py.File, manifest: Mapping[str, Any]) -> Iterator[str]
 def group_problems(
     group: h5py.Group, table: pa.Table, schema: ProductSchema, star_count: int
 ) -> Iterator[str]:
-    """Yield where a product's group differs from its Parquet file or its schema.
-
-    Parameters
-    ----------
-    group : h5py.Group
-        The group of the product.
-    table : pyarrow.Table
-        The product, from its Parquet file.
-    schema : ProductSchema
-        Its contract.
-    star_count : int
-        Stars of the artifact.
-
-    Yields
-    ------
-    str
-        The problem.
-    """
+    """Yield where a product's group differs from its Parquet file or its schema."""
     facts = {"schema": schema.name, "description": schema.description, "rows": len(table)}
     yield from _attribute_problems(group, facts)
     for column in schema.columns:
@@ -101,24 +71,7 @@ def _plain(value: object) -> object:
 def index_problems(
     group: h5py.Group, table: pa.Table, schema: ProductSchema, star_count: int
 ) -> Iterator[str]:
-    """Yield where the indices of a product do not fit its rows.
-
-    Parameters
-    ----------
-    group : h5py.Group
-        The group of the product.
-    table : pyarrow.Table
-        The product.
-    schema : ProductSchema
-        Its contract.
-    star_count : int
-        Stars of the artifact.
-
-    Yields
-    ------
-    str
-        The problem.
-    """
+    """Yield where the indices of a product do not fit its rows."""
     for name in INDICES.get(schema.product, ()):
         if name not in group:
             yield f"{group.name}/{name} is missing"

@@ -140,34 +140,12 @@ class Difference:
         return not (self.spec or self.sources) and all(change.is_same for change in self.products)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return everything as plain values.
-
-        Returns
-        -------
-        dict
-            For JSON.
-        """
+        """Return everything as plain values."""
         return {"is_same": self.is_same, **asdict(self)}
 
 
 def diff_artifacts(a: Artifact, b: Artifact) -> Difference:
-    """Compare two artifacts.
-
-    Parameters
-    ----------
-    a, b : Artifact
-        The earlier and the later one, as a rule.
-
-    Returns
-    -------
-    Difference
-        What differs, all of it.
-
-    Raises
-    ------
-    ProductError
-        If the stars or the rejected stars of one cannot be read.
-    """
+    """Compare two artifacts."""
     tables = [(side.table("stars"), side.table("rejected")) for side in (a, b)]
     (stars_a, rejected_a), (stars_b, rejected_b) = tables
     # A number means the same star only within one catalog.
@@ -232,16 +210,6 @@ def _source_facts(artifact: Artifact) -> dict[str, Any]:
 
 def changes_between(a: Mapping[str, Any], b: Mapping[str, Any]) -> tuple[Change, ...]:
     """Return the keys whose values differ.
-
-    Parameters
-    ----------
-    a, b : mapping of str to object
-        The two sides.
-
-    Returns
-    -------
-    tuple of Change
-        In the order of A, then what B alone has.
 
     Examples
     --------

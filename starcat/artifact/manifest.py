@@ -92,13 +92,7 @@ class SourceFacts:
     moved_arcsec: dict[str, float] | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the facts as the manifest holds them.
-
-        Returns
-        -------
-        dict
-            Plain values.
-        """
+        """Return the facts as the manifest holds them."""
         facts: dict[str, Any] = {
             "source": self.source,
             "role": self.role,
@@ -139,13 +133,7 @@ class ProductFacts:
     records: int | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the facts as the manifest holds them.
-
-        Returns
-        -------
-        dict
-            Plain values.
-        """
+        """Return the facts as the manifest holds them."""
         facts: dict[str, Any] = {
             "schema": self.schema.name,
             "rows": self.rows,
@@ -159,30 +147,13 @@ class ProductFacts:
 
 
 def software_versions() -> dict[str, str]:
-    """Return the versions of what computes and writes the products.
-
-    Returns
-    -------
-    dict of str to str
-        starcat, Python and the libraries whose version can change a byte.
-    """
+    """Return the versions of what computes and writes the products."""
     found = {name: version(name) for name in LIBRARIES}
     return {"starcat": __version__, "python": platform.python_version(), **found}
 
 
 def manifest_digest(manifest: Mapping[str, Any]) -> str:
-    """Return the digest that a manifest carries of itself.
-
-    Parameters
-    ----------
-    manifest : mapping
-        With or without its ``manifest_sha256``.
-
-    Returns
-    -------
-    str
-        SHA-256, hexadecimal, of the canonical JSON of all other keys.
-    """
+    """Return the digest that a manifest carries of itself."""
     from starcat.storage.digests import json_bytes  # with pyarrow, which reading does without
 
     others = {key: value for key, value in manifest.items() if key != "manifest_sha256"}
@@ -190,27 +161,7 @@ def manifest_digest(manifest: Mapping[str, Any]) -> str:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """Read the manifest of an artifact.
-
-    Parameters
-    ----------
-    folder : Path
-        The artifact.
-
-    Returns
-    -------
-    dict
-        Plain values; ``schemas/manifest-*.json`` says which.
-
-    Raises
-    ------
-    ArtifactMissing
-        If there is no folder, or no manifest in it.
-    ProductError
-        If the manifest cannot be read.
-    SchemaVersionError
-        If the manifest is of a version that this starcat does not know.
-    """
+    """Read the manifest of an artifact."""
     path = folder / MANIFEST_NAME
     try:
         data = path.read_bytes()
@@ -227,29 +178,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 def parse_manifest(
     data: bytes, where: str, advice: str, path: Path | None = None
 ) -> dict[str, Any]:
-    """Return a manifest from the bytes of its file, with every part that starcat relies on.
-
-    Parameters
-    ----------
-    data : bytes
-        The file.
-    where, advice : str
-        Where it is from and what to do if it is damaged, for messages.
-    path : Path, optional
-        The file, where it is on disk.
-
-    Returns
-    -------
-    dict
-        Plain values.
-
-    Raises
-    ------
-    ProductError
-        If it is no manifest, or a part is missing or of another type.
-    SchemaVersionError
-        If it is of a version that this starcat does not know.
-    """
+    """Return a manifest from the bytes of its file, with every part that starcat relies on."""
     try:
         manifest = json.loads(data)
     except (ValueError, RecursionError) as error:

@@ -22,20 +22,7 @@ WAY_TOLERANCE_ARCSEC = 1e-6
 
 
 def motion_problems(table: pa.Table, stars: pa.Table) -> Iterator[str]:
-    """Yield where the product ``motions`` contradicts itself or the stars.
-
-    Parameters
-    ----------
-    table : pyarrow.Table
-        The product.
-    stars : pyarrow.Table
-        The artifact's stars.
-
-    Yields
-    ------
-    str
-        The problem.
-    """
+    """Yield where the product ``motions`` contradicts itself or the stars."""
     if not np.array_equal(table["star"].to_numpy(), np.arange(len(stars))):
         yield f"star: not the rows 0 to {len(stars) - 1} of the stars, each once"
         return
@@ -60,39 +47,13 @@ def motion_problems(table: pa.Table, stars: pa.Table) -> Iterator[str]:
 
 
 def joined_of(table: pa.Table, catalog: str) -> int:
-    """Return how many stars have their motion from a catalog.
-
-    Parameters
-    ----------
-    table : pyarrow.Table
-        The product ``motions``.
-    catalog : str
-        A name of ``data_sources``.
-
-    Returns
-    -------
-    int
-        Stars.
-    """
+    """Return how many stars have their motion from a catalog."""
     rows = pc.and_(pc.equal(table["outcome"], JOINED), pc.equal(table["catalog"], catalog))
     return int(pc.sum(rows).as_py() or 0)
 
 
 def motion_count_problems(table: pa.Table, source: Mapping[str, Any]) -> Iterator[str]:
-    """Yield where the manifest says otherwise than the product ``motions`` of a catalog.
-
-    Parameters
-    ----------
-    table : pyarrow.Table
-        The product.
-    source : mapping
-        An entry of the manifest's sources, of the role ``motions``.
-
-    Yields
-    ------
-    str
-        The problem.
-    """
+    """Yield where the manifest says otherwise than the product ``motions`` of a catalog."""
     found = joined_of(table, source["source"])
     if found != source.get("joined"):
         yield (

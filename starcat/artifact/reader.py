@@ -35,39 +35,12 @@ class Artifact:
         return list(self.manifest["products"])
 
     def schema(self, product: str) -> ProductSchema:
-        """Return the schema that a product was written with.
-
-        Parameters
-        ----------
-        product : str
-            Name of the product.
-
-        Returns
-        -------
-        ProductSchema
-            The contract.
-        """
+        """Return the schema that a product was written with."""
         name, _, version = self.manifest["products"][product]["schema"].rpartition("-")
         return product_schema(name, version)
 
     def table(self, product: str) -> pa.Table:
-        """Read a product from its Parquet file.
-
-        Parameters
-        ----------
-        product : str
-            Name of the product.
-
-        Returns
-        -------
-        pyarrow.Table
-            The whole product.
-
-        Raises
-        ------
-        ProductError
-            If the artifact has no such product, or its file cannot be read.
-        """
+        """Read a product from its Parquet file."""
         if product not in self.manifest["products"]:
             raise ProductError(
                 f"{self.folder}: no product {product!r}; it has {', '.join(self.products)}",
@@ -86,21 +59,5 @@ class Artifact:
 
 
 def open_artifact(folder: Path) -> Artifact:
-    """Open an artifact.
-
-    Parameters
-    ----------
-    folder : Path
-        The folder ``<name>-<version>``.
-
-    Returns
-    -------
-    Artifact
-        With its manifest read; products are read when asked for.
-
-    Raises
-    ------
-    ProductError
-        If the folder is not an artifact.
-    """
+    """Open an artifact."""
     return Artifact(folder, read_manifest(folder))

@@ -57,18 +57,7 @@ Check = Callable[[HeldProduct], Iterator[str]]
 
 
 def columns_follow_the_schema(held: HeldProduct) -> Iterator[str]:
-    """Yield the first column that differs from the schema.
-
-    Parameters
-    ----------
-    held : HeldProduct
-        The product.
-
-    Yields
-    ------
-    str
-        The problem.
-    """
+    """Yield the first column that differs from the schema."""
     try:
         held.schema.check(held.table)
     except SchemaError as error:
@@ -76,18 +65,7 @@ def columns_follow_the_schema(held: HeldProduct) -> Iterator[str]:
 
 
 def content_is_the_manifests(held: HeldProduct) -> Iterator[str]:
-    """Yield where row count and content digest differ from the manifest.
-
-    Parameters
-    ----------
-    held : HeldProduct
-        The product.
-
-    Yields
-    ------
-    str
-        The problem.
-    """
+    """Yield where row count and content digest differ from the manifest."""
     rows = held.facts["rows"]
     if len(held.table) != rows:
         yield f"{len(held.table)} rows; the manifest says {rows}"
@@ -96,18 +74,7 @@ def content_is_the_manifests(held: HeldProduct) -> Iterator[str]:
 
 
 def rows_are_in_order(held: HeldProduct) -> Iterator[str]:
-    """Yield the first row that does not come after the one before it, nulls last.
-
-    Parameters
-    ----------
-    held : HeldProduct
-        The product.
-
-    Yields
-    ------
-    str
-        The problem.
-    """
+    """Yield the first row that does not come after the one before it, nulls last."""
     rows = max(len(held.table) - 1, 0)
     tied, wrong = np.ones(rows, dtype=bool), np.zeros(rows, dtype=bool)
     for name in held.schema.order:
@@ -137,18 +104,7 @@ def _with_nulls(column: pa.ChunkedArray) -> tuple[NDArray[Any], NDArray[np.bool_
 
 
 def star_rows_exist(held: HeldProduct) -> Iterator[str]:
-    """Yield the columns that refer to stars which the artifact does not have.
-
-    Parameters
-    ----------
-    held : HeldProduct
-        The product.
-
-    Yields
-    ------
-    str
-        The problem.
-    """
+    """Yield the columns that refer to stars which the artifact does not have."""
     count = len(held.directions)
     for column in held.schema.columns:
         if column.refers_to != "stars":
@@ -163,18 +119,7 @@ def star_rows_exist(held: HeldProduct) -> Iterator[str]:
 
 
 def directions_are_units(held: HeldProduct) -> Iterator[str]:
-    """Yield where x, y, z is no unit vector, or not the direction of ra_deg, dec_deg.
-
-    Parameters
-    ----------
-    held : HeldProduct
-        The product.
-
-    Yields
-    ------
-    str
-        The problem.
-    """
+    """Yield where x, y, z is no unit vector, or not the direction of ra_deg, dec_deg."""
     if not {"x", "y", "z"} <= set(held.table.column_names):
         return
     u = np.stack([held.table[name].to_numpy() for name in ("x", "y", "z")], axis=-1)
@@ -193,18 +138,7 @@ def _first_above(off: NDArray[np.float64], limit: float) -> NDArray[np.intp]:
 
 
 def separations_are_those_of_the_stars(held: HeldProduct) -> Iterator[str]:
-    """Yield where a separation is not that of the two stars in its row.
-
-    Parameters
-    ----------
-    held : HeldProduct
-        The product.
-
-    Yields
-    ------
-    str
-        The problem.
-    """
+    """Yield where a separation is not that of the two stars in its row."""
     ends = [c.name for c in held.schema.columns if c.refers_to == "stars" and not c.is_list]
     if len(ends) != 2 or "separation_rad" not in held.table.column_names:
         return
@@ -217,35 +151,13 @@ def separations_are_those_of_the_stars(held: HeldProduct) -> Iterator[str]:
 
 
 def counterparts_are_those_of_the_stars(held: HeldProduct) -> Iterator[str]:
-    """Yield where counterparts contradict each other or their stars.
-
-    Parameters
-    ----------
-    held : HeldProduct
-        The product; only crossmatch has counterparts.
-
-    Yields
-    ------
-    str
-        The problem.
-    """
+    """Yield where counterparts contradict each other or their stars."""
     if held.schema.product == "crossmatch" and held.stars is not None:
         yield from counterpart_problems(held.table, held.stars)
 
 
 def motions_are_those_of_the_stars(held: HeldProduct) -> Iterator[str]:
-    """Yield where what is said of motions contradicts itself or the stars.
-
-    Parameters
-    ----------
-    held : HeldProduct
-        The product; only motions says where they are from.
-
-    Yields
-    ------
-    str
-        The problem.
-    """
+    """Yield where what is said of motions contradicts itself or the stars."""
     if held.schema.product == "motions" and held.stars is not None:
         yield from motion_problems(held.table, held.stars)
 

@@ -96,35 +96,13 @@ class Verification:
         return f"<Verification {self.folder.name}: {self.checks:,} checks, {found} findings>"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the result as plain values.
-
-        Returns
-        -------
-        dict
-            For JSON.
-        """
+        """Return the result as plain values."""
         findings = [asdict(finding) for finding in self.findings]
         return {"folder": str(self.folder), "checks": self.checks, "findings": findings}
 
 
 def verify_artifact(folder: Path) -> Verification:
-    """Check an artifact as a whole: files, schemas, contents, orders, indices, references, counts.
-
-    Parameters
-    ----------
-    folder : Path
-        The folder ``<name>-<version>``.
-
-    Returns
-    -------
-    Verification
-        With every problem; whatever is damaged, missing or unreadable is one.
-
-    Raises
-    ------
-    ArtifactMissing
-        If there is no such folder.
-    """
+    """Check files, schemas, contents, orders, indices, references and counts of an artifact."""
     if not folder.is_dir():
         raise ArtifactMissing(
             f"{folder}: no such artifact; give the folder <name>-<version> that 'starcat build' "
@@ -141,23 +119,7 @@ def verify_artifact(folder: Path) -> Verification:
 
 
 def check_artifact(folder: Path) -> Artifact:
-    """Check that an artifact is whole.
-
-    Parameters
-    ----------
-    folder : Path
-        The artifact.
-
-    Returns
-    -------
-    Artifact
-        The artifact, found whole.
-
-    Raises
-    ------
-    ProductError
-        With the first problems that `verify_artifact` finds.
-    """
+    """Check that an artifact is whole."""
     found = verify_artifact(folder).findings
     if found:
         raise ProductError(
@@ -169,18 +131,7 @@ def check_artifact(folder: Path) -> Artifact:
 
 
 def first_of(findings: Sequence[Finding]) -> str:
-    """Return the first findings as one line, and how many more there are.
-
-    Parameters
-    ----------
-    findings : sequence of Finding
-        What a verification found; at least one.
-
-    Returns
-    -------
-    str
-        At most `MAX_NAMED` findings.
-    """
+    """Return the first findings as one line, and how many more there are."""
     more = f"; and {len(findings) - MAX_NAMED} more" if len(findings) > MAX_NAMED else ""
     return "; ".join(str(finding) for finding in findings[:MAX_NAMED]) + more
 

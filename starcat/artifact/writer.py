@@ -52,27 +52,7 @@ class Product:
 def write_products(
     folder: Path, products: Sequence[Product], facts: Mapping[str, str | float]
 ) -> dict[str, ProductFacts]:
-    """Write the products of an artifact.
-
-    Parameters
-    ----------
-    folder : Path
-        Where to write ``database.h5`` and one Parquet file a product.
-    products : sequence of Product
-        In the order of the database.
-    facts : mapping of str to str or float
-        Attributes of the database as a whole.
-
-    Returns
-    -------
-    dict of str to ProductFacts
-        For the manifest, by product.
-
-    Raises
-    ------
-    SchemaError
-        If a table does not follow its schema.
-    """
+    """Write the products of an artifact."""
     made: dict[str, ProductFacts] = {}
     star_count = next(len(product.table) for product in products if product.name == "stars")
     with open_for_writing(folder / DATABASE_NAME) as database:
@@ -100,24 +80,7 @@ def write_manifest(
     sources: Sequence[SourceFacts],
     products: Mapping[str, ProductFacts],
 ) -> dict[str, Any]:
-    """Write the manifest of a folder whose other files are complete.
-
-    Parameters
-    ----------
-    folder : Path
-        With all files of the artifact but the manifest.
-    spec : dict
-        The whole build spec.
-    sources : sequence of SourceFacts
-        The catalogs that went in.
-    products : mapping of str to ProductFacts
-        The products that came out.
-
-    Returns
-    -------
-    dict
-        The manifest.
-    """
+    """Write the manifest of a folder whose other files are complete."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     has_motions = any(source.role == "motions" for source in sources)
     manifest: dict[str, Any] = {

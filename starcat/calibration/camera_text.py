@@ -11,18 +11,7 @@ from starcat.specs.camera_file import camera_toml
 
 
 def calibrated_toml(calibration: Calibration) -> str:
-    """Return the TOML text of a calibrated camera.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        Of some frames.
-
-    Returns
-    -------
-    str
-        As `read_camera` reads it; comments say the residual and the standard errors.
-    """
+    """Return the TOML text of a calibrated camera."""
     fit = calibration.fit
     lines = [
         f"# Calibrated from {calibration.n_identified} frames with {len(fit.seen)} stars.",
@@ -35,20 +24,7 @@ def calibrated_toml(calibration: Calibration) -> str:
 
 
 def write_camera(calibration: Calibration, path: Path) -> None:
-    """Write a calibrated camera as a camera file.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        Of some frames.
-    path : Path
-        TOML file, replaced if it exists.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
-    """
+    """Write a calibrated camera as a camera file."""
     try:
         path.write_text(calibrated_toml(calibration), encoding="utf-8")
     except OSError as error:

@@ -30,31 +30,7 @@ def calibrate_files(
     flip: bool | None = None,
     progress: Progress = no_progress,
 ) -> Calibration:
-    """Find the camera that took the frames of files.
-
-    Parameters
-    ----------
-    matcher : Matcher
-        The database and the method.
-    paths, flip
-        As of `measured_frames`.
-    camera, size_px, fov_deg
-        As of `starting_camera`.
-    progress : callable, optional
-        Called with (stage, done, total).
-
-    Returns
-    -------
-    Calibration
-        The camera, its errors and how it was chosen.
-
-    Raises
-    ------
-    ConfigError
-        If a file cannot be read, or what is known of the camera contradicts itself.
-    CalibrationError
-        If too few frames can be identified.
-    """
+    """Find the camera that took the frames of files."""
     frames, image_size_px = measured_frames(paths, flip=flip, progress=progress)
     known, focal_px = starting_camera(
         matcher.database.camera,
@@ -69,29 +45,7 @@ def calibrate_files(
 def measured_frames(
     paths: Sequence[Path], *, flip: bool | None = None, progress: Progress = no_progress
 ) -> tuple[list[MeasuredFrame], tuple[int, int] | None]:
-    """Read the frames of files.
-
-    Parameters
-    ----------
-    paths : sequence of Path
-        Centroids or images, as `images.identification.measure` reads them.
-    flip : bool, optional
-        Whether the first row of an image is its bottom; the file's own word by default.
-    progress : callable, optional
-        Called with (stage, done, total) after each file.
-
-    Returns
-    -------
-    frames : list of MeasuredFrame
-        In the order of the files.
-    size_px : tuple of int, or None
-        Width and height of the images; None where all files are centroids.
-
-    Raises
-    ------
-    ConfigError
-        If a file cannot be read, or images have different sizes.
-    """
+    """Read the frames of files."""
     frames: list[MeasuredFrame] = []
     size_px: tuple[int, int] | None = None
     for number, path in enumerate(paths, start=1):
@@ -117,33 +71,7 @@ def starting_camera(
     image_size_px: tuple[int, int] | None = None,
     fov_deg: tuple[float, float] | None = None,
 ) -> tuple[Camera, tuple[float, float]]:
-    """Return what is known of a camera before its calibration.
-
-    Parameters
-    ----------
-    own : Camera
-        The camera of the database.
-    camera : Camera, optional
-        A better one.
-    size_px : tuple of int, optional
-        Width and height, instead of that.
-    image_size_px : tuple of int, optional
-        Width and height of the images.
-    fov_deg : tuple of float, optional
-        Smallest and largest field across the width, as it were without distortion.
-
-    Returns
-    -------
-    camera : Camera
-        To start from.
-    focal_px : tuple of float
-        Shortest and longest focal length.
-
-    Raises
-    ------
-    ConfigError
-        If the sizes contradict each other, the field is unknown, or its range is none.
-    """
+    """Return what is known of a camera before its calibration."""
     if camera is not None and size_px is not None:
         raise ConfigError("give either a camera or its size, not both; a camera has a size")
     known = camera or own

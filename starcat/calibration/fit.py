@@ -76,18 +76,7 @@ class Seen:
         return len(self.frame)
 
     def of(self, wanted: NDArray[np.bool_]) -> Seen:
-        """Return the stars of some of the frames.
-
-        Parameters
-        ----------
-        wanted : ndarray of bool, shape (F,)
-            Which frames.
-
-        Returns
-        -------
-        Seen
-            Their stars; the frames are counted anew.
-        """
+        """Return the stars of some of the frames."""
         stars, number = wanted[self.frame], np.cumsum(wanted) - 1
         return Seen(
             number[self.frame[stars]],
@@ -139,28 +128,7 @@ def fit_camera(
     passes: int = PASSES,
     accuracy: float = EXACT,
 ) -> Fit:
-    """Fit a camera to stars.
-
-    Parameters
-    ----------
-    seen : Seen
-        The stars; at least two a frame, and more numbers than there are unknowns.
-    values : ndarray of float64, shape (P,)
-        To start from, in the order of `PARAMETERS`; what is not free stays.
-    free : sequence of str
-        The parameters to fit.
-    noise_px : float, default 1
-        About the noise of a centroid on each axis, for the first fit.
-    passes : int, optional
-        Most fits, each with the noise that the one before has found; 1 where it is known.
-    accuracy : float, optional
-        The fit ends where a step lowers the sum of squares by a smaller share.
-
-    Returns
-    -------
-    Fit
-        The camera, its errors and what is left.
-    """
+    """Fit a camera to stars."""
     rows = [PARAMETERS.index(name) for name in free]
     for _ in range(passes):
         fitted = _one_fit(seen, values, rows, BEND * noise_px, accuracy)
@@ -178,24 +146,7 @@ def fit_camera(
 
 
 def turned_to(seen: Seen, values: Array, bend_px: float) -> tuple[Array, Array]:
-    """Find the attitudes that fit the stars best with a given camera.
-
-    Parameters
-    ----------
-    seen : Seen
-        The stars and about the attitudes.
-    values : ndarray of float64, shape (P,)
-        The camera.
-    bend_px : float
-        Where Huber's loss bends.
-
-    Returns
-    -------
-    residual_px : ndarray of float64, shape (N, 2)
-        Where the stars were seen less where they then are.
-    matrices : ndarray of float64, shape (F, 3, 3)
-        The attitudes.
-    """
+    """Find the attitudes that fit the stars best with a given camera."""
     matrices = seen.matrices
     first = np.flatnonzero(np.diff(seen.frame, prepend=-1))
     for turn in range(TURNS):
@@ -250,24 +201,7 @@ def _one_fit(seen: Seen, values: Array, rows: list[int], bend_px: float, accurac
 def reduced_derivatives(
     seen: Seen, values: Array, rows: list[int], inside: NDArray[np.bool_]
 ) -> Array:
-    """Return how pixels change with numbers of the camera when the attitudes follow.
-
-    Parameters
-    ----------
-    seen : Seen
-        The stars, with the attitudes that fit best.
-    values : ndarray of float64, shape (P,)
-        The camera.
-    rows : list of int
-        The numbers, as rows of ``values``.
-    inside : ndarray of bool, shape (N, 2)
-        Which coordinates have a say in the attitudes.
-
-    Returns
-    -------
-    ndarray of float64, shape (2 N, len(rows))
-        Derivatives; what the attitudes take up of them is taken out.
-    """
+    """Return how pixels change with numbers of the camera when the attitudes follow."""
     body = _body(seen, seen.matrices)
     by_value, by_turn = value_derivatives(values, body)[:, :, rows], turn_derivatives(values, body)
     first = np.flatnonzero(np.diff(seen.frame, prepend=-1))

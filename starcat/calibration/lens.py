@@ -32,18 +32,7 @@ y, the tangent of the angle by which the axes are not perpendicular.
 
 
 def values_of(camera: Camera) -> Array:
-    """Return the numbers of a camera.
-
-    Parameters
-    ----------
-    camera : Camera
-        Any.
-
-    Returns
-    -------
-    ndarray of float64, shape (P,)
-        In the order of `PARAMETERS`; aspect and skew are 0.
-    """
+    """Return the numbers of a camera."""
     lens = asdict(camera.distortion)
     values = {**lens, "focal_length_px": camera.focal_length_px}
     values |= dict(zip(CENTRE, camera.principal_point_px, strict=True))
@@ -51,25 +40,7 @@ def values_of(camera: Camera) -> Array:
 
 
 def camera_of(values: Array, size_px: tuple[int, int]) -> Camera:
-    """Return the camera of numbers; aspect and skew are left out.
-
-    Parameters
-    ----------
-    values : ndarray of float64, shape (P,)
-        In the order of `PARAMETERS`.
-    size_px : tuple of int
-        Width and height.
-
-    Returns
-    -------
-    Camera
-        With these numbers.
-
-    Raises
-    ------
-    ConfigError
-        If the distortion folds the image back on the detector, or a number is out of range.
-    """
+    """Return the camera of numbers; aspect and skew are left out."""
     given = dict(zip(PARAMETERS, values.tolist(), strict=True))
     lens = Distortion(**{name: given[name] for name in (*RADIAL, *TANGENTIAL)})
     centre = [given[name] for name in CENTRE]
@@ -78,22 +49,7 @@ def camera_of(values: Array, size_px: tuple[int, int]) -> Camera:
 
 
 def cropped(camera: Camera, share: float) -> tuple[Camera, Array]:
-    """Return the middle of a camera as a camera of its own.
-
-    Parameters
-    ----------
-    camera : Camera
-        The whole.
-    share : float
-        Of width and height, above 0, at most 1.
-
-    Returns
-    -------
-    camera : Camera
-        Width and height a whole number of pixels.
-    corner_px : ndarray of float64, shape (2,)
-        Pixel of the whole camera where the top-left corner is.
-    """
+    """Return the middle of a camera as a camera of its own."""
     size = camera.width_px, camera.height_px
     left, top = (round(0.5 * side * (1.0 - share)) for side in size)
     x_px, y_px = camera.principal_point_px
@@ -108,20 +64,7 @@ def cropped(camera: Camera, share: float) -> tuple[Camera, Array]:
 
 
 def project(values: Array, body: Array) -> Array:
-    """Project directions with any numbers, those of a lens that folds the image included.
-
-    Parameters
-    ----------
-    values : ndarray of float64, shape (P,)
-        In the order of `PARAMETERS`.
-    body : ndarray of float64, shape (N, 3)
-        Directions in the camera frame, before the camera.
-
-    Returns
-    -------
-    ndarray of float64, shape (N, 2)
-        Pixels.
-    """
+    """Project directions with any numbers, those of a lens that folds the image included."""
     w, focal_px = _image(values, _plane(body)), values[0]
     aspect, skew = values[-2:]
     x = values[1] + focal_px * (w.real + skew * w.imag)
@@ -129,20 +72,7 @@ def project(values: Array, body: Array) -> Array:
 
 
 def value_derivatives(values: Array, body: Array) -> Array:
-    """Return how pixels change with the numbers of the camera.
-
-    Parameters
-    ----------
-    values : ndarray of float64, shape (P,)
-        In the order of `PARAMETERS`.
-    body : ndarray of float64, shape (N, 3)
-        Directions in the camera frame, before the camera.
-
-    Returns
-    -------
-    ndarray of float64, shape (N, 2, P)
-        Derivatives by each number.
-    """
+    """Return how pixels change with the numbers of the camera."""
     focal_px, (aspect, skew) = values[0], values[-2:]
     z = _plane(body)
     x, y, s = z.real, z.imag, z.real**2 + z.imag**2
@@ -158,20 +88,7 @@ def value_derivatives(values: Array, body: Array) -> Array:
 
 
 def turn_derivatives(values: Array, body: Array) -> Array:
-    """Return how pixels change with the attitude of the camera.
-
-    Parameters
-    ----------
-    values : ndarray of float64, shape (P,)
-        In the order of `PARAMETERS`.
-    body : ndarray of float64, shape (N, 3)
-        Directions in the camera frame, before the camera.
-
-    Returns
-    -------
-    ndarray of float64, shape (N, 2, 3)
-        Pixels per radian of a small rotation of the directions about the camera's x, y and z.
-    """
+    """Return how pixels change with the attitude of the camera."""
     focal_px, (aspect, skew) = values[0], values[-2:]
     k1, k2, k3, p1, p2 = values[3:8]
     z = _plane(body)

@@ -83,30 +83,7 @@ def choose_model(
     noise_px: float,
     models: Sequence[tuple[str, ...]] = MODELS,
 ) -> list[Trial]:
-    """Compare models by the residuals of frames that they have not seen, and choose one.
-
-    Parameters
-    ----------
-    seen : Seen
-        The stars, of two frames or more.
-    values : ndarray of float64, shape (P,)
-        Numbers to start from; every model starts with 0 in place of those that it does not fit,
-        and with the middle of the detector as the principal point.
-    size_px : tuple of int
-        Width and height of the detector.
-    noise_px : float
-        About the noise of a centroid on each axis. Stars that are farther than `BEND` times as
-        much from where the richest of the models puts them are left out.
-    models : sequence of tuple of str
-        Those to compare; the first one is taken where no model could be fitted.
-
-    Returns
-    -------
-    list of Trial
-        One a model. The one with the fewest terms is chosen that is not worse than the best one
-        by more than `SURE` standard errors; of those with as many terms, one without tangential
-        terms, and then the better one.
-    """
+    """Compare models by the residuals of frames that they have not seen, and choose one."""
     kept = _without_strays(seen, values, noise_px)
     squares = np.array([_held_out(kept, values, free, size_px) for free in models])
     numbers, frames = 2 * len(kept), squares.shape[1]
@@ -134,56 +111,19 @@ def _complexity(free: tuple[str, ...]) -> tuple[int, bool]:
 
 
 def chosen(trials: Sequence[Trial]) -> tuple[str, ...]:
-    """Return the terms of the model that was chosen.
-
-    Parameters
-    ----------
-    trials : sequence of Trial
-        Of `choose_model`.
-
-    Returns
-    -------
-    tuple of str
-        What it fits.
-    """
+    """Return the terms of the model that was chosen."""
     (free,) = (trial.free for trial in trials if trial.is_chosen)
     return free
 
 
 def is_enough(seen: Seen) -> bool:
-    """Return whether models can be compared: two frames, and more numbers than unknowns.
-
-    Parameters
-    ----------
-    seen : Seen
-        The stars.
-
-    Returns
-    -------
-    bool
-        Whether there are half as many numbers again as all models together have unknowns.
-    """
+    """Return whether models can be compared: two frames, and more numbers than unknowns."""
     frames = len(seen.matrices)
     return frames > 1 and 4 * len(seen) > 3 * (3 * frames + len(COMPLETE))
 
 
 def start_of(values: Array, free: Sequence[str], size_px: tuple[int, int]) -> Array:
-    """Return the numbers that a model starts from.
-
-    Parameters
-    ----------
-    values : ndarray of float64, shape (P,)
-        About the camera.
-    free : sequence of str
-        What the model fits.
-    size_px : tuple of int
-        Width and height of the detector.
-
-    Returns
-    -------
-    ndarray of float64, shape (P,)
-        The same where the model fits them, else the middle of the detector and 0.
-    """
+    """Return the numbers that a model starts from."""
     start = np.zeros_like(values)
     start[0] = values[0]
     start[1:3] = values[1:3] if CENTRE[0] in free else 0.5 * np.array(size_px)

@@ -27,25 +27,7 @@ _BINS = 8
 
 
 def draw_residuals(calibration: Calibration, path: Path) -> None:
-    """Draw the residuals of a calibration.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        Of some frames.
-    path : Path
-        ``.png`` or ``.svg``, replaced if it exists. On the left every star's residual is an arrow
-        from where the camera puts it to where it was seen, much enlarged; on the right are the
-        residuals along and across the radius against the distance from the principal point, with
-        their means and the standard errors of these.
-
-    Raises
-    ------
-    ConfigError
-        If the suffix is another one.
-    OutputError
-        If the file cannot be written.
-    """
+    """Draw the residuals of a calibration."""
     checked_kind(path)
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -65,18 +47,7 @@ def draw_residuals(calibration: Calibration, path: Path) -> None:
 
 
 def checked_kind(path: Path | None) -> None:
-    """Refuse a name of a plot before the work for it is done.
-
-    Parameters
-    ----------
-    path : Path, optional
-        File to be written; None is none.
-
-    Raises
-    ------
-    ConfigError
-        If the suffix is none of a plot.
-    """
+    """Refuse a name of a plot before the work for it is done."""
     if path is not None and path.suffix.lower() not in KINDS:
         raise ConfigError(f"{path}: a plot is one of {', '.join(KINDS)}; choose another name")
 

@@ -108,20 +108,7 @@ class Identified:
         return [result.star_index.tobytes() for result in self.results]
 
     def seen(self, frames: Sequence[MeasuredFrame], matcher: Matcher) -> Seen:
-        """Return the stars of the frames that were identified.
-
-        Parameters
-        ----------
-        frames : sequence of MeasuredFrame
-            All frames.
-        matcher : Matcher
-            That identified them.
-
-        Returns
-        -------
-        Seen
-            With the attitudes that the matcher has found.
-        """
+        """Return the stars of the frames that were identified."""
         rows = [np.flatnonzero(self.results[k].star_index >= 0) for k in self.found]
         star = [self.results[k].star_index[row] for k, row in zip(self.found, rows, strict=True)]
         px = [frames[k].centroids_px[row] for k, row in zip(self.found, rows, strict=True)]
@@ -138,27 +125,7 @@ class Identified:
 def first_answer(
     matcher: Matcher, frames: Sequence[MeasuredFrame], camera: Camera, focal_px: tuple[float, float]
 ) -> tuple[Camera, float] | None:
-    """Find a focal length at which any frame is identified.
-
-    Parameters
-    ----------
-    matcher : Matcher
-        The database; its tolerance does not matter.
-    frames : sequence of MeasuredFrame
-        Those with a usual number of centroids are tried first.
-    camera : Camera
-        Size, principal point and distortion to start from.
-    focal_px : tuple of float
-        Shortest and longest focal length.
-
-    Returns
-    -------
-    camera : Camera
-        With the focal length, fitted to the stars of the frame.
-    share : float
-        Part of the frame that was identified.
-        None in place of both where no frame was identified.
-    """
+    """Find a focal length at which any frame is identified."""
     size_px = camera.width_px, camera.height_px
     finds_scale = matcher.method == "triangle" and matcher.database.image is None
     error, step = (FOV_ERROR, (1.0 + FOV_ERROR) ** 2) if finds_scale else (0.0, STEP)
@@ -194,28 +161,7 @@ def identify_part(
     few: int | None = None,
     fov_error: float = 0.0,
 ) -> Identified:
-    """Identify the middle of frames.
-
-    Parameters
-    ----------
-    matcher : Matcher
-        The database and the tolerance.
-    frames : sequence of MeasuredFrame
-        Their centroids.
-    camera : Camera
-        The camera, the whole of it.
-    share : float, default 1
-        Part of width and height to identify.
-    few : int, optional
-        Only so many centroids; all by default.
-    fov_error : float, default 0
-        As `Matcher.identify` takes it.
-
-    Returns
-    -------
-    Identified
-        The answers.
-    """
+    """Identify the middle of frames."""
     middle, corner_px = cropped(camera, share)
     results = []
     for frame in frames:
@@ -237,29 +183,7 @@ def settled(
     share: float,
     progress: Progress,
 ) -> tuple[Identified, Fit | None]:
-    """Identify and fit in turn until the stars no longer change.
-
-    Parameters
-    ----------
-    matcher : Matcher
-        The database.
-    frames : sequence of MeasuredFrame
-        All frames.
-    camera : Camera
-        About the camera.
-    share : float
-        Part of the frame that it holds for.
-    progress : callable
-        Called with (stage, done, total) after each round.
-
-    Returns
-    -------
-    identified : Identified
-        The frames with the last camera.
-    fit : Fit or None
-        The fit to these stars, with the terms that they support; None where no frame is
-        identified any more.
-    """
+    """Identify and fit in turn until the stars no longer change."""
     size_px, tolerance_px = (camera.width_px, camera.height_px), WIDE_PX
     before: list[bytes] = []
     fit = None

@@ -101,22 +101,7 @@ class Part:
 
 
 def parse_block(file_number: int, block: Block, how: Reading) -> Part:
-    """Return the stars and the rejected records of a block.
-
-    Parameters
-    ----------
-    file_number : int
-        Number of the block's file among the inputs.
-    block : Block
-        Whole records.
-    how : Reading
-        Which catalog, band and epoch.
-
-    Returns
-    -------
-    Part
-        Every record of the block, in the one table or the other, or counted.
-    """
+    """Return the stars and the rejected records of a block."""
     layout = block.file.layout
     module = CATALOGS[how.source_name]
     names = list(module.columns[layout.name])
@@ -152,20 +137,7 @@ def parse_block(file_number: int, block: Block, how: Reading) -> Part:
 
 
 def reject_rows(stars: pa.Table, reasons: pa.Array) -> pa.Table:
-    """Return rows of a star table as rows of a rejected table.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        Table of the stars schema.
-    reasons : pyarrow.Array
-        Strings, one a row.
-
-    Returns
-    -------
-    pyarrow.Table
-        Table of the rejected schema.
-    """
+    """Return rows of a star table as rows of a rejected table."""
     schema = product_schema("rejected").arrow_schema
     verdict = {"reason": reasons, "detail": pa.nulls(len(stars), pa.string())}
     columns = [verdict[name] if name in verdict else stars[name] for name in schema.names]
@@ -173,13 +145,7 @@ def reject_rows(stars: pa.Table, reasons: pa.Array) -> pa.Table:
 
 
 class TablePile:
-    """Tables that are to be joined; many small ones are joined as they come, to save memory.
-
-    Parameters
-    ----------
-    product : {"stars", "rejected"}
-        Whose schema they follow.
-    """
+    """Tables that are to be joined; many small ones are joined as they come, to save memory."""
 
     def __init__(self, product: str) -> None:
         self._schema = product_schema(product).arrow_schema
@@ -187,13 +153,7 @@ class TablePile:
         self._small: list[pa.Table] = []
 
     def add(self, table: pa.Table) -> None:
-        """Put a table on the pile.
-
-        Parameters
-        ----------
-        table : pyarrow.Table
-            The next rows.
-        """
+        """Put a table on the pile."""
         self._small += [table] if len(table) else []
         if len(self._small) >= 256 or sum(map(len, self._small)) >= _SMALL_ROWS:
             self._join_small()
@@ -217,20 +177,7 @@ _SMALL_ROWS = 8192
 def join_parts(
     stars: Sequence[pa.Table], rejected: Sequence[pa.Table]
 ) -> tuple[pa.Table, pa.Table]:
-    """Join the parts of a catalog, and reject the records whose star was read before.
-
-    Parameters
-    ----------
-    stars, rejected : sequence of pyarrow.Table
-        At least one of each.
-
-    Returns
-    -------
-    stars : pyarrow.Table
-        Table of the stars schema, by star_id.
-    rejected : pyarrow.Table
-        Table of the rejected schema, in its order.
-    """
+    """Join the parts of a catalog, and reject the records whose star was read before."""
     # Chunks stay as they are: joining them would hold the whole catalog in memory twice.
     keys = ["star_id", "source_file", "source_line"]
     joined = sort_rows(pa.concat_tables(stars), keys)

@@ -43,17 +43,7 @@ class FileFacts:
 
 
 class BytesRead:
-    """How much of the files of a source has been read.
-
-    Parameters
-    ----------
-    files : sequence of InputFile
-        All that will be read.
-    source_name : str
-        What they are.
-    progress : Progress
-        Called with ("read <source>", bytes done, bytes in all): bytes as they lie on disk.
-    """
+    """How much of the files of a source has been read."""
 
     def __init__(self, files: Sequence[InputFile], source_name: str, progress: Progress) -> None:
         self._stage, self._progress = f"read {source_name}", progress
@@ -61,15 +51,7 @@ class BytesRead:
         self._read = [0] * len(files)
 
     def note(self, number: int, count: int) -> None:
-        """Remember how much of a file has been read; any thread may.
-
-        Parameters
-        ----------
-        number : int
-            Number of the file.
-        count : int
-            Bytes of it.
-        """
+        """Remember how much of a file has been read; any thread may."""
         self._read[number] = count
 
     def tell(self) -> None:
@@ -77,18 +59,7 @@ class BytesRead:
         self._progress(self._stage, sum(self._read), self._total)
 
     def teller(self, number: int) -> Callable[[int], None]:
-        """Return a function that notes how much of a file has been read, and tells it.
-
-        Parameters
-        ----------
-        number : int
-            Number of the file.
-
-        Returns
-        -------
-        callable
-            As `FileBlocks` takes it.
-        """
+        """Return a function that notes how much of a file has been read, and tells it."""
 
         def note_and_tell(count: int) -> None:
             self.note(number, count)
@@ -99,15 +70,6 @@ class BytesRead:
 
 class FileBlocks:
     """The blocks of one file, and what is known of the file once it has been read.
-
-    Parameters
-    ----------
-    file : InputFile
-        The file.
-    source : DataSource
-        What it is.
-    on_bytes : callable, optional
-        Called with the bytes of the file, as it lies on disk, that have been read so far.
 
     Attributes
     ----------
@@ -137,20 +99,7 @@ class FileBlocks:
         self._on_bytes(digest.bytes_read)
 
     def add(self, rows: int, problems: Sequence[Problem]) -> None:
-        """Count the records of the next block.
-
-        Parameters
-        ----------
-        rows : int
-            Records in it, malformed ones included.
-        problems : sequence of Problem
-            Its malformed records.
-
-        Raises
-        ------
-        ParseError
-            If it is the first block with records and none of them is good.
-        """
+        """Count the records of the next block."""
         if problems and not self.rows and rows == len(problems):
             raise not_this_archive(self.file, self.source, problems)
         self.rows += rows
@@ -159,15 +108,7 @@ class FileBlocks:
 
     @property
     def facts(self) -> FileFacts:
-        """What the manifest says of the file, which has been read to its end.
-
-        Raises
-        ------
-        ParseError
-            If it has no record, or more than 10 of them and 1 % are malformed.
-        SourceError
-            If it has not been read to its end.
-        """
+        """What the manifest says of the file, which has been read to its end."""
         if self._digest is None:
             raise SourceError(f"{self.file.path}: not read to its end", path=self.file.path)
         check_malformed(self.file, self.rows, self.malformed, self.problems, self.source)
@@ -177,21 +118,6 @@ class FileBlocks:
 
 class FileReading:
     """The parts of one file of a star catalog, in file order.
-
-    Parameters
-    ----------
-    file : InputFile
-        The file.
-    number : int
-        Its number among the inputs, which becomes ``source_file``.
-    source : DataSource
-        What it is.
-    how : Reading
-        Band, epoch and read limit.
-    workers : int, default 0
-        Threads that parse blocks while this one reads; with none, the calling thread does both.
-    on_bytes : callable, optional
-        Called with the bytes of the file, as it lies on disk, that have been read so far.
 
     Attributes
     ----------
@@ -217,21 +143,7 @@ class FileReading:
         self._workers = workers
 
     def __iter__(self) -> Iterator[Part]:
-        """Read the file.
-
-        Yields
-        ------
-        Part
-            Parts of one block each.
-
-        Raises
-        ------
-        ParseError
-            If the file is empty, damaged, or not of the archive: none of the records of its first
-            block is good, or too many of all.
-        SourceError
-            If it cannot be opened.
-        """
+        """Read the file."""
         for part in map_in_order(self._parse, iter(self.blocks), self._workers):
             self.blocks.add(part.rows, part.problems)
             yield part

@@ -84,20 +84,7 @@ class Ingested:
 
 
 def count_by_reason(rejected: pa.Table, beyond_read_limit: int = 0) -> dict[str, int]:
-    """Return how many rows of a rejected table each reason has.
-
-    Parameters
-    ----------
-    rejected : pyarrow.Table
-        Table of the rejected schema.
-    beyond_read_limit : int, default 0
-        Records beyond the read limit, which no table lists.
-
-    Returns
-    -------
-    dict of str to int
-        In the order in which the reasons are tried.
-    """
+    """Return how many rows of a rejected table each reason has."""
     counted = {
         entry["values"]: entry["counts"]
         for entry in pc.value_counts(rejected["reason"]).to_pylist()
@@ -118,42 +105,7 @@ def ingest(
     workers: int = 2,
     progress: Progress = no_progress,
 ) -> Ingested:
-    """Read a star catalog into a star table.
-
-    Parameters
-    ----------
-    source_name : str
-        A star catalog of ``data_sources``.
-    paths : sequence of Path
-        Its files or the folders that hold them.
-    band : str, optional
-        Band of ``mag``; the source's first by default.
-    epoch_jyear : float, optional
-        Julian year to move positions to; by default every star stays at its own epoch.
-    read_limit_mag : float, optional
-        Records fainter than this are counted while reading and never held; they are nobody's
-        neighbour. For catalogs that do not fit into memory.
-    neighbours : bool, default True
-        Whether to find each star's nearest neighbour.
-    workers : int, default 2
-        Threads; the result is the same for any number.
-    progress : Progress
-        Called with ("read <source>", bytes done, bytes in all) after every block.
-
-    Returns
-    -------
-    Ingested
-        The tables, which follow their schemas, and what was read.
-
-    Raises
-    ------
-    ConfigError
-        If the source is not a star catalog or has no such band.
-    SourceError
-        If a file is missing, damaged, given twice, or not of this archive.
-    BuildError
-        If the records read are not all kept or rejected, which is a fault of starcat's own.
-    """
+    """Read a star catalog into a star table."""
     source = star_catalog(source_name)
     how = Reading(source_name, check_band(source, band), epoch_jyear, read_limit_mag)
     files = given_files(source, paths)
@@ -184,18 +136,7 @@ def ingest(
 
 
 def check_balance(read: Ingested) -> None:
-    """Check that every record read is kept or rejected.
-
-    Parameters
-    ----------
-    read : Ingested
-        A whole catalog.
-
-    Raises
-    ------
-    BuildError
-        If some are neither.
-    """
+    """Check that every record read is kept or rejected."""
     rejected = sum(read.rejected_by_reason.values())
     if read.rows_read != len(read.stars) + rejected:
         raise BuildError(
@@ -206,23 +147,7 @@ def check_balance(read: Ingested) -> None:
 
 
 def star_catalog(source_name: str) -> DataSource:
-    """Return a data source that is a star catalog.
-
-    Parameters
-    ----------
-    source_name : str
-        Name of a source.
-
-    Returns
-    -------
-    DataSource
-        The source.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such source, or it has no stars.
-    """
+    """Return a data source that is a star catalog."""
     source = data_source(source_name)
     if source_name not in CATALOGS:
         raise ConfigError(
@@ -234,27 +159,7 @@ def star_catalog(source_name: str) -> DataSource:
 
 
 def given_files(source: DataSource, paths: Sequence[Path]) -> list[InputFile]:
-    """Return the files of a source.
-
-    Parameters
-    ----------
-    source : DataSource
-        What is read.
-    paths : sequence of Path
-        Files, or folders that hold them.
-
-    Returns
-    -------
-    list of InputFile
-        At least one, in reading order.
-
-    Raises
-    ------
-    SourceMissing
-        If there is none, or one is missing.
-    SourceError
-        If one is given twice.
-    """
+    """Return the files of a source."""
     files = find_files(source, paths)
     if not files:
         raise SourceMissing(f"{source.name}: no input files given", source=source.name)
@@ -263,22 +168,7 @@ def given_files(source: DataSource, paths: Sequence[Path]) -> list[InputFile]:
 
 
 def unmoved_stars(source_name: str, stars: pa.Table, epoch_jyear: float | None) -> tuple[str, ...]:
-    """Return a note where most stars of a catalog are not at the epoch that was asked for.
-
-    Parameters
-    ----------
-    source_name : str
-        The catalog.
-    stars : pyarrow.Table
-        Its star table.
-    epoch_jyear : float, optional
-        Julian year that was asked for.
-
-    Returns
-    -------
-    tuple of str
-        How many stars stay at which epochs, having no proper motion; empty for a few.
-    """
+    """Return a note where most stars of a catalog are not at the epoch that was asked for."""
     epochs = floats_of(stars, "epoch_jyear")
     unmoved = epochs[epochs != epoch_jyear] if epoch_jyear is not None else epochs[:0]
     if 2 * len(unmoved) <= len(epochs):
@@ -291,20 +181,7 @@ def unmoved_stars(source_name: str, stars: pa.Table, epoch_jyear: float | None) 
 
 
 def missing_files(source: DataSource, files: Sequence[InputFile]) -> tuple[str, ...]:
-    """Return a note for each optional file of a source that is not among the inputs.
-
-    Parameters
-    ----------
-    source : DataSource
-        What is read.
-    files : sequence of InputFile
-        What it is read from.
-
-    Returns
-    -------
-    tuple of str
-        Naming the file and what is in it.
-    """
+    """Return a note for each optional file of a source that is not among the inputs."""
     given = {file.layout.name for file in files}
     return tuple(
         f"{source.name}: {layout.file_names[0]} is not among the inputs ({layout.description})"
@@ -374,25 +251,7 @@ _TELL_EVERY_S = 0.1
 
 
 def check_band(source: DataSource, band: str | None) -> str:
-    """Return the band to use, after checking that the source has it.
-
-    Parameters
-    ----------
-    source : DataSource
-        The catalog.
-    band : str, optional
-        What was asked for.
-
-    Returns
-    -------
-    str
-        The band; the source's first where none was asked for.
-
-    Raises
-    ------
-    ConfigError
-        If the source has no such band.
-    """
+    """Return the band to use, after checking that the source has it."""
     if band is None:
         return source.bands[0]
     if source.name == "2mass":

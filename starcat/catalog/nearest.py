@@ -10,20 +10,7 @@ from starcat.geometry.proximity import nearest_neighbours
 
 
 def add_nearest_neighbours(stars: pa.Table, workers: int = 2) -> pa.Table:
-    """Return a star table with the columns of the nearest neighbour filled in.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        Table of the stars schema, any number of rows.
-    workers : int, default 2
-        Threads; the result is the same for any number.
-
-    Returns
-    -------
-    pyarrow.Table
-        The same rows.
-    """
+    """Return a star table with the columns of the nearest neighbour filled in."""
     if len(stars) < 2:
         return stars
     angle, index = nearest_neighbours(directions_of(stars), workers)

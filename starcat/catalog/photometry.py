@@ -40,17 +40,6 @@ class JohnsonV:
 def johnson_v(bt_mag: Array, vt_mag: Array) -> JohnsonV:
     """Return Johnson V from Tycho BT and VT.
 
-    Parameters
-    ----------
-    bt_mag, vt_mag : ndarray of float64, shape (N,)
-        Magnitudes; NaN where missing.
-
-    Returns
-    -------
-    JohnsonV
-        ``V = VT - 0.090 (BT - VT)``. Without BT, V is VT; without VT, V is BT, a star at least
-        as bright as that in V for all but the bluest.
-
     References
     ----------
     Hog et al. 2000, ReadMe of I/259, note 7.
@@ -66,21 +55,6 @@ def johnson_v(bt_mag: Array, vt_mag: Array) -> JohnsonV:
 
 def blend_weights(band: str) -> dict[str, float]:
     """Return the weights of J, H and Ks in a band of 2MASS.
-
-    Parameters
-    ----------
-    band : str
-        ``J``, ``H``, ``Ks``, ``(J+H)/2``, or a weighted sum such as ``0.6*J+0.4*H``.
-
-    Returns
-    -------
-    dict of str to float
-        Weights of the bands that take part; they sum to 1.
-
-    Raises
-    ------
-    ConfigError
-        If the text is none of these, or the weights do not sum to 1.
 
     Examples
     --------
@@ -110,16 +84,6 @@ def _blend_message(band: str) -> str:
 
 def combined_magnitude(mags: Array) -> float:
     """Return the magnitude of several stars seen as one.
-
-    Parameters
-    ----------
-    mags : ndarray of float64, shape (N,)
-        Magnitudes in one band.
-
-    Returns
-    -------
-    float
-        Magnitude of the summed flux.
 
     Examples
     --------

@@ -33,18 +33,7 @@ _NEEDED = ("ra_deg", "dec_deg", "epoch_jyear")
 
 
 def without_impossible(block: StarBlock) -> StarBlock:
-    """Reject the records without a position, or with values that no star can have.
-
-    Parameters
-    ----------
-    block : StarBlock
-        What a catalog module has made of its records; the verdicts are added to.
-
-    Returns
-    -------
-    StarBlock
-        The same records. A right ascension of 360 deg, which some archives round to, is 0.
-    """
+    """Reject the records without a position, or with values that no star can have."""
     values = {name: _numbers(block.columns, name) for name in PLAUSIBLE if name in block.columns}
     for name in _NEEDED:
         block.verdicts.reject(np.isnan(values[name]), Reason.no_position)

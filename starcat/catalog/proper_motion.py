@@ -39,18 +39,6 @@ class Motion:
 def propagate(motion: Motion, years: ArrayLike) -> Motion:
     """Move positions by a number of Julian years.
 
-    Parameters
-    ----------
-    motion : Motion
-        Positions and proper motions at the first epoch; a star without proper motion stays.
-    years : array_like of float64, shape (N,) or ()
-        Second epoch minus first, Julian years.
-
-    Returns
-    -------
-    Motion
-        At the second epoch; the proper motion is the derivative there.
-
     References
     ----------
     ESA SP-1200 (1997), vol. 1, eqs. 1.5.21 and 1.5.22 with zero parallax.
@@ -59,22 +47,7 @@ def propagate(motion: Motion, years: ArrayLike) -> Motion:
 
 
 def propagate_directions(motion: Motion, years: ArrayLike) -> tuple[Motion, Array]:
-    """Move positions as `propagate` does, and return the directions too.
-
-    Parameters
-    ----------
-    motion : Motion
-        As for `propagate`.
-    years : array_like of float64, shape (N,) or ()
-        As for `propagate`.
-
-    Returns
-    -------
-    motion : Motion
-        At the second epoch.
-    directions : ndarray of float64, shape (N, 3)
-        ICRS unit vectors at the second epoch.
-    """
+    """Move positions as `propagate` does, and return the directions too."""
     unknown = np.isnan(motion.pm_ra_cosdec_mas_yr) | np.isnan(motion.pm_dec_mas_yr)
     pm_ra = np.where(unknown, 0.0, motion.pm_ra_cosdec_mas_yr) * MAS
     pm_dec = np.where(unknown, 0.0, motion.pm_dec_mas_yr) * MAS

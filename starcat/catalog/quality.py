@@ -25,20 +25,7 @@ class Quality(IntFlag):
 
 
 def quality_flags(count: int, bits: dict[Quality, NDArray[np.bool_]]) -> NDArray[np.int32]:
-    """Return the sum of the bits that apply to each star.
-
-    Parameters
-    ----------
-    count : int
-        Number of stars.
-    bits : dict of Quality to ndarray of bool, shape (count,)
-        Where each bit is set.
-
-    Returns
-    -------
-    ndarray of int32, shape (count,)
-        One integer a star.
-    """
+    """Return the sum of the bits that apply to each star."""
     flags = np.zeros(count, dtype=np.int32)
     for bit, where in bits.items():
         flags |= np.where(where, np.int32(bit), np.int32(0))

@@ -15,20 +15,7 @@ from starcat.errors import SourceError
 
 
 def check_names(files: Sequence[InputFile], source: DataSource) -> None:
-    """Check that no file of the archive is given twice.
-
-    Parameters
-    ----------
-    files : sequence of InputFile
-        What will be read.
-    source : DataSource
-        What they belong to.
-
-    Raises
-    ------
-    SourceError
-        Naming both paths.
-    """
+    """Check that no file of the archive is given twice."""
     seen: dict[str, Path] = {}
     for file in files:
         name = file.path.name.removesuffix(".gz")
@@ -41,22 +28,7 @@ def check_names(files: Sequence[InputFile], source: DataSource) -> None:
 def check_contents(
     files: Sequence[InputFile], facts: Sequence[FileFacts], source: DataSource
 ) -> None:
-    """Check that no two files have the same content.
-
-    Parameters
-    ----------
-    files : sequence of InputFile
-        What was read.
-    facts : sequence of FileFacts
-        Their digests, in the same order.
-    source : DataSource
-        What they belong to.
-
-    Raises
-    ------
-    SourceError
-        Naming both paths.
-    """
+    """Check that no two files have the same content."""
     seen: dict[str, Path] = {}
     for file, fact in zip(files, facts, strict=True):
         earlier = seen.setdefault(fact.sha256, file.path)

@@ -69,20 +69,7 @@ class Selected:
 
 
 def select_guide_stars(stars: pa.Table, selection: Selection) -> Selected:
-    """Select guide stars from a star table.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        Table of the stars schema, by star_id.
-    selection : Selection
-        Limits and rules.
-
-    Returns
-    -------
-    Selected
-        Every row of ``stars`` is in one of its two tables.
-    """
+    """Select guide stars from a star table."""
     verdicts = Verdicts(len(stars))
     steps: list[Step] = []
 
@@ -142,21 +129,7 @@ def _check_pairs(stars: int, separation_deg: float) -> None:
 
 
 def has_companion(stars: pa.Table, selection: Selection) -> Flags:
-    """Return which stars have a companion that the sensor cannot tell apart.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        Table of the stars schema.
-    selection : Selection
-        ``doubles.min_separation_deg``, ``doubles.max_delta_mag`` and the companions' limit.
-
-    Returns
-    -------
-    ndarray of bool, shape (N,)
-        True where another star lies within the separation and is not fainter by more than
-        ``max_delta_mag``.
-    """
+    """Return which stars have a companion that the sensor cannot tell apart."""
     pairs, mag = _companion_pairs(stars, selection)
     most = selection.doubles.max_delta_mag
     found = np.zeros(len(stars), dtype=bool)
@@ -168,23 +141,7 @@ def has_companion(stars: pa.Table, selection: Selection) -> Flags:
 
 
 def merge_doubles(stars: pa.Table, selection: Selection, verdicts: Verdicts) -> pa.Table:
-    """Merge groups of close stars into one star each, at their photocentre.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        Table of the stars schema.
-    selection : Selection
-        As for `has_companion`; groups are chains of such pairs.
-    verdicts : Verdicts
-        Members other than the brightest are rejected here, as merged.
-
-    Returns
-    -------
-    pyarrow.Table
-        The same rows; the brightest of each group has the combined magnitude and the
-        flux-weighted direction.
-    """
+    """Merge groups of close stars into one star each, at their photocentre."""
     pairs, mag = _companion_pairs(stars, selection)
     if selection.doubles.max_delta_mag is not None:
         delta = np.abs(mag[pairs[:, 0]] - mag[pairs[:, 1]])
@@ -235,22 +192,7 @@ def _with_photocentres(
 
 
 def is_unresolved_double(stars: pa.Table, doubles: Doubles) -> Flags:
-    """Return which stars an archive's flags say to leave out as doubles.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        Table of the stars schema.
-    doubles : Doubles
-        ``flags``, with the limits that "unresolved" compares with.
-
-    Returns
-    -------
-    ndarray of bool, shape (N,)
-        ``ignore``: none. ``strict``: every flagged star. ``unresolved``: flagged, with a
-        separation below the limit or not stated, and a stated magnitude difference within
-        ``max_delta_mag``; a double whose difference nobody states is left to the search.
-    """
+    """Return which stars an archive's flags say to leave out as doubles."""
     flagged = np.array(stars["is_flagged_double"])
     if doubles.flags == "ignore" or doubles.action == "keep":
         return np.zeros(len(stars), dtype=bool)
@@ -265,17 +207,7 @@ def is_unresolved_double(stars: pa.Table, doubles: Doubles) -> Flags:
 
 
 def reject_variables(stars: pa.Table, variables: Variables, verdicts: Verdicts) -> None:
-    """Reject the stars whose brightness cannot be relied on.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        Table of the stars schema, amplitudes joined.
-    variables : Variables
-        Limit and rule.
-    verdicts : Verdicts
-        Receives the reasons.
-    """
+    """Reject the stars whose brightness cannot be relied on."""
     amplitude = floats_of(stars, "amplitude_mag")
     if variables.max_amplitude_mag is not None:
         verdicts.reject(amplitude > variables.max_amplitude_mag, Reason.variable)
@@ -287,22 +219,7 @@ def reject_variables(stars: pa.Table, variables: Variables, verdicts: Verdicts) 
 
 
 def beyond_brightest(stars: pa.Table, kept: Flags, count: int) -> Flags:
-    """Return which stars are not among the brightest.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        Table of the stars schema.
-    kept : ndarray of bool, shape (N,)
-        Stars that take part.
-    count : int
-        How many may stay; equal magnitudes go by star_id.
-
-    Returns
-    -------
-    ndarray of bool, shape (N,)
-        True for the stars beyond the count.
-    """
+    """Return which stars are not among the brightest."""
     rows = np.flatnonzero(kept)
     order = np.lexsort((stars["star_id"].to_numpy()[rows], floats_of(stars, "mag")[rows]))
     beyond = np.zeros(len(stars), dtype=bool)
@@ -311,20 +228,7 @@ def beyond_brightest(stars: pa.Table, kept: Flags, count: int) -> Flags:
 
 
 def reject_dense(selected: Selected, kept: NDArray[np.integer]) -> Selected:
-    """Thin the guide stars to those that a tiling asks for.
-
-    Parameters
-    ----------
-    selected : Selected
-        The result of `select_guide_stars`.
-    kept : ndarray of int, shape (K,)
-        Rows of the guide stars to keep, in any order, repeats allowed.
-
-    Returns
-    -------
-    Selected
-        The others are rejected for their density; one more step.
-    """
+    """Thin the guide stars to those that a tiling asks for."""
     stars = selected.guide_stars
     verdicts = Verdicts(len(stars))
     wanted = np.zeros(len(stars), dtype=bool)

@@ -219,23 +219,7 @@ class RecordFile(_Model):
         return self
 
     def column(self, name: str) -> Column:
-        """Return the column called ``name``.
-
-        Parameters
-        ----------
-        name : str
-            Column name.
-
-        Returns
-        -------
-        Column
-            The column.
-
-        Raises
-        ------
-        KeyError
-            If the layout has no such column.
-        """
+        """Return the column called ``name``."""
         for column in self.columns:
             if column.name == name:
                 return column
@@ -287,23 +271,7 @@ class DataSource(_Model):
 
 
 def read_source(path: Path) -> DataSource:
-    """Read one data-source file.
-
-    Parameters
-    ----------
-    path : Path
-        A TOML file.
-
-    Returns
-    -------
-    DataSource
-        The checked content.
-
-    Raises
-    ------
-    ConfigError
-        If the file is not TOML, or a key, unit, format or byte range is wrong.
-    """
+    """Read one data-source file."""
     try:
         return DataSource.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
     except tomllib.TOMLDecodeError as error:
@@ -319,11 +287,6 @@ def read_source(path: Path) -> DataSource:
 def source_names() -> tuple[str, ...]:
     """Return the names of all data sources that ship with starcat, sorted.
 
-    Returns
-    -------
-    tuple of str
-        Names.
-
     Examples
     --------
     >>> "sao" in source_names()
@@ -335,21 +298,6 @@ def source_names() -> tuple[str, ...]:
 @cache
 def data_source(name: str) -> DataSource:
     """Return the data source called ``name``.
-
-    Parameters
-    ----------
-    name : str
-        One of `source_names`.
-
-    Returns
-    -------
-    DataSource
-        The checked content of its TOML file.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such source, naming the nearest.
 
     Examples
     --------

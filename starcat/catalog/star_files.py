@@ -10,36 +10,12 @@ if TYPE_CHECKING:  # other rooms write files without reading a catalog
 
 
 def rejected_path(output: Path) -> Path:
-    """Return where the rejected rows go that belong to a star table.
-
-    Parameters
-    ----------
-    output : Path
-        File of the star table.
-
-    Returns
-    -------
-    Path
-        ``<stem>.rejected<suffix>`` beside it.
-    """
+    """Return where the rejected rows go that belong to a star table."""
     return output.with_name(f"{output.stem}.rejected{output.suffix}")
 
 
 def write_star_tables(read: Ingested, output: Path) -> None:
-    """Write a star table, and its rejected rows beside it where there are any.
-
-    Parameters
-    ----------
-    read : Ingested
-        An ingested catalog.
-    output : Path
-        Parquet file; replaced when the new one is whole.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
+    """Write a star table, and its rejected rows beside it where there are any."""
     from starcat.tables.parquet import write_table
 
     write_table(read.stars, output)

@@ -41,18 +41,7 @@ class StarBlock:
     verdicts: Verdicts
 
     def where(self, chosen: NDArray[np.bool_]) -> StarBlock:
-        """Return some of the records.
-
-        Parameters
-        ----------
-        chosen : ndarray of bool, shape (N,)
-            Which records.
-
-        Returns
-        -------
-        StarBlock
-            Their columns and verdicts, in the same order.
-        """
+        """Return some of the records."""
         columns = {name: _values_where(values, chosen) for name, values in self.columns.items()}
         return StarBlock(columns, self.verdicts.where(chosen))
 
@@ -64,21 +53,7 @@ def _values_where(values: Values, chosen: NDArray[np.bool_]) -> Values:
 
 
 def move_to_epoch(columns: Mapping[str, Values], epoch_jyear: float | None) -> dict[str, Values]:
-    """Return the columns with positions at an epoch, and their directions.
-
-    Parameters
-    ----------
-    columns : mapping of str to Values
-        With ``ra_deg``, ``dec_deg``, ``epoch_jyear`` and, where known, proper motions.
-    epoch_jyear : float, optional
-        Julian year to move to; None leaves every star at its own epoch.
-
-    Returns
-    -------
-    dict of str to Values
-        The same with ``x``, ``y``, ``z``. A star without proper motion stays where and when
-        its archive has it, and its quality flags say so.
-    """
+    """Return the columns with positions at an epoch, and their directions."""
     ra = np.asarray(columns["ra_deg"], dtype=np.float64)
     dec = np.asarray(columns["dec_deg"], dtype=np.float64)
     blank = np.full(len(ra), np.nan)
@@ -108,27 +83,7 @@ def move_to_epoch(columns: Mapping[str, Values], epoch_jyear: float | None) -> d
 
 
 def table_from_columns(product: str, columns: Mapping[str, Values], count: int) -> pa.Table:
-    """Return columns as a table of a product's schema.
-
-    Parameters
-    ----------
-    product : {"stars", "rejected"}
-        Whose schema.
-    columns : mapping of str to Values
-        Arrays of shape (count,) or one value for all; NaN means null.
-    count : int
-        Number of rows.
-
-    Returns
-    -------
-    pyarrow.Table
-        With every column of the schema, in its order; null where none was given.
-
-    Raises
-    ------
-    KeyError
-        If a column is given that the schema does not have.
-    """
+    """Return columns as a table of a product's schema."""
     schema = product_schema(product).arrow_schema
     unknown = set(columns) - set(schema.names)
     if unknown:
@@ -144,20 +99,7 @@ def table_from_columns(product: str, columns: Mapping[str, Values], count: int) 
 
 
 def with_columns(stars: pa.Table, columns: Mapping[str, Values]) -> pa.Table:
-    """Return a table with some of its columns replaced.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        The table.
-    columns : mapping of str to Values
-        Columns that it has, by name; NaN means null.
-
-    Returns
-    -------
-    pyarrow.Table
-        The same rows and schema.
-    """
+    """Return a table with some of its columns replaced."""
     for name, values in columns.items():
         place = stars.schema.get_field_index(name)
         field = stars.schema.field(place)
@@ -180,18 +122,7 @@ def _as_array(value: Values, kind: pa.DataType, count: int) -> pa.Array:
 
 
 def text_column(values: NDArray[Any]) -> pa.Array:
-    """Return fixed-width bytes as trimmed text, null where blank.
-
-    Parameters
-    ----------
-    values : ndarray of bytes, shape (N,)
-        Text as a reader returns it.
-
-    Returns
-    -------
-    pyarrow.Array
-        Strings.
-    """
+    """Return fixed-width bytes as trimmed text, null where blank."""
     try:
         text = pa.array(values).cast(pa.string())
     except pa.ArrowInvalid:  # archives are ASCII, and a damaged byte is read as some letter
@@ -201,18 +132,7 @@ def text_column(values: NDArray[Any]) -> pa.Array:
 
 
 def join_flags(parts: Mapping[str, tuple[NDArray[np.bool_], NDArray[Any] | None]]) -> pa.Array:
-    """Return the archive's codes as one text a star, such as ``Rem=1;m_HD=2``.
-
-    Parameters
-    ----------
-    parts : mapping of str to (ndarray of bool, ndarray of bytes or None)
-        Label of a code, where it applies, and its text (the label alone where None).
-
-    Returns
-    -------
-    pyarrow.Array
-        Strings; null where no code applies.
-    """
+    """Return the archive's codes as one text a star, such as ``Rem=1;m_HD=2``."""
     is_flagged = np.logical_or.reduce([where for where, _ in parts.values()])
     rows = np.flatnonzero(is_flagged)
     joined = pa.nulls(len(rows), pa.string())
@@ -230,72 +150,22 @@ def join_flags(parts: Mapping[str, tuple[NDArray[np.bool_], NDArray[Any] | None]
 
 
 def where_known(values: NDArray[np.float64], text: str) -> pa.Array:
-    """Return a text for every value that is known, such as its source.
-
-    Parameters
-    ----------
-    values : ndarray of float64, shape (N,)
-        NaN where unknown.
-    text : str
-        What to say of the others.
-
-    Returns
-    -------
-    pyarrow.Array
-        Strings; null where the value is NaN.
-    """
+    """Return a text for every value that is known, such as its source."""
     return pc.if_else(pa.array(np.isnan(values)), pa.scalar(None, pa.string()), text)
 
 
 def numbered(prefix: str, number: NDArray[np.int64]) -> pa.Array:
-    """Return designations made of a prefix and a number.
-
-    Parameters
-    ----------
-    prefix : str
-        Such as ``SAO``.
-    number : ndarray of int64, shape (N,)
-        The numbers.
-
-    Returns
-    -------
-    pyarrow.Array
-        Strings such as ``SAO 308``.
-    """
+    """Return designations made of a prefix and a number."""
     return pc.binary_join_element_wise(prefix, pa.array(number).cast(pa.string()), " ")
 
 
 def directions_of(stars: pa.Table) -> NDArray[np.float64]:
-    """Return the directions of a star table.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        Table of the stars schema.
-
-    Returns
-    -------
-    ndarray of float64, shape (N, 3)
-        ICRS unit vectors, contiguous.
-    """
+    """Return the directions of a star table."""
     return np.stack([stars[name].to_numpy() for name in ("x", "y", "z")], axis=-1)
 
 
 def floats_of(stars: pa.Table, name: str) -> NDArray[np.float64]:
-    """Return a numeric column with NaN for null.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        Any table.
-    name : str
-        The column.
-
-    Returns
-    -------
-    ndarray of float64, shape (N,)
-        A copy.
-    """
+    """Return a numeric column with NaN for null."""
     column = stars[name]
     if column.null_count:
         column = pc.fill_null(column.cast(pa.float64()), float("nan"))
@@ -303,20 +173,7 @@ def floats_of(stars: pa.Table, name: str) -> NDArray[np.float64]:
 
 
 def sort_rows(table: pa.Table, keys: Sequence[str]) -> pa.Table:
-    """Sort a table by columns, nulls last; a sorted table is returned as it is.
-
-    Parameters
-    ----------
-    table : pyarrow.Table
-        The table.
-    keys : sequence of str
-        Columns, most significant first.
-
-    Returns
-    -------
-    pyarrow.Table
-        With the rows in order.
-    """
+    """Sort a table by columns, nulls last; a sorted table is returned as it is."""
     first = table[keys[0]]
     if not first.null_count:
         values = first.to_numpy()

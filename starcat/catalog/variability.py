@@ -54,22 +54,7 @@ class AmplitudeTable:
 def read_amplitudes(
     source_name: str, paths: Sequence[Path], progress: Progress = no_progress
 ) -> AmplitudeTable:
-    """Read the amplitudes of a source.
-
-    Parameters
-    ----------
-    source_name : {"hipparcos", "tycho1", "gcvs"}
-        Which.
-    paths : sequence of Path
-        Its files.
-    progress : Progress
-        As for `ingest`.
-
-    Returns
-    -------
-    AmplitudeTable
-        Every record that has a variability code or an amplitude.
-    """
+    """Read the amplitudes of a source."""
     if source_name == "gcvs":
         gcvs = read_gcvs(paths, progress)
         return AmplitudeTable(
@@ -99,22 +84,7 @@ def read_amplitudes(
 
 
 def join_amplitudes(stars: pa.Table, table: AmplitudeTable) -> tuple[pa.Table, int]:
-    """Join amplitudes and codes to the stars that a source knows.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        Table of the stars schema.
-    table : AmplitudeTable
-        What to join.
-
-    Returns
-    -------
-    stars : pyarrow.Table
-        A star's amplitude is the largest that any source states; its codes are added.
-    joined : int
-        Stars that the source knows.
-    """
+    """Join amplitudes and codes to the stars that a source knows."""
     amplitude = floats_of(stars, "amplitude_mag")
     flag = np.array(stars["variable_flag"].to_pylist(), dtype=object)
     origin = np.array(stars["amplitude_source"].to_pylist(), dtype=object)

@@ -43,42 +43,17 @@ _NAMES = pa.array(["kept", *(reason.name for reason in Reason)])
 
 
 class Verdicts:
-    """The verdicts on a number of records: kept until rejected, then final.
-
-    Parameters
-    ----------
-    count : int
-        Number of records.
-    """
+    """The verdicts on a number of records: kept until rejected, then final."""
 
     def __init__(self, count: int) -> None:
         self._code = np.zeros(count, dtype=np.int8)
 
     def reject(self, where: NDArray[np.bool_], reason: Reason) -> None:
-        """Reject records that no earlier reason applied to.
-
-        Parameters
-        ----------
-        where : ndarray of bool, shape (N,)
-            The records.
-        reason : Reason
-            Why.
-        """
+        """Reject records that no earlier reason applied to."""
         self._code[where & (self._code == 0)] = _CODES[reason]
 
     def where(self, chosen: NDArray[np.bool_]) -> Verdicts:
-        """Return the verdicts on some of the records.
-
-        Parameters
-        ----------
-        chosen : ndarray of bool, shape (N,)
-            Which records.
-
-        Returns
-        -------
-        Verdicts
-            Verdicts of their own, in the same order.
-        """
+        """Return the verdicts on some of the records."""
         verdicts = Verdicts(0)
         verdicts._code = self._code[chosen]
         return verdicts
@@ -94,12 +69,6 @@ class Verdicts:
         return _NAMES.take(pa.array(self._code[self._code != 0]))
 
     def count_by_reason(self) -> dict[str, int]:
-        """Return how many records each reason has taken.
-
-        Returns
-        -------
-        dict of str to int
-            Reasons that apply to at least one record, in the order in which they are tried.
-        """
+        """Return how many records each reason has taken."""
         counts = np.bincount(self._code, minlength=len(_NAMES))
         return {r.name: int(counts[_CODES[r]]) for r in Reason if counts[_CODES[r]]}

@@ -25,27 +25,7 @@ Track = Annotated[
 def chosen_prior(
     text: str | None, error_deg: float | None, *, track: bool
 ) -> tuple[list[float], float] | None:
-    """Return the attitude that ``--prior-q`` and ``--prior-error-deg`` say.
-
-    Parameters
-    ----------
-    text : str, optional
-        Four numbers with commas between them, ``q_body_from_icrs``.
-    error_deg : float, optional
-        Its largest error.
-    track : bool
-        Whether frames are followed, each with the prior that the last one gives.
-
-    Returns
-    -------
-    (list of float, float) or None
-        None where neither is given.
-
-    Raises
-    ------
-    ConfigError
-        If one of the two is missing, the text is of another form, or frames are followed.
-    """
+    """Return the attitude that ``--prior-q`` and ``--prior-error-deg`` say."""
     if text is None and error_deg is None:
         return None
     if text is None or error_deg is None:

@@ -107,27 +107,7 @@ WcsFile = Annotated[
 
 
 def chosen_spec(path: Path | None, name: str | None, changes: list[str] | None = None) -> BuildSpec:
-    """Return the spec of a file or of a preset.
-
-    Parameters
-    ----------
-    path : Path, optional
-        A TOML file.
-    name : str, optional
-        A preset.
-    changes : list of str, optional
-        ``KEY=VALUE`` texts that take the place of what the spec says.
-
-    Returns
-    -------
-    BuildSpec
-        Checked.
-
-    Raises
-    ------
-    ConfigError
-        If both are given or neither is, or the spec is wrong.
-    """
+    """Return the spec of a file or of a preset."""
     from starcat.specs.reading import preset as named_preset
     from starcat.specs.reading import preset_names, read_spec
 
@@ -143,23 +123,7 @@ def chosen_spec(path: Path | None, name: str | None, changes: list[str] | None =
 
 
 def changed_keys(given: list[str] | None) -> dict[str, str]:
-    """Return the values of ``KEY=VALUE`` texts by key.
-
-    Parameters
-    ----------
-    given : list of str, optional
-        Texts of ``--set``.
-
-    Returns
-    -------
-    dict of str to str
-        The last of a key counts.
-
-    Raises
-    ------
-    ConfigError
-        If a text is of another form.
-    """
+    """Return the values of ``KEY=VALUE`` texts by key."""
     changes = {}
     for text in given or []:
         key, separator, value = text.partition("=")
@@ -172,27 +136,7 @@ def changed_keys(given: list[str] | None) -> dict[str, str]:
 def camera_of_options(
     size: str, focal_mm: float | None, pixel_um: float | None, fov_x_deg: float | None
 ) -> CameraSpec:
-    """Return a camera from what a command line says of it.
-
-    Parameters
-    ----------
-    size : str
-        ``1280x960``: width and height of the detector, pixels.
-    focal_mm, pixel_um : float, optional
-        Focal length and side of a pixel, together.
-    fov_x_deg : float, optional
-        Field across the width, instead.
-
-    Returns
-    -------
-    CameraSpec
-        Checked.
-
-    Raises
-    ------
-    ConfigError
-        If the size is of another form, the scale is missing or said twice, or out of range.
-    """
+    """Return a camera from what a command line says of it."""
     from pydantic import ValidationError
 
     from starcat.specs.build_spec import CameraSpec
@@ -219,23 +163,7 @@ def size_in_px(text: str) -> tuple[int, int]: ...
 @overload
 def size_in_px(text: str | None) -> tuple[int, int] | None: ...
 def size_in_px(text: str | None) -> tuple[int, int] | None:
-    """Return the width and height of a ``--size``.
-
-    Parameters
-    ----------
-    text : str, optional
-        ``1280x960``.
-
-    Returns
-    -------
-    tuple of int, or None
-        Pixels; None for no text.
-
-    Raises
-    ------
-    ConfigError
-        If the text is of another form.
-    """
+    """Return the width and height of a ``--size``."""
     if text is None:
         return None
     found = re.fullmatch(r"([0-9]{1,6})\s*[xX]\s*([0-9]{1,6})", text.strip())
@@ -245,23 +173,7 @@ def size_in_px(text: str | None) -> tuple[int, int] | None:
 
 
 def field_range(text: str | None) -> tuple[float, float] | None:
-    """Return the smallest and the largest field of a ``--fov``.
-
-    Parameters
-    ----------
-    text : str, optional
-        ``5:20``, or ``12`` for both.
-
-    Returns
-    -------
-    tuple of float, or None
-        Degrees; None for no text.
-
-    Raises
-    ------
-    ConfigError
-        If the text is of another form.
-    """
+    """Return the smallest and the largest field of a ``--fov``."""
     if text is None:
         return None
     low, separator, high = text.partition(":")
@@ -272,25 +184,7 @@ def field_range(text: str | None) -> tuple[float, float] | None:
 
 
 def inputs_by_source(given: list[str] | None, only: str | None = None) -> Mapping[str, list[Path]]:
-    """Return the paths of ``SOURCE=PATH`` texts by source.
-
-    Parameters
-    ----------
-    given : list of str, optional
-        Texts of ``--input``.
-    only : str, optional
-        The source that a text without one is about, where a command is about one source.
-
-    Returns
-    -------
-    mapping of str to list of Path
-        Empty for none.
-
-    Raises
-    ------
-    ConfigError
-        If a text is of another form, or the source is unknown.
-    """
+    """Return the paths of ``SOURCE=PATH`` texts by source."""
     from starcat.catalog.source import data_source
 
     inputs: dict[str, list[Path]] = {}
@@ -315,18 +209,7 @@ class SearchLimits(TypedDict, total=False):
 def limits_of_options(
     min_share: float | None, max_steps: int | None, time_limit_s: float | None
 ) -> SearchLimits:
-    """Return the limits of a search that are given.
-
-    Parameters
-    ----------
-    min_share, max_steps, time_limit_s : float, optional
-        As those of `Matcher`.
-
-    Returns
-    -------
-    SearchLimits
-        Without those that are not given.
-    """
+    """Return the limits of a search that are given."""
     given: SearchLimits = {}
     if min_share is not None:
         given["min_share"] = min_share
@@ -340,25 +223,7 @@ def limits_of_options(
 def unknown_field(
     size: str | None, fov: str | None, fov_error: str | None
 ) -> tuple[tuple[int, int] | None, tuple[float, float] | None]:
-    """Return what is stated of frames whose field of view is not known.
-
-    Parameters
-    ----------
-    size, fov, fov_error : str, optional
-        Texts of ``--size``, ``--fov`` and ``--fov-error``.
-
-    Returns
-    -------
-    size_px : tuple of int, or None
-        Width and height.
-    fov_deg : tuple of float, or None
-        Smallest and largest field across the width, degrees.
-
-    Raises
-    ------
-    ConfigError
-        If a text is of another form, or two are given of which one alone has a meaning.
-    """
+    """Return what is stated of frames whose field of view is not known."""
     if fov is not None and fov_error is not None:
         raise ConfigError("give either --fov, a range of fields, or --fov-error, not both")
     if size is not None and fov is None:
@@ -368,21 +233,6 @@ def unknown_field(
 
 def share_of_percent(text: str | None) -> float | None:
     """Return the number that a share stands for.
-
-    Parameters
-    ----------
-    text : str, optional
-        Such as ``2%`` or ``0.02``.
-
-    Returns
-    -------
-    float or None
-        None where nothing is given.
-
-    Raises
-    ------
-    ConfigError
-        If the text is no number from 0 to a half.
 
     Examples
     --------
@@ -408,27 +258,7 @@ def share_of_percent(text: str | None) -> float | None:
 def observer_of_options(
     time: str | None, velocity: str | None, orbit: str | None
 ) -> Observer | None:
-    """Return the observer that a command line tells of.
-
-    Parameters
-    ----------
-    time : str, optional
-        UTC.
-    velocity : str, optional
-        ``VX,VY,VZ``: relative to the Earth, km/s.
-    orbit : str, optional
-        ``X,Y,Z,VX,VY,VZ``: position and velocity relative to the Earth, km and km/s, instead.
-
-    Returns
-    -------
-    Observer or None
-        None without a time.
-
-    Raises
-    ------
-    ConfigError
-        If a text is of another form, or they do not go together.
-    """
+    """Return the observer that a command line tells of."""
     if time is None:
         if velocity is not None or orbit is not None:
             word = "--velocity" if velocity is not None else "--orbit"

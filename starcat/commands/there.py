@@ -34,27 +34,7 @@ OF_IDENTIFY = (
 
 
 def there(url: str, token: str | None, command: str) -> Client:
-    """Return the service that a command line names.
-
-    Parameters
-    ----------
-    url : str
-        Its address.
-    token : str, optional
-        Its token.
-    command : str
-        The command.
-
-    Returns
-    -------
-    Client
-        Nothing is asked yet.
-
-    Raises
-    ------
-    ConfigError
-        If the text is no address, or the command runs here only.
-    """
+    """Return the service that a command line names."""
     if not url.startswith(("http://", "https://")):
         raise ConfigError(
             f"--server {url!r}: expected an address such as http://127.0.0.1:8000", key="server"
@@ -71,19 +51,7 @@ def there(url: str, token: str | None, command: str) -> Client:
 
 
 def build_there(context: typer.Context, spec: BuildSpec, output: Path, *, as_json: bool) -> None:
-    """Have a database built by a service, bring it here, and print what it holds.
-
-    Parameters
-    ----------
-    context : typer.Context
-        Of the command, with the service.
-    spec : BuildSpec
-        What to build.
-    output : Path
-        Folder to put it into.
-    as_json : bool
-        Whether to print JSON.
-    """
+    """Have a database built by a service, bring it here, and print what it holds."""
     from starcat.artifact.reader import open_artifact
     from starcat.simulation.selftest import rates_of
     from starcat.terminal.builds import print_artifact, print_rates
@@ -129,32 +97,7 @@ def sql_there(
     rows: int,
     time_limit_s: float,
 ) -> None:
-    """Ask a service a question in SQL, and print or keep the answer.
-
-    Parameters
-    ----------
-    context : typer.Context
-        Of the command, with the service.
-    targets : list of str
-        Ids or titles of databases, names of catalogs.
-    query, named : str, optional
-        SQL, or the name of a query of the gallery.
-    values : mapping of str to str
-        Texts of the values.
-    form : str, optional
-        Format of the answer.
-    output : Path, optional
-        File to write.
-    rows : int
-        Rows of a table to show.
-    time_limit_s : float
-        Seconds that it may take.
-
-    Raises
-    ------
-    QueryError
-        If it cannot be answered.
-    """
+    """Ask a service a question in SQL, and print or keep the answer."""
     from starcat.query.gallery import guessed
     from starcat.terminal.asking import Wish, format_of_wish
     from starcat.terminal.console import say
@@ -187,22 +130,7 @@ def sql_there(
 
 
 def identify_there(context: typer.Context, database: str, file: Path) -> None:
-    """Have a service identify frames, and print the answers.
-
-    Parameters
-    ----------
-    context : typer.Context
-        Of the command, with the service and all options.
-    database : str
-        Id or title.
-    file : Path
-        Centroids or an image; ``-`` for centroids from stdin.
-
-    Raises
-    ------
-    NotIdentifiedError
-        If that is wanted, and a frame was not identified.
-    """
+    """Have a service identify frames, and print the answers."""
     from starcat.terminal.console import say
     from starcat.terminal.matches import print_contents
 

@@ -28,40 +28,12 @@ CAP_PX = 3.0
 def with_matcher(
     matcher: Matcher, centroids_px: Array, camera: Camera, mag: Array | None
 ) -> MatchResult:
-    """Answer as starcat does: ranked candidates and the shared verification.
-
-    Parameters
-    ----------
-    matcher : Matcher
-        The matcher, with a database open.
-    centroids_px : ndarray of float64, shape (N, 2)
-        Pixels.
-    camera : Camera
-        What the matcher is told.
-    mag : ndarray of float64, shape (N,), or None
-        Magnitudes.
-
-    Returns
-    -------
-    MatchResult
-        The answer.
-    """
+    """Answer as starcat does: ranked candidates and the shared verification."""
     return matcher.identify(centroids_px, camera, magnitudes=mag)
 
 
 def bare(name: Name) -> Answerer:
-    """Return the answer of a method that only names stars.
-
-    Parameters
-    ----------
-    name : callable
-        Returns a row of the database for each centroid of an observation, -1 for none.
-
-    Returns
-    -------
-    Answerer
-        A result that has stars, but no attitude and no false-match probability below 1.
-    """
+    """Return the answer of a method that only names stars."""
 
     def answer(
         matcher: Matcher, centroids_px: Array, camera: Camera, mag: Array | None

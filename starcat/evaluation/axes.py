@@ -39,25 +39,7 @@ class Axis:
     write: Callable[[Trial, float], Trial]
 
     def with_value(self, trial: Trial, value: float) -> Trial:
-        """Return a trial with another value of this quantity.
-
-        Parameters
-        ----------
-        trial : Trial
-            A trial whose ``camera`` and ``assumed`` are given.
-        value : float
-            The value, in the unit of the label.
-
-        Returns
-        -------
-        Trial
-            All else is the same.
-
-        Raises
-        ------
-        ConfigError
-            If there can be no such trial.
-        """
+        """Return a trial with another value of this quantity."""
         if not self.low <= value <= self.high:
             raise ConfigError(
                 f"{self.label}: {value:g} is out of range; expected {self.low:g} to {self.high:g}",
@@ -150,20 +132,7 @@ AXES: dict[str, Axis] = {
 
 
 def axis_label(trials: Sequence[Trial], x: Sequence[float]) -> str:
-    """Return what the abscissa of a curve is, from the trials along it.
-
-    Parameters
-    ----------
-    trials : sequence of Trial
-        One a point.
-    x : sequence of float
-        The abscissae.
-
-    Returns
-    -------
-    str
-        Label of the quantity that has these values, or these over 100; empty if there is none.
-    """
+    """Return what the abscissa of a curve is, from the trials along it."""
     for axis in AXES.values():
         values = [axis.read(trial) for trial in trials]
         for times, label in ((1.0, axis.label), (100.0, f"{axis.label}, percent")):

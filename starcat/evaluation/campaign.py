@@ -56,13 +56,7 @@ class MeasuredRow:
         return is_often and (row.goal_ms is None or rates.mean_ms <= row.goal_ms)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the row as plain values.
-
-        Returns
-        -------
-        dict
-            Plain values for JSON: the row, its trial in full, the rates with their intervals.
-        """
+        """Return the row as plain values."""
         rates = {
             name: value.as_dict() if isinstance(value, Share) else round(value, 4)
             for name, value in vars(self.rates).items()
@@ -98,13 +92,7 @@ class Outcome:
     statistics: tuple[Statistic, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the outcome as plain values.
-
-        Returns
-        -------
-        dict
-            For JSON; a curve's rows have ``axis``, what their ``x`` is.
-        """
+        """Return the outcome as plain values."""
         labels = {group: _axis(rows) for group, rows in self._groups.items()}
         return {
             "name": self.paper.name,
@@ -127,18 +115,7 @@ class Outcome:
 
 
 def is_goal_reached(statistic: Statistic) -> bool | None:
-    """Return whether a number is what starcat wants.
-
-    Parameters
-    ----------
-    statistic : Statistic
-        The number, with or without a goal.
-
-    Returns
-    -------
-    bool or None
-        None where starcat wants nothing.
-    """
+    """Return whether a number is what starcat wants."""
     measured, goal = statistic.measured, statistic.goal
     if goal is None:
         return None
@@ -156,35 +133,7 @@ def run_paper(
     workers: int = 2,
     progress: Progress = no_progress,
 ) -> Outcome:
-    """Run all trials of a paper, but those whose records are there.
-
-    Parameters
-    ----------
-    paper : Paper
-        What to run.
-    artifacts : mapping of str to Path
-        Artifact by preset.
-    folder : Path
-        The records go to ``<paper>/`` or ``<paper>-quick/`` in it.
-    quick : bool, default False
-        Whether the paper's quick rows are wanted.
-    workers : int, default 2
-        Trials at a time; the records are the same for any number, but for their times.
-    progress : Progress
-        Called with (name of the paper, frames done, frames of all trials).
-
-    Returns
-    -------
-    Outcome
-        Rates by row, and statistics.
-
-    Raises
-    ------
-    ValueError
-        If two different trials have the same name.
-    StarcatError
-        If the system ends a process.
-    """
+    """Run all trials of a paper, but those whose records are there."""
     rows = paper.rows(quick)
     tasks = _tasks(rows, artifacts)
     place = folder / (f"{paper.name}-quick" if quick else paper.name)

@@ -21,48 +21,13 @@ from starcat.simulation.sky import Sky
 
 
 def sky_of_artifact(folder: Path) -> Sky:
-    """Return the whole catalog of an artifact as a camera would see it.
-
-    Parameters
-    ----------
-    folder : Path
-        The artifact's folder.
-
-    Returns
-    -------
-    Sky
-        As `catalog_of_artifact`, but stars closer to each other than the spec's
-        ``min_separation_deg`` are one point: the sum of their light at its centre. Such a point
-        is a guide star if its brightest member is one.
-
-    Raises
-    ------
-    ProductError
-        If the folder is not an artifact.
-    """
+    """Return the whole catalog of an artifact as a camera would see it."""
     doubles = open_artifact(folder).manifest["spec"]["selection"]["doubles"]
     return blend(catalog_of_artifact(folder), float(np.radians(doubles["min_separation_deg"])))
 
 
 def catalog_of_artifact(folder: Path) -> Sky:
-    """Return the whole catalog of an artifact.
-
-    Parameters
-    ----------
-    folder : Path
-        The artifact's folder.
-
-    Returns
-    -------
-    Sky
-        Guide stars, and rejected ones with a position and a magnitude, at the artifact's epoch,
-        by star number. Records beyond the read limit of its spec are in no artifact.
-
-    Raises
-    ------
-    ProductError
-        If the folder is not an artifact.
-    """
+    """Return the whole catalog of an artifact."""
     artifact = open_artifact(folder)
     stars, rejected = artifact.table("stars"), artifact.table("rejected")
     # A merged star's companion is in the guide star already.
@@ -80,20 +45,7 @@ def catalog_of_artifact(folder: Path) -> Sky:
 
 
 def blend(sky: Sky, limit_rad: float) -> Sky:
-    """Join the points that a camera cannot tell apart.
-
-    Parameters
-    ----------
-    sky : Sky
-        Points.
-    limit_rad : float
-        Those closer than this are joined, and so are those that a third one joins.
-
-    Returns
-    -------
-    Sky
-        Merged stars, in the order of each group's brightest member.
-    """
+    """Join the points that a camera cannot tell apart."""
     pairs, apart = pairs_within(sky.directions, limit_rad)
     i, j = pairs[apart < limit_rad].T
     count = len(sky)

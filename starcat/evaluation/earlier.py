@@ -18,24 +18,7 @@ Content = Mapping[str, Any]
 
 
 def with_earlier(results: Path, content: Content, artifact: Path) -> list[dict[str, Any]]:
-    """Return a sweep together with those that were made before it.
-
-    Parameters
-    ----------
-    results : Path
-        ``results.json`` of the folder, which need not be there.
-    content : mapping
-        `Outcome.as_dict` of the sweep.
-    artifact : Path
-        The artifact's folder.
-
-    Returns
-    -------
-    list of dict
-        One content a camera. Each has ``measured_with``, the digests of the artifact and of the
-        code; earlier sweeps of another artifact or by other code are left out, as their trials
-        would be run again.
-    """
+    """Return a sweep together with those that were made before it."""
     basis = {
         "manifest_sha256": read_manifest(artifact)["manifest_sha256"],
         "code_sha256": code_sha256(),

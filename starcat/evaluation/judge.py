@@ -76,31 +76,7 @@ def judge(
     reach_px: float,
     time_ms: float,
 ) -> Verdict:
-    """Compare an answer with the truth.
-
-    Parameters
-    ----------
-    number : int
-        Number of the frame.
-    frame : Frame
-        The truth.
-    result : MatchResult
-        The answer. Stars without an attitude (NaN) are judged as well.
-    database : Database
-        That the answer refers to.
-    camera : Camera
-        The camera as it is.
-    reach_px : float
-        A star is elsewhere if its true place is farther than this from the centroid. A false
-        spot on the place of a star that is missing cannot be told from that star.
-    time_ms : float
-        Time of the identification.
-
-    Returns
-    -------
-    Verdict
-        The record.
-    """
+    """Compare an answer with the truth."""
     named = result.star_index
     is_named = named >= 0
     right = is_named & (named == frame.star_index)
@@ -127,20 +103,7 @@ def judge(
 
 
 def reference_of(frame: Frame, camera: Camera) -> int | None:
-    """Return the centroid of the guide star that is nearest to the centre.
-
-    Parameters
-    ----------
-    frame : Frame
-        The truth.
-    camera : Camera
-        The camera, for its size.
-
-    Returns
-    -------
-    int or None
-        Row of the frame; None if it holds no guide star.
-    """
+    """Return the centroid of the guide star that is nearest to the centre."""
     guides = np.flatnonzero(frame.star_index >= 0)
     if not len(guides):
         return None

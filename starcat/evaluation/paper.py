@@ -115,35 +115,11 @@ class Paper:
 
 
 def tolerance_for(noise_px: float) -> float:
-    """Return the tolerance that a matcher is given for a position noise.
-
-    Parameters
-    ----------
-    noise_px : float
-        Standard deviation, each axis.
-
-    Returns
-    -------
-    float
-        Three of them, and at least a pixel, for doubles that are one spot.
-    """
+    """Return the tolerance that a matcher is given for a position noise."""
     return max(1.0, 3.0 * noise_px)
 
 
 def product_mib(artifact: Path, product: str) -> float:
-    """Return the size of a product in the database.
-
-    Parameters
-    ----------
-    artifact : Path
-        The artifact's folder.
-    product : str
-        Name of the product.
-
-    Returns
-    -------
-    float
-        Mebibytes of all arrays, indices included.
-    """
+    """Return the size of a product in the database."""
     arrays = open_database(artifact, (product,)).products[product].arrays
     return sum(values.nbytes for values in arrays.values()) / 2**20

@@ -85,13 +85,7 @@ class Share:
         return 100.0 * least, 100.0 * most
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the share as plain values.
-
-        Returns
-        -------
-        dict
-            Plain values for JSON; ``percent`` is None where there are no frames.
-        """
+        """Return the share as plain values."""
         low, high = self.interval_percent
         return {
             "hits": self.hits,
@@ -132,22 +126,7 @@ class TrialRates:
 
 
 def rates_of(records: Path, rule: str, reach_px: float) -> TrialRates:
-    """Return the rates of a trial.
-
-    Parameters
-    ----------
-    records : Path
-        The trial's Parquet file.
-    rule : str
-        A key of `RULES`.
-    reach_px : float
-        An attitude is right if it moves no corner of the frame by more, pixels.
-
-    Returns
-    -------
-    TrialRates
-        Rates over all frames of the trial.
-    """
+    """Return the rates of a trial."""
     query = _RATES.format(rule=RULES[rule], own=RULES["starcat"], accepted=_ACCEPTED, holds=_HOLDS)
     (row,) = _rows(query, records, reach_px)
     count, enough, hits, hits_enough, own, own_enough, wrong, mean, median, p95 = row
@@ -165,22 +144,7 @@ def rates_of(records: Path, rule: str, reach_px: float) -> TrialRates:
 
 
 def failures_of(records: Path, rule: str, reach_px: float) -> dict[str, int]:
-    """Count the frames of a trial that failed, by cause.
-
-    Parameters
-    ----------
-    records : Path
-        The trial's Parquet file.
-    rule : str
-        A key of `RULES`.
-    reach_px : float
-        The limit that `rates_of` takes.
-
-    Returns
-    -------
-    dict of str to int
-        Every cause of `CAUSES`, in that order; together all frames without success.
-    """
+    """Count the frames of a trial that failed, by cause."""
     cases = " ".join(f"WHEN {condition} THEN '{cause}'" for cause, condition in CAUSES.items())
     query = _FAILURES.format(cases=cases, rule=RULES[rule])
     return dict.fromkeys(CAUSES, 0) | dict(_rows(query, records, reach_px))

@@ -49,32 +49,7 @@ def prepare_artifacts(
     workers: int = 2,
     progress: Progress = no_progress,
 ) -> dict[str, Path]:
-    """Build the artifacts that papers need.
-
-    Parameters
-    ----------
-    presets : iterable of str
-        Names of specs that ship with starcat.
-    inputs : mapping of str to sequence of Path
-        Input files or folders by source; others are looked for.
-    folder : Path
-        Folder to build them in. An artifact that is there already is left as it is if the build
-        gives the same one, else replaced.
-    workers : int, default 2
-        Threads.
-    progress : Progress
-        Called with (what is built, done, total).
-
-    Returns
-    -------
-    dict of str to Path
-        Artifact by preset.
-
-    Raises
-    ------
-    SourceError, BuildError, OutputError
-        The errors of `build`.
-    """
+    """Build the artifacts that papers need."""
     artifacts = {}
     for name in dict.fromkeys(presets):
 
@@ -97,33 +72,7 @@ def evaluate_papers(
     workers: int = 2,
     progress: Progress = no_progress,
 ) -> Evaluation:
-    """Measure what papers print, and write the report.
-
-    Parameters
-    ----------
-    name : str
-        ``S1`` to ``S5``, or ``all``.
-    inputs : mapping of str to sequence of Path
-        Catalogs, as for a build.
-    output : Path
-        Folder of artifacts, records and reports. Trials whose records are there are not run.
-    quick : bool, default False
-        Whether fewer frames will do.
-    workers : int, default 2
-        Processes.
-    progress : Progress
-        Called with (what is done, done, total).
-
-    Returns
-    -------
-    Evaluation
-        One content a paper.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such paper.
-    """
+    """Measure what papers print, and write the report."""
     papers = papers_named(name)
     presets = [preset for paper in papers for preset in paper.presets]
     artifacts = prepare_artifacts(
@@ -144,25 +93,7 @@ def evaluate_papers(
 def evaluate_artifact(
     sweep: Sweep, output: Path, *, workers: int = 2, progress: Progress = no_progress
 ) -> Evaluation:
-    """Measure how often an artifact identifies, and add it to the report.
-
-    Parameters
-    ----------
-    sweep : Sweep
-        What is tried.
-    output : Path
-        Folder of records and reports.
-    workers : int, default 2
-        Processes.
-    progress : Progress
-        Called with (name of the artifact, frames done, frames in all).
-
-    Returns
-    -------
-    Evaluation
-        One content, with a group a quantity that varies. The page and its files hold the sweeps
-        that were made into this folder before, too.
-    """
+    """Measure how often an artifact identifies, and add it to the report."""
     paper = sweep_paper(sweep)
     outcome = run_paper(
         paper,
@@ -180,25 +111,7 @@ def evaluate_artifact(
 
 
 def write_reproduction(output: Path, docs: Path) -> Path:
-    """Write ``reproduction.md`` and its figures from the full run of all papers.
-
-    Parameters
-    ----------
-    output : Path
-        Folder of `evaluate_papers`.
-    docs : Path
-        Folder of the documentation.
-
-    Returns
-    -------
-    Path
-        The page.
-
-    Raises
-    ------
-    ConfigError
-        If all papers were not evaluated there.
-    """
+    """Write ``reproduction.md`` and its figures from the full run of all papers."""
     return write_page(output / "all" / RESULTS, docs)
 
 

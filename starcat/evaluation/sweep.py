@@ -68,21 +68,6 @@ class Sweep:
 def sweep_values(**texts: str | None) -> dict[str, tuple[float, ...]]:
     """Read the values that a user gives to quantities.
 
-    Parameters
-    ----------
-    **texts : str or None
-        ``value,value,...`` by key of `AXES`; None where nothing was said.
-
-    Returns
-    -------
-    dict of str to tuple of float
-        The values of the quantities that have some.
-
-    Raises
-    ------
-    ConfigError
-        If a text is of another form.
-
     Examples
     --------
     >>> sweep_values(noise_px="0,0.5,1", k1=None)
@@ -115,36 +100,7 @@ def plan_sweep(
     seed: int = 1,
     quick: bool = False,
 ) -> Sweep:
-    """Fill in what a user did not say.
-
-    Parameters
-    ----------
-    artifact : Path
-        The artifact's folder.
-    values : mapping of str to sequence of float
-        As `Sweep` has them; where there are none, every quantity takes its usual values.
-    method : str, optional
-        A key of `METHODS`; ``all`` for every one that the artifact's products allow; by
-        default the best of them.
-    camera : Camera, optional
-        The artifact's own by default.
-    frames, tolerance_px, seed
-        Values for `Sweep`, as it describes them.
-    quick : bool, default False
-        Whether few frames will do where ``frames`` does not say how many.
-
-    Returns
-    -------
-    Sweep
-        Complete.
-
-    Raises
-    ------
-    ConfigError
-        If a quantity or the method is unknown, or a quantity has no value.
-    ProductError
-        If the folder is not an artifact, or lacks a product that the method needs.
-    """
+    """Fill in what a user did not say."""
     manifest = open_artifact(artifact).manifest
     return Sweep(
         artifact,
@@ -183,23 +139,7 @@ def _methods(artifact: Path, method: str | None) -> tuple[str, ...]:
 
 
 def sweep_paper(sweep: Sweep) -> Paper:
-    """Return a sweep as something that `run_paper` runs.
-
-    Parameters
-    ----------
-    sweep : Sweep
-        What is to be tried.
-
-    Returns
-    -------
-    Paper
-        Named after the artifact, which is its only preset; nothing is published or expected.
-
-    Raises
-    ------
-    ConfigError
-        If a value is out of range.
-    """
+    """Return a sweep as something that `run_paper` runs."""
     name = sweep.artifact.resolve().name
     rows = _rows(sweep, name)
 

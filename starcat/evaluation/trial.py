@@ -141,27 +141,7 @@ def run_trial(
     workers: int = 2,
     progress: Progress = no_progress,
 ) -> Path:
-    """Run a trial, unless its result is there.
-
-    Parameters
-    ----------
-    trial : Trial
-        What to do.
-    artifact : Path
-        The artifact's folder.
-    folder : Path
-        Folder of results.
-    workers : int, default 2
-        Processes; the records are the same for any number, but for their times.
-    progress : Progress
-        Called with (name of the trial, frames done, frames in all).
-
-    Returns
-    -------
-    Path
-        ``<name>.parquet``: one row a frame, the columns of `Verdict`, with the trial in its
-        metadata. It appears when it is whole.
-    """
+    """Run a trial, unless its result is there."""
     path = folder / f"{trial.name}.parquet"
     facts = description(trial, artifact)
     if path.is_file() and pq.read_schema(path).metadata.get(b"starcat_trial") == facts:
@@ -187,21 +167,7 @@ def run_trial(
 
 
 def description(trial: Trial, artifact: Path) -> bytes:
-    """Return all that a trial's result depends on.
-
-    Parameters
-    ----------
-    trial : Trial
-        The trial.
-    artifact : Path
-        The artifact's folder.
-
-    Returns
-    -------
-    bytes
-        JSON with sorted keys, with the digests of the artifact's manifest and of the code, and the
-        version of the C library where it may serve.
-    """
+    """Return all that a trial's result depends on."""
     manifest = (artifact / "manifest.json").read_bytes()
     facts = {**asdict(trial), "artifact": artifact.name, "code_sha256": code_sha256()}
     facts["manifest_sha256"] = hashlib.sha256(manifest).hexdigest()
@@ -212,14 +178,7 @@ def description(trial: Trial, artifact: Path) -> bytes:
 
 @cache
 def code_sha256() -> str:
-    """Return the digest of the code that simulates, identifies and judges.
-
-    Returns
-    -------
-    str
-        SHA-256, hexadecimal, of the modules of the rooms that do so.
-        Records of other code are not taken for results of this.
-    """
+    """Return the digest of the code that simulates, identifies and judges."""
     package = Path(__file__).parents[1]
     paths = [path for room in MEASURED_ROOMS for path in (package / room).rglob("*.py")]
     digest = hashlib.sha256()
@@ -229,18 +188,7 @@ def code_sha256() -> str:
 
 
 def frame_count(trial: Trial) -> int:
-    """Return how many frames a trial has.
-
-    Parameters
-    ----------
-    trial : Trial
-        The trial.
-
-    Returns
-    -------
-    int
-        Those asked for, or all of the grid.
-    """
+    """Return how many frames a trial has."""
     wanted = trial.attitudes
     if wanted.kind != "grid":
         return wanted.count
@@ -307,24 +255,7 @@ def attitude_of(
     guide_stars: NDArray[np.float64],
     generator: np.random.Generator,
 ) -> NDArray[np.float64]:
-    """Return the attitude of one frame of a trial.
-
-    Parameters
-    ----------
-    trial : Trial
-        The trial.
-    number : int
-        Number of the frame.
-    guide_stars : ndarray of float64, shape (N, 3)
-        Directions, for boresights at stars.
-    generator : numpy.random.Generator
-        The frame's own.
-
-    Returns
-    -------
-    ndarray of float64, shape (3, 3)
-        ``body = matrix @ icrs``.
-    """
+    """Return the attitude of one frame of a trial."""
     wanted = trial.attitudes
     if wanted.kind == "random":
         return matrix_from_quaternion(generator.normal(size=4))

@@ -23,24 +23,7 @@ _CASTS = {
 
 
 def plain_schema(schema: pa.Schema) -> pa.Schema:
-    """Return a schema without types that mean the same as a plainer one.
-
-    Parameters
-    ----------
-    schema : pyarrow.Schema
-        The schema of any table or query.
-
-    Returns
-    -------
-    pyarrow.Schema
-        Same names and field metadata; codes as their values, all sizes of texts and lists as
-        ``string`` and ``list``.
-
-    Raises
-    ------
-    SchemaError
-        If two columns have one name, or a type has no place in any format.
-    """
+    """Return a schema without types that mean the same as a plainer one."""
     twice = [name for name, times in Counter(schema.names).items() if times > 1]
     if twice:
         raise SchemaError(
@@ -52,20 +35,7 @@ def plain_schema(schema: pa.Schema) -> pa.Schema:
 
 
 def plain_batch(batch: pa.RecordBatch, schema: pa.Schema) -> pa.RecordBatch:
-    """Return a batch with the types of a plain schema.
-
-    Parameters
-    ----------
-    batch : pyarrow.RecordBatch
-        As it came.
-    schema : pyarrow.Schema
-        A schema that `plain_schema` returned.
-
-    Returns
-    -------
-    pyarrow.RecordBatch
-        The same values.
-    """
+    """Return a batch with the types of a plain schema."""
     columns = [
         column if column.type == field.type else column.cast(field.type)
         for column, field in zip(batch.columns, schema, strict=True)
@@ -74,50 +44,17 @@ def plain_batch(batch: pa.RecordBatch, schema: pa.Schema) -> pa.RecordBatch:
 
 
 def is_list(kind: pa.DataType) -> bool:
-    """Return whether a plain type is a list.
-
-    Parameters
-    ----------
-    kind : pyarrow.DataType
-        A type of a plain schema.
-
-    Returns
-    -------
-    bool
-        True for lists of any items.
-    """
+    """Return whether a plain type is a list."""
     return bool(pa.types.is_list(kind))
 
 
 def is_number(kind: pa.DataType) -> bool:
-    """Return whether a type is an integer or a floating-point number.
-
-    Parameters
-    ----------
-    kind : pyarrow.DataType
-        Any.
-
-    Returns
-    -------
-    bool
-        False for decimals, which numpy does not have.
-    """
+    """Return whether a type is an integer or a floating-point number."""
     return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))
 
 
 def time_texts(values: pa.Array) -> pa.Array:
-    """Return dates and times as ISO 8601 text.
-
-    Parameters
-    ----------
-    values : pyarrow.Array
-        Dates, times of day or timestamps; those of a time zone are given in UTC.
-
-    Returns
-    -------
-    pyarrow.StringArray
-        Such as ``2026-01-31T12:00:00.000000Z``; null stays null.
-    """
+    """Return dates and times as ISO 8601 text."""
     if pa.types.is_timestamp(values.type):
         if values.type.tz is not None:
             values = values.cast(pa.timestamp(values.type.unit, "UTC"))

@@ -21,22 +21,7 @@ _BREAKS = re.compile(r"\0|[^\S \t\n]")
 
 
 def write_ecsv(columns: list[NumpyColumn], path: Path, label: Label = UNLABELLED) -> None:
-    """Write columns as ECSV.
-
-    Parameters
-    ----------
-    columns : list of NumpyColumn
-        The table.
-    path : Path
-        Overwritten if it exists.
-    label : Label
-        The table's name, artifact and version, which go into ``meta``.
-
-    Raises
-    ------
-    SchemaError
-        If a unit is not one that astropy knows, or a text would be misread.
-    """
+    """Write columns as ECSV."""
     _check_texts(columns)
     table = astropy_table(columns)
     table.meta |= {**({"name": label.table} if label.table else {}), **label.origin}
@@ -44,23 +29,7 @@ def write_ecsv(columns: list[NumpyColumn], path: Path, label: Label = UNLABELLED
 
 
 def astropy_table(columns: list[NumpyColumn]) -> Table:
-    """Return columns as an astropy table.
-
-    Parameters
-    ----------
-    columns : list of NumpyColumn
-        With their facts.
-
-    Returns
-    -------
-    astropy.table.Table
-        With units, meanings and UCDs; nulls are masked.
-
-    Raises
-    ------
-    SchemaError
-        If a unit is not one that astropy knows.
-    """
+    """Return columns as an astropy table."""
     from astropy.table import Table
 
     table = Table()

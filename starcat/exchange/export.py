@@ -97,37 +97,7 @@ def export_tables(
     replace: bool = False,
     max_partition_rows: int = MAX_ROWS,
 ) -> Exported:
-    """Write tables in a format, one file a product.
-
-    Parameters
-    ----------
-    tables : NamedTables
-        The tables of an artifact, a file or a peer.
-    file_format : str
-        One of `EXPORT_FORMATS`.
-    folder : Path
-        Made where it is missing; other files in it stay.
-    products : sequence of str, optional
-        Names; by default all, and for HATS all star tables.
-    replace : bool, default False
-        Whether files of the same names that differ may be replaced.
-    max_partition_rows : int
-        Rows that a partition of HATS may hold at most.
-
-    Returns
-    -------
-    Exported
-        The files and their sizes.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such format or product.
-    SchemaError
-        If a column cannot be said in the format.
-    OutputError
-        If the folder cannot be written to, or already holds something else.
-    """
+    """Write tables in a format, one file a product."""
     _check_asked(file_format, folder)
     columns: list[tuple[str, ...]] = []
     with whole_folder(folder) as partial:

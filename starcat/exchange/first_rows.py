@@ -8,17 +8,7 @@ import pyarrow as pa
 
 
 class FirstRows:
-    """No more rows than are asked for.
-
-    Parameters
-    ----------
-    batches : pyarrow.RecordBatchReader
-        The table. One row more than asked for has to be among its rows for it to be known that
-        rows were left out.
-    count : int, optional
-        The largest number of rows to give; all by default. With 0 nothing is read, and rows count
-        as left out.
-    """
+    """No more rows than are asked for."""
 
     def __init__(self, batches: pa.RecordBatchReader, count: int | None) -> None:
         self._batches = batches
@@ -41,11 +31,5 @@ class FirstRows:
                 return
 
     def reader(self) -> pa.RecordBatchReader:
-        """Return the rows as a reader.
-
-        Returns
-        -------
-        pyarrow.RecordBatchReader
-            To be read once.
-        """
+        """Return the rows as a reader."""
         return pa.RecordBatchReader.from_batches(self._batches.schema, iter(self))

@@ -31,25 +31,7 @@ _HEAP_LIMIT_BYTES = 2**31 - 1
 def write_fits(
     columns: list[NumpyColumn], rows: int, path: Path, label: Label = UNLABELLED
 ) -> None:
-    """Write columns as a FITS file with one binary table.
-
-    Parameters
-    ----------
-    columns : list of NumpyColumn
-        With integers that FITS has.
-    rows : int
-        Number of rows.
-    path : Path
-        Overwritten if it exists.
-    label : Label
-        The table's name, which becomes ``EXTNAME``, and its artifact and version, which become
-        ``ARTIFACT`` and ``VERSION``.
-
-    Raises
-    ------
-    SchemaError
-        If a text, name or unit cannot be said in FITS.
-    """
+    """Write columns as a FITS file with one binary table."""
     from astropy.io import fits
 
     _check_names(columns)

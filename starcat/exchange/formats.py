@@ -46,21 +46,6 @@ _CHUNKS: dict[str, Callable[[pa.RecordBatchReader], Iterator[tuple[bytes, int]]]
 def format_of(path: str | Path) -> str:
     """Return the format that the name of a file asks for.
 
-    Parameters
-    ----------
-    path : str or Path
-        Such as ``stars.fits``; capitals do not matter.
-
-    Returns
-    -------
-    str
-        One of `FORMATS`.
-
-    Raises
-    ------
-    ConfigError
-        If the suffix is none of theirs.
-
     Examples
     --------
     >>> format_of("stars.vot")
@@ -82,31 +67,6 @@ def write_batches(
 ) -> int:
     """Write a table to a file, which appears at its name when it is whole.
 
-    Parameters
-    ----------
-    batches : pyarrow.RecordBatchReader
-        The table; ``unit``, ``description`` and ``ucd`` in its field metadata are passed on.
-    target : Path
-        The file; replaced if it exists.
-    file_format : str
-        One of `FORMATS`.
-    label : Label
-        What VOTable, FITS and ECSV say of the table as a whole.
-
-    Returns
-    -------
-    int
-        Rows written.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such format.
-    SchemaError
-        If a column cannot be said in the format; the message says what to cast it to.
-    OutputError
-        If the file cannot be written.
-
     Notes
     -----
     What goes wrong with reading the batches is raised as it comes.
@@ -124,29 +84,7 @@ def write_batches(
 
 
 def write_text_batches(batches: pa.RecordBatchReader, stream: IO[str], file_format: str) -> int:
-    """Write a table as text, for instance to the standard output.
-
-    Parameters
-    ----------
-    batches : pyarrow.RecordBatchReader
-        The table.
-    stream : text stream
-        Written to batch by batch.
-    file_format : {"csv", "json"}
-        The formats that are text and need no file.
-
-    Returns
-    -------
-    int
-        Rows written.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such format.
-    SchemaError
-        If a column cannot be said in text.
-    """
+    """Write a table as text, for instance to the standard output."""
     _check(file_format, TEXT_FORMATS)
     rows = 0
     for text, more in _CHUNKS[file_format](batches):

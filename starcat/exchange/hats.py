@@ -46,30 +46,7 @@ class HatsCatalog:
 
 
 def write_hats(stars: pa.Table, folder: Path, name: str, max_rows: int = MAX_ROWS) -> HatsCatalog:
-    """Write a star table as a HATS catalog.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        With ``star_id``, ``ra_deg`` and ``dec_deg``.
-    folder : Path
-        Made; it must not exist.
-    name : str
-        The name that the catalog gets.
-    max_rows : int
-        Rows that a partition may hold at most.
-
-    Returns
-    -------
-    HatsCatalog
-        The counts of what was written.
-
-    Raises
-    ------
-    ConfigError
-        If the table lacks a column, has no star with a position or more than `max_rows` in
-        one place, or cdshealpix is not installed.
-    """
+    """Write a star table as a HATS catalog."""
     table, left_out = _with_pixels(stars, name)
     found, counts = np.unique(table[HEALPIX_COLUMN].to_numpy(), return_counts=True)
     partitions = partition_pixels(found, counts, MAX_ORDER, max_rows, name)

@@ -22,20 +22,7 @@ _NAME_BYTES = (1 << 16) - 1
 
 
 def write_npz(columns: list[NumpyColumn], path: Path) -> None:
-    """Write columns as an npz file.
-
-    Parameters
-    ----------
-    columns : list of NumpyColumn
-        The table.
-    path : Path
-        Overwritten if it exists.
-
-    Raises
-    ------
-    SchemaError
-        If a text ends with a null character, or a name is too long.
-    """
+    """Write columns as an npz file."""
     # Not numpy.savez: it takes a column named "file" for its own argument.
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for column in columns:

@@ -61,27 +61,7 @@ class NumpyColumn:
 
 
 def numpy_columns(table: pa.Table, *, signed: bool) -> list[NumpyColumn]:
-    """Return the columns of a table as numpy arrays.
-
-    Parameters
-    ----------
-    table : pyarrow.Table
-        The table; its columns are of any types that `plain_schema` accepts.
-    signed : bool
-        Whether to widen integers to those that FITS and VOTable have: 8 bits without a sign,
-        and 16, 32, 64 with.
-
-    Returns
-    -------
-    list of NumpyColumn
-        In order. Decimals are int64 or float64; dates and times ISO 8601 text; records and lists
-        of anything but numbers JSON text.
-
-    Raises
-    ------
-    SchemaError
-        If a value does not fit, or a list of integers has a missing item.
-    """
+    """Return the columns of a table as numpy arrays."""
     table = table.cast(plain_schema(table.schema))
     return [
         _numpy_column(field, table[field.name].combine_chunks(), signed=signed)
@@ -90,20 +70,7 @@ def numpy_columns(table: pa.Table, *, signed: bool) -> list[NumpyColumn]:
 
 
 def check_names(names: Iterable[str], file_format: str) -> None:
-    """Refuse a column without a name, which these formats have no place for.
-
-    Parameters
-    ----------
-    names : iterable of str
-        Names of the columns.
-    file_format : str
-        For the message.
-
-    Raises
-    ------
-    SchemaError
-        If a name is empty.
-    """
+    """Refuse a column without a name, which these formats have no place for."""
     for number, name in enumerate(names, start=1):
         if not name:
             raise SchemaError(
@@ -114,18 +81,7 @@ def check_names(names: Iterable[str], file_format: str) -> None:
 
 
 def field_facts(field: pa.Field) -> dict[str, str]:
-    """Return what the metadata of a field says about its column.
-
-    Parameters
-    ----------
-    field : pyarrow.Field
-        A field of a product, or of a query.
-
-    Returns
-    -------
-    dict of str to str
-        ``unit``, ``description``, ``ucd``, each only where it says something.
-    """
+    """Return what the metadata of a field says about its column."""
     known = field.metadata or {}
     return {
         key: known[key.encode()].decode()
@@ -144,27 +100,7 @@ def _numpy_column(field: pa.Field, values: pa.Array, *, signed: bool) -> NumpyCo
 
 
 def list_items(name: str, values: pa.Array) -> tuple[NDArray[np.int64], pa.Array]:
-    """Return where the list of each row begins and ends, and the items of all rows.
-
-    Parameters
-    ----------
-    name : str
-        Name of the column, for the message.
-    values : pyarrow.ListArray
-        Lists of numbers; null counts as an empty one.
-
-    Returns
-    -------
-    offsets : ndarray of int64, shape (N + 1,)
-        Places in the items.
-    items : pyarrow.Array
-        One row's items after the other.
-
-    Raises
-    ------
-    SchemaError
-        If an integer is missing.
-    """
+    """Return where the list of each row begins and ends, and the items of all rows."""
     lengths = pc.fill_null(values.value_lengths(), 0).to_numpy(zero_copy_only=False)
     offsets = np.concatenate(([0], np.cumsum(lengths, dtype=np.int64)))
     items = values.flatten()
@@ -179,27 +115,7 @@ def list_items(name: str, values: pa.Array) -> tuple[NDArray[np.int64], pa.Array
 
 
 def plain_values(name: str, values: pa.Array, *, signed: bool) -> pa.Array:
-    """Return values as numbers, truth values or texts.
-
-    Parameters
-    ----------
-    name : str
-        Name of the column, for the message.
-    values : pyarrow.Array
-        Values of a plain type, no lists of numbers.
-    signed : bool
-        Whether to widen integers to those that FITS and VOTable have.
-
-    Returns
-    -------
-    pyarrow.Array
-        Null stays null.
-
-    Raises
-    ------
-    SchemaError
-        If a value does not fit.
-    """
+    """Return values as numbers, truth values or texts."""
     kind = values.type
     if pa.types.is_decimal(kind):
         return _narrowed(name, values, pa.float64() if kind.scale else pa.int64())

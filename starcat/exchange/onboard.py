@@ -82,41 +82,7 @@ def export_image(
     max_bytes: int | None = None,
     replace: bool = False,
 ) -> ExportedImage:
-    """Write the onboard image of an artifact.
-
-    Parameters
-    ----------
-    artifact : Path
-        The folder ``<name>-<version>``; it is verified first.
-    file_format : {"onboard", "c"}
-        The image, or C source with a header beside it.
-    output : Path, optional
-        The file; by default ``<name>-<version>.img`` or ``.c``.
-    method : {"triangle", "pyramid"}
-        What the image is for.
-    endian : {"little", "big"}
-        Byte order of the target.
-    max_bytes : int, optional
-        Size of the image at most.
-    replace : bool, default False
-        Whether files that differ may be replaced.
-
-    Returns
-    -------
-    ExportedImage
-        The files and what is in them.
-
-    Raises
-    ------
-    ConfigError
-        If an option is wrong, or the artifact lacks the product of the method.
-    ProductError
-        If the artifact is damaged.
-    OnboardSizeError
-        If the image cannot be made so small.
-    OutputError
-        If a file cannot be written, or is there and differs.
-    """
+    """Write the onboard image of an artifact."""
     check_method(method)
     order = next((known for known in BYTE_ORDERS if known == endian), None)
     if order is None:
@@ -144,25 +110,7 @@ def export_image(
 
 
 def contents_of(artifact: Artifact, method: str) -> Contents:
-    """Return what the image of an artifact is made of.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        Open.
-    method : {"triangle", "pyramid"}
-        What the features are.
-
-    Returns
-    -------
-    Contents
-        All stars, and all triangles or pairs.
-
-    Raises
-    ------
-    ConfigError
-        If the artifact lacks the product of the method.
-    """
+    """Return what the image of an artifact is made of."""
     _check_product(artifact, method)
     product, columns = FEATURES[method]
     stars, features = artifact.table("stars"), artifact.table(product)
@@ -182,31 +130,7 @@ def contents_of(artifact: Artifact, method: str) -> Contents:
 
 
 def verify_image(path: Path, against: Path | None = None) -> Verification:
-    """Check an onboard image: its blocks, its parts, and what its artifact says.
-
-    Parameters
-    ----------
-    path : Path
-        The image.
-    against : Path, optional
-        The folder of the artifact that it should be of.
-
-    Returns
-    -------
-    Verification
-        With every problem; of a damaged image the blocks, as nothing in them is to be trusted.
-
-    Raises
-    ------
-    ArtifactMissing
-        If there is no such file, or no such artifact.
-    OnboardImageError
-        If the file cannot be read.
-    SchemaVersionError
-        If it is of a version of the format that this starcat does not read.
-    ProductError
-        If the artifact is damaged.
-    """
+    """Check an onboard image: its blocks, its parts, and what its artifact says."""
     artifact = None if against is None else check_artifact(against)
     data = bytes_of_file(path)
     checks, findings = 1, list(_damage(data, path.name))

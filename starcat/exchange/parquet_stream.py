@@ -27,25 +27,7 @@ _DESCRIBED = {
 
 
 def write_parquet_stream(batches: pa.RecordBatchReader, path: Path) -> int:
-    """Write batches as a Parquet file.
-
-    Parameters
-    ----------
-    batches : pyarrow.RecordBatchReader
-        The table.
-    path : Path
-        Overwritten if it exists.
-
-    Returns
-    -------
-    int
-        Rows written.
-
-    Raises
-    ------
-    SchemaError
-        If a column has no place in a file.
-    """
+    """Write batches as a Parquet file."""
     schema = plain_schema(batches.schema)
     texts = [field.name for field in schema if pa.types.is_string(field.type)]
     floating = [field.name for field in schema if pa.types.is_floating(field.type)]

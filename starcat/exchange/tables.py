@@ -35,38 +35,11 @@ class NamedTables:
     version: str = ""
 
     def label(self, product: str) -> Label:
-        """Return what an exported file says of its table.
-
-        Parameters
-        ----------
-        product : str
-            One of the names.
-
-        Returns
-        -------
-        Label
-            With the name of the product.
-        """
+        """Return what an exported file says of its table."""
         return Label(product, self.artifact, self.version)
 
     def chosen(self, products: Sequence[str] | None) -> list[str]:
-        """Return the names asked for, in the order of the tables.
-
-        Parameters
-        ----------
-        products : sequence of str, optional
-            Names; all by default.
-
-        Returns
-        -------
-        list of str
-            Each once.
-
-        Raises
-        ------
-        ConfigError
-            If one is not there.
-        """
+        """Return the names asked for, in the order of the tables."""
         for product in products or ():
             if product not in self.readers:
                 hint = suggest(product, self.readers)
@@ -80,25 +53,7 @@ class NamedTables:
 
 
 def tables_of(path: Path) -> NamedTables:
-    """Return the tables of an artifact, or the one of a Parquet file.
-
-    Parameters
-    ----------
-    path : Path
-        The folder of an artifact, or a file such as 'starcat ingest' writes.
-
-    Returns
-    -------
-    NamedTables
-        Products by name; the table of a file has the name of the file.
-
-    Raises
-    ------
-    ProductError
-        If a folder is not an artifact.
-    SourceError
-        If a file is missing or not Parquet.
-    """
+    """Return the tables of an artifact, or the one of a Parquet file."""
     if path.is_dir():
         artifact = open_artifact(path)
         readers = {name: partial(artifact.table, name) for name in artifact.products}
@@ -112,20 +67,7 @@ def tables_of(path: Path) -> NamedTables:
 
 
 def in_memory(name: str, tables: Mapping[str, pa.Table]) -> NamedTables:
-    """Return tables that have been read.
-
-    Parameters
-    ----------
-    name : str
-        Name of all of them together.
-    tables : mapping of str to pyarrow.Table
-        By product.
-
-    Returns
-    -------
-    NamedTables
-        The same.
-    """
+    """Return tables that have been read."""
     return NamedTables(name, {product: partial(tables.__getitem__, product) for product in tables})
 
 

@@ -24,23 +24,7 @@ _BREAKS = "[\\t\\r\\n]"
 
 
 def csv_chunks(batches: pa.RecordBatchReader) -> Iterator[tuple[bytes, int]]:
-    """Yield a table as CSV.
-
-    Parameters
-    ----------
-    batches : pyarrow.RecordBatchReader
-        The table.
-
-    Yields
-    ------
-    tuple of (bytes, int)
-        UTF-8 text, the header first, and how many rows it holds.
-
-    Raises
-    ------
-    SchemaError
-        If a column has no place in a file.
-    """
+    """Yield a table as CSV."""
     schema = plain_schema(batches.schema)
     yield _csv(schema.empty_table().to_batches(), schema, header=True), 0
     for batch in _small_batches(batches, schema):
@@ -48,24 +32,7 @@ def csv_chunks(batches: pa.RecordBatchReader) -> Iterator[tuple[bytes, int]]:
 
 
 def tsv_chunks(batches: pa.RecordBatchReader) -> Iterator[tuple[bytes, int]]:
-    """Yield a table as text with tabs between the cells and nothing quoted.
-
-    Parameters
-    ----------
-    batches : pyarrow.RecordBatchReader
-        The table.
-
-    Yields
-    ------
-    tuple of (bytes, int)
-        UTF-8 text, the names first, and how many rows it holds. Null and an empty text are both
-        an empty cell; a tab or the end of a line in a text becomes a blank.
-
-    Raises
-    ------
-    SchemaError
-        If a column has no place in a file.
-    """
+    """Yield a table as text with tabs between the cells and nothing quoted."""
     schema = plain_schema(batches.schema)
     names = pc.replace_substring_regex(pa.array(schema.names, pa.string()), _BREAKS, " ")
     yield ("\t".join(names.to_pylist()) + "\n").encode(), 0
@@ -86,23 +53,7 @@ def tsv_chunks(batches: pa.RecordBatchReader) -> Iterator[tuple[bytes, int]]:
 
 
 def json_chunks(batches: pa.RecordBatchReader) -> Iterator[tuple[bytes, int]]:
-    """Yield a table as a JSON array of objects.
-
-    Parameters
-    ----------
-    batches : pyarrow.RecordBatchReader
-        The table.
-
-    Yields
-    ------
-    tuple of (bytes, int)
-        UTF-8 text and how many rows it holds.
-
-    Raises
-    ------
-    SchemaError
-        If a column has no place in a file.
-    """
+    """Yield a table as a JSON array of objects."""
     schema = plain_schema(batches.schema)
     before = "[\n"
     for batch in _small_batches(batches, schema):
@@ -113,18 +64,7 @@ def json_chunks(batches: pa.RecordBatchReader) -> Iterator[tuple[bytes, int]]:
 
 
 def json_texts(values: pa.Array) -> pa.Array:
-    """Return each value as JSON.
-
-    Parameters
-    ----------
-    values : pyarrow.Array
-        Values of a plain type.
-
-    Returns
-    -------
-    pyarrow.StringArray
-        Without nulls: a missing value, NaN and the infinities are ``null``.
-    """
+    """Return each value as JSON."""
     kind = values.type
     if is_list(kind):
         texts = _list_texts(values)

@@ -6,27 +6,7 @@ from starcat.errors import SchemaError
 
 
 def unit_text(name: str, unit: str | None, standard: str) -> str | None:
-    """Return the unit of a column in the spelling of a standard.
-
-    Parameters
-    ----------
-    name : str
-        Name of the column, for the message.
-    unit : str, optional
-        Its unit as our schemas write it.
-    standard : {"fits", "vounit", "generic"}
-        A unit format of `astropy.units`.
-
-    Returns
-    -------
-    str or None
-        Such as ``mas yr-1`` (FITS) or ``mas.yr**-1`` (VOUnit); None without a unit.
-
-    Raises
-    ------
-    SchemaError
-        If the standard does not know the unit.
-    """
+    """Return the unit of a column in the spelling of a standard."""
     if not unit:
         return None
     from astropy import units

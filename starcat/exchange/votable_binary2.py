@@ -22,32 +22,13 @@ _FOUR_BYTES = 0xF0
 
 
 class Binary2:
-    """What writes batches of a table as BINARY2.
-
-    Parameters
-    ----------
-    columns : sequence of VotableColumn
-        The columns of the table.
-    """
+    """What writes batches of a table as BINARY2."""
 
     def __init__(self, columns: Sequence[VotableColumn]) -> None:
         self._columns = tuple(columns)
 
     def rows(self, cells: Sequence[Cells], count: int) -> bytes:
-        """Return rows.
-
-        Parameters
-        ----------
-        cells : sequence of Cells
-            The cells of each column.
-        count : int
-            How many rows.
-
-        Returns
-        -------
-        bytes
-            Before base64.
-        """
+        """Return rows."""
         if not count:
             return b""
         parts: list[pa.Array] = []

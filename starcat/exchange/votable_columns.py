@@ -101,47 +101,13 @@ class Cells:
 
 
 def votable_columns(schema: pa.Schema) -> list[VotableColumn]:
-    """Return what the columns of a table are in a VOTable.
-
-    Parameters
-    ----------
-    schema : pyarrow.Schema
-        One that `plain_schema` returned.
-
-    Returns
-    -------
-    list of VotableColumn
-        In order.
-
-    Raises
-    ------
-    SchemaError
-        If a name is empty or cannot be said in XML.
-    """
+    """Return what the columns of a table are in a VOTable."""
     check_names(schema.names, "votable")
     return [_votable_column(field) for field in schema]
 
 
 def cells_of(column: VotableColumn, values: pa.Array) -> Cells:
-    """Return the cells of a column in a batch.
-
-    Parameters
-    ----------
-    column : VotableColumn
-        The column.
-    values : pyarrow.Array
-        Its values, of a plain type.
-
-    Returns
-    -------
-    Cells
-        The same values in the types that VOTable has.
-
-    Raises
-    ------
-    SchemaError
-        If a value does not fit, or is a text that XML cannot hold.
-    """
+    """Return the cells of a column in a batch."""
     is_null = values.is_null().to_numpy(zero_copy_only=False) if values.null_count else None
     offsets = None
     if column.is_list:
@@ -153,20 +119,7 @@ def cells_of(column: VotableColumn, values: pa.Array) -> Cells:
 
 
 def text_bytes(values: pa.Array) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-    """Return the UTF-8 bytes of texts.
-
-    Parameters
-    ----------
-    values : pyarrow.StringArray or pyarrow.BinaryArray, shape (N,)
-        The texts; null counts as an empty one.
-
-    Returns
-    -------
-    offsets : ndarray of int64, shape (N + 1,)
-        Where each text begins and ends.
-    content : ndarray of uint8
-        The bytes of all, one text after the other.
-    """
+    """Return the UTF-8 bytes of texts."""
     if values.null_count:
         values = pc.fill_null(values, "")
     _, places, content = values.buffers()
@@ -179,18 +132,7 @@ def text_bytes(values: pa.Array) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
 
 
 def is_constant(values: pa.Array) -> bool:
-    """Return whether all of more than one value are the same.
-
-    Parameters
-    ----------
-    values : pyarrow.Array
-        Numbers, truth values or texts.
-
-    Returns
-    -------
-    bool
-        Whether they have the same bytes; False where there is but one, or a null.
-    """
+    """Return whether all of more than one value are the same."""
     if len(values) < 2 or values.null_count:
         return False
     if pa.types.is_string(values.type):
@@ -210,36 +152,12 @@ def is_constant(values: pa.Array) -> bool:
 
 
 def is_ascii(letters: NDArray[np.uint8]) -> bool:
-    """Return whether UTF-8 bytes are all ASCII.
-
-    Parameters
-    ----------
-    letters : ndarray of uint8
-        The bytes.
-
-    Returns
-    -------
-    bool
-        True where there are none, too.
-    """
+    """Return whether UTF-8 bytes are all ASCII."""
     return not len(letters) or bool(letters.max() < _NOT_ASCII)
 
 
 def check_xml(name: str, texts: Iterable[str | None]) -> None:
-    """Refuse texts with a character that XML cannot hold.
-
-    Parameters
-    ----------
-    name : str
-        Name of the column, for the message.
-    texts : iterable of str
-        The texts; null is passed over.
-
-    Raises
-    ------
-    SchemaError
-        If one has such a character.
-    """
+    """Refuse texts with a character that XML cannot hold."""
     for text in texts:
         if text and _NOT_XML.search(text):
             raise SchemaError(
@@ -251,18 +169,7 @@ def check_xml(name: str, texts: Iterable[str | None]) -> None:
 
 
 def said_in_xml(text: str) -> str:
-    """Return a text with a question mark for each character that XML cannot hold.
-
-    Parameters
-    ----------
-    text : str
-        Of a message or a description, which nobody reads back.
-
-    Returns
-    -------
-    str
-        Not escaped yet.
-    """
+    """Return a text with a question mark for each character that XML cannot hold."""
     return _NOT_XML.sub("?", text)
 
 

@@ -18,27 +18,7 @@ _EPOCH_ROOM = 32
 
 
 def write_votable(batches: pa.RecordBatchReader, path: Path, label: Label = UNLABELLED) -> int:
-    """Write batches as a VOTable.
-
-    Parameters
-    ----------
-    batches : pyarrow.RecordBatchReader
-        The table.
-    path : Path
-        Overwritten if it exists.
-    label : Label
-        The table's name; its artifact and version become ``INFO`` elements.
-
-    Returns
-    -------
-    int
-        Rows written.
-
-    Raises
-    ------
-    SchemaError
-        If a column, text or unit cannot be said in a VOTable.
-    """
+    """Write batches as a VOTable."""
     schema = plain_schema(batches.schema)
     columns = votable_columns(schema)
     with_epoch = has_epoch(schema, columns)

@@ -44,31 +44,7 @@ def head(
     infos: Mapping[str, str],
     epoch: str,
 ) -> str:
-    """Return all that stands before the rows.
-
-    Parameters
-    ----------
-    columns : sequence of VotableColumn
-        The columns of the table.
-    serialization : {"binary2", "tabledata"}
-        What follows.
-    label : Label
-        The table's name; its artifact and version become ``INFO`` elements.
-    infos : mapping of str to str
-        Names and values of more of them.
-    epoch : str
-        The attribute of the coordinate system with the epoch, or blanks.
-
-    Returns
-    -------
-    str
-        XML.
-
-    Raises
-    ------
-    SchemaError
-        If VOUnits has no such unit.
-    """
+    """Return all that stands before the rows."""
     parts = [_VOTABLE, _RESULTS]
     for name, text in label.origin.items():
         parts.append(info(name, text, f"starcat.{name}"))
@@ -82,76 +58,25 @@ def head(
 
 
 def foot(serialization: str, infos: Sequence[str] = ()) -> str:
-    """Return all that stands after the rows.
-
-    Parameters
-    ----------
-    serialization : {"binary2", "tabledata"}
-        What came before.
-    infos : sequence of str
-        ``INFO`` elements to stand after the table.
-
-    Returns
-    -------
-    str
-        XML.
-    """
+    """Return all that stands after the rows."""
     return "".join([_AFTER_ROWS[serialization], "  </TABLE>\n", *infos, _AFTER_TABLE])
 
 
 def info(name: str, value: str, identifier: str = "", text: str = "") -> str:
-    """Return an ``INFO`` element.
-
-    Parameters
-    ----------
-    name, value : str
-        Any text.
-    identifier : str
-        Its identifier in the document, if it has one.
-    text : str
-        What stands in it.
-
-    Returns
-    -------
-    str
-        XML.
-    """
+    """Return an ``INFO`` element."""
     begins = f"ID={_attribute(identifier)} " if identifier else ""
     start = f"  <INFO {begins}name={_attribute(name)} value={_attribute(value)}"
     return f"{start}>{escape(said_in_xml(text))}</INFO>\n" if text else f"{start}/>\n"
 
 
 def error_document(text: str) -> str:
-    """Return a VOTable that says why there is no answer.
-
-    Parameters
-    ----------
-    text : str
-        What went wrong.
-
-    Returns
-    -------
-    str
-        XML with an ``INFO`` named ``Error``, as a simple cone search has it, and one named
-        ``QUERY_STATUS``, as DALI has it.
-    """
+    """Return a VOTable that says why there is no answer."""
     said = info("Error", text) + _RESULTS + info("QUERY_STATUS", "ERROR", text=text)
     return f"{_VOTABLE}{said}{_AFTER_TABLE}"
 
 
 def has_places(columns: Sequence[VotableColumn]) -> bool:
-    """Return whether a table has coordinates, and so a coordinate system.
-
-    Parameters
-    ----------
-    columns : sequence of VotableColumn
-        The columns of the table.
-
-    Returns
-    -------
-    bool
-        True where one is a coordinate or a motion on the sky.
-    """
+    """Return whether a table has coordinates, and so a coordinate system."""
     return any(column.is_place for column in columns)
 
 

@@ -47,30 +47,6 @@ def votable_chunks(
 ) -> Iterator[bytes]:
     """Yield a table as a VOTable with a status, as services answer.
 
-    Parameters
-    ----------
-    batches : pyarrow.RecordBatchReader
-        The table; ``unit``, ``description`` and ``ucd`` in its field metadata are passed on.
-    serialization : {"binary2", "tabledata"}
-        How rows are written.
-    label : Label
-        The table's name; its artifact and version become ``INFO`` elements.
-    maxrec : int, optional
-        The largest number of rows to give; all by default. One row more has to be among the
-        batches for it to be known that rows were left out. With 0 nothing is read.
-    infos : mapping of str to str, optional
-        Names and values of more ``INFO`` elements.
-
-    Yields
-    ------
-    bytes
-        UTF-8, all that stands before the rows first.
-
-    Raises
-    ------
-    SchemaError
-        If a column cannot be said in a VOTable.
-
     Notes
     -----
     What goes wrong with the first rows is raised before anything is given. What goes wrong later
@@ -115,27 +91,6 @@ def row_chunks(
 ) -> Iterator[bytes]:
     """Yield what stands between the head and the foot of a VOTable.
 
-    Parameters
-    ----------
-    batches : iterable of pyarrow.RecordBatch
-        The rows.
-    schema : pyarrow.Schema
-        Their schema as `plain_schema` returned it.
-    columns : sequence of VotableColumn
-        The columns of that schema.
-    serialization : {"binary2", "tabledata"}
-        How rows are written.
-
-    Yields
-    ------
-    bytes
-        UTF-8.
-
-    Raises
-    ------
-    SchemaError
-        If a value cannot be said in a VOTable.
-
     Notes
     -----
     What goes wrong with reading the batches is raised as it comes, after the rows before it were
@@ -164,37 +119,13 @@ def row_chunks(
 
 
 def has_epoch(schema: pa.Schema, columns: Sequence[VotableColumn]) -> bool:
-    """Return whether a table has coordinates and says of which epoch they are.
-
-    Parameters
-    ----------
-    schema : pyarrow.Schema
-        As `plain_schema` returned it.
-    columns : sequence of VotableColumn
-        The columns of that schema.
-
-    Returns
-    -------
-    bool
-        True where there is a column of epochs.
-    """
+    """Return whether a table has coordinates and says of which epoch they are."""
     place = schema.get_field_index(_EPOCH)
     return place >= 0 and pa.types.is_floating(schema.field(place).type) and has_places(columns)
 
 
 def epochs_of(batches: Iterable[pa.RecordBatch]) -> set[float]:
-    """Return the epochs of the positions of batches.
-
-    Parameters
-    ----------
-    batches : iterable of pyarrow.RecordBatch
-        With a column of epochs.
-
-    Returns
-    -------
-    set of float
-        Julian years, at most two of each batch: more than one means that there is no common one.
-    """
+    """Return the epochs of the positions of batches."""
     found: set[float] = set()
     for batch in batches:
         extremes = pc.min_max(batch.column(_EPOCH)).as_py()
@@ -203,18 +134,7 @@ def epochs_of(batches: Iterable[pa.RecordBatch]) -> set[float]:
 
 
 def epoch_attribute(epochs: set[float]) -> str:
-    """Return the attribute of the coordinate system with the epoch.
-
-    Parameters
-    ----------
-    epochs : set of float
-        The epochs of the positions, Julian years.
-
-    Returns
-    -------
-    str
-        Such as `` epoch="J2026"``; empty where the positions have no epoch in common.
-    """
+    """Return the attribute of the coordinate system with the epoch."""
     if len(epochs) != 1:
         return ""
     [epoch] = epochs

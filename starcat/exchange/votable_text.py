@@ -17,32 +17,13 @@ _ESCAPES = (("&", "&amp;"), ("<", "&lt;"), (">", "&gt;"))
 
 
 class Tabledata:
-    """What writes batches of a table as TABLEDATA.
-
-    Parameters
-    ----------
-    columns : sequence of VotableColumn
-        The columns of the table.
-    """
+    """What writes batches of a table as TABLEDATA."""
 
     def __init__(self, columns: Sequence[VotableColumn]) -> None:
         self._columns = tuple(columns)
 
     def rows(self, cells: Sequence[Cells], count: int) -> bytes:
-        """Return rows.
-
-        Parameters
-        ----------
-        cells : sequence of Cells
-            The cells of each column.
-        count : int
-            How many rows.
-
-        Returns
-        -------
-        bytes
-            UTF-8.
-        """
+        """Return rows."""
         if not count:
             return b""
         parts: list[pa.Array | str] = []

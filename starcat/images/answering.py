@@ -37,29 +37,7 @@ def measure_input(
     wcs: Path | None = None,
     options: PictureOptions | None = None,
 ) -> MeasuredFile:
-    """Read centroids from a file or from stdin, or find them in an image.
-
-    Parameters
-    ----------
-    path : Path
-        As for `measure`; ``-`` for centroids from stdin.
-    flip : bool, optional
-        As for `measure`.
-    wcs : Path, optional
-        FITS copy of the picture that is to be written.
-    options : PictureOptions, optional
-        As for `measure`.
-
-    Returns
-    -------
-    MeasuredFile
-        The frames of stdin can be gone through once, and are read as they come.
-
-    Raises
-    ------
-    ConfigError
-        As `measure`, and while the frames of stdin are read; if there can be no such copy.
-    """
+    """Read centroids from a file or from stdin, or find them in an image."""
     if path == STDIN:
         # Its frames are only ever gone through.
         measured = MeasuredFile(cast(Sequence[MeasuredFrame], _frames_of_stdin()))
@@ -80,27 +58,7 @@ def _frames_of_stdin() -> Iterator[MeasuredFrame]:
 def camera_of_size(
     measured: MeasuredFile, size_px: tuple[int, int] | None, known: Camera
 ) -> Camera:
-    """Return the camera of frames of which nothing is known but their size.
-
-    Parameters
-    ----------
-    measured : MeasuredFile
-        The frames; a picture says its size itself.
-    size_px : tuple of int, optional
-        Width and height as they were stated.
-    known : Camera
-        The camera whose size centroids have where none is stated.
-
-    Returns
-    -------
-    Camera
-        Of that size, with the field of the known camera and no distortion.
-
-    Raises
-    ------
-    ConfigError
-        If the picture is of another size than was stated.
-    """
+    """Return the camera of frames of which nothing is known but their size."""
     width, height = size_px or (known.width_px, known.height_px)
     if measured.image is not None:
         height, width = measured.image.shape
@@ -124,20 +82,7 @@ def answer_each(
     near: Near | None = None,
     fov_deg: tuple[float, float] | None = None,
 ) -> Iterator[tuple[MeasuredFrame, MatchResult]]:
-    """Identify the frames of a file or stream, one when it is asked for.
-
-    Parameters
-    ----------
-    matcher, measured, camera, observer, fov_error, near, fov_deg
-        As for `identify_frames`.
-    flip : bool, optional
-        Whether y of centroids was counted from the bottom; images were turned when read.
-
-    Yields
-    ------
-    (MeasuredFrame, MatchResult)
-        A frame and its answer.
-    """
+    """Identify the frames of a file or stream, one when it is asked for."""
     for given in measured.frames:
         turned = bool(flip) and measured.image is None
         frame = upside_down(given, camera.height_px) if turned else given
@@ -149,22 +94,7 @@ def answer_each(
 def sky_of_answer(
     frame: MeasuredFrame, result: MatchResult, observer: Observer | None
 ) -> SkyInTime | None:
-    """Return what a time adds to the answer to a frame.
-
-    Parameters
-    ----------
-    frame : MeasuredFrame
-        The frame.
-    result : MatchResult
-        Its answer.
-    observer : Observer or None
-        When and where it was taken.
-
-    Returns
-    -------
-    SkyInTime or None
-        None where it is not identified, or the time is not known.
-    """
+    """Return what a time adds to the answer to a frame."""
     if observer is None or result.asked is None or result.camera is None:
         return None
     from starcat.sky.in_time import sky_in_time
@@ -185,38 +115,7 @@ def write_extras(
     flip: bool | None = None,
     observer: Observer | None = None,
 ) -> None:
-    """Write what is asked for beside the answer to a frame.
-
-    Parameters
-    ----------
-    source : Path
-        The file that the frame is of.
-    measured : MeasuredFile
-        What was read from it.
-    frame : MeasuredFrame
-        The frame.
-    result : MatchResult
-        Its answer.
-    camera : Camera
-        The camera, for its size.
-    picture : Path, optional
-        PNG or SVG file of the frame with its stars named.
-    wcs : Path, optional
-        FITS copy of the picture with the world coordinates; only if it was identified.
-    flip : bool, optional
-        As for `measure`.
-    observer : Observer, optional
-        When and where the frame was taken: its planets are in the picture.
-
-    Raises
-    ------
-    ConfigError
-        If the picture is of another kind.
-    NotIdentifiedError
-        If there is no attitude to write.
-    OutputError
-        If a file cannot be written.
-    """
+    """Write what is asked for beside the answer to a frame."""
     if picture is not None and result.asked is not None:
         database = result.asked.database
         eye = result.camera or camera

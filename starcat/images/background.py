@@ -74,18 +74,7 @@ class Levels:
 
 
 def load_sep() -> Any:
-    """Return the library that measures stars, Source Extractor's.
-
-    Returns
-    -------
-    module
-        ``sep``.
-
-    Raises
-    ------
-    ConfigError
-        If it is not installed.
-    """
+    """Return the library that measures stars, Source Extractor's."""
     try:
         return importlib.import_module("sep")
     except ImportError as error:
@@ -96,24 +85,7 @@ def load_sep() -> Any:
 
 
 def subtract_background(image: ArrayLike) -> Levels:
-    """Take the background off an image.
-
-    Parameters
-    ----------
-    image : array_like, shape (height, width)
-        Grey values.
-
-    Returns
-    -------
-    Levels
-        The background is the mode of boxes of 64 px, smoothed over three by three boxes and
-        joined by splines.
-
-    Raises
-    ------
-    ConfigError
-        If sep is not installed, or the image is not 2-D, too small or without a finite value.
-    """
+    """Take the background off an image."""
     values = np.asarray(image)
     if values.ndim != 2 or min(values.shape) < SMALLEST_PX or values.dtype.kind not in "buif":
         raise ConfigError(
@@ -253,21 +225,7 @@ def _noise_above_black(values: Grey) -> float:
 
 
 def repair_hot_pixels(levels: Levels, psf_sigma_px: float) -> Levels:
-    """Replace single bright pixels by the mean of their neighbours.
-
-    Parameters
-    ----------
-    levels : Levels
-        An image above its background.
-    psf_sigma_px : float
-        Standard deviation of a star's spot: a pixel is hot if its neighbours have less than a
-        quarter of the light that they would have beside the middle of a star.
-
-    Returns
-    -------
-    Levels
-        The same levels with another ``above``; ``raw`` stays.
-    """
+    """Replace single bright pixels by the mean of their neighbours."""
     centre, square = (erf(half / (np.sqrt(2.0) * psf_sigma_px)) ** 2 for half in (0.5, 1.5))
     y, x = np.nonzero(levels.above > _HOT_NOISE * levels.noise)
     around = pixels_around(levels.above, x, y).astype(np.float64)
@@ -280,19 +238,6 @@ def repair_hot_pixels(levels: Levels, psf_sigma_px: float) -> Levels:
 
 
 def pixels_around(image: Grey, x: NDArray[np.int64], y: NDArray[np.int64]) -> Grey:
-    """Return the 3 by 3 pixels around places of an image.
-
-    Parameters
-    ----------
-    image : ndarray of float32, shape (height, width)
-        Grey values.
-    x, y : ndarray of int64, shape (N,)
-        Columns and rows.
-
-    Returns
-    -------
-    ndarray of float32, shape (N, 3, 3)
-        0 outside of the image.
-    """
+    """Return the 3 by 3 pixels around places of an image."""
     steps = np.arange(3)
     return np.asarray(np.pad(image, 1)[y[:, None, None] + steps[:, None], x[:, None, None] + steps])

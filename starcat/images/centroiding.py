@@ -72,18 +72,7 @@ class Spots:
         return len(self.flux)
 
     def brightest(self, count: int) -> Spots:
-        """Return the first spots.
-
-        Parameters
-        ----------
-        count : int
-            How many there are to be at most.
-
-        Returns
-        -------
-        Spots
-            The brightest ones, in the same order.
-        """
+        """Return the first spots."""
         columns = {field.name: getattr(self, field.name)[:count] for field in fields(self)[:-1]}
         return Spots(**columns, psf_sigma_px=self.psf_sigma_px)
 
@@ -98,36 +87,6 @@ def find_spots(
     most_spots: int | None = None,
 ) -> Spots:
     """Find the spots of an image and measure them.
-
-    Parameters
-    ----------
-    image : array_like, shape (height, width)
-        Grey values, row 0 at the top. Values that are not finite are left out.
-    threshold_sigma : float, default 5
-        Least signal over noise of a spot, after smoothing with a star's own shape. A frame of
-        a million pixels has about one false spot at 5.
-    psf_sigma_px : float, optional
-        Standard deviation of a star's spot, pixels; without it, measured on the brightest.
-    saturation : float, optional
-        Grey value from which a pixel is saturated; without it, a spot is saturated if three of
-        its pixels form a plateau at the largest value of the image.
-    gain_e_per_adu : float, optional
-        Electrons of one grey step, for the photon noise in ``snr``; without it only the noise
-        of the background counts.
-    most_spots : int, optional
-        The brightest so many are returned; all by default.
-
-    Returns
-    -------
-    Spots
-        Spots by flux, equal ones by x, then by y. Empty if nothing stands out.
-
-    Raises
-    ------
-    ConfigError
-        If sep is not installed; if the image is not 2-D, too small, without a finite value, or
-        has too much in it to tell stars from the sky; if the stars are trails; if a parameter
-        is not positive.
 
     References
     ----------
@@ -212,20 +171,7 @@ def _measured(
 
 
 def brightest_first(flux: Array, centroids_px: Array) -> NDArray[np.int64]:
-    """Return the order of spots.
-
-    Parameters
-    ----------
-    flux : ndarray of float64, shape (N,)
-        Light of each spot.
-    centroids_px : ndarray of float64, shape (N, 2)
-        Places of the spots.
-
-    Returns
-    -------
-    ndarray of int64, shape (N,)
-        Rows by flux, the brightest first; equal ones by x, then by y.
-    """
+    """Return the order of spots."""
     return np.lexsort((centroids_px[:, 1], centroids_px[:, 0], -flux))
 
 

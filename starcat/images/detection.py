@@ -29,25 +29,6 @@ _RAISE, _TRIES = 1.5, 4
 def detect(levels: Levels, sigma: float, threshold: float) -> NDArray[Any]:
     """Return what stands out after smoothing with a star's shape.
 
-    Parameters
-    ----------
-    levels : Levels
-        An image above its background.
-    sigma : float
-        Standard deviation of the star's shape, pixels.
-    threshold : float
-        Least signal over noise.
-
-    Returns
-    -------
-    ndarray
-        Table of ``sep.extract``.
-
-    Raises
-    ------
-    ConfigError
-        If too much stands out at four thresholds, the last 3.4 times as high as the first.
-
     Notes
     -----
     Where noise is white, its part that is left by the filter is known. Where it is not

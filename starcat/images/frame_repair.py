@@ -17,49 +17,13 @@ _BINOMIAL = np.array([0.25, 0.5, 0.25])
 
 
 def without_dark(image: NDArray[Any], dark: NDArray[Any]) -> NDArray[Any]:
-    """Return an image without the dark current of its pixels.
-
-    Parameters
-    ----------
-    image : ndarray, shape (height, width)
-        Grey values.
-    dark : ndarray, shape (height, width)
-        The same camera with the lid on.
-
-    Returns
-    -------
-    ndarray of float64, shape (height, width)
-        The difference, which may be negative.
-
-    Raises
-    ------
-    ConfigError
-        If the sizes differ.
-    """
+    """Return an image without the dark current of its pixels."""
     _check_size(image, dark, "dark frame")
     return np.asarray(np.asarray(image, dtype=np.float64) - dark)
 
 
 def without_dead_zones(image: NDArray[Any], mask: NDArray[Any]) -> NDArray[Any]:
-    """Return an image in which dead pixels have no value.
-
-    Parameters
-    ----------
-    image : ndarray, shape (height, width)
-        Grey values.
-    mask : ndarray, shape (height, width)
-        Not zero where a pixel is dead or hot, or where no stars are wanted.
-
-    Returns
-    -------
-    ndarray of float64, shape (height, width)
-        NaN there: no spot is found in them.
-
-    Raises
-    ------
-    ConfigError
-        If the sizes differ, or nothing is left.
-    """
+    """Return an image in which dead pixels have no value."""
     _check_size(image, mask, "mask")
     is_dead = np.asarray(mask) != 0
     if is_dead.all():
@@ -68,21 +32,7 @@ def without_dead_zones(image: NDArray[Any], mask: NDArray[Any]) -> NDArray[Any]:
 
 
 def grey_of_mosaic(image: NDArray[Any]) -> NDArray[Any]:
-    """Return the light of a mosaic of colour filters, at the mosaic's own resolution.
-
-    Parameters
-    ----------
-    image : ndarray, shape (height, width)
-        Values behind filters of 2 by 2 px (Bayer), in any of their four orders.
-
-    Returns
-    -------
-    ndarray of float64, shape (height, width)
-        At every pixel a quarter of each of the four filters, interpolated linearly: the weights
-        of the neighbours are 1, 2, 1 along both axes, which is the same for every order. The
-        filters' different backgrounds become one, and centroids do not depend on the colour of
-        a star. Spots become wider by 0.5 px squared.
-    """
+    """Return the light of a mosaic of colour filters, at the mosaic's own resolution."""
     grey = np.asarray(image, dtype=np.float64)
     for axis in (0, 1):
         grey = convolve1d(grey, _BINOMIAL, axis=axis, mode="mirror")

@@ -93,28 +93,7 @@ class PictureOptions:
 def measure(
     path: Path, *, flip: bool | None = None, options: PictureOptions | None = None
 ) -> MeasuredFile:
-    """Read centroids, or find them in an image.
-
-    Parameters
-    ----------
-    path : Path
-        CSV, JSON, FITS, PNG, TIFF or JPEG.
-    flip : bool, optional
-        Whether the first row of an image is its bottom; the file's own word by default. Those
-        of centroids, whose camera is not known here, are turned when they are answered.
-    options : PictureOptions, optional
-        How a picture is read and measured.
-
-    Returns
-    -------
-    MeasuredFile
-        One frame for CSV and images.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read, or images cannot be for lack of a package.
-    """
+    """Read centroids, or find them in an image."""
     if path.suffix.lower() not in IMAGE_SUFFIXES:
         return MeasuredFile(read_frames(path))
     from starcat.images.centroiding import find_spots
@@ -134,27 +113,7 @@ def measure(
 
 
 def read_picture(path: Path, flip: bool | None, options: PictureOptions) -> NDArray[Any]:
-    """Read an image and repair it as the options say: dark frame, mask, mosaic.
-
-    Parameters
-    ----------
-    path : Path
-        Image file.
-    flip : bool, optional
-        As that of `measure`; dark frame and mask are turned like the image.
-    options : PictureOptions
-        What is to be done.
-
-    Returns
-    -------
-    ndarray, shape (height, width)
-        Grey values; NaN where the mask is not zero.
-
-    Raises
-    ------
-    ConfigError
-        If a file cannot be read or is not of the image's size.
-    """
+    """Read an image and repair it as the options say: dark frame, mask, mosaic."""
     from starcat.images.frame_repair import grey_of_mosaic, without_dark, without_dead_zones
     from starcat.images.image_file import read_image
 
@@ -177,36 +136,7 @@ def identify_frames(
     near: Near | None = None,
     fov_deg: tuple[float, float] | None = None,
 ) -> list[MatchResult]:
-    """Identify the frames of a file.
-
-    Parameters
-    ----------
-    matcher : Matcher
-        The matcher, with a database open.
-    measured : MeasuredFile
-        The frames.
-    camera : Camera
-        That took them.
-    observer : Observer, optional
-        When and where they were taken: then the spots of planets are named.
-    fov_error : float, optional
-        Largest relative error of the camera's focal length. By default 2 % for an image, where
-        the matcher can find it, and 0 for centroids.
-    near : Tracker or (list of float, float), optional
-        What says where the frames are expected, with the same matcher.
-    fov_deg : pair of float, optional
-        Narrowest and widest field across the width, in place of what the camera says of it.
-
-    Returns
-    -------
-    list of MatchResult
-        One a frame.
-
-    Raises
-    ------
-    ConfigError
-        If the image is not of the camera's size, or a tracker is to tell planets.
-    """
+    """Identify the frames of a file."""
     if measured.image is not None:
         height, width = measured.image.shape
         if (width, height) != (camera.width_px, camera.height_px):
@@ -258,26 +188,7 @@ def _asked(
 
 
 def write_simulated(path: Path, frame: Frame, camera: Camera, seed: int) -> None:
-    """Write a simulated frame as centroids, or as the image that a camera would take.
-
-    Parameters
-    ----------
-    path : Path
-        CSV, FITS, PNG or TIFF; JPEG with eight bits.
-    frame : Frame
-        Centroids and magnitudes.
-    camera : Camera
-        The camera, for its size.
-    seed : int
-        Seed of the image's noise.
-
-    Raises
-    ------
-    ConfigError
-        If the suffix says neither centroids nor a kind of image that is written.
-    OutputError
-        If the file cannot be written.
-    """
+    """Write a simulated frame as centroids, or as the image that a camera would take."""
     from starcat.images.image_file import WRITTEN_KINDS, write_image
 
     suffix = path.suffix.lower()
@@ -309,30 +220,7 @@ def draw(
     camera: Camera,
     sky: SkyInTime | None = None,
 ) -> None:
-    """Draw the first frame of a file with its stars circled and named.
-
-    Parameters
-    ----------
-    path : Path
-        PNG or SVG file to write.
-    measured : MeasuredFile
-        The frames.
-    result : MatchResult
-        The answer to the first one.
-    database : Database
-        Names of the stars.
-    camera : Camera
-        The camera.
-    sky : SkyInTime, optional
-        What the time adds: its planets are drawn.
-
-    Raises
-    ------
-    ConfigError
-        If the picture is of another kind.
-    OutputError
-        If it cannot be written.
-    """
+    """Draw the first frame of a file with its stars circled and named."""
     from starcat.images.overlay import overlay_from_attitude
     from starcat.images.picture import compass_from_matrix, draw_identified
 
@@ -388,16 +276,6 @@ def _labels(result: MatchResult, database: Database, sky: SkyInTime | None) -> l
 
 def short_name(designation: str) -> str:
     """Return a designation that fits beside a star.
-
-    Parameters
-    ----------
-    designation : str
-        Catalog and number.
-
-    Returns
-    -------
-    str
-        Long numbers keep their last eight digits: of six, Gaia's have 15,625 endings only.
 
     Examples
     --------

@@ -49,28 +49,6 @@ def read_image(
 ) -> Grey:
     """Read the grey values of an image.
 
-    Parameters
-    ----------
-    path : Path
-        FITS (also gzipped or tile-compressed), PNG, TIFF or JPEG.
-    flip : bool, optional
-        Whether the first row of the file is the bottom of the picture. If not given, it is so
-        where a FITS file says ``ROWORDER = 'BOTTOM-UP'``, and nowhere else.
-    hdu : int, optional
-        Part of a FITS file, counted from 0; the first that holds a plane if not given. Which
-        one it was is logged.
-
-    Returns
-    -------
-    ndarray of float32 or float64, shape (height, width)
-        Row 0 is the top row. float64 only where float32 would lose digits of the file.
-
-    Raises
-    ------
-    ConfigError
-        If the file is missing, damaged, of another kind, not one plane, or if
-        colour of 16 bits is to be read without imagecodecs.
-
     Notes
     -----
     The FITS standard does not say which row is the top one. Programs that write arrays put the
@@ -214,26 +192,7 @@ def _bits(data: bytes, picture: Any) -> tuple[int, bool]:
 
 
 def write_image(path: Path, image: NDArray[Any], *, quality: int = 95) -> None:
-    """Write an image, the same bytes for the same values.
-
-    Parameters
-    ----------
-    path : Path
-        ``.fits``, ``.png``, ``.tif`` or ``.jpg``, replaced if it exists.
-    image : ndarray, shape (height, width)
-        Row 0 is the top row. PNG and TIFF take uint8 and uint16, JPEG uint8, FITS all numbers.
-    quality : int, default 95
-        Quality of JPEG, up to 95.
-
-    Raises
-    ------
-    ConfigError
-        If the suffix names another kind.
-    ValueError
-        If the array is not 2-D or its type does not go into the file.
-    OutputError
-        If the file cannot be written.
-    """
+    """Write an image, the same bytes for the same values."""
     kind = WRITTEN_KINDS.get(path.suffix.lower())
     if kind is None:
         raise ConfigError(f"{path}: unknown kind of image; expected {', '.join(WRITTEN_KINDS)}")

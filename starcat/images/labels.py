@@ -23,26 +23,6 @@ def place_labels(
 ) -> dict[int, tuple[float, float]]:
     """Place labels beside round marks, one after the other, each where it covers nothing.
 
-    Parameters
-    ----------
-    centres : ndarray of float64, shape (N, 2)
-        Middles of all marks (x right, y down), in any unit that all lengths here share.
-    radii : ndarray of float64, shape (N,)
-        Radii of the marks.
-    sizes : ndarray of float64, shape (N, 2)
-        Width and height of each mark's label.
-    wanted : sequence of int
-        Marks that should get a label, the most important first.
-    frame : tuple of float
-        Width and height of the picture; labels stay inside.
-    taken : ndarray of float64, shape (K, 4)
-        Boxes that are not free: left, top, right, bottom.
-
-    Returns
-    -------
-    dict of int to tuple of float
-        Top left corner of each label. A label that finds no place is left out.
-
     Examples
     --------
     >>> import numpy as np

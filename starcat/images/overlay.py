@@ -52,42 +52,12 @@ class Overlay:
 def overlay_from_attitude(
     matrix: Array, camera: Camera, epoch_jyear: float, bodies: tuple[BodyInFrame, ...] = ()
 ) -> Overlay:
-    """Return what lies behind the stars of a frame.
-
-    Parameters
-    ----------
-    matrix : ndarray of float64, shape (3, 3)
-        Attitude that puts the stars of a catalog on their spots, ``body = matrix @ icrs``.
-    camera : Camera
-        The camera.
-    epoch_jyear : float
-        Julian year that the stars of constellations are moved to.
-    bodies : tuple of BodyInFrame
-        Planets in the frame.
-
-    Returns
-    -------
-    Overlay
-        The lines that have a part on the detector.
-    """
+    """Return what lies behind the stars of a frame."""
     return Overlay(_grid(matrix, camera), _figures(matrix, camera, epoch_jyear), bodies)
 
 
 def draw_overlay(plate: Plate, overlay: Overlay) -> Array:
-    """Draw lines and planets.
-
-    Parameters
-    ----------
-    plate : Plate
-        What is being drawn.
-    overlay : Overlay
-        Lines and planets.
-
-    Returns
-    -------
-    ndarray of float64, shape (K, 4)
-        Boxes of the words written, points from the top left: left, top, right, bottom.
-    """
+    """Draw lines and planets."""
     taken: list[list[float]] = []
     for name, points in overlay.grid:
         plate.axes.plot(*points.T, color=GRID, lw=0.6, alpha=0.75, zorder=0.5)

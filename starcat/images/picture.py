@@ -57,41 +57,7 @@ def draw_identified(
     compass: tuple[Array, Array] | None = None,
     overlay: Overlay | None = None,
 ) -> None:
-    """Draw which spots of a frame are which stars.
-
-    Parameters
-    ----------
-    path : Path
-        ``.png`` or ``.svg``, replaced if it exists.
-    image : ndarray, shape (height, width), or None
-        Grey values, row 0 at the top; without it the spots are drawn as dots.
-    camera_size : tuple of int
-        Width and height, pixels.
-    centroids_px : ndarray of float64, shape (N, 2)
-        Spots, in pixels (x right, y down, origin at the outer corner of the top-left pixel).
-    names : sequence of str or None, length N
-        Name of each spot's star, which may be empty; None where a spot is not identified.
-    title : str
-        Above the picture.
-    mag : ndarray of float64, shape (N,), optional
-        Brightness of the spots, in magnitudes of any zero point: sizes of marks, and which
-        names come first. In the order of the spots without it.
-    below : str, default ""
-        A second line, under the title.
-    compass : tuple of two ndarrays of float64, shape (2,), optional
-        Directions of north and of east in pixels (x right, y down).
-    overlay : Overlay, optional
-        Grid, lines of constellations, planets.
-
-    Raises
-    ------
-    ConfigError
-        If the suffix is another one.
-    ValueError
-        If the numbers of spots, names and magnitudes differ, or image and camera do.
-    OutputError
-        If the file cannot be written.
-    """
+    """Draw which spots of a frame are which stars."""
     if path.suffix.lower() not in (".png", ".svg"):
         raise ConfigError(f"{path}: a picture is .png or .svg")
     _check(image, camera_size, centroids_px, names, mag)
@@ -109,16 +75,6 @@ def draw_identified(
 
 def compass_from_matrix(matrix: Array) -> tuple[Array, Array]:
     """Return where north and east are in the middle of a frame.
-
-    Parameters
-    ----------
-    matrix : ndarray of float64, shape (3, 3)
-        Attitude, ``body = matrix @ icrs``.
-
-    Returns
-    -------
-    north, east : ndarray of float64, shape (2,)
-        Unit directions in pixels (x right, y down).
 
     Examples
     --------

@@ -70,20 +70,7 @@ class Plate:
 
 
 def mark_radii(count: int, mag: Array | None) -> Array:
-    """Return the sizes of marks.
-
-    Parameters
-    ----------
-    count : int
-        Number of marks.
-    mag : ndarray of float64, shape (count,), or None
-        Magnitudes of any zero point.
-
-    Returns
-    -------
-    ndarray of float64, shape (count,)
-        Radii in points: 5 for the faintest, 10 for the brightest, 6 where nothing is known.
-    """
+    """Return the sizes of marks."""
     if mag is None or not np.isfinite(mag).any():
         return np.full(count, 6.0)
     brightest, faintest = np.nanmin(mag), np.nanmax(mag)
@@ -92,15 +79,7 @@ def mark_radii(count: int, mag: Array | None) -> Array:
 
 
 def draw_sky(plate: Plate, image: NDArray[Any] | None) -> None:
-    """Draw the sky.
-
-    Parameters
-    ----------
-    plate : Plate
-        What is being drawn.
-    image : ndarray, shape (height, width), or None
-        Grey values; without it every spot becomes a dot with a glow.
-    """
+    """Draw the sky."""
     from matplotlib.colors import LinearSegmentedColormap
 
     width, height = plate.size
@@ -117,13 +96,7 @@ def draw_sky(plate: Plate, image: NDArray[Any] | None) -> None:
 
 
 def draw_marks(plate: Plate) -> None:
-    """Draw a ring around what is identified, and a diamond around what is not.
-
-    Parameters
-    ----------
-    plate : Plate
-        What is being drawn.
-    """
+    """Draw a ring around what is identified, and a diamond around what is not."""
     is_star = np.array([name is not None for name in plate.names], dtype=bool)
     for chosen, marker, colour in ((is_star, "o", STAR), (~is_star, "D", LOST)):
         x, y = plate.centroids[chosen].T
@@ -132,20 +105,7 @@ def draw_marks(plate: Plate) -> None:
 
 
 def draw_compass(plate: Plate, compass: tuple[Array, Array] | None) -> Array:
-    """Draw north and east in the corner with the fewest spots.
-
-    Parameters
-    ----------
-    plate : Plate
-        What is being drawn.
-    compass : tuple of two ndarrays of float64, shape (2,), or None
-        Directions of north and of east in pixels, of any length.
-
-    Returns
-    -------
-    ndarray of float64, shape (0, 4) or (1, 4)
-        The box that it takes, points from the top left: left, top, right, bottom.
-    """
+    """Draw north and east in the corner with the fewest spots."""
     if compass is None:
         return np.empty((0, 4))
     width, height = plate.frame
@@ -168,20 +128,7 @@ def draw_compass(plate: Plate, compass: tuple[Array, Array] | None) -> Array:
 
 
 def draw_names(plate: Plate, taken: Array) -> int:
-    """Write the names that find room, those of the largest marks first.
-
-    Parameters
-    ----------
-    plate : Plate
-        What is being drawn.
-    taken : ndarray of float64, shape (K, 4)
-        Boxes that are not free, points from the top left: left, top, right, bottom.
-
-    Returns
-    -------
-    int
-        Names that found none.
-    """
+    """Write the names that find room, those of the largest marks first."""
     from matplotlib.patheffects import withStroke
 
     widths = [LETTER_PT * len(name or "") + _LABEL_GAP_PT for name in plate.names]

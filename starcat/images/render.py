@@ -74,30 +74,7 @@ class Optics:
 def star_electrons(
     centroids_px: Array, mag: Array, camera_size: tuple[int, int], optics: Optics
 ) -> Array:
-    """Return the mean number of electrons that stars release, without background or noise.
-
-    Parameters
-    ----------
-    centroids_px : ndarray of float64, shape (N, 2)
-        Pixels (x right, y down, origin at the outer corner of the top-left pixel). A star
-        outside of the frame still shines into it; one at NaN is not drawn.
-    mag : ndarray of float64, shape (N,)
-        Magnitudes in the passband of the zero point.
-    camera_size : tuple of int
-        Width and height, pixels.
-    optics : Optics
-        The optics: spot and zero point; the well has no bottom here.
-
-    Returns
-    -------
-    ndarray of float64, shape (height, width)
-        Electrons.
-
-    Raises
-    ------
-    ValueError
-        If the shapes differ, a magnitude is not a number, or the frame has no pixels.
-    """
+    """Return the mean number of electrons that stars release, without background or noise."""
     width, height = camera_size
     centroids_px, mag = np.asarray(centroids_px), np.asarray(mag)
     _check(centroids_px, mag, camera_size)
@@ -146,31 +123,6 @@ def render_image(
     light_e: Array | None = None,
 ) -> NDArray[np.uint16]:
     """Return the image of stars as a detector would record it.
-
-    Parameters
-    ----------
-    centroids_px : ndarray of float64, shape (N, 2)
-        Pixels, as in `star_electrons`.
-    mag : ndarray of float64, shape (N,)
-        Magnitudes in the passband of the zero point.
-    camera_size : tuple of int
-        Width and height, pixels.
-    optics : Optics
-        Spot, zero point, noise and limits.
-    seed : int
-        Seed of all that is random; the same seed gives the same image.
-    light_e : ndarray of float64, shape (height, width), optional
-        Electrons of other light, such as that of `scene_light`.
-
-    Returns
-    -------
-    ndarray of uint16, shape (height, width)
-        ADU, row 0 at the top; values that 16 bits cannot hold are cut.
-
-    Raises
-    ------
-    ValueError
-        The errors of `star_electrons`.
 
     Notes
     -----

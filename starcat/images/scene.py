@@ -72,24 +72,7 @@ class Scene:
 
 
 def scene_light(scene: Scene, camera_size: tuple[int, int], full_well_e: float, seed: int) -> Array:
-    """Return the mean number of electrons that a scene adds to the background.
-
-    Parameters
-    ----------
-    scene : Scene
-        The scene.
-    camera_size : tuple of int
-        Width and height, pixels.
-    full_well_e : float
-        Electrons that a pixel of the Moon's disk has, at least.
-    seed : int
-        Seed of the nebulous light.
-
-    Returns
-    -------
-    ndarray of float64, shape (height, width)
-        Electrons.
-    """
+    """Return the mean number of electrons that a scene adds to the background."""
     width, height = camera_size
     y, x = np.mgrid[:height, :width] + 0.5
     light = np.zeros((height, width))
@@ -111,18 +94,6 @@ def scene_light(scene: Scene, camera_size: tuple[int, int], full_well_e: float, 
 
 def in_file_steps(adu: NDArray[Any], scene: Scene) -> NDArray[Any]:
     """Return an image of a detector as the file of a camera has it.
-
-    Parameters
-    ----------
-    adu : ndarray, shape (height, width)
-        Steps of the detector.
-    scene : Scene
-        Black point, scale and bits.
-
-    Returns
-    -------
-    ndarray of uint8 or uint16, shape (height, width)
-        Rounded; cut at both ends.
 
     Examples
     --------

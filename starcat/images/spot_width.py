@@ -30,23 +30,7 @@ _BRIGHT, _BRIGHT_SHARE = 10, 0.1
 
 
 def best_widths(levels: Levels, places: Array) -> tuple[Array, Array]:
-    """Return the Gaussian under which each spot stands out most.
-
-    Parameters
-    ----------
-    levels : Levels
-        An image above its background.
-    places : ndarray of float64, shape (N, 2)
-        Middles of spots, pixels, x and y, counted from the centre of the first pixel.
-
-    Returns
-    -------
-    sigma_px : ndarray of float64, shape (N,)
-        Standard deviation of the Gaussian with the largest signal over noise, before the pixels
-        sample it. A constant below the spot does not matter.
-    snr : ndarray of float64, shape (N,)
-        That signal over noise, of the noise of single pixels.
-    """
+    """Return the Gaussian under which each spot stands out most."""
     if not len(places):
         return np.empty(0), np.empty(0)
     low, high = SIGMA_RANGE_PX
@@ -66,23 +50,7 @@ def best_widths(levels: Levels, places: Array) -> tuple[Array, Array]:
 
 
 def is_sharp(levels: Levels, places: Array, sigma: float) -> NDArray[np.bool_]:
-    """Return which spots are too narrow for the light of a star, beyond their noise.
-
-    Parameters
-    ----------
-    levels : Levels
-        An image above its background.
-    places : ndarray of float64, shape (N, 2)
-        Middles of spots, counted from the centre of the first pixel.
-    sigma : float
-        Standard deviation of a star's spot, pixels.
-
-    Returns
-    -------
-    ndarray of bool, shape (N,)
-        Those that stand out more under a Gaussian of half the width, and clearly: their own
-        width is less than 0.7 of a star's. Two hot pixels side by side are so.
-    """
+    """Return which spots are too narrow for the light of a star, beyond their noise."""
     if not len(places):
         return np.zeros(0, dtype=np.bool_)
     corner = np.floor(places + 0.5).astype(np.int64)
@@ -144,25 +112,7 @@ def _patches(above: NDArray[np.float32], corner: NDArray[np.int64]) -> Array:
 
 
 def sigma_of_stars(levels: Levels, places: Array, peak: Array) -> float:
-    """Return the width of an image's stars.
-
-    Parameters
-    ----------
-    levels : Levels
-        An image above its background.
-    places : ndarray of float64, shape (N, 2)
-        Middles of spots, without saturated ones, counted from the centre of the first pixel.
-    peak : ndarray of float64, shape (N,)
-        Largest value of each: the highest are looked at. Clouds have more light than stars, but
-        it is spread.
-
-    Returns
-    -------
-    float
-        Standard deviation, pixels: the width that most of them have, hot pixels and clouds
-        aside; 1 if there is none. It is 0.45 if all are narrower: those cannot be told from
-        hot pixels.
-    """
+    """Return the width of an image's stars."""
     order = np.argsort(-peak, kind="stable")[: 2 * _MOST_SPOTS]
     if not len(order):
         return 1.0

@@ -13,20 +13,7 @@ _LONG_SIDE_PX = 900
 
 
 def stretch(image: NDArray[Any]) -> Array:
-    """Return an image as it is shown.
-
-    Parameters
-    ----------
-    image : ndarray, shape (height, width)
-        Grey values.
-
-    Returns
-    -------
-    ndarray of float64
-        0 to 1: the inverse hyperbolic sine of the value above the background, in units of the
-        noise; 0 where it is not finite. Of an image of 1,800 px or more the brightest of each
-        2 by 2 pixels, and so on, so that no star is lost when it is drawn.
-    """
+    """Return an image as it is shown."""
     values = _brightest(np.where(np.isfinite(image), image, np.nan).astype(np.float64))
     finite = values[np.isfinite(values)]
     if not finite.size:

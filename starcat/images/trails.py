@@ -19,20 +19,7 @@ _ALIGNED = 0.9
 
 
 def trail_px(found: NDArray[Any]) -> float | None:
-    """Return the length of trails.
-
-    Parameters
-    ----------
-    found : ndarray
-        Table of ``sep.extract``, without saturated spots: of the brightest 30, the axes ``a``
-        and ``b``, pixels, and the angle ``theta``, radians.
-
-    Returns
-    -------
-    float or None
-        Pixels; None if half of the spots are shorter than 2.5 times their width, if their
-        directions differ, or if there are fewer than five.
-    """
+    """Return the length of trails."""
     bright = found[np.argsort(-found["flux"], kind="stable")[:_MOST]]
     if len(bright) < _FEWEST:
         return None

@@ -28,22 +28,7 @@ _OF_A_WCS = re.compile(
 
 
 def expect_room_for_wcs(path: Path, source: Path, *, is_picture: bool) -> None:
-    """Check, before anything is done, that a WCS can be written.
-
-    Parameters
-    ----------
-    path : Path
-        The file to write.
-    source : Path
-        The picture.
-    is_picture : bool
-        Whether the source is one; it may hold centroids.
-
-    Raises
-    ------
-    ConfigError
-        If the source is no picture, or the name is not that of a FITS file.
-    """
+    """Check, before anything is done, that a WCS can be written."""
     if path.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"--wcs {path}: a FITS file has a name that ends with .fits")
     if not is_picture:
@@ -61,30 +46,7 @@ def write_wcs(
     *,
     flip: bool | None = None,
 ) -> None:
-    """Write a FITS copy of a picture with the world coordinates of its answer.
-
-    Parameters
-    ----------
-    path : Path
-        FITS file to write, replaced if it exists.
-    source : Path
-        The picture. Of a FITS file all parts, values and keywords are kept, but for what an older
-        world coordinate system left in the part with the picture; any other becomes a FITS file
-        of its grey values.
-    image : ndarray, shape (height, width)
-        The grey values, row 0 at the top.
-    result : MatchResult
-        The answer to the picture.
-    flip : bool, optional
-        As it was given to `read_image`, for FITS files whose first row is the bottom.
-
-    Raises
-    ------
-    NotIdentifiedError
-        If the picture was not identified.
-    OutputError
-        If the file cannot be written.
-    """
+    """Write a FITS copy of a picture with the world coordinates of its answer."""
     from astropy.utils.exceptions import AstropyWarning
 
     data = source.read_bytes()

@@ -38,11 +38,6 @@ class _Part:
 class StarsAround:
     """The stars of a database, to be asked for those around a boresight.
 
-    Parameters
-    ----------
-    database : Database
-        The stars.
-
     Notes
     -----
     What is kept makes answers faster and never different.
@@ -54,22 +49,7 @@ class StarsAround:
         self._part: _Part | None = None
 
     def near(self, boresight: Array, radius_rad: float) -> tuple[Rows, Array]:
-        """Return the stars around a boresight.
-
-        Parameters
-        ----------
-        boresight : ndarray of float64, shape (3,)
-            Unit vector.
-        radius_rad : float
-            Largest separation.
-
-        Returns
-        -------
-        rows : ndarray of int64, shape (M,)
-            Ascending.
-        directions : ndarray of float64, shape (M, 3)
-            Of the same stars.
-        """
+        """Return the stars around a boresight."""
         part = self._part
         if part is not None and part.radius_rad >= radius_rad and _is_in(part, boresight):
             inside = (part.directions @ boresight >= math.cos(radius_rad)).nonzero()[0]
@@ -83,15 +63,7 @@ class StarsAround:
         return (self._directions @ boresight >= math.cos(radius_rad)).nonzero()[0]
 
     def keep(self, boresight: Array, radius_rad: float) -> None:
-        """Keep the stars around a boresight at hand, unless those around a near one are.
-
-        Parameters
-        ----------
-        boresight : ndarray of float64, shape (3,)
-            Unit vector.
-        radius_rad : float
-            Largest radius that will be asked for.
-        """
+        """Keep the stars around a boresight at hand, unless those around a near one are."""
         part = self._part
         if part is None or part.radius_rad < radius_rad or not _is_in(part, boresight):
             margin_rad = MARGIN * radius_rad
@@ -105,18 +77,7 @@ class StarsAround:
 
 
 def stars_around(database: Database) -> StarsAround:
-    """Return the stars of a database, to be asked for those around a boresight.
-
-    Parameters
-    ----------
-    database : Database
-        The stars.
-
-    Returns
-    -------
-    StarsAround
-        The same one every time.
-    """
+    """Return the stars of a database, to be asked for those around a boresight."""
     return database.derived(StarsAround)
 
 

@@ -69,18 +69,7 @@ class Asking(Protocol):
 
 
 def check_scale_free(asking: Asking) -> None:
-    """Check that a method can do without the focal length.
-
-    Parameters
-    ----------
-    asking : Asking
-        A `Matcher`.
-
-    Raises
-    ------
-    ConfigError
-        If its method needs the focal length.
-    """
+    """Check that a method can do without the focal length."""
     if asking.method not in SCALE_FREE:
         text = f"method {asking.method!r} needs the focal length; only 'triangle' can find it"
         raise ConfigError(text, key="method", value=asking.method)
@@ -94,28 +83,7 @@ def as_asked(
     fov_error: float = 0.0,
     budget: Budget | None = None,
 ) -> Observation:
-    """Return a frame with all that a matcher states of it.
-
-    Parameters
-    ----------
-    asking : Asking
-        A `Matcher`, whose tolerance, noises and limits hold.
-    centroids_px : ndarray of float64, shape (N, 2)
-        Pixels.
-    camera : Camera
-        The camera.
-    mag : ndarray of float64, shape (N,), or None
-        Magnitudes.
-    fov_error : float
-        Largest relative error of the focal length.
-    budget : Budget, optional
-        What several searches share; by default this frame has one of its own.
-
-    Returns
-    -------
-    Observation
-        Ready to be searched.
-    """
+    """Return a frame with all that a matcher states of it."""
     return observe(
         centroids_px,
         camera,

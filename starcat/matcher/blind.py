@@ -91,28 +91,7 @@ class _Search:
 def parts_of_range(
     known: Sequence[Level], camera: Camera, fov_deg: tuple[float, float]
 ) -> list[Part]:
-    """Return the parts of a range of fields of view.
-
-    Parameters
-    ----------
-    known : sequence of Level
-        Levels of the database, the narrowest first.
-    camera : Camera
-        Its size is used.
-    fov_deg : pair of float
-        Narrowest and widest field across the width, degrees.
-
-    Returns
-    -------
-    list of Part
-        The widest field first; they do not overlap. A level's part goes from its own field to
-        that of the next level.
-
-    Raises
-    ------
-    ConfigError
-        If the range is none, or goes beyond what the levels are made for by more than `BEYOND`.
-    """
+    """Return the parts of a range of fields of view."""
     narrow_deg, wide_deg = (float(angle) for angle in fov_deg)
     if not 0.0 < narrow_deg < wide_deg < 180.0:
         raise ConfigError(
@@ -153,31 +132,6 @@ def identify_blind(
     fov_deg: tuple[float, float],
 ) -> MatchResult:
     """Identify a frame of a camera of which only a range of fields of view is known.
-
-    Parameters
-    ----------
-    matcher : Asking
-        A `Matcher`: its database, its limits, and its method, which has to be ``triangle``.
-    centroids_px : ndarray of float64, shape (N, 2)
-        Pixels.
-    camera : Camera
-        Its size is used. Its axis is taken to be in the middle, and its lens not to distort.
-    mag : ndarray of float64, shape (N,), or None
-        Magnitudes. Without them, frames of many more stars than a level's are hard to identify.
-    fov_deg : pair of float
-        Narrowest and widest field across the width, degrees.
-
-    Returns
-    -------
-    MatchResult
-        With the camera that was found.
-
-    Raises
-    ------
-    ConfigError
-        If the method or the range cannot be used.
-    ProductError
-        If the database has no levels.
 
     Notes
     -----

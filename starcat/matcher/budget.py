@@ -20,13 +20,7 @@ AGREEMENT = 50
 
 
 class BudgetSpentError(Exception):
-    """A search is over before it has come to its end.
-
-    Parameters
-    ----------
-    limit : {"time", "steps"}
-        What was used up.
-    """
+    """A search is over before it has come to its end."""
 
     def __init__(self, limit: Literal["time", "steps"]) -> None:
         super().__init__(f"the {limit} of a search are used up")
@@ -53,18 +47,7 @@ class Budget:
     _start_s: float = field(default_factory=time.perf_counter, repr=False)
 
     def spend(self, steps: int) -> None:
-        """Take steps.
-
-        Parameters
-        ----------
-        steps : int
-            How many are about to be taken.
-
-        Raises
-        ------
-        BudgetSpentError
-            If there are not as many left, or the time is over.
-        """
+        """Take steps."""
         if self.steps + steps > self.max_steps:
             raise BudgetSpentError("steps")
         self.steps += steps

@@ -53,24 +53,7 @@ class MeasuredFrame:
 
 
 def read_frames(path: str | os.PathLike[str]) -> list[MeasuredFrame]:
-    """Read the frames of a centroid file.
-
-    Parameters
-    ----------
-    path : str or path-like
-        CSV with a header that names ``x_px`` and ``y_px``, or JSON (ending ``.json``).
-
-    Returns
-    -------
-    list of MeasuredFrame
-        In the order of the file; one for CSV.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read, lacks a column or key, or holds what is not a number, with
-        the line or frame.
-    """
+    """Read the frames of a centroid file."""
     path = Path(path)
     try:
         # Spreadsheets put a mark of the byte order before the header.
@@ -171,36 +154,12 @@ def _json_frame(frame: Any, name: str, where: str) -> MeasuredFrame:
 
 
 def upside_down(frame: MeasuredFrame, height_px: int) -> MeasuredFrame:
-    """Return a frame whose y was counted from the bottom, counted from the top.
-
-    Parameters
-    ----------
-    frame : MeasuredFrame
-        The frame.
-    height_px : int
-        Height of the camera's detector, pixels.
-
-    Returns
-    -------
-    MeasuredFrame
-        The same with ``height_px - y``.
-    """
+    """Return a frame whose y was counted from the bottom, counted from the top."""
     return replace(frame, centroids_px=frame.centroids_px * (1.0, -1.0) + (0.0, height_px))
 
 
 def said_of_columns(frames: Sequence[MeasuredFrame]) -> str | None:
-    """Return what a user should know about columns that were not used.
-
-    Parameters
-    ----------
-    frames : sequence of MeasuredFrame
-        Frames of one file.
-
-    Returns
-    -------
-    str or None
-        One line; None if all were known.
-    """
+    """Return what a user should know about columns that were not used."""
     names = sorted({name for frame in frames for name in frame.ignored})
     if not names:
         return None
@@ -221,26 +180,7 @@ def _number(value: Any, name: str, where: str) -> float:
 
 
 def read_stream(lines: Iterable[str], name: str = "stdin") -> Iterator[MeasuredFrame]:
-    """Read the frames of a stream, each as soon as it is there.
-
-    Parameters
-    ----------
-    lines : iterable of str
-        CSV or JSON as `read_frames` takes them, or JSON with a frame on every line.
-    name : str, default "stdin"
-        What the stream is called in messages and in names of frames.
-
-    Yields
-    ------
-    MeasuredFrame
-        In the order of the stream. Where the first line is JSON by itself, a line is read when
-        the frame before it was taken; all else is read to its end first.
-
-    Raises
-    ------
-    ConfigError
-        As `read_frames`.
-    """
+    """Read the frames of a stream, each as soon as it is there."""
     rest = enumerate(lines, start=1)
     filled = ((number, line.removeprefix("\ufeff")) for number, line in rest if line.strip())
     begin, first = next(filled, (1, ""))
@@ -257,22 +197,7 @@ def read_stream(lines: Iterable[str], name: str = "stdin") -> Iterator[MeasuredF
 
 
 def write_centroids(centroids_px: Array, path: Path, mag: Array | None = None) -> None:
-    """Write the centroids of one frame.
-
-    Parameters
-    ----------
-    centroids_px : ndarray of float64, shape (N, 2)
-        Pixels.
-    path : Path
-        CSV file, replaced if it exists.
-    mag : ndarray of float64, shape (N,), optional
-        Magnitudes, as a third column.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
+    """Write the centroids of one frame."""
     try:
         with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file, lineterminator="\n")

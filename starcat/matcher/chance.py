@@ -46,32 +46,6 @@ def false_match_probability(
 ) -> float:
     """Bound the probability that random centroids agree as well with any attitude.
 
-    Parameters
-    ----------
-    square_px : float
-        Sum of the squared distances between the matched centroids and the places of their
-        stars, after the attitude was fitted to them, square pixels.
-    body : ndarray of float64, shape (n, 3)
-        Directions of the matched centroids in the camera frame, n >= 2.
-    n_centroids : int
-        Centroids in the frame, matched or not.
-    stars_in_frame : int
-        Stars of the database that the attitude puts on the detector or within reach of it.
-    camera : Camera
-        The camera, whose detector size and focal length are used.
-    noise_px : float, optional
-        Standard deviation of a centroid on each axis, where it was stated.
-    compatible : ndarray of bool, shape (n_centroids, stars_in_frame), optional
-        Which centroids may be which of these stars by their magnitudes, where the error of
-        magnitudes was stated. Every matched centroid is compatible with its star.
-    log_scales : float
-        Logarithm of the longest over the shortest focal length, where it was fitted too.
-
-    Returns
-    -------
-    float
-        Upper bound, 0 to 1.
-
     Notes
     -----
     There are ``C(N, n) M! / (M - n)!`` ways to assign n of N centroids to n of M stars. In each

@@ -119,58 +119,24 @@ class Answers:
 
 
 def is_compiled() -> bool:
-    """Return whether the C library is there.
-
-    Returns
-    -------
-    bool
-        False where starcat was installed without a compiler.
-    """
+    """Return whether the C library is there."""
     return _onboard is not None
 
 
 def library_version() -> str | None:
-    """Return the version of the C library.
-
-    Returns
-    -------
-    str or None
-        None where it is not compiled.
-    """
+    """Return the version of the C library."""
     if _onboard is None:
         return None
     return str(_onboard.ffi.string(_onboard.lib.starcat_version()).decode())
 
 
 def most_stars() -> int:
-    """Return the number of stars in or next to a frame that the C library has room for.
-
-    Returns
-    -------
-    int
-        As it was compiled for the ground; `docs/onboard-format.md` calls it ``most_near``.
-    """
+    """Return the number of stars in or next to a frame that the C library has room for."""
     return int(_onboard.lib.STARCAT_MAX_STARS)
 
 
 class FastMatcher:
-    """An onboard image in memory, and the C library that reads it.
-
-    Parameters
-    ----------
-    data : bytes
-        The image.
-    rows : ndarray of int64, shape (N,), optional
-        Row of the database for each star of the image; the image's own rows by default.
-    directions : ndarray of float64, shape (N, 3), optional
-        Directions of the image's stars before they were rounded, for attitudes without that
-        error; the image's own by default, as in flight.
-
-    Raises
-    ------
-    ProductError
-        If the library does not open the image.
-    """
+    """An onboard image in memory, and the C library that reads it."""
 
     def __init__(
         self,
@@ -196,18 +162,7 @@ class FastMatcher:
         self._rows = np.concatenate([own, [-4, -3, -2, -1]]).astype(np.int32)
 
     def takes(self, count: int) -> bool:
-        """Return whether a frame of so many centroids is small enough.
-
-        Parameters
-        ----------
-        count : int
-            Centroids.
-
-        Returns
-        -------
-        bool
-            False where the matcher of numpy has to serve.
-        """
+        """Return whether a frame of so many centroids is small enough."""
         return count <= int(_onboard.lib.STARCAT_MAX_CENTROIDS)
 
     def identify(
@@ -219,28 +174,7 @@ class FastMatcher:
         priors: tuple[Array, float] | None = None,
         threads: int = 1,
     ) -> Answers:
-        """Identify the stars of many frames.
-
-        Parameters
-        ----------
-        frames : sequence of ndarray of float64, shape (n, 2)
-            Centroids, pixels.
-        camera : Camera
-            The camera of all of them.
-        limits : Limits
-            What the caller states.
-        magnitudes : sequence of ndarray of float64, shape (n,), optional
-            One array a frame.
-        priors : (ndarray of float64, shape (N, 4), float), optional
-            Prior attitudes and the radians that they may be wrong by; lost in space by default.
-        threads : int, default 1
-            The library runs without the interpreter's lock.
-
-        Returns
-        -------
-        Answers
-            In the order of the frames, whatever the number of threads.
-        """
+        """Identify the stars of many frames."""
         starts = np.zeros(len(frames) + 1, dtype=np.int64)
         if len(frames) == 1:  # by far the most frequent call
             starts[1], px = len(frames[0]), frames[0]
@@ -342,23 +276,7 @@ MOST_FEATURES = 4_000_000
 
 
 def fast_matcher(database: Database, method: str, always: bool = True) -> FastMatcher | None:
-    """Return the fast path of a database, made once.
-
-    Parameters
-    ----------
-    database : Database
-        With the product that the method needs.
-    method : str
-        A key of `METHODS`.
-    always : bool, default True
-        Whether an image is made however long that takes.
-
-    Returns
-    -------
-    FastMatcher or None
-        None where the library is not compiled, the method has no image, or the database is too
-        dense or too large for one.
-    """
+    """Return the fast path of a database, made once."""
     if _onboard is None or method not in FEATURES:
         return None
     if database.image is not None:

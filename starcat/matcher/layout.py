@@ -145,24 +145,7 @@ LAYOUT: dict[str, Layout] = {
 
 
 def check_product(name: str, arrays: Arrays, numbers: Numbers, star_count: int) -> None:
-    """Check that a product is what `LAYOUT` says.
-
-    Parameters
-    ----------
-    name : str
-        The product.
-    arrays : mapping of str to ndarray
-        Its datasets, all that the layout names.
-    numbers : mapping of str to float
-        Its attributes.
-    star_count : int
-        Rows of the stars.
-
-    Raises
-    ------
-    ProductError
-        Naming the first dataset or attribute that is not as it should be.
-    """
+    """Check that a product is what `LAYOUT` says."""
     layout = LAYOUT[name]
     checks = _Checks(name, arrays, star_count)
     rows = len(arrays[layout.columns[0]])

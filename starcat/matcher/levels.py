@@ -42,39 +42,12 @@ class Level:
     rows: NDArray[np.int64]
 
     def focal_length_px(self, camera: Camera) -> float:
-        """Return the focal length with which a detector has the level's field of view.
-
-        Parameters
-        ----------
-        camera : Camera
-            Its size is used.
-
-        Returns
-        -------
-        float
-            Pixels.
-        """
+        """Return the focal length with which a detector has the level's field of view."""
         return 0.5 * math.sqrt(camera.width_px * camera.height_px) / self.half_width
 
 
 def levels(database: Database) -> tuple[Level, ...]:
-    """Return the levels of a database, made once.
-
-    Parameters
-    ----------
-    database : Database
-        With the products ``triangles`` and ``levels``.
-
-    Returns
-    -------
-    tuple of Level
-        The narrowest first, which is the database itself.
-
-    Raises
-    ------
-    ProductError
-        If the product is not there, or a triangle has a star that is not of its level.
-    """
+    """Return the levels of a database, made once."""
     return database.derived(_levels)
 
 

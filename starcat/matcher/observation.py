@@ -47,18 +47,7 @@ class FocalRange:
         return math.log(self.high / self.low)
 
     def clip(self, factors: Array | float) -> Array:
-        """Return factors, those outside of the range moved to its nearer end.
-
-        Parameters
-        ----------
-        factors : ndarray of float64, or float
-            Focal lengths over the one that was given.
-
-        Returns
-        -------
-        ndarray of float64
-            Of the same shape.
-        """
+        """Return factors, those outside of the range moved to its nearer end."""
         return np.minimum(np.maximum(factors, self.low), self.high)
 
 
@@ -144,33 +133,7 @@ def observe(
     min_share: float = MIN_SHARE,
     budget: Budget | None = None,
 ) -> Observation:
-    """Prepare a frame for identification.
-
-    Parameters
-    ----------
-    centroids_px : array_like of float64, shape (N, 2)
-        Pixels; the order carries no meaning.
-    camera : Camera
-        The camera that took the frame.
-    tolerance_px : float
-        Largest error of a centroid, as a radius.
-    magnitudes : array_like of float64, shape (N,), optional
-        Magnitudes, larger is fainter; NaN where unknown. The zero point may be any one, unless
-        ``noise_mag`` is stated.
-    noise_px, noise_mag, fov_error, min_share, budget
-        As the attributes of `Observation`.
-
-    Returns
-    -------
-    Observation
-        The frame with the centroids that can be used. Where several lie at exactly the same
-        place, one is kept: the brightest, if magnitudes are known.
-
-    Raises
-    ------
-    ValueError
-        If the centroids are not pairs of numbers, or the magnitudes are not one a centroid.
-    """
+    """Prepare a frame for identification."""
     given, mag = as_frame(centroids_px, magnitudes)
     usable = camera.contains(given)
     if usable.all():
@@ -201,27 +164,7 @@ def observe(
 def as_frame(
     centroids_px: ArrayLike, magnitudes: ArrayLike | None = None
 ) -> tuple[Array, Array | None]:
-    """Return what a caller gives as arrays.
-
-    Parameters
-    ----------
-    centroids_px : array_like of float64, shape (N, 2)
-        Pixels.
-    magnitudes : array_like of float64, shape (N,), optional
-        One a centroid.
-
-    Returns
-    -------
-    centroids_px : ndarray of float64, shape (N, 2)
-        The same.
-    magnitudes : ndarray of float64, shape (N,), or None
-        The same.
-
-    Raises
-    ------
-    ValueError
-        If the centroids are not pairs of numbers, or the magnitudes are not one a centroid.
-    """
+    """Return what a caller gives as arrays."""
     given = np.asarray(centroids_px, dtype=np.float64)
     given = given.reshape(0, 2) if given.size == 0 else given
     if given.ndim != 2 or given.shape[1] != 2:

@@ -49,24 +49,7 @@ class Pose:
 def first_poses(
     candidates: Candidates, observation: Observation, icrs: Array
 ) -> tuple[Array, Array]:
-    """Return the attitudes and scales that candidates stand for.
-
-    Parameters
-    ----------
-    candidates : Candidates
-        K of them.
-    observation : Observation
-        The frame.
-    icrs : ndarray of float64, shape (S, 3)
-        Directions of the database's stars.
-
-    Returns
-    -------
-    matrices : ndarray of float64, shape (K, 3, 3)
-        Attitudes.
-    factors : ndarray of float64, shape (K,)
-        Focal lengths over the one that was given; 1 each where it is known.
-    """
+    """Return the attitudes and scales that candidates stand for."""
     body, stars = observation.body[candidates.centroids], icrs[candidates.stars]
     factors = np.ones(len(candidates))
     if observation.fov_error:
@@ -79,21 +62,7 @@ def first_poses(
 
 
 def scaled_directions(body: Array, factors: Array) -> Array:
-    """Return directions as a camera with another focal length sees them.
-
-    Parameters
-    ----------
-    body : ndarray of float64, shape (K, N, 3) or (N, 3)
-        Directions in the camera frame.
-    factors : ndarray of float64, shape (K,)
-        Focal lengths over that of the directions.
-
-    Returns
-    -------
-    ndarray of float64, shape (K, N, 3)
-        Unit vectors. Exact without distortion; with distortion, its coefficients are taken to
-        hold for the angles of the given focal length.
-    """
+    """Return directions as a camera with another focal length sees them."""
     longer = np.empty((len(factors), *body.shape[-2:]))
     longer[..., :2] = body[..., :2]
     np.multiply(body[..., 2], factors[:, None], out=longer[..., 2])
@@ -108,22 +77,7 @@ def _squared_chords(directions: Array) -> Array:
 
 
 def pose_at(matrix: Array, factor: float, observation: Observation) -> Pose:
-    """Return the pose of an attitude and a scale.
-
-    Parameters
-    ----------
-    matrix : ndarray of float64, shape (3, 3)
-        Attitude.
-    factor : float
-        Focal length over the one that was given.
-    observation : Observation
-        The frame.
-
-    Returns
-    -------
-    Pose
-        With the observation's own camera where the factor is 1 or the lens has no other one.
-    """
+    """Return the pose of an attitude and a scale."""
     own = observation.camera
     if factor == 1.0:
         return Pose(matrix, own, observation.body)
@@ -137,25 +91,7 @@ def pose_at(matrix: Array, factor: float, observation: Observation) -> Pose:
 def refitted(
     pose: Pose, matched: NDArray[np.int64], stars: Array, observation: Observation
 ) -> Pose:
-    """Return the pose that fits centroids and their stars best.
-
-    Parameters
-    ----------
-    pose : Pose
-        A pose near the best one.
-    matched : ndarray of int64, shape (n,)
-        Rows of the centroids, n >= 4.
-    stars : ndarray of float64, shape (n, 3)
-        ICRS directions of their stars.
-    observation : Observation
-        The frame; it says whether the focal length is free, and within which limits.
-
-    Returns
-    -------
-    Pose
-        The attitude of least squares. A free focal length is improved by one step of Newton's
-        method for both, which squares the error that it has.
-    """
+    """Return the pose that fits centroids and their stars best."""
     if not observation.fov_error:
         near = solve_wahba_near(pose.body[matched], stars, pose.matrix)
         return Pose(near, pose.camera, pose.body)
@@ -188,25 +124,7 @@ def _by_scale(body: Array) -> Array:
 def focal_length_error_px(
     pose: Pose, matched: NDArray[np.int64], residual_rad: float, observation: Observation
 ) -> float:
-    """Return the standard error of a focal length that was fitted with an attitude.
-
-    Parameters
-    ----------
-    pose : Pose
-        The pose that was fitted.
-    matched : ndarray of int64, shape (n,)
-        Rows of the centroids that it was fitted to, n >= 4.
-    residual_rad : float
-        Root mean square separation of these centroids from their stars.
-    observation : Observation
-        The frame, with the noise of a centroid where it was stated.
-
-    Returns
-    -------
-    float
-        Pixels. Without a stated noise, that of the residuals, and so much wider for few stars
-        that three of it hold the truth as often as three standard deviations do: Student's t.
-    """
+    """Return the standard error of a focal length that was fitted with an attitude."""
     focal_px, n = pose.camera.focal_length_px, len(matched)
     try:
         covariance = np.linalg.inv(information(pose.body[matched], with_scale=True))

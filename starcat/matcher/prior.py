@@ -53,25 +53,7 @@ class Prior:
 
 
 def prior_of(quaternion: ArrayLike | None, error_deg: float | None) -> Prior | None:
-    """Return a prior attitude from what a caller states.
-
-    Parameters
-    ----------
-    quaternion : array_like of float64, shape (4,), optional
-        Attitude, scalar last, of any length.
-    error_deg : float, optional
-        Largest error, as an angle of rotation; above 0, at most `WIDEST_PRIOR_DEG`.
-
-    Returns
-    -------
-    Prior or None
-        None where neither is given.
-
-    Raises
-    ------
-    ConfigError
-        If one of the two is missing, the first is no quaternion, or the second out of range.
-    """
+    """Return a prior attitude from what a caller states."""
     if quaternion is None and error_deg is None:
         return None
     if quaternion is None or error_deg is None:
@@ -100,27 +82,7 @@ def search_near(
     best: BestOf,
     whole_sky: Iterator[Candidates],
 ) -> None:
-    """Work out the agreements near a prior attitude until one is certain.
-
-    Parameters
-    ----------
-    prior : Prior
-        The attitude.
-    observation : Observation
-        The frame.
-    database : Database
-        The stars.
-    best : BestOf
-        Keeps the best agreement.
-    whole_sky : iterator of Candidates
-        What a method proposes. Where the stars near the prior are too many, or the focal length
-        is not known, those of its candidates are taken that are near the prior.
-
-    Raises
-    ------
-    BudgetSpentError
-        If the search may take no further step.
-    """
+    """Work out the agreements near a prior attitude until one is certain."""
     matrix = matrix_from_quaternion(prior.q_body_from_icrs)
     camera, tolerance_rad = observation.camera, observation.tolerance_rad
     # A tracked camera is near its last place, where the stars are at hand.
@@ -154,25 +116,7 @@ def search_near(
 def expected_near(
     prior: Prior, answer: MatchResult, camera: Camera, tolerance_px: float
 ) -> MatchResult:
-    """Return an answer if its attitude is as near to the prior as that says.
-
-    Parameters
-    ----------
-    prior : Prior
-        What was stated.
-    answer : MatchResult
-        An answer, identified or not.
-    camera : Camera
-        The camera.
-    tolerance_px : float
-        Largest error of a centroid. The attitude may be farther from the prior by
-        `turn_of_noise_rad`.
-
-    Returns
-    -------
-    MatchResult
-        The same, or one that is withheld for ``prior``.
-    """
+    """Return an answer if its attitude is as near to the prior as that says."""
     if answer.ok:
         prior_q, found_q = prior.q_body_from_icrs.tolist(), answer.q_body_from_icrs.tolist()
         slack_rad = turn_of_noise_rad(camera, tolerance_px)
@@ -182,18 +126,5 @@ def expected_near(
 
 
 def turn_of_noise_rad(camera: Camera, tolerance_px: float) -> float:
-    """Return the angle that the errors of centroids may turn a frame by.
-
-    Parameters
-    ----------
-    camera : Camera
-        The camera.
-    tolerance_px : float
-        Largest error of a centroid.
-
-    Returns
-    -------
-    float
-        That of an error which displaces the middles of two opposite edges so far.
-    """
+    """Return the angle that the errors of centroids may turn a frame by."""
     return 2.0 * tolerance_px / min(camera.width_px, camera.height_px)

@@ -30,18 +30,7 @@ Where more is allowed, a hundredth of it ends the search; else the best answer i
 
 
 def certainty(matcher: Asking) -> float:
-    """Return how low a false-match probability ends a search.
-
-    Parameters
-    ----------
-    matcher : Asking
-        A `Matcher`, whose limit an answer has to keep.
-
-    Returns
-    -------
-    float
-        The limit, or a hundredth of it where it is loose.
-    """
+    """Return how low a false-match probability ends a search."""
     limit = matcher.max_false_match_probability
     return limit if limit <= CERTAIN else max(CERTAIN, 0.01 * limit)
 
@@ -54,33 +43,7 @@ def searched(
     fov_error: float = 0.0,
     prior: Prior | None = None,
 ) -> MatchResult:
-    """Identify a frame with numpy.
-
-    Parameters
-    ----------
-    matcher : Asking
-        A `Matcher`: database, method and limits.
-    frame : ndarray of float64, shape (N, 2)
-        Centroids, pixels.
-    camera : Camera
-        The camera.
-    mag : ndarray of float64, shape (N,), or None
-        Magnitudes.
-    fov_error : float
-        Largest relative error of the focal length.
-    prior : Prior, optional
-        Where the frame is expected.
-
-    Returns
-    -------
-    MatchResult
-        The answer, or why there is none.
-
-    Raises
-    ------
-    ConfigError
-        If the matcher has an onboard image, which holds nothing to search with.
-    """
+    """Identify a frame with numpy."""
     if matcher.database.image is not None:
         raise ConfigError(
             f"a frame of {len(frame)} centroids and this camera are beyond the C library, and "
@@ -130,22 +93,7 @@ def refusal_of(
     limit: Literal["time", "steps"] | None,
     prior: Prior | None = None,
 ) -> Refusal:
-    """Return why the best agreement, if there is one, is no answer.
-
-    Parameters
-    ----------
-    found : Agreement or None
-        The best agreement.
-    limit : {"time", "steps"}, optional
-        What ended the search before it had come to its end.
-    prior : Prior, optional
-        Where the frame was expected.
-
-    Returns
-    -------
-    Refusal
-        The limit, or why the agreement is withheld.
-    """
+    """Return why the best agreement, if there is one, is no answer."""
     if found is None or (prior is not None and found.chance >= 1.0):
         return Refusal(limit or ("no_candidate" if prior is None else "prior"))
     return Refusal(limit or found.withheld or "chance", found.n_matched, found.chance, found.share)

@@ -43,25 +43,7 @@ _log = logging.getLogger(__name__)
 
 
 def table(stars: MatchedStars, facts: Mapping[str, Any]) -> QTable:
-    """Return stars as a table of astropy.
-
-    Parameters
-    ----------
-    stars : MatchedStars
-        The stars.
-    facts : mapping
-        What goes into the table's ``meta``.
-
-    Returns
-    -------
-    astropy.table.QTable
-        A column a field, with the unit that its name ends with.
-
-    Raises
-    ------
-    ConfigError
-        If astropy is not installed.
-    """
+    """Return stars as a table of astropy."""
     made = _astropy("table").QTable(meta=dict(facts))
     for field in fields(stars):
         unit = _UNITS.get(field.name.rpartition("_")[2])
@@ -73,47 +55,12 @@ def table(stars: MatchedStars, facts: Mapping[str, Any]) -> QTable:
 
 
 def skycoord(ra_deg: float, dec_deg: float) -> SkyCoord:
-    """Return a direction as astropy has it.
-
-    Parameters
-    ----------
-    ra_deg, dec_deg : float
-        ICRS, degrees.
-
-    Returns
-    -------
-    astropy.coordinates.SkyCoord
-        In ICRS.
-
-    Raises
-    ------
-    ConfigError
-        If astropy is not installed.
-    """
+    """Return a direction as astropy has it."""
     return _astropy("coordinates").SkyCoord(ra_deg, dec_deg, unit="deg", frame="icrs")
 
 
 def wcs(camera: Camera, matrix: Array, bottom_up: bool = False) -> WCS:
     """Return the world coordinates of a picture.
-
-    Parameters
-    ----------
-    camera : Camera
-        That took it.
-    matrix : ndarray of float64, shape (3, 3)
-        Attitude, ``body = matrix @ icrs``.
-    bottom_up : bool, default False
-        Whether the first row of the picture's file is its bottom.
-
-    Returns
-    -------
-    astropy.wcs.WCS
-        TAN, or TAN with SIP where the camera has distortion.
-
-    Raises
-    ------
-    ConfigError
-        If astropy is not installed.
 
     Notes
     -----

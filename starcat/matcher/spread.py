@@ -32,30 +32,7 @@ def share_of_frame(
     observation: Observation,
     enough: float = 1.0,
 ) -> float:
-    """Return which share of a frame an attitude explains, by weight.
-
-    Parameters
-    ----------
-    matched : ndarray of float64, shape (n, 3)
-        Directions of the matched centroids in the camera frame, n >= 2.
-    stars : ndarray of float64, shape (M, 3)
-        Directions of the stars that the attitude puts on the detector or within reach of it.
-    residual_rad : float
-        Root mean square separation of the matched centroids and their stars.
-    observation : Observation
-        The frame, with all centroids.
-    enough : float
-        The share of the stars is returned if it is as large as this.
-
-    Returns
-    -------
-    float
-        `explained_share` of the stars or of the centroids, whichever is larger, because a camera
-        may see fewer stars than the database holds, or more. Where the matched stars do not
-        determine the corners of the frame to within the tolerance it is the share of the stars:
-        that the camera saw no others adds nothing to the attitude. 0 if the matched stars
-        determine no attitude at all.
-    """
+    """Return which share of a frame an attitude explains, by weight."""
     with_scale = observation.fov_error > 0.0
     try:
         normal = information(matched, with_scale=with_scale)
@@ -79,19 +56,6 @@ def share_of_frame(
 def information(directions: Array, *, with_scale: bool = False) -> Array:
     """Return the information matrix of an attitude that the centroids of stars determine.
 
-    Parameters
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        Unit vectors of the stars, in any frame; in the camera frame if the scale is free.
-    with_scale : bool
-        Whether the logarithm of the focal length is a fourth unknown.
-
-    Returns
-    -------
-    ndarray of float64, shape (3, 3) or (4, 4)
-        Inverse of the covariance of the three small angles about the axes of that frame, and of
-        the scale, in units of the variance of a direction along each of the two axes across it.
-
     References
     ----------
     Shuster and Oh 1981, "Three-axis attitude determination from vector observations".
@@ -111,19 +75,6 @@ def information(directions: Array, *, with_scale: bool = False) -> Array:
 
 def explained_share(covariance: Array, directions: Array) -> float:
     """Return which share of the stars of a frame an attitude explains, by their weight.
-
-    Parameters
-    ----------
-    covariance : ndarray of float64, shape (3, 3) or (4, 4)
-        Inverse of the `information` of the matched stars.
-    directions : ndarray of float64, shape (N, 3)
-        Unit vectors of all stars, matched or not, in the same frame.
-
-    Returns
-    -------
-    float
-        1 if all stars are matched; about n / N if the n matched ones are spread like the N
-        stars; much less if the matched ones are close together.
 
     Notes
     -----
@@ -151,21 +102,7 @@ def explained_share(covariance: Array, directions: Array) -> float:
 
 
 def corner_deviation(covariance: Array, camera: Camera) -> float:
-    """Return the error of the worst corner of a frame under an attitude.
-
-    Parameters
-    ----------
-    covariance : ndarray of float64, shape (3, 3) or (4, 4)
-        Inverse of the `information` of the matched stars in the camera frame.
-    camera : Camera
-        The camera.
-
-    Returns
-    -------
-    float
-        Root mean square over both axes of the worst corner, in units of the error of a
-        direction along one axis.
-    """
+    """Return the error of the worst corner of a frame under an attitude."""
     corners = camera.corner_directions
     if len(covariance) == 3:
         along = np.einsum("ni,ij,nj->n", corners, covariance, corners)
@@ -181,19 +118,6 @@ def corner_deviation(covariance: Array, camera: Camera) -> float:
 
 def is_scaled(predicted_px: Array, centroids_px: Array, observation: Observation) -> bool:
     """Return whether a frame differs in scale from the stars that it matches.
-
-    Parameters
-    ----------
-    predicted_px, centroids_px : ndarray of float64, shape (n, 2)
-        Places of the matched stars and their centroids, n >= 3.
-    observation : Observation
-        The frame.
-
-    Returns
-    -------
-    bool
-        True if the scale differs by more than `SCALE_DEVIATIONS` and by so much that the corner
-        of the frame is displaced by more than the largest error of a centroid.
 
     Notes
     -----

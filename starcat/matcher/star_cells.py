@@ -52,25 +52,7 @@ class StarCells:
     rows: NDArray[np.int64]
 
     def has_star(self, directions: Array, reach_rad: float) -> NDArray[np.bool_]:
-        """Return which directions have a star within reach.
-
-        Parameters
-        ----------
-        directions : ndarray of float64, shape (P, 3)
-            Unit vectors.
-        reach_rad : float
-            Largest separation, radians, at most the margin.
-
-        Returns
-        -------
-        ndarray of bool, shape (P,)
-            Separations by the chord, which at this size is the angle.
-
-        Raises
-        ------
-        ValueError
-            If the reach is beyond the margin.
-        """
+        """Return which directions have a star within reach."""
         if reach_rad > self.margin:
             raise ValueError(f"reach_rad is {reach_rad}; these cells allow {self.margin}")
         key = _keys(directions, self.side)
@@ -89,20 +71,7 @@ class StarCells:
 
 
 def cells_for(database: Database, reach_rad: float) -> StarCells:
-    """Return the cells of a database's stars for a reach, which are made once.
-
-    Parameters
-    ----------
-    database : Database
-        The stars, at least one.
-    reach_rad : float
-        Largest reach that will be asked for, radians.
-
-    Returns
-    -------
-    StarCells
-        Cells for the next power of two: they serve all reaches below it, as those of many cameras.
-    """
+    """Return the cells of a database's stars for a reach, which are made once."""
     margin_rad = max(SMALLEST_REACH, 2.0 ** math.ceil(math.log2(reach_rad)))
     return database.derived(_of_database, margin_rad)
 
@@ -112,20 +81,7 @@ def _of_database(database: Database, reach_rad: float) -> StarCells:
 
 
 def star_cells(directions: Array, reach_rad: float) -> StarCells:
-    """Sort stars into cells.
-
-    Parameters
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        Unit vectors, at least one.
-    reach_rad : float
-        Largest reach that will be asked for, radians.
-
-    Returns
-    -------
-    StarCells
-        The stars, in cells that are four times as wide as the reach, or wider.
-    """
+    """Sort stars into cells."""
     side = max(MIN_SIDE, 4.0 * reach_rad)
     margin = 0.25 * side
     corners = np.array(list(product((-margin, margin), repeat=3)))

@@ -103,18 +103,7 @@ class Agreement:
         return 1.0 if self.withheld else self.chance
 
     def is_better_than(self, other: Agreement | None) -> bool:
-        """Return whether chance explains it less, be it only among those that are withheld.
-
-        Parameters
-        ----------
-        other : Agreement, optional
-            Another one.
-
-        Returns
-        -------
-        bool
-            True where there is no other one.
-        """
+        """Return whether chance explains it less, be it only among those that are withheld."""
         if other is None:
             return True
         own = self.false_match_probability, self.chance
@@ -147,13 +136,7 @@ class BestOf:
         return self.found is not None and self.found.false_match_probability <= self.certain
 
     def offer(self, found: Agreement) -> None:
-        """Keep an agreement if it is better than the best one so far.
-
-        Parameters
-        ----------
-        found : Agreement
-            Another one.
-        """
+        """Keep an agreement if it is better than the best one so far."""
         if found.is_better_than(self.found):
             self.found = found
 
@@ -161,24 +144,7 @@ class BestOf:
 def verify(
     candidates: Candidates, observation: Observation, database: Database, best: BestOf
 ) -> None:
-    """Work out the agreements of a batch of candidates until one is certain.
-
-    Parameters
-    ----------
-    candidates : Candidates
-        A batch. After the first one, those with more agreeing centroids are tried first.
-    observation : Observation
-        The frame.
-    database : Database
-        The stars.
-    best : BestOf
-        Keeps the best agreement, also where the budget of the observation ends the search.
-
-    Raises
-    ------
-    BudgetSpentError
-        If the search may take no further step.
-    """
+    """Work out the agreements of a batch of candidates until one is certain."""
     for first in range(0, len(candidates), AT_ONCE):
         part = candidates[first : first + AT_ONCE]
         for pose in _worth_trying(part, observation, database):
@@ -212,24 +178,7 @@ def _worth_trying(
 def agreeing_centroids(
     matrices: Array, observation: Observation, database: Database, factors: Array | None = None
 ) -> NDArray[np.int64]:
-    """Count the centroids that attitudes put near a star, on the detector or just off it.
-
-    Parameters
-    ----------
-    matrices : ndarray of float64, shape (K, 3, 3)
-        Attitudes.
-    observation : Observation
-        The frame.
-    database : Database
-        The stars.
-    factors : ndarray of float64, shape (K,), optional
-        Focal lengths over the one that was given, where they are not known.
-
-    Returns
-    -------
-    ndarray of int64, shape (K,)
-        Centroids within reach of some star.
-    """
+    """Count the centroids that attitudes put near a star, on the detector or just off it."""
     reach_rad = REACH * observation.tolerance_rad
     body = observation.body
     if observation.fov_error and factors is not None:
@@ -247,29 +196,7 @@ def agree(
     certain: float = 1.0,
     first: tuple[float, ...] = (),
 ) -> Agreement:
-    """Match the centroids of a frame with the stars that an attitude predicts.
-
-    Parameters
-    ----------
-    pose : Pose
-        Attitude to test, and the camera that it is tested with.
-    observation : Observation
-        The frame.
-    database : Database
-        The stars.
-    certain : float
-        With a false-match probability as low as this no smaller reach is tried; with 1, none is.
-    first : tuple of float
-        Reaches of first refinements, one after the other, in units of the final reach, where
-        the attitude is only roughly known.
-
-    Returns
-    -------
-    Agreement
-        The agreement after the attitude was refined on all matched stars until these no longer
-        changed. Each star has one centroid at most. The false-match probability is 1 if too
-        much of the frame is unexplained (``min_share``) or if the frame is scaled.
-    """
+    """Match the centroids of a frame with the stars that an attitude predicts."""
     observation.budget.spend(AGREEMENT)
     rough = ROUGH if observation.fov_error and not first else first
     fit = _refined(pose, observation, database, rough)

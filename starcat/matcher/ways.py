@@ -21,20 +21,6 @@ MAG_DEVIATIONS = 3.5
 def compatible_pairs(mag: Array, star_mag: Array, noise_mag: float) -> Compatible:
     """Return which centroids may be which stars by their magnitudes.
 
-    Parameters
-    ----------
-    mag : ndarray of float64, shape (N,)
-        Magnitudes of the centroids in the band of the database, NaN where unknown.
-    star_mag : ndarray of float64, shape (M,)
-        Magnitudes of the stars, NaN where unknown.
-    noise_mag : float
-        Standard deviation of the magnitude of a centroid.
-
-    Returns
-    -------
-    ndarray of bool, shape (N, M)
-        True where they differ by `MAG_DEVIATIONS` at the most, or one is unknown.
-
     Examples
     --------
     >>> compatible_pairs(np.array([3.0, np.nan]), np.array([3.5, 5.0, np.nan]), 0.2)
@@ -46,18 +32,6 @@ def compatible_pairs(mag: Array, star_mag: Array, noise_mag: float) -> Compatibl
 
 def log_ways(n: int, n_centroids: int, stars: int) -> float:
     """Return the logarithm of the number of ways to assign n of the centroids to n of the stars.
-
-    Parameters
-    ----------
-    n : int
-        Centroids that have a star, at most the smaller of the other two.
-    n_centroids, stars : int
-        Centroids and stars, N and M.
-
-    Returns
-    -------
-    float
-        Natural logarithm of ``C(N, n) M! / (M - n)!``.
 
     Examples
     --------
@@ -71,19 +45,6 @@ def log_ways(n: int, n_centroids: int, stars: int) -> float:
 
 def log_compatible_ways(most: int, compatible: Compatible) -> Array:
     """Bound the numbers of ways to assign n centroids to n compatible stars.
-
-    Parameters
-    ----------
-    most : int
-        Largest n.
-    compatible : ndarray of bool, shape (N, M)
-        Which centroids may be which stars; N and M are at least ``most``.
-
-    Returns
-    -------
-    ndarray of float64, shape (most + 1,)
-        Natural logarithm of the bound for every n from 0; -inf where there is no way. It is that
-        of `log_ways` at the most.
 
     Notes
     -----

@@ -25,20 +25,7 @@ _AT_ITSELF = _AT_WHOLE + 4
 
 
 def check_blocks(data: bytes, byte_order: ByteOrder) -> bytes:
-    """Return the check blocks of data.
-
-    Parameters
-    ----------
-    data : bytes
-        Header and sections, in whole blocks.
-    byte_order : {"little", "big"}
-        That of the target.
-
-    Returns
-    -------
-    bytes
-        CRC-32 of each block, of the whole, and of each check block itself.
-    """
+    """Return the check blocks of data."""
     word = in_order("u4", byte_order)
     whole = np.array(zlib.crc32(data), dtype=word).tobytes()
     crcs = np.zeros(check_bytes(len(data)) // BLOCK_BYTES * CRCS_PER_BLOCK, dtype=word)
@@ -53,16 +40,6 @@ def check_blocks(data: bytes, byte_order: ByteOrder) -> bytes:
 def data_blocks(size_bytes: int) -> int:
     """Return how many of an image's blocks are data.
 
-    Parameters
-    ----------
-    size_bytes : int
-        Size of the image, in whole blocks.
-
-    Returns
-    -------
-    int
-        The others, which follow, are check blocks.
-
     Examples
     --------
     >>> [data_blocks(4096 * blocks) for blocks in (2, 1023, 1025)]
@@ -73,34 +50,12 @@ def data_blocks(size_bytes: int) -> int:
 
 
 def has_check_blocks(image: bytes) -> bool:
-    """Return whether bytes end with at least one check block that is whole.
-
-    Parameters
-    ----------
-    image : bytes
-        Any.
-
-    Returns
-    -------
-    bool
-        True for a damaged image as well, unless all of its check blocks are damaged.
-    """
+    """Return whether bytes end with at least one check block that is whole."""
     return len(image) % BLOCK_BYTES == 0 and any(_sound_checks(image).values())
 
 
 def scrub(image: bytes) -> list[int]:
     """Return the damaged blocks of an image.
-
-    Parameters
-    ----------
-    image : bytes
-        All of it, in either byte order.
-
-    Returns
-    -------
-    list of int
-        Numbers of blocks of 4096 bytes, from 0, ascending; a block that is not whole is the last.
-        Data blocks whose check block is damaged cannot be told apart, and are not listed.
 
     Examples
     --------

@@ -19,16 +19,6 @@ _WORDS_A_LINE = 4
 def c_symbol(name: str) -> str:
     """Return the name of the array.
 
-    Parameters
-    ----------
-    name : str
-        ``<name>-<version>`` of the artifact.
-
-    Returns
-    -------
-    str
-        An identifier of C.
-
     Examples
     --------
     >>> c_symbol("sao-12deg-1.0.0")
@@ -38,20 +28,7 @@ def c_symbol(name: str) -> str:
 
 
 def c_header(name: str, size_bytes: int) -> str:
-    """Return the header that declares the array.
-
-    Parameters
-    ----------
-    name : str
-        ``<name>-<version>`` of the artifact.
-    size_bytes : int
-        Size of the image.
-
-    Returns
-    -------
-    str
-        C99, and C++.
-    """
+    """Return the header that declares the array."""
     symbol = c_symbol(name)
     guard = f"{symbol.upper()}_H"
     return f"""\
@@ -75,24 +52,7 @@ extern const uint64_t {symbol}[{size_bytes // 8}];
 
 
 def c_source(name: str, data: bytes, byte_order: ByteOrder, header_name: str) -> str:
-    """Return the source that defines the array.
-
-    Parameters
-    ----------
-    name : str
-        ``<name>-<version>`` of the artifact.
-    data : bytes
-        The image.
-    byte_order : {"little", "big"}
-        That of the image, and so of the target.
-    header_name : str
-        The file of `c_header`.
-
-    Returns
-    -------
-    str
-        C99.
-    """
+    """Return the source that defines the array."""
     words = [f"0x{word:016X}u" for word in np.frombuffer(data, in_order("u8", byte_order)).tolist()]
     lines = ",\n".join(
         "    " + ", ".join(words[n : n + _WORDS_A_LINE])

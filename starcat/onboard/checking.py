@@ -28,18 +28,7 @@ MAX_PRODUCTS = 20_000_000
 
 
 def value_problems(image: OnboardImage) -> Iterator[str]:
-    """Yield where values, K-vector, circumradii and longest side are not those of the stars.
-
-    Parameters
-    ----------
-    image : OnboardImage
-        As `read_image` returns it.
-
-    Yields
-    ------
-    str
-        What is wrong; nothing for a sound image.
-    """
+    """Yield where values, K-vector, circumradii and longest side are not those of the stars."""
     values, radii, longest = _values(image)
     if (np.diff(values) < -VALUE_TOLERANCE).any():
         yield f"section {_features(image)}: not by ascending value"
@@ -71,18 +60,7 @@ def _fits_line(image: OnboardImage, values: Array) -> bool:
 
 
 def capacity_problems(image: OnboardImage) -> Iterator[str]:
-    """Yield where a circle about a star holds more stars than the header says one can.
-
-    Parameters
-    ----------
-    image : OnboardImage
-        As `read_image` returns it.
-
-    Yields
-    ------
-    str
-        What is wrong.
-    """
+    """Yield where a circle about a star holds more stars than the header says one can."""
     u = image.directions
     if not len(u):
         return
@@ -98,20 +76,7 @@ def capacity_problems(image: OnboardImage) -> Iterator[str]:
 
 
 def artifact_problems(image: OnboardImage, contents: Contents) -> Iterator[str]:
-    """Yield where an image is not of an artifact.
-
-    Parameters
-    ----------
-    image : OnboardImage
-        As `read_image` returns it.
-    contents : Contents
-        Of the artifact, for the method of the image.
-
-    Yields
-    ------
-    str
-        What is wrong. An image may have fewer stars and features than its artifact.
-    """
+    """Yield where an image is not of an artifact."""
     digest = contents.manifest_sha256.hex()
     if image.manifest_sha256 != digest:
         yield (

@@ -58,29 +58,7 @@ def fit(
     fields: Callable[[], FieldStars],
     max_bytes: int | None,
 ) -> Fitted:
-    """Leave out as little as makes an image fit.
-
-    Parameters
-    ----------
-    contents : Contents
-        All that the artifact has.
-    times_seen : ndarray of int32, shape (M,), optional
-        Boresights that see each triangle; None for pairs.
-    fields : callable
-        What returns the tiling of the stars; called only where stars have to go.
-    max_bytes : int, optional
-        Size of the image; None for no limit.
-
-    Returns
-    -------
-    Fitted
-        With the features in the order in which they would be left out, the last first.
-
-    Raises
-    ------
-    OnboardSizeError
-        If less would be left than is of any use.
-    """
+    """Leave out as little as makes an image fit."""
     kept, weight = _by_use(contents, times_seen)
     n_stars, n_features = len(contents.star_id), len(kept.features)
     if max_bytes is None:

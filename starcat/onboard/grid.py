@@ -56,18 +56,7 @@ class Grid:
         return self.bands * self.sectors
 
     def cells(self, u: Array) -> NDArray[np.int64]:
-        """Return the cells of directions.
-
-        Parameters
-        ----------
-        u : ndarray of float64, shape (N, 3)
-            ICRS directions.
-
-        Returns
-        -------
-        ndarray of int64, shape (N,)
-            Band times sectors plus sector.
-        """
+        """Return the cells of directions."""
         band = np.floor((u[:, 2] + 1.0) / 2.0 * self.bands)
         sector = np.floor(quarter_turns(u) / 4.0 * self.sectors)
         band = np.minimum(np.maximum(band, 0.0), self.bands - 1)
@@ -75,34 +64,13 @@ class Grid:
         return np.asarray(band * self.sectors + sector).astype(np.int64)
 
     def offsets(self, cells: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the row of the first star of each cell.
-
-        Parameters
-        ----------
-        cells : ndarray of int64, shape (N,)
-            Ascending.
-
-        Returns
-        -------
-        ndarray of int64, shape (n_cells + 1,)
-            The last entry is the number of stars.
-        """
+        """Return the row of the first star of each cell."""
         first = np.searchsorted(cells, np.arange(self.n_cells + 1), side="left")
         return np.asarray(first, dtype=np.int64)
 
 
 def quarter_turns(u: Array) -> Array:
     """Return a number that grows with right ascension, from 0 to 4, without an angle.
-
-    Parameters
-    ----------
-    u : ndarray of float64, shape (N, 3)
-        ICRS directions.
-
-    Returns
-    -------
-    ndarray of float64, shape (N,)
-        0, 1, 2, 3 at right ascension 0, 90, 180, 270 deg; 0 at a pole.
 
     Examples
     --------
@@ -119,20 +87,7 @@ def quarter_turns(u: Array) -> Array:
 
 
 def grid_for(n_stars: int, radius_rad: float) -> Grid:
-    """Return a grid of about as many cells as stars, but no finer than a camera has use for.
-
-    Parameters
-    ----------
-    n_stars : int
-        Stars.
-    radius_rad : float
-        Angle from the camera's axis to a corner, radians.
-
-    Returns
-    -------
-    Grid
-        Twice as many sectors as bands, so that cells at the equator are about square.
-    """
+    """Return a grid of about as many cells as stars, but no finer than a camera has use for."""
     useful = math.ceil(BANDS_OF_A_FIELD / math.sin(min(radius_rad, 0.5 * math.pi)))
     largest = math.isqrt(MAX_CELLS // 2)
     bands = max(1, min(round(math.sqrt(n_stars / 2.0)), useful, largest))
@@ -141,18 +96,6 @@ def grid_for(n_stars: int, radius_rad: float) -> Grid:
 
 def most_near(u: Array, radius_rad: float) -> int:
     """Return an upper bound of the stars within a radius of any direction.
-
-    Parameters
-    ----------
-    u : ndarray of float64, shape (N, 3)
-        ICRS directions of the stars.
-    radius_rad : float
-        Radians.
-
-    Returns
-    -------
-    int
-        Never too small; too large by what a ring of a sixteenth of the radius adds.
 
     Notes
     -----
@@ -186,28 +129,7 @@ def _most_in(
     radius_rad: float,
     most: int,
 ) -> int:
-    """Return an upper bound for the directions of one cell, or that of the others if larger.
-
-    Parameters
-    ----------
-    face : ndarray of float64, shape (3, 3)
-        The face of the cube.
-    squares : ndarray of float64, shape (1, 2)
-        Middle of the cell on the face.
-    half : float
-        Half of its side.
-    near : ndarray of float64, shape (P, 3)
-        Directions of the stars that are near.
-    radius_rad : float
-        Radians.
-    most : int
-        The bound of the others.
-
-    Returns
-    -------
-    int
-        The larger of both bounds.
-    """
+    """Return an upper bound for the directions of one cell, or that of the others if larger."""
     inner = _cosines(np.array(radius_rad))
     while True:
         half *= 0.5

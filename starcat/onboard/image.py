@@ -113,25 +113,7 @@ class MadeImage:
 
 
 def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImage:
-    """Make the image of guide stars and their triangles or pairs.
-
-    Parameters
-    ----------
-    contents : Contents
-        Stars and features.
-    byte_order : {"little", "big"}
-        That of the target.
-
-    Returns
-    -------
-    MadeImage
-        Pairs longer than the longer side of the detector are not in it.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such method, the name is too long, or the image would be 4 GiB or more.
-    """
+    """Make the image of guide stars and their triangles or pairs."""
     check_method(contents.method)
     _check_name(contents.name)
     directions = quantised(contents.directions)
@@ -177,18 +159,7 @@ def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImag
 
 
 def check_method(method: str) -> None:
-    """Check that there are onboard images for a method.
-
-    Parameters
-    ----------
-    method : str
-        Its name.
-
-    Raises
-    ------
-    ConfigError
-        If there are none.
-    """
+    """Check that there are onboard images for a method."""
     if method not in METHODS:
         raise ConfigError(
             f"method {method!r} has no onboard image; choose one of {', '.join(METHODS)}",
@@ -209,34 +180,12 @@ def _check_name(name: str) -> None:
 
 
 def quantised(directions: Array) -> NDArray[np.int64]:
-    """Return directions as the image holds them.
-
-    Parameters
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        Unit vectors.
-
-    Returns
-    -------
-    ndarray of int64, shape (N, 3)
-        Components times 2147483647, rounded.
-    """
+    """Return directions as the image holds them."""
     return np.rint(np.clip(directions, -1.0, 1.0) * DIRECTION_SCALE).astype(np.int64)
 
 
 def longest_pair_rad(camera: Camera) -> float:
-    """Return the longest pair that an image holds: the angle across the detector's longer side.
-
-    Parameters
-    ----------
-    camera : Camera
-        With its axis in the middle.
-
-    Returns
-    -------
-    float
-        Radians.
-    """
+    """Return the longest pair that an image holds: the angle across the detector's longer side."""
     half_px = 0.5 * max(camera.width_px, camera.height_px)
     return float(2.0 * np.arctan(half_px / camera.focal_length_px))
 

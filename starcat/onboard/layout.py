@@ -123,13 +123,7 @@ class Sizes:
         return self.n_features // 4 + 2
 
     def sections(self) -> list[tuple[str, str, tuple[int, ...]]]:
-        """Return name, dtype and shape of each section, in order.
-
-        Returns
-        -------
-        list of tuple
-            Types of this machine's byte order.
-        """
+        """Return name, dtype and shape of each section, in order."""
         n, m, index = self.n_stars, self.n_features, f"u{self.index_bytes}"
         every = {
             "directions": ("i4", (n, 3)),
@@ -144,13 +138,7 @@ class Sizes:
         return [(name, *every[name]) for name in SECTIONS[self.method]]
 
     def table(self) -> NDArray[Any]:
-        """Return the section table.
-
-        Returns
-        -------
-        ndarray of SECTION, shape (MAX_SECTIONS,)
-            In this machine's byte order; offsets are those of an image of this size.
-        """
+        """Return the section table."""
         table = np.zeros(MAX_SECTIONS, dtype=[(name, "u8") for name in SECTION.names or ()])
         offset = HEADER_BYTES
         for row, (name, dtype, shape) in enumerate(self.sections()):
@@ -174,16 +162,6 @@ class Sizes:
 def check_bytes(data_bytes: int) -> int:
     """Return the size of the check blocks.
 
-    Parameters
-    ----------
-    data_bytes : int
-        Size of what they check, in whole blocks.
-
-    Returns
-    -------
-    int
-        Bytes.
-
     Examples
     --------
     >>> check_bytes(1023 * 4096)
@@ -195,16 +173,6 @@ def check_bytes(data_bytes: int) -> int:
 def rounded_up(value: int, step: int) -> int:
     """Return the next multiple.
 
-    Parameters
-    ----------
-    value, step : int
-        0 or more, and 1 or more.
-
-    Returns
-    -------
-    int
-        ``value`` itself if it is one.
-
     Examples
     --------
     >>> rounded_up(65, 64)
@@ -214,18 +182,5 @@ def rounded_up(value: int, step: int) -> int:
 
 
 def in_order(dtype: np.dtype[Any] | str, byte_order: ByteOrder) -> np.dtype[Any]:
-    """Return a type in a byte order.
-
-    Parameters
-    ----------
-    dtype : dtype or str
-        In any order.
-    byte_order : {"little", "big"}
-        The order.
-
-    Returns
-    -------
-    dtype
-        With the fields at the same places.
-    """
+    """Return a type in a byte order."""
     return np.dtype(dtype).newbyteorder(byte_order)

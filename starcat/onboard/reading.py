@@ -136,18 +136,7 @@ class OnboardImage:
 
 
 def is_image(path: Path) -> bool:
-    """Return whether a file begins as an onboard image does.
-
-    Parameters
-    ----------
-    path : Path
-        Anything; a folder is none.
-
-    Returns
-    -------
-    bool
-        By its first eight bytes.
-    """
+    """Return whether a file begins as an onboard image does."""
     try:
         with path.open("rb") as file:
             return file.read(len(MAGIC)) == MAGIC
@@ -156,27 +145,7 @@ def is_image(path: Path) -> bool:
 
 
 def read_image(source: bytes | Path) -> OnboardImage:
-    """Read an onboard image.
-
-    Parameters
-    ----------
-    source : bytes or Path
-        The image, or its file.
-
-    Returns
-    -------
-    OnboardImage
-        Whose sections can be used without fear: rows are rows, and offsets ascend.
-
-    Raises
-    ------
-    OnboardImageError
-        If it is no image, a block is damaged, or its parts contradict each other.
-    SchemaVersionError
-        If it is of a version of the format that this starcat does not read.
-    ArtifactMissing
-        If there is no such file.
-    """
+    """Read an onboard image."""
     path = source if isinstance(source, Path) else None
     where = str(path) if path is not None else "the onboard image"
     data = bytes_of_file(path) if path is not None else bytes(source)
@@ -208,25 +177,7 @@ def read_image(source: bytes | Path) -> OnboardImage:
 
 
 def bytes_of_file(path: Path) -> bytes:
-    """Return the content of a file that should be an image.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    bytes
-        All of it.
-
-    Raises
-    ------
-    ArtifactMissing
-        If there is no such file.
-    OnboardImageError
-        If it cannot be read.
-    """
+    """Return the content of a file that should be an image."""
     try:
         return path.read_bytes()
     except FileNotFoundError:

@@ -34,18 +34,7 @@ UNIT_TOLERANCE = 1e-8
 
 
 def sizes_of(header: Numbers) -> Sizes:
-    """Return what the size of an image depends on, after `header_problems` has found none.
-
-    Parameters
-    ----------
-    header : mapping
-        Numbers of the header by name.
-
-    Returns
-    -------
-    Sizes
-        With the number of entries that the K-vector has.
-    """
+    """Return what the size of an image depends on, after `header_problems` has found none."""
     methods = {number: name for name, number in METHOD_NUMBERS.items()}
     cells = int(header["grid_bands"]) * int(header["grid_sectors"])
     return Sizes(
@@ -54,20 +43,7 @@ def sizes_of(header: Numbers) -> Sizes:
 
 
 def header_problems(header: Numbers, size_bytes: int) -> Iterator[str]:
-    """Yield what is wrong with a header by itself.
-
-    Parameters
-    ----------
-    header : mapping
-        Numbers of the header by name.
-    size_bytes : int
-        Size of the file or the memory.
-
-    Yields
-    ------
-    str
-        The name of the number, what it is, what was expected.
-    """
+    """Yield what is wrong with a header by itself."""
     for name in HEADER.names or ():
         if HEADER[name].kind == "f" and not math.isfinite(header[name]):
             yield f"{name} is {header[name]}; expected a finite number"
@@ -108,22 +84,7 @@ def header_problems(header: Numbers, size_bytes: int) -> Iterator[str]:
 
 
 def section_problems(table: NDArray[Any], sizes: Sizes, data_bytes: int) -> Iterator[str]:
-    """Yield what is wrong with the places of the sections.
-
-    Parameters
-    ----------
-    table : ndarray of SECTION
-        The section table.
-    sizes : Sizes
-        What the header says.
-    data_bytes : int
-        Where the check blocks begin.
-
-    Yields
-    ------
-    str
-        The section, and what is wrong with it.
-    """
+    """Yield what is wrong with the places of the sections."""
     kinds, end = table["kind"].tolist(), HEADER_BYTES
     for name, dtype, shape in sizes.sections():
         if kinds.count(KINDS[name]) != 1:
@@ -151,20 +112,7 @@ def section_problems(table: NDArray[Any], sizes: Sizes, data_bytes: int) -> Iter
 
 
 def content_problems(header: Numbers, sections: Mapping[str, NDArray[Any]]) -> Iterator[str]:
-    """Yield what is wrong with the rows and the order of the sections.
-
-    Parameters
-    ----------
-    header : mapping
-        Numbers of the header by name.
-    sections : mapping of str to ndarray
-        The sections by name.
-
-    Yields
-    ------
-    str
-        The section, and what is wrong with it.
-    """
+    """Yield what is wrong with the rows and the order of the sections."""
     n_stars, n_features = int(header["n_stars"]), int(header["n_features"])
     for name, last in (("grid", n_stars), ("kvector", n_features)):
         entries = sections[name].astype(np.int64)

@@ -121,40 +121,7 @@ def build(
     announce: Callable[[Cost], None] | None = None,
     max_memory_bytes: int | None = None,
 ) -> Built:
-    """Build an artifact.
-
-    Parameters
-    ----------
-    spec : BuildSpec
-        Everything that the database depends on.
-    inputs : mapping of str to sequence of Path
-        Input files or folders by source; others are looked for (`locate`).
-    output : Path
-        Folder that the artifact's own folder is made in.
-    replace : bool, default False
-        Whether a different artifact of the same name and version may be replaced.
-    workers : int, default 2
-        Threads; the artifact is the same for any number.
-    progress : Progress
-        Called with (stage, done, total).
-    announce : callable, optional
-        Called with what the products will cost, before any is made.
-    max_memory_bytes : int, optional
-        A build that would take more is refused before it begins. By default what the machine has
-        left.
-
-    Returns
-    -------
-    Built
-        The artifact and what is worth telling about it.
-
-    Raises
-    ------
-    ConfigError, SourceError, BuildError, OutputError
-        If the spec or an input cannot be used, too few stars are left, the products would not
-        fit into the memory, the database cannot identify its own fields, or the output cannot be
-        written. After a failed self-test the error has what was made as its ``built``.
-    """
+    """Build an artifact."""
     final = output / f"{spec.name}-{spec.version}"
     clock = Stopwatch()
     with whole_folder(final) as partial:
@@ -232,26 +199,7 @@ def _make(partial: Path, plan: _Plan, clock: Stopwatch, progress: Progress) -> B
 def read_sources(
     spec: BuildSpec, inputs: Inputs, workers: int, progress: Progress
 ) -> tuple[Ingested, list[AmplitudeTable]]:
-    """Read the star catalog and the sources of amplitudes.
-
-    Parameters
-    ----------
-    spec : BuildSpec
-        Which sources, and the epoch.
-    inputs : mapping of str to sequence of Path
-        Inputs, as `build` takes them.
-    workers : int
-        Threads.
-    progress : Progress
-        Passed on.
-
-    Returns
-    -------
-    catalog : Ingested
-        The star table, at the epoch of the spec.
-    amplitudes : list of AmplitudeTable
-        Catalogs, in the order of the spec.
-    """
+    """Read the star catalog and the sources of amplitudes."""
     joins = spec.selection.variables.join
     check_inputs(spec, inputs)
     # All inputs are found before any is read: a missing one is known at once.
@@ -270,20 +218,7 @@ def read_sources(
 
 
 def check_inputs(spec: BuildSpec, inputs: Inputs) -> None:
-    """Check that the spec uses every source that an input is given for.
-
-    Parameters
-    ----------
-    spec : BuildSpec
-        Which sources.
-    inputs : mapping of str to sequence of Path
-        Inputs, as `build` takes them.
-
-    Raises
-    ------
-    ConfigError
-        Naming the source that would be ignored.
-    """
+    """Check that the spec uses every source that an input is given for."""
     for name in inputs:
         if name not in spec.sources:
             raise ConfigError(
@@ -297,22 +232,7 @@ def check_inputs(spec: BuildSpec, inputs: Inputs) -> None:
 def join_all(
     stars: pa.Table, amplitudes: Sequence[AmplitudeTable]
 ) -> tuple[pa.Table, dict[str, int]]:
-    """Join amplitudes to a star table.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        Star table (schema ``stars``).
-    amplitudes : sequence of AmplitudeTable
-        In the order of the spec.
-
-    Returns
-    -------
-    stars : pyarrow.Table
-        The same rows.
-    joined : dict of str to int
-        Stars whose amplitude came from each.
-    """
+    """Join amplitudes to a star table."""
     joined: dict[str, int] = {}
     for table in amplitudes:
         stars, joined[table.source] = join_amplitudes(stars, table)
@@ -320,20 +240,7 @@ def join_all(
 
 
 def report_build(folder: Path, results: Results) -> CoverageReport:
-    """Write the report of a build.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder with the products written; it gets a folder ``report``.
-    results : Results
-        Results of the stages before.
-
-    Returns
-    -------
-    CoverageReport
-        What it says about coverage.
-    """
+    """Write the report of a build."""
     facts = build_facts(folder, results)
     (folder / "report").mkdir()
     write_report(folder / "report", facts)
@@ -350,26 +257,7 @@ def make_products(
     fields: FieldStars,
     progress: Progress = no_progress,
 ) -> list[Product]:
-    """Compute the products of an artifact.
-
-    Parameters
-    ----------
-    spec : BuildSpec
-        Which products, and their parameters.
-    catalog : Ingested
-        Records rejected while reading.
-    selected : Selected
-        Guide stars, and stars rejected by the selection.
-    fields : FieldStars
-        The tiling of the guide stars.
-    progress : Progress
-        Called with ("product <name>", 0, None).
-
-    Returns
-    -------
-    list of Product
-        Products, in the order of the database.
-    """
+    """Compute the products of an artifact."""
     rejected = pa.concat_tables([catalog.rejected, selected.rejected]).combine_chunks()
     order = product_schema("rejected").order
     products = [
@@ -389,18 +277,7 @@ def make_products(
 
 
 def database_facts(spec: BuildSpec) -> dict[str, str | float]:
-    """Return the attributes of the database as a whole.
-
-    Parameters
-    ----------
-    spec : BuildSpec
-        The build.
-
-    Returns
-    -------
-    dict of str to str or float
-        Name, version, frame, epoch, camera and the whole spec as JSON.
-    """
+    """Return the attributes of the database as a whole."""
     camera = spec.camera.camera()
     size = {"width_px": camera.width_px, "height_px": camera.height_px}
     content = spec.recorded()
@@ -415,22 +292,7 @@ def database_facts(spec: BuildSpec) -> dict[str, str | float]:
 
 
 def run_self_test(folder: Path, spec: BuildSpec, progress: Progress) -> tuple[Rates, ...]:
-    """Identify simulated fields with a database.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder with ``database.h5``.
-    spec : BuildSpec
-        How many fields, their noise and seed.
-    progress : Progress
-        Passed on.
-
-    Returns
-    -------
-    tuple of Rates
-        How they fared, as `starcat.simulation.selftest.self_test` says.
-    """
+    """Identify simulated fields with a database."""
     test = spec.self_test
     matcher = Matcher.open(folder, None, tolerance_px=max(0.5, 4.0 * test.noise_px), engine="numpy")
     return self_test(

@@ -170,26 +170,7 @@ def estimate_cost(
     spec: BuildSpec,
     others: Sequence[Product] = (),
 ) -> Cost:
-    """Estimate what the products of a build will cost.
-
-    Parameters
-    ----------
-    catalog : Ingested
-        All stars that were read.
-    selected : Selected
-        Guide stars.
-    fields : FieldStars
-        The tiling of the guide stars.
-    spec : BuildSpec
-        Which products, and their parameters.
-    others : sequence of Product
-        Products that are there already, such as ``motions``.
-
-    Returns
-    -------
-    Cost
-        The same for the same input, on every machine.
-    """
+    """Estimate what the products of a build will cost."""
     rejected = pa.concat_tables([catalog.rejected, selected.rejected])
     base = base_memory(catalog.stars.nbytes + catalog.rejected.nbytes)
     made = Made(
@@ -199,34 +180,12 @@ def estimate_cost(
 
 
 def base_memory(catalog_bytes: float) -> float:
-    """Return the memory that is taken when the guide stars are selected.
-
-    Parameters
-    ----------
-    catalog_bytes : float
-        Of the tables of the catalog.
-
-    Returns
-    -------
-    float
-        Bytes, those of the program included.
-    """
+    """Return the memory that is taken when the guide stars are selected."""
     return BASE_BYTES + CATALOG_FACTOR * catalog_bytes
 
 
 def whole_cost(made: Made) -> Cost:
-    """Estimate what a build will cost, its files included.
-
-    Parameters
-    ----------
-    made : Made
-        What is there.
-
-    Returns
-    -------
-    Cost
-        The same for the same input, on every machine.
-    """
+    """Estimate what a build will cost, its files included."""
     spec, stars = made.spec, made.guide_stars
     extents, levels = count_products(made.ingredients), None
     if spec.products.levels.enabled:
@@ -252,20 +211,7 @@ def whole_cost(made: Made) -> Cost:
 
 
 def product_cost(given: Ingredients, base_bytes: float) -> Cost:
-    """Estimate what products that are made from guide stars alone will cost.
-
-    Parameters
-    ----------
-    given : Ingredients
-        Guide stars, tiling and spec.
-    base_bytes : float
-        Memory that is taken before.
-
-    Returns
-    -------
-    Cost
-        Without files; the same for the same input, on every machine.
-    """
+    """Estimate what products that are made from guide stars alone will cost."""
     return _cost(given, count_products(given), None, base_bytes)
 
 
@@ -306,22 +252,7 @@ def _cost(
 
 
 def check_memory(cost: Cost, spec: BuildSpec, max_memory_bytes: int | None = None) -> None:
-    """Check that a build fits into the memory.
-
-    Parameters
-    ----------
-    cost : Cost
-        The estimate.
-    spec : BuildSpec
-        For the message.
-    max_memory_bytes : int, optional
-        The limit; by default what this process has and what the machine has left.
-
-    Raises
-    ------
-    BuildError
-        Naming the key that saves most.
-    """
+    """Check that a build fits into the memory."""
     limit, whose = max_memory_bytes, "the limit that was given"
     if limit is None:
         limit, whose = available_memory_bytes(), "what this machine has left"

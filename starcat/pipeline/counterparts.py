@@ -61,18 +61,7 @@ class Counterparts:
 
 
 def model_from_spec(wanted: Crossmatch) -> MatchModel:
-    """Return the model of errors that a spec asks for.
-
-    Parameters
-    ----------
-    wanted : Crossmatch
-        The section of the spec.
-
-    Returns
-    -------
-    MatchModel
-        In radians.
-    """
+    """Return the model of errors that a spec asks for."""
     error = wanted.position_error_arcsec
     return MatchModel(
         position_error_rad=None if error is None else error * ARCSEC,
@@ -89,22 +78,7 @@ def model_from_spec(wanted: Crossmatch) -> MatchModel:
 def match_tables(
     stars: pa.Table, counterparts: pa.Table, wanted: Crossmatch
 ) -> tuple[pa.Table, Summary]:
-    """Find the counterparts of one star table in another.
-
-    Parameters
-    ----------
-    stars, counterparts : pyarrow.Table
-        With the columns of the stars schema that `NEEDED` lists.
-    wanted : Crossmatch
-        Radius and model.
-
-    Returns
-    -------
-    table : pyarrow.Table
-        Counterparts, as the schema ``crossmatch`` has them.
-    summary : Summary
-        Counts and medians.
-    """
+    """Find the counterparts of one star table in another."""
     radius = wanted.radius_arcsec * ARCSEC
     model = model_from_spec(wanted)
     found = crossmatch(moving_stars(stars), moving_stars(counterparts), radius, model)
@@ -126,20 +100,6 @@ def _median(values: NDArray[np.float64]) -> float | None:
 
 def with_rivals(stars: pa.Table, selected: Selected, radius_rad: float) -> pa.Table:
     """Return guide stars, followed by the rejected stars that may be their counterparts' own.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        The stars that the selection chose from, with all their columns.
-    selected : Selected
-        Guide stars, and which of the others were rejected.
-    radius_rad : float
-        Largest separation of a candidate.
-
-    Returns
-    -------
-    pyarrow.Table
-        The guide stars in their order, then every rejected star within two radii of one.
 
     Notes
     -----
@@ -163,33 +123,7 @@ def match_catalogs(
     workers: int = 2,
     progress: Progress = no_progress,
 ) -> Counterparts:
-    """Find the counterparts of a build's guide stars in the catalogs of its spec.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        The stars that the selection chose from.
-    selected : Selected
-        Guide stars, in the order of the artifact, and which of the others were rejected.
-    spec : BuildSpec
-        Its section ``products.crossmatch``.
-    inputs : mapping of str to sequence of Path
-        Input files or folders by source; others are looked for (`locate`).
-    workers : int, default 2
-        Threads; the result is the same for any number.
-    progress : Progress
-        Called with (stage, done, total).
-
-    Returns
-    -------
-    Counterparts
-        Nothing where the product is not enabled.
-
-    Raises
-    ------
-    SourceError
-        If a catalog is missing or damaged.
-    """
+    """Find the counterparts of a build's guide stars in the catalogs of its spec."""
     wanted = spec.products.crossmatch
     if not wanted.enabled:
         return Counterparts()
@@ -237,32 +171,7 @@ def _in_order(tables: Sequence[pa.Table]) -> pa.Table:
 
 
 def match_files(a: Path, b: Path, output: Path, wanted: Crossmatch) -> Summary:
-    """Find the counterparts of the stars of one file in another.
-
-    Parameters
-    ----------
-    a, b : Path
-        Parquet files of star tables: the stars, and where their counterparts are looked for.
-    output : Path
-        Parquet file: the columns of the crossmatch schema with ``star_id`` and
-        ``star_designation`` of A in front; replaced when the new one is whole.
-    wanted : Crossmatch
-        Radius and model.
-
-    Returns
-    -------
-    Summary
-        Counts and medians.
-
-    Raises
-    ------
-    SourceError
-        If a file cannot be read.
-    SchemaError
-        If a file is no star table.
-    OutputError
-        If the output cannot be written.
-    """
+    """Find the counterparts of the stars of one file in another."""
     stars, counterparts = read_star_table(a), read_star_table(b)
     table, summary = match_tables(stars, counterparts, wanted)
     write_table(with_own_names(table, stars), output)
@@ -270,60 +179,21 @@ def match_files(a: Path, b: Path, output: Path, wanted: Crossmatch) -> Summary:
 
 
 def with_own_names(table: pa.Table, stars: pa.Table) -> pa.Table:
-    """Return counterparts with the number and the name of their star in front.
-
-    Parameters
-    ----------
-    table : pyarrow.Table
-        As the schema ``crossmatch`` has them.
-    stars : pyarrow.Table
-        The star table that the rows of ``star`` are of.
-
-    Returns
-    -------
-    pyarrow.Table
-        With ``star_id`` and ``star_designation``.
-    """
+    """Return counterparts with the number and the name of their star in front."""
     own = stars.select(["star_id", "designation"]).take(table["star"].combine_chunks())
     columns = [own["star_id"], own["designation"], *table.columns]
     return pa.Table.from_arrays(columns, schema=schema_with_own_names())
 
 
 def schema_with_own_names() -> pa.Schema:
-    """Return the schema ``crossmatch`` with the number and the name of the star in front.
-
-    Returns
-    -------
-    pyarrow.Schema
-        With ``star_id`` and ``star_designation``.
-    """
+    """Return the schema ``crossmatch`` with the number and the name of the star in front."""
     known = product_schema("stars").arrow_schema
     own = [known.field("star_id"), known.field("designation").with_name("star_designation")]
     return pa.schema([*own, *product_schema("crossmatch").arrow_schema])
 
 
 def read_star_table(path: Path) -> pa.Table:
-    """Read the columns of a star table that a cross-identification needs.
-
-    Parameters
-    ----------
-    path : Path
-        A Parquet file as ``starcat ingest`` or a build writes it.
-
-    Returns
-    -------
-    pyarrow.Table
-        With the columns that `NEEDED` lists.
-
-    Raises
-    ------
-    SourceMissing
-        If there is no such file.
-    ParseError
-        If it is no Parquet file.
-    SchemaError
-        If it is no star table, or a star has no number, position or epoch.
-    """
+    """Read the columns of a star table that a cross-identification needs."""
     hint = "give a star table, as 'starcat ingest' writes it"
     try:
         with pq.ParquetFile(path) as file:
@@ -347,20 +217,7 @@ def read_star_table(path: Path) -> pa.Table:
 
 
 def check_star_columns(table: pa.Table, path: Path) -> None:
-    """Check types, and that every star has what places it.
-
-    Parameters
-    ----------
-    table : pyarrow.Table
-        Columns of a star table, all or some.
-    path : Path
-        Where they are from, for the message.
-
-    Raises
-    ------
-    SchemaError
-        If a column is of another type, or a star lacks a value that every star has.
-    """
+    """Check types, and that every star has what places it."""
     for column in product_schema("stars").columns:
         if column.name not in NEEDED or column.name not in table.column_names:
             continue

@@ -59,18 +59,7 @@ class Extent:
 
 
 def count_products(given: Ingredients) -> dict[str, Extent]:
-    """Count the rows of the products that are made from guide stars alone.
-
-    Parameters
-    ----------
-    given : Ingredients
-        Guide stars, tiling and spec.
-
-    Returns
-    -------
-    dict of str to Extent
-        By product, of those that the spec enables, in the order of the database.
-    """
+    """Count the rows of the products that are made from guide stars alone."""
     spec, stars = given.spec, len(given.directions)
     wanted = [name for name in RECIPES if getattr(spec.products, name).enabled]
     reach = {name: _reach_rad(name, given) for name in wanted if name != "triangles"}
@@ -122,22 +111,7 @@ class LevelExtent:
 
 
 def count_levels(directions: Array, mag: Array, spec: BuildSpec) -> LevelExtent:
-    """Count the stars and the triangles of a range of fields.
-
-    Parameters
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        Guide stars, ICRS.
-    mag : ndarray of float64, shape (N,)
-        Their magnitudes.
-    spec : BuildSpec
-        Its ``products.levels`` and ``boresights``.
-
-    Returns
-    -------
-    LevelExtent
-        The stars to the last one, the triangles by estimate.
-    """
+    """Count the stars and the triangles of a range of fields."""
     wanted, own = spec.products.levels, field_size(spec)
     fields = level_fields(own, wanted.widest_fov_x_deg, wanted.max_ratio)
     stars, triangles, records = 0, 0.0, 0.0
@@ -205,23 +179,7 @@ def _distinct(around: Array, share: Array) -> float:
 
 
 def count_triangles(fields: FieldStars, stars: int, brightest: int) -> tuple[float, float]:
-    """Return the triangles of all fields, and about how many of them are distinct.
-
-    Parameters
-    ----------
-    fields : FieldStars
-        The tiling.
-    stars : int
-        Rows of the star table.
-    brightest : int
-        Stars of a field that make its triangles.
-
-    Returns
-    -------
-    records, distinct : float
-        A triangle that t fields have is counted t times; so the distinct ones are as many as all
-        times the mean of 1 / t.
-    """
+    """Return the triangles of all fields, and about how many of them are distinct."""
     offsets, star = fields.brightest(brightest)
     size = np.diff(offsets)
     each = size * (size - 1) * (size - 2) // 6
@@ -243,16 +201,6 @@ def count_triangles(fields: FieldStars, stars: int, brightest: int) -> tuple[flo
 
 def triple_of_rank(rank: Counts) -> Counts:
     """Return three numbers for each rank, each three of them once.
-
-    Parameters
-    ----------
-    rank : ndarray of int64, shape (M,)
-        0 or more.
-
-    Returns
-    -------
-    ndarray of int64, shape (M, 3)
-        Ascending in a row; the ranks below n (n - 1) (n - 2) / 6 have those below n.
 
     Examples
     --------

@@ -79,25 +79,7 @@ class Choice:
 
 
 def choose_stars(read: StarsRead, spec: BuildSpec) -> Choice:
-    """Choose the guide stars of a spec, as its build does.
-
-    Parameters
-    ----------
-    read : StarsRead
-        The catalogs of the spec.
-    spec : BuildSpec
-        Limits, rules and the tiling.
-
-    Returns
-    -------
-    Choice
-        The same guide stars as in the build, to the last bit; a field may have too few of them.
-
-    Raises
-    ------
-    BuildError
-        If too few stars are left, or the tiling is larger than an estimate goes through.
-    """
+    """Choose the guide stars of a spec, as its build does."""
     order, mag = read.by_brightness
     bright = np.sort(order[: np.searchsorted(mag, _faintest(spec.selection), side="right")])
     stars = read.stars.take(pa.array(bright)).combine_chunks()
@@ -205,24 +187,7 @@ class Estimate:
 def estimate(
     read: StarsRead, choice: Choice, spec: BuildSpec, max_memory_bytes: int | None = None
 ) -> Estimate:
-    """Estimate what a spec will give.
-
-    Parameters
-    ----------
-    read : StarsRead
-        The catalogs of the spec.
-    choice : Choice
-        Its guide stars.
-    spec : BuildSpec
-        The spec.
-    max_memory_bytes : int, optional
-        What a build may take; by default what this machine has left.
-
-    Returns
-    -------
-    Estimate
-        The same for the same input, but for what ``refusals`` says of memory.
-    """
+    """Estimate what a spec will give."""
     guide_stars, fields = choice.selected.guide_stars, choice.fields
     made = Made(
         guide_stars,
@@ -297,28 +262,6 @@ def estimate_spec(
     workers: int = 2,
     progress: Progress = no_progress,
 ) -> Estimate:
-    """Read the catalogs of a spec and estimate what it will give.
-
-    Parameters
-    ----------
-    spec : BuildSpec
-        The spec.
-    inputs : mapping of str to sequence of Path
-        Inputs, as `starcat.pipeline.build.build` takes them.
-    workers : int, default 2
-        Threads; the result is the same for any number.
-    progress : Progress
-        Passed on.
-
-    Returns
-    -------
-    Estimate
-        What its build will give.
-
-    Raises
-    ------
-    ConfigError, SourceError, BuildError
-        If the spec or an input cannot be used, too few stars are left, or the tiling is too large.
-    """
+    """Read the catalogs of a spec and estimate what it will give."""
     read = read_stars(spec, inputs, workers, progress)
     return estimate(read, choose_stars(read, spec), spec)

@@ -58,20 +58,7 @@ class FilterCoverage:
 
 
 def filter_coverage(step: Step, spec: BuildSpec) -> FilterCoverage:
-    """Count what a filter leaves in the fields of the tiling.
-
-    Parameters
-    ----------
-    step : Step
-        The stars left.
-    spec : BuildSpec
-        The tiling.
-
-    Returns
-    -------
-    FilterCoverage
-        One line of the table of filters.
-    """
+    """Count what a filter leaves in the fields of the tiling."""
     return _filter_coverage(step, _counts(step, spec))
 
 
@@ -99,22 +86,7 @@ def _filter_coverage(step: Step, count: NDArray[np.int64]) -> FilterCoverage:
 def filter_coverages(
     steps: Sequence[Step], fields: FieldStars, spec: BuildSpec
 ) -> tuple[FilterCoverage, ...]:
-    """Count what each filter leaves in the fields of the tiling.
-
-    Parameters
-    ----------
-    steps : sequence of Step
-        The stars left by each filter, a part of those before it.
-    fields : FieldStars
-        The tiling of the stars that the last one left.
-    spec : BuildSpec
-        The tiling.
-
-    Returns
-    -------
-    tuple of FilterCoverage
-        One a filter. Fields are counted anew only where stars were left out.
-    """
+    """Count what each filter leaves in the fields of the tiling."""
     found: dict[int, FilterCoverage] = {}
     for step in steps:
         stars = len(step.directions)
@@ -125,20 +97,7 @@ def filter_coverages(
 
 
 def coverage_report(coverage: Coverage, spec: BuildSpec) -> CoverageReport:
-    """Return what a report says about coverage.
-
-    Parameters
-    ----------
-    coverage : Coverage
-        Stars, pairs and triangles by boresight.
-    spec : BuildSpec
-        Says how far a field reaches at any roll: half of its narrower angle.
-
-    Returns
-    -------
-    CoverageReport
-        Coverage with the gaps of the tiling.
-    """
+    """Return what a report says about coverage."""
     size = field_size(spec)
     return report_coverage(coverage, 0.5 * float(np.radians(min(size.fov_x_deg, size.fov_y_deg))))
 
@@ -149,24 +108,7 @@ def source_facts(
     amplitudes: Sequence[AmplitudeTable],
     joined: Mapping[str, int],
 ) -> list[SourceFacts]:
-    """Return what went into a build as the manifest has it.
-
-    Parameters
-    ----------
-    catalog : Ingested
-        The star catalog.
-    selected : Selected
-        What became of its stars.
-    amplitudes : sequence of AmplitudeTable
-        The sources joined to it.
-    joined : mapping of str to int
-        Stars whose amplitude came from each.
-
-    Returns
-    -------
-    list of SourceFacts
-        The star catalog first.
-    """
+    """Return what went into a build as the manifest has it."""
     rejected = {**catalog.rejected_by_reason, **count_by_reason(selected.rejected)}
     for reason in catalog.rejected_by_reason.keys() & count_by_reason(selected.rejected).keys():
         rejected[reason] += catalog.rejected_by_reason[reason]
@@ -228,20 +170,7 @@ class Results:
 
 
 def build_facts(folder: Path, results: Results) -> BuildFacts:
-    """Return what the report of a build is made of.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder with the products written.
-    results : Results
-        Results of the stages before.
-
-    Returns
-    -------
-    BuildFacts
-        Plain data.
-    """
+    """Return what the report of a build is made of."""
     spec, tables = results.spec, {product.name: product.table for product in results.products}
     products = {name: facts.as_dict() for name, facts in results.facts.items()}
     for facts in products.values():
@@ -265,18 +194,7 @@ def build_facts(folder: Path, results: Results) -> BuildFacts:
 
 
 def artifact_coverage(artifact: Artifact) -> CoverageReport:
-    """Return the coverage of an artifact, from its own boresights.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        Open.
-
-    Returns
-    -------
-    CoverageReport
-        The same as the report of its build has.
-    """
+    """Return the coverage of an artifact, from its own boresights."""
     from starcat.pipeline.facts import coverage_report
     from starcat.products.coverage import coverage_from_counts
     from starcat.specs.reading import spec_from_dict

@@ -29,27 +29,7 @@ FIRST_LOOK = 4.0
 
 
 def select_stars(stars: pa.Table, spec: BuildSpec) -> tuple[Selected, FieldStars]:
-    """Select guide stars, thin them if the spec says so, and tile the sphere.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        Star table (schema ``stars``), amplitudes joined.
-    spec : BuildSpec
-        Limits, rules and the tiling.
-
-    Returns
-    -------
-    selected : Selected
-        Guide stars, and the others with their reasons.
-    fields : FieldStars
-        The tiling of the guide stars.
-
-    Raises
-    ------
-    BuildError
-        If too few stars are left, in all or in a field.
-    """
+    """Select guide stars, thin them if the spec says so, and tile the sphere."""
     selected = thinned_stars(stars, spec)
     fields = tile_guide_stars(selected.guide_stars, spec)
     check_fields(fields, spec)
@@ -57,25 +37,7 @@ def select_stars(stars: pa.Table, spec: BuildSpec) -> tuple[Selected, FieldStars
 
 
 def thinned_stars(stars: pa.Table, spec: BuildSpec) -> Selected:
-    """Select guide stars, and thin them if the spec says so.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        Star table (schema ``stars``), amplitudes joined.
-    spec : BuildSpec
-        Limits, rules and the tiling.
-
-    Returns
-    -------
-    Selected
-        Guide stars, and the others with their reasons.
-
-    Raises
-    ------
-    BuildError
-        If too few stars are left.
-    """
+    """Select guide stars, and thin them if the spec says so."""
     selected = select_guide_stars(stars, spec.selection)
     check_guide_stars(selected, spec)
     most = spec.selection.max_stars_per_field
@@ -87,20 +49,6 @@ def thinned_stars(stars: pa.Table, spec: BuildSpec) -> Selected:
 
 def brightest_of_fields(guide_stars: pa.Table, spec: BuildSpec, most: int) -> NDArray[np.int64]:
     """Return the stars that are among the brightest of some field of the tiling.
-
-    Parameters
-    ----------
-    guide_stars : pyarrow.Table
-        Guide stars, as the schema ``stars`` has them.
-    spec : BuildSpec
-        Number, size and shape of the fields.
-    most : int
-        So many of each field.
-
-    Returns
-    -------
-    ndarray of int64
-        Rows of the guide stars, ascending, each once.
 
     Notes
     -----
@@ -126,42 +74,14 @@ def brightest_of_fields(guide_stars: pa.Table, spec: BuildSpec, most: int) -> ND
 
 
 def field_share(spec: BuildSpec) -> float:
-    """Return how much of the sphere a field of the tiling covers, about.
-
-    Parameters
-    ----------
-    spec : BuildSpec
-        Size and shape of the fields.
-
-    Returns
-    -------
-    float
-        0 to 1: the share that the circle takes which the stars of a field are looked for in.
-    """
+    """Return how much of the sphere a field of the tiling covers, about."""
     return 0.5 * (1.0 - float(np.cos(reach_rad(field_size(spec), spec.boresights.field))))
 
 
 def check_tiling(
     stars: int, spec: BuildSpec, thinned_to: int | None, most: int = MOST_FIELD_STARS
 ) -> None:
-    """Check that the fields of a tiling have not too many stars to be gone through in a moment.
-
-    Parameters
-    ----------
-    stars : int
-        Guide stars of the whole sky.
-    spec : BuildSpec
-        Number, size and shape of the fields.
-    thinned_to : int, optional
-        Only so many of each field are wanted.
-    most : int, default `MOST_FIELD_STARS`
-        Stars of all fields together.
-
-    Raises
-    ------
-    BuildError
-        Naming what makes them fewer.
-    """
+    """Check that the fields of a tiling have not too many stars to be gone through in a moment."""
     in_field = stars * field_share(spec)
     if thinned_to is not None:
         in_field = min(in_field, FIRST_LOOK * thinned_to)
@@ -176,20 +96,7 @@ def check_tiling(
 
 
 def check_guide_stars(selected: Selected, spec: BuildSpec) -> None:
-    """Check that the selection left stars to build from.
-
-    Parameters
-    ----------
-    selected : Selected
-        The selection.
-    spec : BuildSpec
-        For the message.
-
-    Raises
-    ------
-    BuildError
-        If fewer than 4 stars are left, with the reasons of the others.
-    """
+    """Check that the selection left stars to build from."""
     left = len(selected.guide_stars)
     if left < MIN_GUIDE_STARS:
         counts = count_by_reason(selected.rejected)
@@ -204,20 +111,7 @@ def check_guide_stars(selected: Selected, spec: BuildSpec) -> None:
 
 
 def check_fields(fields: FieldStars, spec: BuildSpec) -> None:
-    """Check that every field has the guide stars that the spec asks for.
-
-    Parameters
-    ----------
-    fields : FieldStars
-        The tiling.
-    spec : BuildSpec
-        ``boresights.min_stars_per_field``.
-
-    Raises
-    ------
-    BuildError
-        Naming the fields that fall short, the worst first.
-    """
+    """Check that every field has the guide stars that the spec asks for."""
     wanted, count = spec.boresights.min_stars_per_field, fields.count
     if wanted is None or count.min() >= wanted:
         return

@@ -26,23 +26,7 @@ THINNED = 1.5
 
 
 def check_rates(rates: Sequence[Rates], spec: BuildSpec, gap: TilingGap) -> None:
-    """Check that a database identifies its own fields.
-
-    Parameters
-    ----------
-    rates : sequence of Rates
-        Rates of the self-test, those of the clean frames with magnitudes first.
-    spec : BuildSpec
-        ``self_test.min_identified``.
-    gap : TilingGap
-        The widest gap of the tiling.
-
-    Raises
-    ------
-    BuildError
-        If not even the upper end of the interval of the clean frames reaches what is asked for,
-        or any answer was wrong.
-    """
+    """Check that a database identifies its own fields."""
     clean, wanted = rates[0], spec.self_test.min_identified
     most = clean.interval[1] if clean.identifiable else 0.0
     if most < wanted:
@@ -58,22 +42,7 @@ def check_rates(rates: Sequence[Rates], spec: BuildSpec, gap: TilingGap) -> None
 
 
 def causes(rates: Rates, spec: BuildSpec, gap: TilingGap) -> list[str]:
-    """Return why frames were not identified, and which keys of the spec to change.
-
-    Parameters
-    ----------
-    rates : Rates
-        Of the frames.
-    spec : BuildSpec
-        Of the database.
-    gap : TilingGap
-        The widest gap of the tiling.
-
-    Returns
-    -------
-    list of str
-        A sentence each, the most certain cause first; at least one.
-    """
+    """Return why frames were not identified, and which keys of the spec to change."""
     return list(_causes(rates, spec, gap)) or [
         "More of the triangles of a frame are held with a larger boresights.brightest or "
         "boresights.count"
@@ -106,20 +75,7 @@ def _causes(rates: Rates, spec: BuildSpec, gap: TilingGap) -> Iterator[str]:
 
 
 def advice_without_magnitudes(rates: Sequence[Rates], spec: BuildSpec) -> str | None:
-    """Return what to say of a database that is good only where magnitudes are given.
-
-    Parameters
-    ----------
-    rates : sequence of Rates
-        Rates of the self-test, as `starcat.simulation.selftest.self_test` returns them.
-    spec : BuildSpec
-        ``self_test.min_identified``, and the density.
-
-    Returns
-    -------
-    str or None
-        One line; None where it is as good without.
-    """
+    """Return what to say of a database that is good only where magnitudes are given."""
     clean, bare = rates[0], rates[2]
     wanted = spec.self_test.min_identified
     if not bare.identifiable or bare.interval[1] >= min(wanted, clean.interval[0]):

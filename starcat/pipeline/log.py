@@ -26,13 +26,7 @@ class Stopwatch:
         self._seconds: dict[str, float] = {}
 
     def lap(self, stage: str) -> None:
-        """Say that a stage has ended.
-
-        Parameters
-        ----------
-        stage : str
-            Its name; the next stage begins now.
-        """
+        """Say that a stage has ended."""
         now = time.perf_counter()
         self._seconds[stage] = self._seconds.get(stage, 0.0) + now - self._last
         self._last = now
@@ -45,13 +39,7 @@ class Stopwatch:
 
 
 def peak_memory_bytes() -> int | None:
-    """Return the most memory that this process has held.
-
-    Returns
-    -------
-    int or None
-        Resident bytes; None where the system does not say.
-    """
+    """Return the most memory that this process has held."""
     if sys.platform == "win32":
         return None
     status = Path("/proc/self/status")
@@ -67,14 +55,7 @@ def peak_memory_bytes() -> int | None:
 
 
 def available_memory_bytes() -> int | None:
-    """Return how much memory this process may have in all.
-
-    Returns
-    -------
-    int or None
-        What it has, and what the machine and the group of processes that it is in have left; all
-        memory of the machine where only that is known, None where the system does not say.
-    """
+    """Return how much memory this process may have in all."""
     try:
         fields = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
         own = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
@@ -91,22 +72,7 @@ def available_memory_bytes() -> int | None:
 
 
 def write_build_log(artifact: Path, outcome: str, times_s: Mapping[str, float]) -> Path:
-    """Write the log of a build beside its artifact.
-
-    Parameters
-    ----------
-    artifact : Path
-        The folder ``<name>-<version>``.
-    outcome : str
-        What happened to it.
-    times_s : mapping of str to float
-        Seconds by stage.
-
-    Returns
-    -------
-    Path
-        The file ``<name>-<version>.build.json``; that of an earlier build is replaced whole.
-    """
+    """Write the log of a build beside its artifact."""
     content: dict[str, Any] = {
         "artifact": artifact.name,
         "outcome": outcome,

@@ -113,20 +113,7 @@ def _local(job: Job, piece: Piece, rings: int, columns: Sequence[str]) -> _Local
 
 
 def measure_piece(job: Job, piece: Piece) -> Counted:
-    """Find the sure pairs of a piece, whose separations and magnitudes go to the scratch folder.
-
-    Parameters
-    ----------
-    job : Job
-        What all tasks need.
-    piece : Piece
-        The piece.
-
-    Returns
-    -------
-    Counted
-        How many there are.
-    """
+    """Find the sure pairs of a piece, whose separations and magnitudes go to the scratch folder."""
     here = _local(job, piece, 2, PLACED)
     i, j = here.pairs.star, here.pairs.counterpart
     own = here.is_own[i]
@@ -139,20 +126,7 @@ def measure_piece(job: Job, piece: Piece) -> Counted:
 
 
 def judge_piece(job: Job, piece: Piece) -> Judged:
-    """Judge the candidates of the stars of a piece; they go to the scratch folder.
-
-    Parameters
-    ----------
-    job : Job
-        With the figures of both catalogs.
-    piece : Piece
-        The piece.
-
-    Returns
-    -------
-    Judged
-        What was found.
-    """
+    """Judge the candidates of the stars of a piece; they go to the scratch folder."""
     if job.figures is None:
         raise ValueError("figures are missing; both catalogs have to be measured first")
     # Clusters mostly end within three rings, which cost nothing where these are narrow.

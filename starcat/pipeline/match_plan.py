@@ -55,18 +55,7 @@ class Extent:
 
     @classmethod
     def of(cls, stars: MovingStars) -> Extent:
-        """Return what is known of stars.
-
-        Parameters
-        ----------
-        stars : MovingStars
-            Any number.
-
-        Returns
-        -------
-        Extent
-            Of these.
-        """
+        """Return what is known of stars."""
         speed = np.sqrt(np.einsum("ij,ij->i", stars.velocities, stars.velocities))
         return cls(
             Census.of(stars),
@@ -78,13 +67,7 @@ class Extent:
 
     @classmethod
     def of_none(cls) -> Extent:
-        """Return what is known of no stars.
-
-        Returns
-        -------
-        Extent
-            Nothing.
-        """
+        """Return what is known of no stars."""
         return cls.of(moving_stars(pa.table({name: pa.array([], pa.float64()) for name in PLACED})))
 
     def __add__(self, other: Extent) -> Extent:
@@ -134,20 +117,7 @@ class Piece:
 
 
 def hop_of(a: Extent, b: Extent, radius_rad: float) -> float:
-    """Return how far the positions of a star and a candidate may be apart.
-
-    Parameters
-    ----------
-    a, b : Extent
-        The stars, and where their counterparts are looked for.
-    radius_rad : float
-        Largest separation at the epoch of comparison.
-
-    Returns
-    -------
-    float
-        Radians: the radius, and what the fastest star can move between the epochs.
-    """
+    """Return how far the positions of a star and a candidate may be apart."""
     years = max(a.last_jyear - b.first_jyear, b.last_jyear - a.first_jyear, 0.0)
     # Candidates are moved only to stars that cannot be moved themselves.
     speed = max(a.speed_rad_yr, b.speed_rad_yr if a.has_still else 0.0)
@@ -160,22 +130,7 @@ def pieces_of(
     job: Job,
     piece_load: int = PIECE_LOAD,
 ) -> list[Piece]:
-    """Divide the sky into pieces that one worker at a time can hold.
-
-    Parameters
-    ----------
-    a, b : sequence of (Pixel, int)
-        Partitions of the two catalogs, and their stars.
-    job : Job
-        With the hop, which no piece is narrower than.
-    piece_load : int
-        Stars and pairs that a piece should have at most.
-
-    Returns
-    -------
-    list of Piece
-        In order of the sky; together they have all stars of A.
-    """
+    """Divide the sky into pieces that one worker at a time can hold."""
     finest = border_order(job.hop_rad)
     share = np.pi * job.radius_rad**2 / (4.0 * np.pi / 12.0)
     chosen: list[Pixel] = []
@@ -206,20 +161,7 @@ def _rows_within(parts: Sequence[tuple[Pixel, int]], pixel: Pixel) -> float:
 
 
 def extent_of_partition(job: Job, place: tuple[Path, int]) -> Extent:
-    """Count the stars of a partition of a store.
-
-    Parameters
-    ----------
-    job : Job
-        What all tasks need.
-    place : (Path, int)
-        The store, and the number of the partition.
-
-    Returns
-    -------
-    Extent
-        Of its stars.
-    """
+    """Count the stars of a partition of a store."""
     store = opened(place[0], job.scratch)
     partition = store.catalog.partitions[place[1]]
     total = Extent.of_none()
@@ -229,38 +171,10 @@ def extent_of_partition(job: Job, place: tuple[Path, int]) -> Extent:
 
 
 def numbers_path(job: Job, kind: str, piece: Piece) -> Path:
-    """Return the file of some numbers of a piece.
-
-    Parameters
-    ----------
-    job : Job
-        With the scratch folder.
-    kind : str
-        What they are.
-    piece : Piece
-        The piece.
-
-    Returns
-    -------
-    Path
-        In the scratch folder.
-    """
+    """Return the file of some numbers of a piece."""
     return job.scratch / f"{kind}-{piece.number}.f8"
 
 
 def rows_path(job: Job, piece: Piece) -> Path:
-    """Return the file of the rows of a piece.
-
-    Parameters
-    ----------
-    job : Job
-        With the scratch folder.
-    piece : Piece
-        The piece.
-
-    Returns
-    -------
-    Path
-        In the scratch folder.
-    """
+    """Return the file of the rows of a piece."""
     return job.scratch / f"rows-{piece.number}.parquet"

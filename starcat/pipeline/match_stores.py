@@ -67,22 +67,7 @@ def run_here(
     items: Sequence[Any],
     report: Callable[[int, Any], None] | None = None,
 ) -> list[Any]:
-    """Call a function with each of some items, in this process.
-
-    Parameters
-    ----------
-    function : callable
-        Of one argument.
-    items : sequence of object
-        What to call it with.
-    report : callable, optional
-        Called with the number of an item and its result when that is done.
-
-    Returns
-    -------
-    list of object
-        Results in the order of the items.
-    """
+    """Call a function with each of some items, in this process."""
     results = []
     for number, item in enumerate(items):
         results.append(function(item))
@@ -100,33 +85,7 @@ def match_on_cluster(
     scheduler: str | None = None,
     progress: Progress = no_progress,
 ) -> Summary:
-    """Find the counterparts of the stars of one catalog in another, on a Dask cluster.
-
-    Parameters
-    ----------
-    a, b, output : Path
-        As `match_stores` takes them.
-    wanted : Crossmatch
-        Radius and model.
-    workers : int, default 2
-        Processes on this machine; threads where the stores are small.
-    scheduler : str, optional
-        Address of a cluster to use instead.
-    progress : Progress
-        Called with (stage, done, total).
-
-    Returns
-    -------
-    Summary
-        Counts and medians.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such cluster.
-    StarcatError
-        As `match_stores` does.
-    """
+    """Find the counterparts of the stars of one catalog in another, on a Dask cluster."""
     is_small = _bytes_of(a) + _bytes_of(b) < _SMALL_BYTES
     with cluster(workers, scheduler, is_small=is_small) as client:
         return match_stores(a, b, output, wanted, partial(run_tasks, client), progress)
@@ -148,43 +107,7 @@ def match_stores(
     progress: Progress = no_progress,
     piece_load: int = PIECE_LOAD,
 ) -> Summary:
-    """Find the counterparts of the stars of one catalog in another; neither need fit in memory.
-
-    Parameters
-    ----------
-    a, b : Path
-        Catalog stores or Parquet files of star tables: the stars, and where their counterparts
-        are looked for. A Parquet file is held in memory while it is divided.
-    output : Path
-        Parquet file: what `match_files` writes without ``star``, as a store has no numbers of
-        rows; in order of the stars' pixel of order 29, ``star_id`` and rank. Replaced when the
-        new one is whole.
-    wanted : Crossmatch
-        Radius and model.
-    run : callable
-        Runs tasks, such as `starcat.store.cluster.run_tasks` of a client; the result is the same
-        for any number of workers. They need the same paths.
-    progress : Progress
-        Called with (stage, done, total).
-    piece_load : int
-        Stars and pairs that a task should hold at most; the result is the same for any.
-
-    Returns
-    -------
-    Summary
-        Counts and medians.
-
-    Raises
-    ------
-    SourceError
-        If a file cannot be read.
-    SchemaError
-        If a catalog is no star table.
-    ProductError
-        If a store is not whole.
-    OutputError
-        If the output cannot be written.
-    """
+    """Find the counterparts of the stars of one catalog in another; neither need fit in memory."""
     if output.is_dir():
         raise OutputError(
             f"{output}: cannot be written (Is a directory); choose another --output", path=output

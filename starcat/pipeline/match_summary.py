@@ -55,13 +55,7 @@ class Summary:
     completeness: float
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the summary as plain values.
-
-        Returns
-        -------
-        dict
-            For JSON.
-        """
+        """Return the summary as plain values."""
         return asdict(self)
 
 
@@ -91,13 +85,7 @@ class Tally:
 
     @classmethod
     def of_none(cls) -> Tally:
-        """Return the tally of no stars.
-
-        Returns
-        -------
-        Tally
-            Zeros.
-        """
+        """Return the tally of no stars."""
         return cls(0, 0, 0, 0, {name: 0 for name in VERDICTS if name != "other"})
 
     def __add__(self, other: Tally) -> Tally:
@@ -128,20 +116,7 @@ class MeasuredFigures(Protocol):
 
 
 def tally_of(found: Matches, table: pa.Table) -> Tally:
-    """Count what was found.
-
-    Parameters
-    ----------
-    found : Matches
-        All candidates of some stars.
-    table : pyarrow.Table
-        The same, as rows of the crossmatch product.
-
-    Returns
-    -------
-    Tally
-        The counts.
-    """
+    """Count what was found."""
     first = found.rank == 1
     return Tally(
         len(found.rank),
@@ -153,22 +128,7 @@ def tally_of(found: Matches, table: pa.Table) -> Tally:
 
 
 def differences_of(found: Matches, table: pa.Table) -> tuple[Array, Array]:
-    """Return by how much the matched stars and their counterparts differ.
-
-    Parameters
-    ----------
-    found : Matches
-        All candidates of some stars.
-    table : pyarrow.Table
-        The same, as rows of the crossmatch product.
-
-    Returns
-    -------
-    separation_arcsec : ndarray of float64, shape (M,)
-        Of each matched star and its counterpart.
-    delta_mag : ndarray of float64, shape (K,)
-        Of those whose magnitudes are both known.
-    """
+    """Return by how much the matched stars and their counterparts differ."""
     rows = matched_stars(table)
     delta = found.delta_mag[rows]
     return found.separation_rad[rows] / ARCSEC, delta[~np.isnan(delta)]
@@ -182,26 +142,7 @@ def summary_of(
     median_separation_arcsec: float | None,
     median_delta_mag: float | None,
 ) -> Summary:
-    """Return the summary of a tally of all stars.
-
-    Parameters
-    ----------
-    tally : Tally
-        What was found of them.
-    rows : tuple of int
-        Stars of the two catalogs.
-    radius_arcsec : float
-        Largest separation of a candidate.
-    figures : Odds or Figures
-        What the odds assume.
-    median_separation_arcsec, median_delta_mag : float, optional
-        Over the matched stars; None where there is none.
-
-    Returns
-    -------
-    Summary
-        Rounded.
-    """
+    """Return the summary of a tally of all stars."""
     stars, counterparts = rows
     return Summary(
         stars,

@@ -18,38 +18,13 @@ _CHUNK = 1 << 20
 
 
 def write_numbers(values: Array, path: Path) -> None:
-    """Write numbers to a file that `median_of` reads.
-
-    Parameters
-    ----------
-    values : ndarray of float64, shape (N,)
-        None of them NaN.
-    path : Path
-        Replaced if it exists.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
+    """Write numbers to a file that `median_of` reads."""
     with whole_file(path) as partial:
         partial.write_bytes(np.ascontiguousarray(values, dtype="<f8").tobytes())
 
 
 def median_of(paths: Sequence[Path]) -> tuple[int, float | None]:
     """Return how many numbers files have, and the median of all.
-
-    Parameters
-    ----------
-    paths : sequence of Path
-        Files of `write_numbers`.
-
-    Returns
-    -------
-    count : int
-        Numbers.
-    median : float or None
-        The bits that ``numpy.median`` gives for all of them at once; None where there is none.
 
     Notes
     -----

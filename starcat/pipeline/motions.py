@@ -75,32 +75,7 @@ def join_motions(
     workers: int = 2,
     progress: Progress = no_progress,
 ) -> JoinedMotions:
-    """Give the stars that have no proper motion those of other catalogs.
-
-    Parameters
-    ----------
-    catalog : Ingested
-        A star catalog, as it was read for the build.
-    spec : BuildSpec
-        Its key ``catalog.motions``, its epoch, and the model of ``products.crossmatch``.
-    inputs : mapping of str to sequence of Path
-        Input files or folders by source; others are looked for (`locate`).
-    workers : int, default 2
-        Threads; the result is the same for any number.
-    progress : Progress
-        Called with (stage, done, total).
-
-    Returns
-    -------
-    JoinedMotions
-        The catalog as it was where the spec asks for no motions. A star with a motion of its own
-        keeps it; of several catalogs the first that has one of a star gives it.
-
-    Raises
-    ------
-    SourceError
-        If a catalog of motions is missing or damaged.
-    """
+    """Give the stars that have no proper motion those of other catalogs."""
     if not spec.catalog.motions:
         return JoinedMotions(catalog)
     wanted, stars = spec.products.crossmatch, catalog.stars
@@ -132,42 +107,14 @@ def join_motions(
 
 
 def motion_product(joined: JoinedMotions, guide_stars: pa.Table) -> tuple[Product, ...]:
-    """Return where the motions of guide stars are from, as a product.
-
-    Parameters
-    ----------
-    joined : JoinedMotions
-        What `join_motions` returned.
-    guide_stars : pyarrow.Table
-        The guide stars, by star_id: some of its stars.
-
-    Returns
-    -------
-    tuple of Product
-        The product ``motions``; none where the spec asks for no motions.
-    """
+    """Return where the motions of guide stars are from, as a product."""
     if joined.table is None:
         return ()
     return (motions_of(joined.catalog.stars, joined.table, guide_stars),)
 
 
 def motions_of(stars: pa.Table, motions: pa.Table, guide_stars: pa.Table) -> Product:
-    """Return the rows of guide stars in a table of motions.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        Star table, by star_id.
-    motions : pyarrow.Table
-        Rows of the schema ``motions``, one for each of its stars.
-    guide_stars : pyarrow.Table
-        Some of its stars, by star_id.
-
-    Returns
-    -------
-    Product
-        The product ``motions``.
-    """
+    """Return the rows of guide stars in a table of motions."""
     number = stars["star_id"].to_numpy()
     rows = np.searchsorted(number, guide_stars["star_id"].to_numpy())
     table = motions.take(pa.array(rows)).combine_chunks()
@@ -177,20 +124,7 @@ def motions_of(stars: pa.Table, motions: pa.Table, guide_stars: pa.Table) -> Pro
 
 
 def motion_sources(joined: JoinedMotions, products: Sequence[Product]) -> list[SourceFacts]:
-    """Return what the manifest says of the catalogs of motions.
-
-    Parameters
-    ----------
-    joined : JoinedMotions
-        What `join_motions` returned.
-    products : sequence of Product
-        The products of the build; ``motions`` is among them where there are such catalogs.
-
-    Returns
-    -------
-    list of SourceFacts
-        With the number of guide stars whose motion is from each, and how far those moved.
-    """
+    """Return what the manifest says of the catalogs of motions."""
     facts = []
     for source in joined.sources:
         table = next(product.table for product in products if product.name == "motions")
@@ -205,20 +139,7 @@ def motion_sources(joined: JoinedMotions, products: Sequence[Product]) -> list[S
 
 
 def motion_notes(spec: BuildSpec, products: Sequence[Product]) -> tuple[str, ...]:
-    """Return a note where guide stars stay at the epoch of their catalog.
-
-    Parameters
-    ----------
-    spec : BuildSpec
-        The build.
-    products : sequence of Product
-        The products of the build.
-
-    Returns
-    -------
-    tuple of str
-        How many stay, for which reasons; empty where all have a motion, or none was asked for.
-    """
+    """Return a note where guide stars stay at the epoch of their catalog."""
     for product in products:
         if product.name != "motions":
             continue

@@ -63,13 +63,7 @@ class Rebuilt:
         return not self.changes
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the outcome as plain values.
-
-        Returns
-        -------
-        dict
-            For JSON.
-        """
+        """Return the outcome as plain values."""
         return {"is_identical": self.is_identical, **asdict(self)}
 
 
@@ -79,34 +73,7 @@ def rebuild(
     output: Path | None = None,
     progress: Progress = no_progress,
 ) -> Rebuilt:
-    """Build an artifact again from its manifest, and compare every file.
-
-    Parameters
-    ----------
-    artifact : Path
-        The folder ``<name>-<version>``.
-    inputs : mapping of str to sequence of Path
-        Input files or folders by source; others are looked for (`locate`).
-    output : Path, optional
-        Folder to keep the new artifact in; without it, it is built in a temporary folder and
-        removed.
-    progress : Progress
-        Called with (stage, done, total).
-
-    Returns
-    -------
-    Rebuilt
-        Whether the bytes are the same, and what differs.
-
-    Raises
-    ------
-    ProductError
-        If the artifact has no readable manifest.
-    SourceMissing
-        If an input is not found.
-    ChecksumMismatch
-        If an input is not the file that the artifact was made from.
-    """
+    """Build an artifact again from its manifest, and compare every file."""
     old = open_artifact(artifact)
     spec = spec_from_dict(old.manifest["spec"], f"{artifact.name}/{MANIFEST_NAME}")
     check_inputs(spec, inputs)

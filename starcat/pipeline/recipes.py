@@ -52,20 +52,7 @@ class Ingredients:
     spec: BuildSpec
 
     def radius_rad(self, radius_deg: float | None, factor: float = 1.0) -> float:
-        """Return a product's radius.
-
-        Parameters
-        ----------
-        radius_deg : float, optional
-            As the spec has it.
-        factor : float
-            Times half of the camera's narrower field, where the spec has none.
-
-        Returns
-        -------
-        float
-            Radians.
-        """
+        """Return a product's radius."""
         if radius_deg is not None:
             return float(np.radians(radius_deg))
         return factor * float(np.radians(self.spec.camera.half_field_deg))
@@ -133,18 +120,7 @@ RECIPES: dict[str, Callable[[Ingredients], Any]] = {
 
 
 def field_size(spec: BuildSpec) -> FieldSize:
-    """Return the size of the tiling's fields.
-
-    Parameters
-    ----------
-    spec : BuildSpec
-        Its ``boresights`` section; the camera where that says nothing.
-
-    Returns
-    -------
-    FieldSize
-        Full angles across width and height.
-    """
+    """Return the size of the tiling's fields."""
     camera, wanted = spec.camera.camera(), spec.boresights
     return NominalField(
         camera.fov_x_deg if wanted.fov_x_deg is None else wanted.fov_x_deg,
@@ -153,20 +129,7 @@ def field_size(spec: BuildSpec) -> FieldSize:
 
 
 def tile_guide_stars(guide_stars: pa.Table, spec: BuildSpec) -> FieldStars:
-    """Tile the sphere and find the guide stars in each field.
-
-    Parameters
-    ----------
-    guide_stars : pyarrow.Table
-        Guide stars, as the schema ``stars`` has them.
-    spec : BuildSpec
-        Number, size and shape of the fields.
-
-    Returns
-    -------
-    FieldStars
-        In spiral order.
-    """
+    """Tile the sphere and find the guide stars in each field."""
     return tile_sphere(
         spec.boresights.count,
         directions_of(guide_stars),
@@ -177,39 +140,13 @@ def tile_guide_stars(guide_stars: pa.Table, spec: BuildSpec) -> FieldStars:
 
 
 def cook(name: str, given: Ingredients) -> Product:
-    """Make one product.
-
-    Parameters
-    ----------
-    name : str
-        A key of `RECIPES`.
-    given : Ingredients
-        Guide stars, tiling and spec.
-
-    Returns
-    -------
-    Product
-        Ready to be written.
-    """
+    """Make one product."""
     made = RECIPES[name](given)
     return Product(name, table_from_result(made, product_schema(name)), made.index)
 
 
 def table_from_result(result: Any, schema: ProductSchema) -> pa.Table:
-    """Return the columns of a product's result as a table.
-
-    Parameters
-    ----------
-    result : object
-        Its attributes carry the names of the schema's columns.
-    schema : ProductSchema
-        The contract.
-
-    Returns
-    -------
-    pyarrow.Table
-        With every column of the schema, in its order.
-    """
+    """Return the columns of a product's result as a table."""
     arrays = []
     for column in schema.columns:
         values, kind = getattr(result, column.name), column.arrow_field.type
@@ -222,20 +159,7 @@ def table_from_result(result: Any, schema: ProductSchema) -> pa.Table:
 
 
 def boresight_product(fields: FieldStars, brightest: int) -> Product:
-    """Return the boresights as a product.
-
-    Parameters
-    ----------
-    fields : FieldStars
-        The tiling.
-    brightest : int
-        Length of each field's list of stars.
-
-    Returns
-    -------
-    Product
-        One row a boresight.
-    """
+    """Return the boresights as a product."""
     ra_deg, dec_deg = radec_from_directions(fields.boresights)
     u = np.ascontiguousarray(fields.boresights.T)
     rows = np.arange(len(ra_deg), dtype=np.int32)
@@ -247,20 +171,7 @@ def boresight_product(fields: FieldStars, brightest: int) -> Product:
 
 
 def level_product(guide_stars: pa.Table, spec: BuildSpec) -> Product:
-    """Return the levels of a range of fields as a product.
-
-    Parameters
-    ----------
-    guide_stars : pyarrow.Table
-        Guide stars, as the schema ``stars`` has them.
-    spec : BuildSpec
-        Its ``products.levels`` and ``boresights``.
-
-    Returns
-    -------
-    Product
-        One row a level; the camera's own field is none of them.
-    """
+    """Return the levels of a range of fields as a product."""
     wanted, own = spec.products.levels, field_size(spec)
     result = find_levels(
         directions_of(guide_stars),

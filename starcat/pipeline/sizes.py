@@ -116,20 +116,7 @@ PART_ROWS, PARTS = 8192, 3
 
 
 def table_bytes(table: pa.Table, rows: int | None = None) -> int:
-    """Return about how large the Parquet file of a table will be.
-
-    Parameters
-    ----------
-    table : pyarrow.Table
-        As a product's schema has it.
-    rows : int, optional
-        Rows of the product, where the table is a part of it; by default those of the table.
-
-    Returns
-    -------
-    int
-        Bytes: to the last one for a whole table that is not large.
-    """
+    """Return about how large the Parquet file of a table will be."""
     count = len(table) if rows is None else rows
     if len(table) <= PART_ROWS * PARTS and count == len(table):
         return parquet_bytes(table)
@@ -143,24 +130,7 @@ def table_bytes(table: pa.Table, rows: int | None = None) -> int:
 def product_files(
     extents: Mapping[str, Extent], levels: LevelExtent | None, stars: int, spec: BuildSpec
 ) -> dict[str, int]:
-    """Return how large the Parquet files of products will be.
-
-    Parameters
-    ----------
-    extents : mapping of str to Extent
-        Products that are made from guide stars alone.
-    levels : LevelExtent, optional
-        The levels of a range of fields.
-    stars : int
-        Guide stars.
-    spec : BuildSpec
-        Parameters of the products.
-
-    Returns
-    -------
-    dict of str to int
-        Bytes by product.
-    """
+    """Return how large the Parquet files of products will be."""
     found = {}
     for name, extent in extents.items():
         base, more = FOOTER[name]
@@ -212,27 +182,7 @@ def database_bytes(
     spec: BuildSpec,
     designation_bytes: int = 28,
 ) -> int:
-    """Return how large the HDF5 file of a build will be.
-
-    Parameters
-    ----------
-    extents : mapping of str to Extent
-        Products that are made from guide stars alone, and ``boresights`` with the stars that its
-        lists name.
-    levels : LevelExtent, optional
-        The levels of a range of fields.
-    stars : int
-        Guide stars.
-    spec : BuildSpec
-        Parameters of the products.
-    designation_bytes : int, default 28
-        Length of the longest name of a star.
-
-    Returns
-    -------
-    int
-        Bytes.
-    """
+    """Return how large the HDF5 file of a build will be."""
     total, datasets = 0.0, 0
     every = {"stars": Extent(float(stars)), **extents}
     if levels is not None:
@@ -283,33 +233,11 @@ def _no_counterparts() -> int:
 
 
 def counterparts_bytes(rows: float) -> int:
-    """Return about how large the file of counterparts will be.
-
-    Parameters
-    ----------
-    rows : float
-        Of the product ``crossmatch``.
-
-    Returns
-    -------
-    int
-        Bytes.
-    """
+    """Return about how large the file of counterparts will be."""
     return round(_no_counterparts() + COUNTERPART_BYTES * rows)
 
 
 def other_bytes(fields: int) -> int:
-    """Return about how large the report and the manifest of a build will be.
-
-    Parameters
-    ----------
-    fields : int
-        Boresights.
-
-    Returns
-    -------
-    int
-        Bytes of all their files together.
-    """
+    """Return about how large the report and the manifest of a build will be."""
     beyond = max(0.0, fields - REPORT_BYTES[0][-1])
     return round(_at(REPORT_BYTES, fields) + REPORT_BYTES_PER_FIELD * beyond + MANIFEST_BYTES)

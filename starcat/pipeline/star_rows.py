@@ -47,27 +47,7 @@ _HINT = "give a catalog store, as 'starcat ingest SOURCE --to hats -o DIR' write
 
 @lru_cache(maxsize=4)
 def opened(folder: Path, run: Path) -> Store:
-    """Open a store once in each process and run.
-
-    Parameters
-    ----------
-    folder : Path
-        The store.
-    run : Path
-        What no other run has, such as its folder for unfinished work.
-
-    Returns
-    -------
-    Store
-        Checked to have the columns of a star table.
-
-    Raises
-    ------
-    SchemaError
-        If it lacks one.
-    ProductError
-        If it is no store.
-    """
+    """Open a store once in each process and run."""
     store = open_store(folder)
     order = store.catalog.properties.get("hats_col_healpix_order", str(MAX_ORDER))
     if order != str(MAX_ORDER):
@@ -105,31 +85,7 @@ def _check_partitions(store: Store) -> None:
 def rows_of_partition(
     store: Store, partition: Partition, columns: Sequence[str]
 ) -> Iterator[pa.Table]:
-    """Yield the stars of a partition, a row group at a time.
-
-    Parameters
-    ----------
-    store : Store
-        The catalog.
-    partition : Partition
-        One of its partitions.
-    columns : sequence of str
-        Columns of a star table.
-
-    Yields
-    ------
-    pyarrow.Table
-        With these columns and ``_healpix_29``.
-
-    Raises
-    ------
-    SchemaError
-        If a star lacks what places it, or a column is of another type.
-    ProductError
-        If a star is not in the pixel of the partition.
-    ParseError
-        If a file is damaged.
-    """
+    """Yield the stars of a partition, a row group at a time."""
     first, end = partition.pixel.first, partition.pixel.end
     for path in partition.paths:
         with _parquet(path) as file:
@@ -146,27 +102,7 @@ def rows_of_partition(
 
 
 def rows_of_region(store: Store, region: Region, columns: Sequence[str]) -> pa.Table:
-    """Return the stars of a region.
-
-    Parameters
-    ----------
-    store : Store
-        The catalog.
-    region : Region
-        Any part of the sky.
-    columns : sequence of str
-        Columns of a star table, ``star_id`` among them.
-
-    Returns
-    -------
-    pyarrow.Table
-        With these columns and ``_healpix_29``, in order of ``star_id`` and pixel.
-
-    Raises
-    ------
-    SchemaError, ParseError
-        As `rows_of_partition` does.
-    """
+    """Return the stars of a region."""
     schema = _schema(tuple(columns))
     parts = [schema.empty_table()]
     bounds = np.array(region.ranges, dtype=np.int64)
@@ -268,22 +204,7 @@ def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
 
 
 def store_of_file(stars: pa.Table, path: Path, folder: Path) -> None:
-    """Write a star table as a HATS catalog of twelve partitions, to be read by place.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        As `read_star_table` gives it.
-    path : Path
-        Where it is from, for the message.
-    folder : Path
-        Made.
-
-    Raises
-    ------
-    SchemaError
-        If a declination is none.
-    """
+    """Write a star table as a HATS catalog of twelve partitions, to be read by place."""
     dec_deg = stars["dec_deg"].to_numpy()
     if len(dec_deg) and np.abs(dec_deg).max() > 90.0:
         raise SchemaError(

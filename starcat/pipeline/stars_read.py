@@ -90,29 +90,7 @@ def read_stars(
     workers: int = 2,
     progress: Progress = no_progress,
 ) -> StarsRead:
-    """Read the catalogs of a spec, as its build does.
-
-    Parameters
-    ----------
-    spec : BuildSpec
-        Which sources, and the epoch.
-    inputs : mapping of str to sequence of Path
-        Inputs, as `starcat.pipeline.build.build` takes them.
-    workers : int, default 2
-        Threads; the result is the same for any number.
-    progress : Progress
-        Passed on.
-
-    Returns
-    -------
-    StarsRead
-        Which depends on no more of the spec than `what_is_read` has.
-
-    Raises
-    ------
-    ConfigError, SourceError
-        If the spec or an input cannot be used.
-    """
+    """Read the catalogs of a spec, as its build does."""
     catalog, amplitudes = read_sources(spec, inputs, workers, progress)
     joined = join_motions(catalog, spec, inputs, workers, progress)
     stars, _ = join_all(joined.catalog.stars, amplitudes)
@@ -130,18 +108,7 @@ def read_stars(
 
 
 def what_is_read(spec: BuildSpec) -> dict[str, Any]:
-    """Return all of a spec that reading its catalogs depends on.
-
-    Parameters
-    ----------
-    spec : BuildSpec
-        Any.
-
-    Returns
-    -------
-    dict
-        As JSON has it.
-    """
+    """Return all of a spec that reading its catalogs depends on."""
     content = spec.model_dump(mode="json")
     wanted = {
         "catalog": content["catalog"],

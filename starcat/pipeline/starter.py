@@ -144,40 +144,7 @@ def starter_spec(
     sky: pa.Table | None = None,
     most_field_stars: int = MOST_LOOKED_AT,
 ) -> Starter:
-    """Return a spec for a camera, from the embedded sky.
-
-    Parameters
-    ----------
-    name : str
-        Name of the artifact; what no artifact's name may have becomes a hyphen.
-    camera : CameraSpec
-        The camera.
-    faint_limit_mag : float, optional
-        What the camera sees, Gaia's G. By default the limit that leaves at least
-        `ENOUGH_STARS` stars in `ENOUGH_SHARE` of the fields, a tenth of a magnitude at a time.
-    progress : Progress
-        Passed on.
-    widest_fov_x_deg : float, optional
-        Field across the width that the database is to serve too, for cameras of which only a range
-        is known; ``camera`` is the narrow end of it. Only products that find a focal length are
-        made then.
-    sky : pyarrow.Table, optional
-        Star table of the embedded sky, where it was read already.
-    most_field_stars : int
-        Stars of all fields of the tiling that may be gone through.
-
-    Returns
-    -------
-    Starter
-        The spec, and the stars of a field for limits around its own.
-
-    Raises
-    ------
-    ConfigError
-        If the camera or the limit is out of range.
-    BuildError
-        If the limit leaves far more stars in the fields than a database is made of.
-    """
+    """Return a spec for a camera, from the embedded sky."""
     name = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:64] or "camera"
     if sky is None:
         sky = ingest(SOURCE, locate(SOURCE, {}), progress=progress).stars
@@ -210,22 +177,7 @@ def _is_quick(mag: NDArray[np.float64], limit: float, spec: BuildSpec, most: int
 
 
 def write_starter(starter: Starter, path: Path, *, replace: bool) -> None:
-    """Write a first spec as a TOML file in which every key is explained.
-
-    Parameters
-    ----------
-    starter : Starter
-        The spec.
-    path : Path
-        The file.
-    replace : bool
-        Whether a file that is there may be replaced.
-
-    Raises
-    ------
-    OutputError
-        If a file is there and may not be replaced, or the file cannot be written.
-    """
+    """Write a first spec as a TOML file in which every key is explained."""
     if path.exists() and not replace:
         raise OutputError(f"{path} is there already; choose another name or --replace", path=path)
     with whole_file(path) as partial:
@@ -234,17 +186,6 @@ def write_starter(starter: Starter, path: Path, *, replace: bool) -> None:
 
 def boresight_count(camera: CameraSpec) -> int:
     """Return how many boresights a camera's fields want.
-
-    Parameters
-    ----------
-    camera : CameraSpec
-        The camera.
-
-    Returns
-    -------
-    int
-        `OVERLAP` times as many as leave no hole between the circles inside the fields, from 2,000
-        to 30,000; more only where a hole would be left.
 
     Notes
     -----
@@ -351,18 +292,7 @@ def _row(sky: pa.Table, spec: BuildSpec) -> LimitRow:
 
 
 def advice(starter: Starter) -> Sequence[str]:
-    """Return what to think of before a limit is kept.
-
-    Parameters
-    ----------
-    starter : Starter
-        A first spec.
-
-    Returns
-    -------
-    sequence of str
-        One sentence each; empty where the limit is a good one.
-    """
+    """Return what to think of before a limit is kept."""
     own, told = starter.own, []
     if starter.spec.selection.faint_limit_mag > starter.deepest_mag + 0.1:
         told.append(

@@ -38,13 +38,7 @@ class Facts:
     ucd: str = ""
 
     def as_metadata(self) -> dict[str, str]:
-        """Return the facts as the metadata of an Arrow field.
-
-        Returns
-        -------
-        dict of str to str
-            Without those that are empty.
-        """
+        """Return the facts as the metadata of an Arrow field."""
         return {key: value for key, value in vars(self).items() if value}
 
     def __str__(self) -> str:
@@ -52,19 +46,7 @@ class Facts:
 
 
 def facts_by_name(views: Iterable[View]) -> dict[str, Facts]:
-    """Return what is known of columns by their name.
-
-    Parameters
-    ----------
-    views : iterable of View
-        All that a query can see.
-
-    Returns
-    -------
-    dict of str to Facts
-        The facts of each name. Where views disagree on what a name means, only the unit is kept,
-        if they agree on that.
-    """
+    """Return what is known of columns by their name."""
     found: dict[str, Facts] = {}
     for view in views:
         for column in view.schema.columns if view.schema else ():
@@ -77,18 +59,6 @@ def facts_by_name(views: Iterable[View]) -> dict[str, Facts]:
 
 def column_facts(name: str, known: Mapping[str, Facts]) -> Facts:
     """Return what is known of a column of an answer.
-
-    Parameters
-    ----------
-    name : str
-        The name of the column.
-    known : mapping of str to Facts
-        What is known of the columns of the views, by name.
-
-    Returns
-    -------
-    Facts
-        The facts of the view's column of that name, else the unit that the name ends with.
 
     Examples
     --------

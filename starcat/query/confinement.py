@@ -32,16 +32,6 @@ def forbid_writing(except_in: Path) -> bool:
     """Forbid this process to write, make or remove files, whatever their permissions are.
 
     It holds for threads that start afterwards, and cannot be taken back.
-
-    Parameters
-    ----------
-    except_in : Path
-        Folder in which it may.
-
-    Returns
-    -------
-    bool
-        Whether the operating system can do that.
     """
     if sys.platform != "linux":
         return False
@@ -68,13 +58,7 @@ def forbid_writing(except_in: Path) -> bool:
 
 
 def limit_memory(more_bytes: int) -> None:
-    """Limit the memory of this process.
-
-    Parameters
-    ----------
-    more_bytes : int
-        How much it may have beyond what it has now, bytes. An allocation beyond that fails.
-    """
+    """Limit the memory of this process."""
     if sys.platform == "win32":
         return
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -87,13 +71,7 @@ def limit_memory(more_bytes: int) -> None:
 
 
 def limit_time(more_s: float) -> None:
-    """Limit the processor time of this process; it is ended when it takes more.
-
-    Parameters
-    ----------
-    more_s : float
-        How much it may take beyond what it took, seconds, all processors together.
-    """
+    """Limit the processor time of this process; it is ended when it takes more."""
     if sys.platform == "win32":
         return
     used = resource.getrusage(resource.RUSAGE_SELF)

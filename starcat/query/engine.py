@@ -98,15 +98,7 @@ class WorkerEnded(QueryError):  # noqa: N818 - the name reads as the fact
 
 
 class Engine:
-    """A process with a DuckDB, started again when it was ended.
-
-    Parameters
-    ----------
-    scratch : Path
-        Folder for what does not fit into its memory.
-    memory_gb, disk_gb : float
-        Gigabytes that it may take of each.
-    """
+    """A process with a DuckDB, started again when it was ended."""
 
     def __init__(self, scratch: Path, memory_gb: float, disk_gb: float) -> None:
         self._opening = Opening(scratch / "spill", memory_gb, disk_gb, os.getpid())
@@ -118,18 +110,7 @@ class Engine:
         self._process = self._started()
 
     def open(self, views: Views) -> None:
-        """Make the views; from here on the process reads nothing else.
-
-        Parameters
-        ----------
-        views : Views
-            Views and macros; made again in every process that is started.
-
-        Raises
-        ------
-        QueryError
-            If they cannot be made.
-        """
+        """Make the views; from here on the process reads nothing else."""
         self.ask("open", views)
         self._views = views
 
@@ -140,31 +121,7 @@ class Engine:
         allowance: Allowance | None = None,
         progress: Progress = no_progress,
     ) -> list[Any]:
-        """Ask the process for something, and wait for the answer.
-
-        Parameters
-        ----------
-        name : str
-            A method of `starcat.query.worker.Worker`.
-        *arguments : object
-            The arguments of the method.
-        allowance : Allowance, optional
-            Time that it may take; what it took is taken from it.
-        progress : Progress
-            Called with ("query", percent, 100) while it runs.
-
-        Returns
-        -------
-        list of object
-            The parts of the answer; most have one.
-
-        Raises
-        ------
-        QueryError
-            If there is none.
-        QueryLimitError
-            If it takes longer, or more memory and disk, than it may.
-        """
+        """Ask the process for something, and wait for the answer."""
         with self._asking:
             if not self.is_running:
                 self.close()

@@ -71,23 +71,7 @@ class NamedQuery:
     text: str
 
     def with_values(self, given: Mapping[str, str]) -> dict[str, Literal]:
-        """Return the values of the query, given or by default.
-
-        Parameters
-        ----------
-        given : mapping of str to str
-            Texts by name.
-
-        Returns
-        -------
-        dict of str to int, float or str
-            A value for each ``$name``.
-
-        Raises
-        ------
-        QueryError
-            If a name is unknown, or a text is no number where one is wanted.
-        """
+        """Return the values of the query, given or by default."""
         values: dict[str, Literal] = {value.name: value.default for value in self.values}
         for name, text in given.items():
             if name not in values:
@@ -110,17 +94,6 @@ def _as(kind: type[Literal], text: str, where: str) -> Literal:
 def guessed(text: str) -> Literal:
     """Return the value that a text stands for where nothing declares its type.
 
-    Parameters
-    ----------
-    text : str
-        The text of a value on the command line.
-
-    Returns
-    -------
-    int, float or str
-        A number where the text is one as numbers are written, and the text itself otherwise: a
-        name such as ``007`` keeps its zeros.
-
     Examples
     --------
     >>> guessed("7"), guessed("-1.5e3"), guessed("007"), guessed("nan"), guessed("1_000")
@@ -135,11 +108,6 @@ def guessed(text: str) -> Literal:
 def gallery() -> dict[str, NamedQuery]:
     """Return all named queries.
 
-    Returns
-    -------
-    dict of str to NamedQuery
-        The queries by their names.
-
     Examples
     --------
     >>> gallery()["densest-fields"].values[0].default
@@ -149,23 +117,7 @@ def gallery() -> dict[str, NamedQuery]:
 
 
 def named_query(name: str) -> NamedQuery:
-    """Return a query of the gallery.
-
-    Parameters
-    ----------
-    name : str
-        A name that ``starcat sql --list`` shows.
-
-    Returns
-    -------
-    NamedQuery
-        The query.
-
-    Raises
-    ------
-    QueryError
-        If there is none of that name.
-    """
+    """Return a query of the gallery."""
     known = gallery()
     if name not in known:
         hint = suggest(name, known)

@@ -44,20 +44,7 @@ class Macro:
         return "AS TABLE" in self.text
 
     def statement(self, schema: str, places: str) -> str:
-        """Return the SQL that makes a table macro.
-
-        Parameters
-        ----------
-        schema : str
-            Schema to make it in.
-        places : str
-            Schema of the views with places that it is about.
-
-        Returns
-        -------
-        str
-            One or more statements.
-        """
+        """Return the SQL that makes a table macro."""
         made = self.text.replace("{places}", places)
         return made.replace("CREATE MACRO ", f"CREATE MACRO {schema}.")
 
@@ -65,11 +52,6 @@ class Macro:
 @cache
 def macros() -> tuple[Macro, ...]:
     """Return all macros, in an order in which they can be made.
-
-    Returns
-    -------
-    tuple of Macro
-        The macros; those that others use come first.
 
     Examples
     --------

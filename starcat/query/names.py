@@ -38,16 +38,6 @@ CATALOGS = frozenset({"main", "memory", "temp", "system", "information_schema", 
 def identifier(text: str) -> str:
     """Return a name that SQL needs no quotes for.
 
-    Parameters
-    ----------
-    text : str
-        Any.
-
-    Returns
-    -------
-    str
-        Lower case letters, digits and underscores; a word of SQL ends with an underscore.
-
     Examples
     --------
     >>> identifier("gaia-12deg"), identifier("2mass-8x6"), identifier("Group")
@@ -62,16 +52,6 @@ def identifier(text: str) -> str:
 def short_names(many: int) -> list[str]:
     """Return the short names of several targets, in their order.
 
-    Parameters
-    ----------
-    many : int
-        How many targets.
-
-    Returns
-    -------
-    list of str
-        ``a`` to ``z``, then ``aa``, ``ab`` …; words of SQL end with an underscore.
-
     Examples
     --------
     >>> short_names(3), short_names(45)[-1]
@@ -83,19 +63,6 @@ def short_names(many: int) -> list[str]:
 
 def distinct(names: Sequence[str], taken: Sequence[str] = ()) -> list[str]:
     """Return names that differ from each other and from those that are taken.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Identifiers.
-    taken : sequence of str
-        Identifiers that mean something else.
-
-    Returns
-    -------
-    list of str
-        The first of a name as it is, the next with ``_2``, ``_3`` … behind it; a taken one with
-        an underscore.
 
     Examples
     --------
@@ -119,16 +86,6 @@ def _variants(name: str, is_taken: bool) -> Iterator[str]:
 def quoted(text: str) -> str:
     """Return a text as SQL writes it.
 
-    Parameters
-    ----------
-    text : str
-        Any.
-
-    Returns
-    -------
-    str
-        The text in single quotes, with single quotes inside it doubled.
-
     Examples
     --------
     >>> print(quoted("Barnard's star"))
@@ -138,16 +95,5 @@ def quoted(text: str) -> str:
 
 
 def quoted_name(text: str) -> str:
-    """Return any name of a column or variable as SQL writes it.
-
-    Parameters
-    ----------
-    text : str
-        Any.
-
-    Returns
-    -------
-    str
-        The name in double quotes, with double quotes inside it doubled.
-    """
+    """Return any name of a column or variable as SQL writes it."""
     return '"' + text.replace('"', '""') + '"'

@@ -55,18 +55,7 @@ class Extents:
 
 
 def extents(pixels: Sequence[Pixel]) -> Extents:
-    """Return circles and boxes that hold pixels.
-
-    Parameters
-    ----------
-    pixels : sequence of Pixel
-        N pixels.
-
-    Returns
-    -------
-    Extents
-        No point of a pixel is outside of its circle or its box.
-    """
+    """Return circles and boxes that hold pixels."""
     order = np.array([pixel.order for pixel in pixels], dtype=np.int64)
     number = np.array([pixel.number for pixel in pixels], dtype=np.int64)
     centre, middle, _ = _place(order, number, 0.5, 0.5)

@@ -32,45 +32,17 @@ _IN_FILES = {
 
 
 def place_macros() -> str:
-    """Return the SQL that makes what the macros with places share.
-
-    Returns
-    -------
-    str
-        Statements; they use ``separation``.
-    """
+    """Return the SQL that makes what the macros with places share."""
     return _MACROS.read_text(encoding="utf-8").strip()
 
 
 def places_schema(target: Target) -> str:
-    """Return the schema of the views with places of a target.
-
-    Parameters
-    ----------
-    target : Target
-        The target.
-
-    Returns
-    -------
-    str
-        A name that no target and no short name has: those begin with no underscore and a letter.
-    """
+    """Return the schema of the views with places of a target."""
     return f"_places_{target.name}"
 
 
 def place_statements(target: Target) -> Iterator[str]:
-    """Give the SQL that makes the views with places of a target.
-
-    Parameters
-    ----------
-    target : Target
-        The target.
-
-    Yields
-    ------
-    str
-        A statement.
-    """
+    """Give the SQL that makes the views with places of a target."""
     schema = places_schema(target)
     yield f"CREATE SCHEMA IF NOT EXISTS {schema};"
     is_store = any(view.pixels for view in target.views)
@@ -92,20 +64,7 @@ def place_statements(target: Target) -> Iterator[str]:
 
 
 def reading(view: View, more: str = "") -> str:
-    """Return the SQL that reads the files of a view.
-
-    Parameters
-    ----------
-    view : View
-        The view.
-    more : str
-        More arguments of ``read_parquet``.
-
-    Returns
-    -------
-    str
-        From FROM on.
-    """
+    """Return the SQL that reads the files of a view."""
     files = ", ".join(map(quoted, view.files))
     return f"FROM read_parquet([{files}], hive_partitioning = false{more})"
 

@@ -19,37 +19,14 @@ PREAMBLE_GB = 1.0
 
 
 def schemas_of(targets: Sequence[Target]) -> dict[str, Target]:
-    """Return the schemas of some targets.
-
-    Parameters
-    ----------
-    targets : sequence of Target
-        The targets in the order in which they were given.
-
-    Returns
-    -------
-    dict of str to Target
-        A target alone is ``main`` and its own name; several are ``a``, ``b`` … ``z``, ``aa``,
-        ``ab`` … and their names.
-    """
+    """Return the schemas of some targets."""
     short = ["main"] if len(targets) == 1 else short_names(len(targets))
     named = {target.name: target for target in targets}
     return {**dict(zip(short, targets, strict=True)), **named}
 
 
 def preamble(targets: Sequence[Target]) -> str:
-    """Return the SQL that makes the views and the macros of some targets.
-
-    Parameters
-    ----------
-    targets : sequence of Target
-        The targets whose tables the views show.
-
-    Returns
-    -------
-    str
-        Statements, each on one line or more.
-    """
+    """Return the SQL that makes the views and the macros of some targets."""
     tables = [macro for macro in macros() if macro.is_table]
     lines = [macro.text + ";" for macro in macros() if not macro.is_table]
     lines.append(place_macros())
@@ -64,23 +41,7 @@ def preamble(targets: Sequence[Target]) -> str:
 
 
 def preamble_of(given: Sequence[str]) -> str:
-    """Return the preamble of targets by name, for use outside of starcat.
-
-    Parameters
-    ----------
-    given : sequence of str
-        Artifacts and Parquet files, as for `open_targets`.
-
-    Returns
-    -------
-    str
-        After it, any DuckDB has the views and macros; nothing limits what it may do.
-
-    Raises
-    ------
-    QueryError
-        If a target is an archive, which has no tables before it is ingested.
-    """
+    """Return the preamble of targets by name, for use outside of starcat."""
     with tempfile.TemporaryDirectory(prefix="starcat-sql-") as folder:
         engine = Engine(Path(folder), PREAMBLE_GB, PREAMBLE_GB)
         try:

@@ -16,23 +16,7 @@ if TYPE_CHECKING:
 
 
 class RunningQuery:
-    """What a query finds; nothing runs before something is asked for.
-
-    Parameters
-    ----------
-    engine : Engine
-        The process that runs the query.
-    text : str
-        SQL that was checked.
-    values : dict of str to object, optional
-        The values of the ``$name`` in it.
-    known : mapping of str to Facts
-        What is known of the columns of the views, by name.
-    allowance : Allowance
-        The time that it may take.
-    progress : Progress
-        Called with ("query", percent, 100) while it runs.
-    """
+    """What a query finds; nothing runs before something is asked for."""
 
     def __init__(
         self,
@@ -70,38 +54,14 @@ class RunningQuery:
         return [column_facts(name, self._known) for name, _ in self._described]
 
     def rows(self, count: int) -> list[tuple[Any, ...]]:
-        """Return the first rows.
-
-        Parameters
-        ----------
-        count : int
-            The largest number of rows to return.
-
-        Returns
-        -------
-        list of tuple
-            The rows; fewer where there are no more.
-
-        Raises
-        ------
-        QueryError
-            If the query asks for what is not there.
-        QueryLimitError
-            If it takes longer, or more memory and disk, than it may.
-        """
+        """Return the first rows."""
         *parts, (described, last) = self._ask("rows", self._text, self._values, count)
         # Known now, without looking at the files once more.
         self._described = described
         return list(chain(*parts, last))
 
     def batches(self) -> pa.RecordBatchReader:
-        """Return all rows as Arrow batches, with units and meanings in the field metadata.
-
-        Returns
-        -------
-        pyarrow.RecordBatchReader
-            To be read before the next query. Reading raises what `rows` raises.
-        """
+        """Return all rows as Arrow batches, with units and meanings in the field metadata."""
         import pyarrow as pa
 
         [begun] = self._ask("batches", self._text, self._values)

@@ -80,39 +80,12 @@ class Session:
         return self._engine.is_running
 
     def statements(self, text: str) -> list[str]:
-        """Return the queries of a text.
-
-        Parameters
-        ----------
-        text : str
-            SQL, queries with semicolons between them.
-
-        Returns
-        -------
-        list of str
-            Not checked; a text that is no SQL is one query, which `ask` refuses with the place.
-        """
+        """Return the queries of a text."""
         [found] = self._engine.ask("statements", text)
         return list(found)
 
     def check(self, text: str) -> Statement:
-        """Check that a text is a query that may run.
-
-        Parameters
-        ----------
-        text : str
-            SQL.
-
-        Returns
-        -------
-        Statement
-            What of it may run.
-
-        Raises
-        ------
-        QueryError
-            If none may.
-        """
+        """Check that a text is a query that may run."""
         known = self._checked.pop(text, None)
         if known is None:
             [known] = self._engine.ask("check", text, allowance=self._allowance())
@@ -128,29 +101,7 @@ class Session:
         values: Mapping[str, Any] | None = None,
         progress: Progress = no_progress,
     ) -> Iterator[RunningQuery]:
-        """Ask a query; its rows are read within the context.
-
-        Parameters
-        ----------
-        text : str
-            SQL, one statement that reads.
-        values : mapping of str to object, optional
-            The values of the ``$name`` in it.
-        progress : Progress
-            Called with ("query", percent, 100) while it runs.
-
-        Yields
-        ------
-        RunningQuery
-            The columns; the query runs when the rows are asked for.
-
-        Raises
-        ------
-        QueryError
-            If the text is no query that may run, or asks for what is not there.
-        QueryLimitError
-            If it takes longer, or more memory and disk, than it may; also while reading.
-        """
+        """Ask a query; its rows are read within the context."""
         statement = self.check(text)
         given = values or {}
         for name in statement.parameters:
@@ -196,28 +147,7 @@ class Session:
 def open_session(
     given: Sequence[str], limits: Limits | None = None, progress: Progress = no_progress
 ) -> Iterator[Session]:
-    """Open a session about some targets.
-
-    Parameters
-    ----------
-    given : sequence of str
-        What to open; `open_targets` says what it may be.
-    limits : Limits, optional
-        What each query may take.
-    progress : Progress
-        Called while archive files are read.
-
-    Yields
-    ------
-    Session
-        One target has its views in the main schema and in one of its own name; several have a
-        schema each, and are ``a``, ``b``, ``c`` … in their order too.
-
-    Raises
-    ------
-    QueryError, ProductError, SourceError
-        If a target cannot be read.
-    """
+    """Open a session about some targets."""
     allowed = limits or Limits()
     scratch = Path(tempfile.mkdtemp(prefix="starcat-sql-"))
     try:

@@ -56,27 +56,7 @@ EXPLAIN_FORMATS = {"default", "text", "json", "html", "graphviz", "yaml", "merma
 def check_statement(
     text: str, connection: DuckDBPyConnection, macros: frozenset[str] = frozenset()
 ) -> Statement:
-    """Check that a text is one statement that reads, and write that statement anew.
-
-    Parameters
-    ----------
-    text : str
-        SQL: SELECT, FROM, WITH, VALUES, DESCRIBE, SHOW, SUMMARIZE or EXPLAIN of one.
-    connection : duckdb.DuckDBPyConnection
-        Parses it.
-    macros : frozenset of str
-        Table macros of starcat, allowed after FROM as views are.
-
-    Returns
-    -------
-    Statement
-        What may run.
-
-    Raises
-    ------
-    QueryError
-        If it is no SQL, more than one statement, or does more than read.
-    """
+    """Check that a text is one statement that reads, and write that statement anew."""
     try:
         text.encode()
     except UnicodeEncodeError as error:

@@ -78,34 +78,7 @@ class Target:
 def open_targets(
     given: Sequence[str], scratch: Path, engine: Engine, progress: Progress = no_progress
 ) -> tuple[Target, ...]:
-    """Find the tables of what was named.
-
-    Parameters
-    ----------
-    given : sequence of str
-        For each target the folder of an artifact or of a store (a HATS collection or catalog), a
-        folder of Parquet files, a Parquet file, an archive's file under its own name,
-        ``SOURCE=PATH``, or the name of a source that `locate` finds.
-    scratch : Path
-        Folder for the star tables of archive files.
-    engine : Engine
-        Looks into Parquet files.
-    progress : Progress
-        Called while archive files are read.
-
-    Returns
-    -------
-    tuple of Target
-        With names that differ: where two are the same, version or number is added, and where one
-        is a short name of another target, an underscore.
-
-    Raises
-    ------
-    QueryError
-        If something is none of these.
-    ProductError, SchemaVersionError, SourceError
-        If it is, but cannot be read.
-    """
+    """Find the tables of what was named."""
     targets = [
         _open_target(text, scratch / str(k), engine, progress) for k, text in enumerate(given)
     ]

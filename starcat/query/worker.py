@@ -75,15 +75,7 @@ def serve() -> None:
 
 
 class Worker:
-    """A DuckDB and what it is asked.
-
-    Parameters
-    ----------
-    opening : Opening
-        Limits, and the folder that may be written in.
-    replies : binary file
-        The pipe for the replies.
-    """
+    """A DuckDB and what it is asked."""
 
     def __init__(self, opening: Opening, replies: BinaryIO) -> None:
         self._opening = opening
@@ -99,17 +91,7 @@ class Worker:
         threading.Thread(target=self._watch, daemon=True).start()
 
     def answer(self, name: str, time_s: float, arguments: bytes) -> None:
-        """Answer a request.
-
-        Parameters
-        ----------
-        name : str
-            The name of one of the methods below.
-        time_s : float
-            Seconds after which nobody waits for the answer.
-        arguments : bytes
-            Pickled, those of the method.
-        """
+        """Answer a request."""
         limit_time(max(1.0, time_s) * (os.cpu_count() or 1) + 1.0)
         with self._sending:
             self._is_running = True

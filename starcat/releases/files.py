@@ -30,26 +30,7 @@ _AS_BYTES = getattr(os, "O_BINARY", 0)
 def copy_to_part(
     source: Path, blob: Blob, part: Path, progress: Progress = no_progress, stage: str = "copy"
 ) -> None:
-    """Copy a file, going on where an earlier copy ended, and check what has been written.
-
-    Parameters
-    ----------
-    source : Path
-        The file.
-    blob : Blob
-        The content that it should hold.
-    part : Path
-        Where to; whole and on disk afterwards. Dropped if it is wrong.
-    progress : Progress
-        Called with (stage, bytes there are, bytes in all).
-    stage : str
-        For ``progress``.
-
-    Raises
-    ------
-    ProductError
-        If the source is missing, is a symbolic link, or holds something else.
-    """
+    """Copy a file, going on where an earlier copy ended, and check what has been written."""
     with _reading(source, blob) as reader:
         for goes_on in (True, False):
             _refuse_links(part)
@@ -113,18 +94,5 @@ def _copy_rest(
 
 
 def damaged(path: Path, what: str) -> ProductError:
-    """Return the error about a file that is not what it should be.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    what : str
-        What was found and what was expected.
-
-    Returns
-    -------
-    ProductError
-        To be raised.
-    """
+    """Return the error about a file that is not what it should be."""
     return ProductError(f"{path}: {what}", path=path)

@@ -48,25 +48,7 @@ class _Lock(_Head):
 
 
 def read_pins(path: Path) -> dict[str, Pin]:
-    """Read a lock file.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    dict of str to Pin
-        By name of the artifact; none if there is no file.
-
-    Raises
-    ------
-    ProductError
-        If it is damaged.
-    SchemaVersionError
-        If it is of a newer starcat.
-    """
+    """Read a lock file."""
     try:
         data = path.read_bytes()
     except (FileNotFoundError, NotADirectoryError):
@@ -83,18 +65,7 @@ def read_pins(path: Path) -> dict[str, Pin]:
 
 
 def prepare(path: Path) -> None:
-    """Make the folder of a lock file, before anything is pulled that could not be pinned.
-
-    Parameters
-    ----------
-    path : Path
-        The lock file.
-
-    Raises
-    ------
-    OutputError
-        If that is not possible.
-    """
+    """Make the folder of a lock file, before anything is pulled that could not be pinned."""
     with _writing(path):
         make_folder(path.parent)
 
@@ -104,22 +75,7 @@ def _writing(path: Path) -> AbstractContextManager[None]:
 
 
 def write_pin(path: Path, release: Release, registry: str) -> None:
-    """Pin a release, in place of another version of the same artifact.
-
-    Parameters
-    ----------
-    path : Path
-        The lock file; made if need be. Other entries stay.
-    release : Release
-        The release to pin.
-    registry : str
-        A folder or an address.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
+    """Pin a release, in place of another version of the same artifact."""
     given = registry if is_address(registry) else _seen_from(path.parent, registry)
     pin = Pin(name=release.name, version=release.version, manifest=release.manifest, registry=given)
     prepare(path)
@@ -147,47 +103,12 @@ def _seen_from(folder: Path, registry: str) -> str:
 
 
 def pinned_registry(path: Path, pin: Pin) -> str:
-    """Return the registry of a pin as seen from here.
-
-    Parameters
-    ----------
-    path : Path
-        The lock file.
-    pin : Pin
-        One of its entries.
-
-    Returns
-    -------
-    str
-        A folder or an address.
-    """
+    """Return the registry of a pin as seen from here."""
     return pin.registry if is_address(pin.registry) else str(path.parent / pin.registry)
 
 
 def pin_of(path: Path, pins: Mapping[str, Pin], name: str, version: str | None) -> Pin:
-    """Return the pin of an artifact.
-
-    Parameters
-    ----------
-    path : Path
-        The lock file, for messages.
-    pins : mapping of str to Pin
-        Its entries.
-    name : str
-        Name of the artifact.
-    version : str, optional
-        The one that is asked for, if any.
-
-    Returns
-    -------
-    Pin
-        The entry.
-
-    Raises
-    ------
-    ConfigError
-        If there is none, or it is of another version.
-    """
+    """Return the pin of an artifact."""
     if name not in pins:
         there = ", ".join(sorted(pins)) or "nothing"
         raise ConfigError(

@@ -22,42 +22,7 @@ def pull_wanted(
     progress: Progress = no_progress,
     max_bytes: int | None = None,
 ) -> Pulled:
-    """Pull what a registry lists, and pin it.
-
-    Parameters
-    ----------
-    wanted : str
-        ``NAME@VERSION``, ``NAME@latest`` or ``NAME``, which is the latest.
-    registry : str, optional
-        A folder or an address; without it, the one that the artifact is pinned to.
-    output : Path
-        Folder to put ``<name>-<version>/`` into.
-    lock : Path
-        The lock file; written when all is there.
-    options : DownloadOptions, optional
-        How to download.
-    progress : Progress
-        Called with ("pull <name>", bytes done, bytes in all).
-    max_bytes : int, optional
-        An artifact whose files have more together is refused before they are brought.
-
-    Returns
-    -------
-    Pulled
-        The release, and the folder that it is in.
-
-    Raises
-    ------
-    ConfigError
-        If ``wanted`` is of another form, or there is no registry to pull from.
-    SourceMissing
-        If the registry has no such release.
-    OutputError
-        If there is no writing to the output or the lock file's folder.
-    ProductError
-        If the lock file pins the same version with another content; also as for
-        `pull_release`.
-    """
+    """Pull what a registry lists, and pin it."""
     name, version = parse_wanted(wanted)
     pin = read_pins(lock).get(name)
     opened = open_registry(registry or _registry_of(lock, name, pin), options)
@@ -101,37 +66,7 @@ def pull_pinned(
     progress: Progress = no_progress,
     max_bytes: int | None = None,
 ) -> list[Pulled]:
-    """Pull exactly what a lock file says; no index is read, and the lock file stays.
-
-    Parameters
-    ----------
-    wanted : str, optional
-        Only this artifact; with a version, it has to be the pinned one. None for all.
-    registry : str, optional
-        A folder or an address to take the content from; without it, those that are pinned.
-    output : Path
-        Folder to put ``<name>-<version>/`` into.
-    lock : Path
-        The lock file.
-    options : DownloadOptions, optional
-        How to download.
-    progress : Progress
-        Called with ("pull <name>", bytes done, bytes in all).
-    max_bytes : int, optional
-        An artifact whose files have more together is refused before they are brought.
-
-    Returns
-    -------
-    list of Pulled
-        In the order of the names.
-
-    Raises
-    ------
-    ConfigError
-        If the lock file is missing, or does not pin what is asked for.
-    ProductError, DownloadError
-        As for `pull_release`.
-    """
+    """Pull exactly what a lock file says; no index is read, and the lock file stays."""
     pins = read_pins(lock)
     if not pins:
         raise ConfigError(

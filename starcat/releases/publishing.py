@@ -55,13 +55,7 @@ class Published:
     new_bytes: int
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the outcome as plain values.
-
-        Returns
-        -------
-        dict
-            For JSON.
-        """
+        """Return the outcome as plain values."""
         return {
             "outcome": self.outcome,
             "registry": str(self.registry),
@@ -72,31 +66,7 @@ class Published:
 
 
 def publish_artifact(artifact: Path, registry: str, progress: Progress = no_progress) -> Published:
-    """Put an artifact into a registry.
-
-    Parameters
-    ----------
-    artifact : Path
-        The folder ``<name>-<version>``.
-    registry : str
-        A folder; made if need be.
-    progress : Progress
-        Called with ("publish", bytes done, bytes in all).
-
-    Returns
-    -------
-    Published
-        The release and what was new.
-
-    Raises
-    ------
-    ConfigError
-        If the registry is an address, which can only be read.
-    ProductError
-        If the artifact is not whole, or the registry is damaged.
-    OutputError
-        If the version is there with another content, or the folder cannot be written to.
-    """
+    """Put an artifact into a registry."""
     if is_address(registry):
         raise ConfigError(
             f"{registry}: a registry behind an address can only be read; publish into a folder, "
@@ -260,23 +230,7 @@ def _make_index(root: Path) -> None:
 
 
 def recorded(root: Path) -> list[Listed]:
-    """Return the releases of a registry by their own files, which the index is made from.
-
-    Parameters
-    ----------
-    root : Path
-        The registry.
-
-    Returns
-    -------
-    list of Listed
-        By name, then by version.
-
-    Raises
-    ------
-    ProductError
-        If one is damaged, or under another name than its own.
-    """
+    """Return the releases of a registry by their own files, which the index is made from."""
     found = []
     for path in root.glob("versions/[!.]*/[!.]*.json"):
         release = parse(Listed, path.read_bytes(), str(path))

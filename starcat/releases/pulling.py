@@ -49,13 +49,7 @@ class Pulled:
     outcome: Literal["pulled", "unchanged"]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the outcome as plain values.
-
-        Returns
-        -------
-        dict
-            For JSON.
-        """
+        """Return the outcome as plain values."""
         release = self.release
         return {
             "outcome": self.outcome,
@@ -74,38 +68,7 @@ def pull_release(
     progress: Progress = no_progress,
     max_bytes: int | None = None,
 ) -> Pulled:
-    """Pull a release into a folder.
-
-    Parameters
-    ----------
-    registry : Registry
-        The registry to pull from.
-    release : Release
-        The release; its manifest is taken by its digest.
-    output : Path
-        Folder to put ``<name>-<version>/`` into.
-    progress : Progress
-        Called with ("pull <name>", bytes done, bytes in all).
-    max_bytes : int, optional
-        A release whose files have more together is refused before they are brought.
-
-    Returns
-    -------
-    Pulled
-        The release, and the folder that it is in.
-
-    Raises
-    ------
-    OutputError
-        If something else has the name there, the folder cannot be written to, or the release is
-        larger than it may be or than the disk has room for.
-    DownloadError
-        If a file does not come; what has arrived is kept.
-    ProductError
-        If the registry is damaged, or what it holds is no whole artifact.
-    SchemaVersionError
-        If the artifact is of a newer starcat.
-    """
+    """Pull a release into a folder."""
     final = output / release.title
     if _is_there(final, release) and not _place_for(final, release).exists():
         return Pulled(release, registry.address, final, "unchanged")

@@ -51,20 +51,7 @@ class FolderRegistry:
         return str(self.root)
 
     def releases(self) -> list[Listed]:
-        """Return what the index lists.
-
-        Returns
-        -------
-        list of Listed
-            By name, then by version.
-
-        Raises
-        ------
-        SourceMissing
-            If there is no index.
-        ProductError
-            If it is damaged.
-        """
+        """Return what the index lists."""
         path = self.root / INDEX_NAME
         try:
             with path.open("rb") as file:
@@ -82,18 +69,7 @@ class FolderRegistry:
         return read_index(data, str(path))
 
     def bring(self, blob: Blob, path: Path, progress: Progress) -> None:
-        """Copy content, going on where an earlier copy ended.
-
-        Parameters
-        ----------
-        progress : Progress
-                Called with ("pull", bytes there are, bytes in all).
-
-        Raises
-        ------
-            ProductError
-                If the registry lacks it, or holds something else under its digest.
-        """
+        """Copy content, going on where an earlier copy ended."""
         try:
             copy_to_part(self.root / blob.path, blob, part_of(path), progress)
         except ProductError as error:
@@ -125,22 +101,7 @@ class HttpRegistry:
         return self.root
 
     def releases(self) -> list[Listed]:
-        """Return what the index lists.
-
-        Returns
-        -------
-        list of Listed
-            By name, then by version.
-
-        Raises
-        ------
-        SourceMissing
-            If the server has no index.
-        DownloadError
-            If it does not answer.
-        ProductError
-            If the index is damaged.
-        """
+        """Return what the index lists."""
         url = f"{self.root}/{INDEX_NAME}"
         with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
             path = Path(folder) / INDEX_NAME
@@ -153,20 +114,7 @@ class HttpRegistry:
             return read_index(part_of(path).read_bytes(), url)
 
     def bring(self, blob: Blob, path: Path, progress: Progress) -> None:
-        """Download content, going on where an earlier download ended.
-
-        Parameters
-        ----------
-        progress : Progress
-                Called with (file name, bytes there are, bytes in all).
-
-        Raises
-        ------
-            DownloadError
-                If it does not come; what has arrived is kept.
-            ProductError
-                If the server has something else under its digest.
-        """
+        """Download content, going on where an earlier download ended."""
         url = f"{self.root}/{blob.path}"
         options = replace(self.options, fixed_bytes=blob.bytes, progress=progress)
         arrival = "resumed"
@@ -193,48 +141,14 @@ class HttpRegistry:
 
 
 def open_registry(text: str, options: DownloadOptions | None = None) -> Registry:
-    """Return the registry at a folder or an address; nothing is read yet.
-
-    Parameters
-    ----------
-    text : str
-        A folder, or an address of http or https.
-    options : DownloadOptions, optional
-        How to download.
-
-    Returns
-    -------
-    Registry
-        To be asked.
-
-    Raises
-    ------
-    ConfigError
-        If it is an address of another kind.
-    """
+    """Return the registry at a folder or an address; nothing is read yet."""
     if is_address(text):
         return HttpRegistry(text.rstrip("/"), options or DownloadOptions())
     return FolderRegistry(Path(text))
 
 
 def is_address(text: str) -> bool:
-    """Return whether a registry is reached over HTTP.
-
-    Parameters
-    ----------
-    text : str
-        A folder or an address.
-
-    Returns
-    -------
-    bool
-        False for a folder.
-
-    Raises
-    ------
-    ConfigError
-        If it is an address of another kind.
-    """
+    """Return whether a registry is reached over HTTP."""
     if "://" not in text:
         return False
     try:

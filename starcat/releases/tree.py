@@ -116,18 +116,7 @@ class _Files(_Model):
 
 
 def index_bytes(releases: Iterable[Listed]) -> bytes:
-    """Return the index of some releases.
-
-    Parameters
-    ----------
-    releases : iterable of Listed
-        In any order.
-
-    Returns
-    -------
-    bytes
-        The same for the same releases.
-    """
+    """Return the index of some releases."""
     content = {
         "format": "starcat-registry",
         "registry_version": REGISTRY_VERSION,
@@ -137,27 +126,7 @@ def index_bytes(releases: Iterable[Listed]) -> bytes:
 
 
 def read_index(data: bytes, where: str) -> list[Listed]:
-    """Read an index.
-
-    Parameters
-    ----------
-    data : bytes
-        The file.
-    where : str
-        For messages.
-
-    Returns
-    -------
-    list of Listed
-        By name, then by version.
-
-    Raises
-    ------
-    ProductError
-        If it is damaged.
-    SchemaVersionError
-        If it is of a newer starcat.
-    """
+    """Read an index."""
     check_version("registry", parse(_Head, data, where).registry_version, REGISTRY_VERSION, where)
     index = parse(_Index, data, where)
     releases = sorted(index.releases, key=lambda release: release.order)
@@ -168,22 +137,7 @@ def read_index(data: bytes, where: str) -> list[Listed]:
 
 
 def check_version(kind: str, found: str, known: str, where: str) -> None:
-    """Refuse a file of another major version, whose content may be anything.
-
-    Parameters
-    ----------
-    kind : str
-        The kind of file, for messages.
-    found, known : str
-        Version of the file, and the one that this starcat writes.
-    where : str
-        For messages.
-
-    Raises
-    ------
-    SchemaVersionError
-        If the major numbers differ.
-    """
+    """Refuse a file of another major version, whose content may be anything."""
     if found.split(".")[0] != known.split(".")[0]:
         raise SchemaVersionError(
             f"{where}: {kind} version {found}; this starcat reads {known}. Install a newer starcat",
@@ -196,27 +150,7 @@ DAMAGED = "the registry is damaged"
 
 
 def parse(model: type[_M], data: bytes, where: str, advice: str = DAMAGED) -> _M:
-    """Read a JSON file of a registry, or one like it.
-
-    Parameters
-    ----------
-    model : type of BaseModel
-        The class that says what it should be.
-    data : bytes
-        The file.
-    where, advice : str
-        For messages: where it is from, and what to do or to know if it is damaged.
-
-    Returns
-    -------
-    BaseModel
-        The content, as an object of that type.
-
-    Raises
-    ------
-    ProductError
-        If it is not what it should be, naming the first thing that is wrong.
-    """
+    """Read a JSON file of a registry, or one like it."""
     with _explained(where, advice):
         return model.model_validate_json(data)
 
@@ -237,25 +171,7 @@ def _explained(where: str, advice: str = DAMAGED) -> Iterator[None]:
 
 
 def files_of(manifest: Mapping[str, Any], where: str) -> dict[str, Blob]:
-    """Return the files that a manifest lists, none of which lies outside the artifact.
-
-    Parameters
-    ----------
-    manifest : mapping
-        As read.
-    where : str
-        For messages.
-
-    Returns
-    -------
-    dict of str to Blob
-        By path within the artifact, sorted.
-
-    Raises
-    ------
-    ProductError
-        If a path is absolute, leads out, or is no plain path.
-    """
+    """Return the files that a manifest lists, none of which lies outside the artifact."""
     with _explained(where):
         files = _Files.model_validate({"files": manifest["files"]}).files
     folders = {name[:k] for name in files for k, letter in enumerate(name) if letter == "/"}
@@ -269,25 +185,7 @@ def files_of(manifest: Mapping[str, Any], where: str) -> dict[str, Blob]:
 
 
 def parse_wanted(text: str) -> tuple[str, str | None]:
-    """Read ``NAME@VERSION``.
-
-    Parameters
-    ----------
-    text : str
-        ``NAME``, ``NAME@latest`` or ``NAME@VERSION``.
-
-    Returns
-    -------
-    name : str
-        Name of the artifact.
-    version : str or None
-        None for the latest.
-
-    Raises
-    ------
-    ConfigError
-        If it is something else.
-    """
+    """Read ``NAME@VERSION``."""
     name, separator, version = text.partition("@")
     version = version if separator else LATEST
     zeros = Blob(sha256="0" * 64, bytes=0)
@@ -303,29 +201,7 @@ def parse_wanted(text: str) -> tuple[str, str | None]:
 
 
 def choose(releases: Iterable[Listed], name: str, version: str | None, where: str) -> Listed:
-    """Find a release.
-
-    Parameters
-    ----------
-    releases : iterable of Listed
-        The releases that a registry lists.
-    name : str
-        Name of the artifact.
-    version : str, optional
-        None for the latest, which is the highest and not the newest.
-    where : str
-        For messages.
-
-    Returns
-    -------
-    Listed
-        The release.
-
-    Raises
-    ------
-    SourceMissing
-        If there is none, saying what there is.
-    """
+    """Find a release."""
     listed = list(releases)
     named = sorted((r for r in listed if r.name == name), key=lambda r: r.order)
     found = [r for r in named if version in (None, r.version)]

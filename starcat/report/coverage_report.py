@@ -50,13 +50,7 @@ class CoverageReport:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the summary as JSON holds it.
-
-        Returns
-        -------
-        dict
-            Plain values; angles in degrees.
-        """
+        """Return the summary as JSON holds it."""
         summary, gap = self.summary, self.gap
         counts = {
             name: {**asdict(spread), "mean": round(spread.mean, DECIMALS)}
@@ -87,37 +81,13 @@ class CoverageReport:
 
 
 def report_coverage(coverage: Coverage, tile_radius_rad: float) -> CoverageReport:
-    """Summarise a coverage and look for holes in its tiling.
-
-    Parameters
-    ----------
-    coverage : Coverage
-        Stars, pairs and triangles by boresight.
-    tile_radius_rad : float
-        Radians: of the largest circle inside a field.
-
-    Returns
-    -------
-    CoverageReport
-        Ready to be printed or written.
-    """
+    """Summarise a coverage and look for holes in its tiling."""
     gap = tiling_gap(coverage.boresights, tile_radius_rad)
     return CoverageReport(coverage, summarise_coverage(coverage), gap)
 
 
 def holes_warning(gap: TilingGap) -> str | None:
-    """Return what to say about holes of a tiling.
-
-    Parameters
-    ----------
-    gap : TilingGap
-        The widest gap.
-
-    Returns
-    -------
-    str or None
-        One line; None where there are no holes.
-    """
+    """Return what to say about holes of a tiling."""
     if not gap.has_holes:
         return None
     return (
@@ -129,18 +99,7 @@ def holes_warning(gap: TilingGap) -> str | None:
 
 
 def coverage_csv(coverage: Coverage) -> bytes:
-    """Return the coverage by boresight as CSV.
-
-    Parameters
-    ----------
-    coverage : Coverage
-        Stars, pairs and triangles by boresight.
-
-    Returns
-    -------
-    bytes
-        Columns boresight, ra_deg, dec_deg, stars, pairs, triangles.
-    """
+    """Return the coverage by boresight as CSV."""
     ra_deg, dec_deg = radec_from_directions(coverage.boresights)
     columns = (ra_deg, dec_deg, coverage.stars, coverage.pairs, coverage.triangles)
     lines = ["boresight,ra_deg,dec_deg,stars,pairs,triangles"]
@@ -150,39 +109,13 @@ def coverage_csv(coverage: Coverage) -> bytes:
 
 
 def histogram_csv(summary: CoverageSummary) -> bytes:
-    """Return the histogram of stars in a field as CSV.
-
-    Parameters
-    ----------
-    summary : CoverageSummary
-        Summary with the histogram.
-
-    Returns
-    -------
-    bytes
-        Columns stars and fields.
-    """
+    """Return the histogram of stars in a field as CSV."""
     rows = (f"{stars},{fields}" for stars, fields in enumerate(summary.histogram.tolist()))
     return ("\n".join(["stars,fields", *rows]) + "\n").encode()
 
 
 def write_coverage(folder: Path, title: str, report: CoverageReport) -> list[str]:
-    """Write tables and plots of a coverage.
-
-    Parameters
-    ----------
-    folder : Path
-        An existing folder.
-    title : str
-        Name of the database, for the plots.
-    report : CoverageReport
-        What to write.
-
-    Returns
-    -------
-    list of str
-        Names of the files.
-    """
+    """Write tables and plots of a coverage."""
     (folder / "coverage.csv").write_bytes(coverage_csv(report.coverage))
     (folder / "coverage_histogram.csv").write_bytes(histogram_csv(report.summary))
     (folder / "coverage.json").write_bytes(json_bytes(report.as_dict()))

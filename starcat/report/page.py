@@ -47,20 +47,7 @@ _ALT = {
 
 
 def report_page(content: Mapping[str, Any], plots: Mapping[str, bytes]) -> str:
-    """Return the report of a build as an HTML page.
-
-    Parameters
-    ----------
-    content : mapping
-        The report, as `report_content` returns it.
-    plots : mapping of str to bytes
-        SVG by name.
-
-    Returns
-    -------
-    str
-        HTML5; the plots and the style are inside.
-    """
+    """Return the report of a build as an HTML page."""
     title = f"{content['name']}-{content['version']}"
     parts = [
         f"<h1>{escape(title)}</h1>",
@@ -102,24 +89,7 @@ def table(
     rows: Iterable[Sequence[Any]],
     numbers: Sequence[int] = (),
 ) -> str:
-    """Return a table.
-
-    Parameters
-    ----------
-    caption : str
-        Above it; none if empty.
-    columns : sequence of str
-        Headings.
-    rows : iterable of sequence
-        Cells; numbers get separators, digests are broken into lines.
-    numbers : sequence of int
-        Columns to align at the right.
-
-    Returns
-    -------
-    str
-        HTML, escaped.
-    """
+    """Return a table."""
     kinds = [' class="number"' if k in numbers else "" for k in range(len(columns))]
     head = "".join(
         f'<th scope="col"{kind}>{escape(name)}</th>'

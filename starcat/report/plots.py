@@ -72,23 +72,7 @@ def own_style() -> Iterator[None]:
 
 
 def draw_map(title: str, coverage: Coverage, summary: CoverageSummary) -> Figure:
-    """Draw the number of stars in each field over the whole sky.
-
-    Parameters
-    ----------
-    title : str
-        Name of the database.
-    coverage : Coverage
-        Stars by boresight.
-    summary : CoverageSummary
-        Summary of the coverage; it says which field is the worst.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Mollweide's projection, ICRS, right ascension to the left; colours end at the 99.5 %
-        of the fields, so that one cluster does not take them all.
-    """
+    """Draw the number of stars in each field over the whole sky."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Ellipse
 
@@ -139,18 +123,7 @@ def headline(figure: Figure, title: str, below: str) -> None:
 
 
 def colour_map(steps: int) -> Any:
-    """Return a colour map for counts.
-
-    Parameters
-    ----------
-    steps : int
-        Number of colours.
-
-    Returns
-    -------
-    matplotlib.colors.Colormap
-        Viridis: even in lightness, and safe for the colour-blind.
-    """
+    """Return a colour map for counts."""
     import matplotlib
 
     return matplotlib.colormaps["viridis"].resampled(steps)
@@ -192,20 +165,7 @@ def _chart(title: str, below: str) -> tuple[Figure, Axes]:
 
 
 def draw_histogram(title: str, summary: CoverageSummary) -> Figure:
-    """Draw how many fields hold how many stars.
-
-    Parameters
-    ----------
-    title : str
-        Name of the database.
-    summary : CoverageSummary
-        Summary with the histogram.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Bars of one star each, or of several where fields hold more than 100.
-    """
+    """Draw how many fields hold how many stars."""
     width = -(-len(summary.histogram) // 100)
     padded = np.append(summary.histogram, np.zeros(-len(summary.histogram) % width, dtype=int))
     fields = padded.reshape(-1, width).sum(axis=1)
@@ -233,22 +193,7 @@ def draw_histogram(title: str, summary: CoverageSummary) -> Figure:
 
 
 def draw_magnitudes(title: str, band: str, counts: Mapping[str, Any]) -> Figure:
-    """Draw how many stars of each magnitude were read and how many were kept.
-
-    Parameters
-    ----------
-    title : str
-        Name of the database.
-    band : str
-        Band of the magnitudes.
-    counts : mapping of str to sequence
-        ``from_mag``, ``to_mag``, ``guide_stars`` and ``rejected``, a bin each.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Counts on a logarithmic axis.
-    """
+    """Draw how many stars of each magnitude were read and how many were kept."""
     left, right = np.asarray(counts["from_mag"]), np.asarray(counts["to_mag"])
     kept = np.asarray(counts["guide_stars"])
     read = kept + np.asarray(counts["rejected"])
@@ -274,17 +219,7 @@ def _whole_ticks() -> Any:
 
 
 def save_plot(figure: Figure, folder: Path, name: str) -> None:
-    """Write a drawing as PNG, and as SVG that turns dark where the reader's system is.
-
-    Parameters
-    ----------
-    figure : matplotlib.figure.Figure
-        The drawing.
-    folder : Path
-        Folder to write to.
-    name : str
-        Name of the files, without a suffix.
-    """
+    """Write a drawing as PNG, and as SVG that turns dark where the reader's system is."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 

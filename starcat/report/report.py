@@ -73,17 +73,6 @@ class BuildFacts:
 def count_magnitudes(guide_star_mag: Array, rejected_mag: Array) -> dict[str, list[Any]]:
     """Count guide stars and rejected stars by magnitude.
 
-    Parameters
-    ----------
-    guide_star_mag, rejected_mag : ndarray of float64, shape (N,) and (M,)
-        Magnitudes; NaN is left out.
-
-    Returns
-    -------
-    dict of str to list
-        ``from_mag`` (does not belong to the bin), ``to_mag`` (does, as a faint limit does),
-        ``guide_stars``, ``rejected``; bins are half a magnitude wide, none is left out between.
-
     Examples
     --------
     >>> count_magnitudes(np.array([1.0, 1.2]), np.array([2.1, np.nan]))["guide_stars"]
@@ -107,18 +96,7 @@ def count_magnitudes(guide_star_mag: Array, rejected_mag: Array) -> dict[str, li
 
 
 def report_content(facts: BuildFacts) -> dict[str, Any]:
-    """Return the report as JSON holds it.
-
-    Parameters
-    ----------
-    facts : BuildFacts
-        What is known of the build.
-
-    Returns
-    -------
-    dict
-        Plain values: every table of the page, and the whole spec.
-    """
+    """Return the report as JSON holds it."""
     coverage = facts.coverage.as_dict()
     warning = holes_warning(facts.coverage.gap)
     return {
@@ -145,15 +123,7 @@ def report_content(facts: BuildFacts) -> dict[str, Any]:
 
 
 def write_report(folder: Path, facts: BuildFacts) -> None:
-    """Write all files of a report.
-
-    Parameters
-    ----------
-    folder : Path
-        An existing folder.
-    facts : BuildFacts
-        What is known of the build.
-    """
+    """Write all files of a report."""
     content = report_content(facts)
     write_coverage(folder, facts.title, facts.coverage)
     counts = content["magnitudes"]

@@ -24,16 +24,6 @@ GALACTIC_POLE_DEG = (192.85948, 27.12825)
 def project(ra_deg: ArrayLike, dec_deg: ArrayLike) -> tuple[Array, Array]:
     """Return the place of positions on the map.
 
-    Parameters
-    ----------
-    ra_deg, dec_deg : array_like of float64, shape (N,)
-        Degrees. Right ascension 0 is the middle of the map and grows to the left.
-
-    Returns
-    -------
-    x, y : ndarray of float64, shape (N,)
-        Within the ellipse of `HALF_WIDTH` and `HALF_HEIGHT`.
-
     Examples
     --------
     >>> x, y = project([270.0], [0.0])
@@ -58,22 +48,7 @@ def _auxiliary(dec: Array) -> Array:
 
 
 def nearest_raster(boresights: Array, values: NDArray[np.int64], width: int) -> Array:
-    """Return the map as a raster of the value at the nearest boresight.
-
-    Parameters
-    ----------
-    boresights : ndarray of float64, shape (F, 3)
-        ICRS directions.
-    values : ndarray of int64, shape (F,)
-        One a boresight.
-    width : int
-        Columns; there are half as many rows.
-
-    Returns
-    -------
-    ndarray of float64, shape (width // 2, width)
-        North at the top; NaN outside of the ellipse.
-    """
+    """Return the map as a raster of the value at the nearest boresight."""
     height = width // 2
     x = ((np.arange(width) + 0.5) / width * 2.0 - 1.0) * HALF_WIDTH
     y = (1.0 - (np.arange(height) + 0.5) / height * 2.0) * HALF_HEIGHT
@@ -90,18 +65,7 @@ def nearest_raster(boresights: Array, values: NDArray[np.int64], width: int) -> 
 
 
 def galactic_equator(count: int = 721) -> tuple[Array, Array]:
-    """Return positions along the middle of the Milky Way.
-
-    Parameters
-    ----------
-    count : int, default 721
-        Number of positions, the first again at the end.
-
-    Returns
-    -------
-    ra_deg, dec_deg : ndarray of float64, shape (count,)
-        Degrees, ICRS.
-    """
+    """Return positions along the middle of the Milky Way."""
     pole = directions_from_radec(*GALACTIC_POLE_DEG)
     ascending = np.cross([0.0, 0.0, 1.0], pole)
     ascending /= np.linalg.norm(ascending)

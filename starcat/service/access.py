@@ -47,18 +47,7 @@ class Principal:
 
 
 def principal_of(request: Request) -> Principal:
-    """Return who asks.
-
-    Parameters
-    ----------
-    request : Request
-        The request.
-
-    Returns
-    -------
-    Principal
-        As the middleware found out; without it, whoever everybody is.
-    """
+    """Return who asks."""
     found = getattr(request.state, "principal", None)
     if isinstance(found, Principal):
         return found
@@ -66,18 +55,7 @@ def principal_of(request: Request) -> Principal:
 
 
 def needs(role: Role) -> Callable[[Request], Awaitable[Principal]]:
-    """Return a dependency that refuses whoever has not a role.
-
-    Parameters
-    ----------
-    role : Role
-        The least that is needed.
-
-    Returns
-    -------
-    callable
-        Gives the principal; raises a `Problem` with status 401 or 403.
-    """
+    """Return a dependency that refuses whoever has not a role."""
 
     async def check(request: Request) -> Principal:  # plain functions are sent to a thread
         principal = principal_of(request)

@@ -19,29 +19,7 @@ MAX_BYTES = 4 << 30
 
 
 def keep_rows(batches: pa.RecordBatchReader, path: Path, most: int) -> tuple[int, bool]:
-    """Write the first rows of an answer to a file, as an Arrow stream.
-
-    Parameters
-    ----------
-    batches : pyarrow.RecordBatchReader
-        The answer.
-    path : Path
-        The file.
-    most : int
-        Rows to keep at most.
-
-    Returns
-    -------
-    count : int
-        How many were kept.
-    is_cut : bool
-        Whether there are more.
-
-    Raises
-    ------
-    QueryLimitError
-        If they take more than `MAX_BYTES`, or the query is stopped while they are read.
-    """
+    """Write the first rows of an answer to a file, as an Arrow stream."""
     import pyarrow as pa
 
     count = size = 0
@@ -60,30 +38,6 @@ def keep_rows(batches: pa.RecordBatchReader, path: Path, most: int) -> tuple[int
 def file_of_rows(
     confined: Confined, rows: Path, target: Path, form: str
 ) -> tuple[Iterator[bytes], int]:
-    """Have a file made of rows that were kept, by a process that may hold a table in memory.
-
-    Parameters
-    ----------
-    confined : Confined
-        What makes it.
-    rows : Path
-        What `keep_rows` wrote.
-    target : Path
-        The file, beside it.
-    form : str
-        One of `starcat.exchange.formats.FORMATS`.
-
-    Returns
-    -------
-    chunks : iterator of bytes
-        The file, which may be removed at once.
-    size : int
-        Bytes.
-
-    Raises
-    ------
-    SchemaError
-        If a column cannot be said in the format.
-    """
+    """Have a file made of rows that were kept, by a process that may hold a table in memory."""
     confined.call("convert", {"source": str(rows), "target": str(target), "form": form})
     return sent_once(target)

@@ -68,19 +68,7 @@ OTHERS: tuple[APIRouter, ...] = (
 
 
 def make_app(settings: Settings) -> FastAPI:
-    """Make the application.
-
-    Parameters
-    ----------
-    settings : Settings
-        What the operator set.
-
-    Returns
-    -------
-    FastAPI
-        With the service as ``app.state.service`` and its workers as ``app.state.workers``, which
-        run while its lifespan lasts.
-    """
+    """Make the application."""
     service = open_service(settings)
     metrics, identities = Metrics(service), Identities(service)
     app = FastAPI(

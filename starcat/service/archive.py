@@ -12,44 +12,13 @@ CHUNK_BYTES = 1 << 18
 
 
 def archive_bytes(folder: str, files: Mapping[str, Blob]) -> int:
-    """Return the size of an archive.
-
-    Parameters
-    ----------
-    folder : str
-        Name of the folder in it.
-    files : mapping of str to Blob
-        What is in that, by path.
-
-    Returns
-    -------
-    int
-        Bytes.
-    """
+    """Return the size of an archive."""
     parts = (len(_head(folder, name, blob)) + _whole(blob.bytes) for name, blob in files.items())
     return sum(parts) + 2 * tarfile.BLOCKSIZE
 
 
 def archive_chunks(folder: Path, files: Mapping[str, Blob]) -> Iterator[bytes]:
-    """Give the bytes of an archive, the same for the same files.
-
-    Parameters
-    ----------
-    folder : Path
-        The folder, whose name is in the archive.
-    files : mapping of str to Blob
-        What of it goes in, by path.
-
-    Yields
-    ------
-    bytes
-        A part of the archive.
-
-    Raises
-    ------
-    OSError
-        If a file is shorter than was said: the archive breaks off.
-    """
+    """Give the bytes of an archive, the same for the same files."""
     for name, blob in files.items():
         yield _head(folder.name, name, blob)
         left = blob.bytes

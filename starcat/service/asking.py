@@ -89,29 +89,7 @@ class Answered:
 def named_text(
     name: str, values: Mapping[str, Any], targets: int
 ) -> tuple[str, dict[str, int | float | str]]:
-    """Return a query of the gallery.
-
-    Parameters
-    ----------
-    name : str
-        Its name.
-    values : mapping of str to object
-        Values that take the place of those by default.
-    targets : int
-        How many targets there are.
-
-    Returns
-    -------
-    text : str
-        SQL.
-    values : dict of str to int, float or str
-        All values.
-
-    Raises
-    ------
-    QueryError
-        If there is none of that name, or it is about another number of targets.
-    """
+    """Return a query of the gallery."""
     query = named_query(name)
     if query.targets != targets:
         raise QueryError(f"{query.name} is about {query.targets} targets; {targets} given")
@@ -119,25 +97,7 @@ def named_text(
 
 
 def rows_of(service: Service, question: Question) -> Rows:
-    """Answer a question with rows.
-
-    Parameters
-    ----------
-    service : Service
-        The service.
-    question : Question
-        What is asked.
-
-    Returns
-    -------
-    Rows
-        The first ones.
-
-    Raises
-    ------
-    QueryError
-        If it cannot be answered.
-    """
+    """Answer a question with rows."""
     paths = target_paths(service, question.targets)
     with (
         service.sessions.session(paths, question.time_s) as session,
@@ -153,29 +113,7 @@ def rows_of(service: Service, question: Question) -> Rows:
 
 
 def file_of(service: Service, question: Question, form: str) -> Answered:
-    """Answer a question with a file.
-
-    Parameters
-    ----------
-    service : Service
-        The service.
-    question : Question
-        What is asked.
-    form : str
-        One of `starcat.exchange.formats.FORMATS`.
-
-    Returns
-    -------
-    Answered
-        Whole: what goes wrong is raised here.
-
-    Raises
-    ------
-    QueryError
-        If it cannot be answered.
-    SchemaError
-        If a column cannot be said in the format.
-    """
+    """Answer a question with a file."""
     paths = target_paths(service, question.targets)
     with scratch_folder(service.places) as folder:
         source, target = folder / "rows.arrow", folder / "answer"
@@ -190,17 +128,6 @@ def file_of(service: Service, question: Question, form: str) -> Answered:
 
 def plain(value: Any) -> Any:
     """Return a value as JSON has it.
-
-    Parameters
-    ----------
-    value : object
-        Of a row.
-
-    Returns
-    -------
-    object
-        Whole numbers that some readers would round are texts, and so are times; what is no
-        number is none.
 
     Examples
     --------

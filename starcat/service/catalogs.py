@@ -70,17 +70,7 @@ class Offered:
 
 
 class Catalogs:
-    """The catalogs of a service, and estimates from them.
-
-    Parameters
-    ----------
-    folder : Path
-        Where those that were read are kept.
-    max_memory_bytes : int, optional
-        What a build may take; by default what this machine has left.
-    wait_s : float
-        Seconds that a request waits.
-    """
+    """The catalogs of a service, and estimates from them."""
 
     def __init__(
         self, folder: Path, max_memory_bytes: int | None = None, wait_s: float = WAIT_S
@@ -98,13 +88,7 @@ class Catalogs:
         self._reader = ThreadPoolExecutor(1, "catalog-reader")
 
     def offered(self) -> list[Offered]:
-        """Return the catalogs that a spec may name.
-
-        Returns
-        -------
-        list of Offered
-            Those that are here first, in the order of the documentation.
-        """
+        """Return the catalogs that a spec may name."""
         known = list(self._cache.catalogs().values())
         found = []
         for name in CATALOGS:
@@ -113,25 +97,7 @@ class Catalogs:
         return sorted(found, key=lambda one: not one.is_here)
 
     def estimate(self, spec: BuildSpec) -> Estimate:
-        """Estimate what a spec will give.
-
-        Parameters
-        ----------
-        spec : BuildSpec
-            Checked.
-
-        Returns
-        -------
-        Estimate
-            What its build will give.
-
-        Raises
-        ------
-        SourceError, BuildError
-            If a catalog is not here, too few stars are left, or the tiling is too large.
-        Problem
-            With status 503, while a catalog is being read, or too many ask.
-        """
+        """Estimate what a spec will give."""
         key = self._key(spec)
         whole = (key, spec.model_dump_json())
         found = self._estimates.get(whole)
@@ -151,25 +117,7 @@ class Catalogs:
         faint_limit_mag: float | None = None,
         widest_fov_x_deg: float | None = None,
     ) -> Starter:
-        """Return a first spec for a camera, from the embedded sky.
-
-        Parameters
-        ----------
-        name, camera, faint_limit_mag, widest_fov_x_deg
-            As `starcat.pipeline.starter.starter_spec` takes them.
-
-        Returns
-        -------
-        Starter
-            The spec, and what it gives.
-
-        Raises
-        ------
-        ConfigError, BuildError
-            If the camera or the limit is out of range.
-        Problem
-            With status 503, while the sky is being read, or too many ask.
-        """
+        """Return a first spec for a camera, from the embedded sky."""
         # The default preset reads what a first spec is made from.
         sky = self.read(preset(preset_names()[0])).stars
         with self._turn():
@@ -183,27 +131,7 @@ class Catalogs:
             )
 
     def read(self, spec: BuildSpec, key: str | None = None) -> StarsRead:
-        """Return the catalogs of a spec; read them where that was not done yet.
-
-        Parameters
-        ----------
-        spec : BuildSpec
-            Checked.
-        key : str, optional
-            What they are kept under, where that is known.
-
-        Returns
-        -------
-        StarsRead
-            Which nobody may change.
-
-        Raises
-        ------
-        SourceError
-            If a catalog is not here, or cannot be read.
-        Problem
-            With status 503, if that takes longer than a request waits.
-        """
+        """Return the catalogs of a spec; read them where that was not done yet."""
         key = self._key(spec) if key is None else key
         found = self._read.get(key)
         if found is not None:
@@ -277,18 +205,7 @@ def _busy(what: str, again_s: int) -> Problem:
 
 
 def is_here(name: str) -> bool:
-    """Return whether the files of a source are here.
-
-    Parameters
-    ----------
-    name : str
-        A name of ``data_sources``.
-
-    Returns
-    -------
-    bool
-        Whether a build would find them.
-    """
+    """Return whether the files of a source are here."""
     try:
         return bool(locate(name, {}))
     except SourceMissing:
@@ -296,18 +213,7 @@ def is_here(name: str) -> bool:
 
 
 def check_size(spec: BuildSpec) -> None:
-    """Check that the files of a spec's catalogs are not too large to be read for an estimate.
-
-    Parameters
-    ----------
-    spec : BuildSpec
-        Which catalogs, and how faint they are read.
-
-    Raises
-    ------
-    Problem
-        With status 413.
-    """
+    """Check that the files of a spec's catalogs are not too large to be read for an estimate."""
     for name in _sources_read(spec):
         limit = spec.catalog.read_limit_mag
         key = "catalog.read_limit_mag"

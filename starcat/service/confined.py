@@ -35,13 +35,6 @@ _PROGRAM = (
 class Confined:
     """Processes that are asked one thing after the other.
 
-    Parameters
-    ----------
-    settings : Settings
-        How many, and what each may take: as queries.
-    scratch : Path
-        The only folder that they may write in.
-
     Attributes
     ----------
     run : coroutine function
@@ -60,30 +53,7 @@ class Confined:
         weakref.finalize(self, _end_all, self._idle)
 
     def call(self, task: str, arguments: Mapping[str, Any]) -> Any:
-        """Have something done.
-
-        Parameters
-        ----------
-        task : {"identify", "convert", "upload"}
-            What.
-        arguments : mapping
-            As JSON has them.
-
-        Returns
-        -------
-        object
-            As JSON has it.
-
-        Raises
-        ------
-        StarcatError
-            What the task raised, by its class and its words.
-        QueryLimitError
-            If it took too long.
-        Problem
-            With status 413 if memory ran out, 422 if the process ended by itself, 503 if others
-            take too long.
-        """
+        """Have something done."""
         if not self._places.acquire(timeout=turns.WAIT_S):
             raise busy()
         try:

@@ -6,29 +6,7 @@ from pathlib import Path
 
 
 def convert(source: str, target: str, form: str) -> int:
-    """Write a table to a file.
-
-    Parameters
-    ----------
-    source : str
-        An Arrow stream.
-    target : str
-        The file to write.
-    form : str
-        One of `starcat.exchange.formats.FORMATS`.
-
-    Returns
-    -------
-    int
-        Rows.
-
-    Raises
-    ------
-    SchemaError
-        If a column cannot be said in the format.
-    OutputError
-        If the file cannot be written.
-    """
+    """Write a table to a file."""
     import pyarrow as pa
 
     from starcat.exchange.formats import write_batches

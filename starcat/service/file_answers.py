@@ -86,35 +86,7 @@ def file_answer(
     cache: str = IMMUTABLE,
     content_type: str | None = None,
 ) -> Response:
-    """Answer with a file.
-
-    Parameters
-    ----------
-    request : Request
-        With what it says of ranges and of what it has already.
-    path : Path
-        The file; checked by who calls, never what a request says.
-    sha256 : str
-        Digest of the content, which is its ETag.
-    file_name : str
-        What it is saved as.
-    cache : str
-        ``Cache-Control``.
-    content_type : str, optional
-        By default what the suffix says.
-
-    Returns
-    -------
-    Response
-        200, 206 or 304.
-
-    Raises
-    ------
-    TargetMissing
-        If the file is not there.
-    Problem
-        With status 416, if the range lies outside of the file.
-    """
+    """Answer with a file."""
     try:
         found = path.stat()
     except OSError:
@@ -143,20 +115,7 @@ def _at_once(content: bytes, part: tuple[int, int] | None, headers: dict[str, st
 
 
 def has_already(request: Request, sha256: str) -> bool:
-    """Return whether who asks has the same content already.
-
-    Parameters
-    ----------
-    request : Request
-        With ``If-None-Match``, or without.
-    sha256 : str
-        Digest of the content.
-
-    Returns
-    -------
-    bool
-        Whether 304 is the answer.
-    """
+    """Return whether who asks has the same content already."""
     given = request.headers.get("if-none-match", "")
     tags = [tag.strip().removeprefix("W/") for tag in given.split(",")]
     return "*" in tags or f'"{sha256}"' in tags
@@ -164,16 +123,6 @@ def has_already(request: Request, sha256: str) -> bool:
 
 def type_of(file_name: str) -> str:
     """Return the content type of a file.
-
-    Parameters
-    ----------
-    file_name : str
-        With its suffix.
-
-    Returns
-    -------
-    str
-        Bytes where the suffix is unknown.
 
     Examples
     --------

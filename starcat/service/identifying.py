@@ -84,34 +84,7 @@ def identify(
     options: dict[str, Any],
     picture: Literal["png", "svg"] | None = None,
 ) -> dict[str, Any]:
-    """Identify the frames of a file.
-
-    Parameters
-    ----------
-    folder : str
-        Folder of the file, and of the camera file where the options have one.
-    file : str
-        Its name there: centroids or an image.
-    artifact : str
-        Folder of the database.
-    options : dict
-        Of `IdentifyOptions`.
-    picture : {"png", "svg"}, optional
-        Whether to draw the first frame into the folder, as ``picture.png`` or ``picture.svg``.
-
-    Returns
-    -------
-    dict
-        ``database``, ``method``, ``frames`` as 'starcat identify --json' prints them, and
-        ``notes`` for people.
-
-    Raises
-    ------
-    ConfigError
-        If the file or an option cannot be used.
-    ProductError
-        If the database lacks what the method needs.
-    """
+    """Identify the frames of a file."""
     from starcat.images.answering import answer_each, camera_of_size, write_extras
     from starcat.images.identification import PictureOptions, measure
     from starcat.matcher.centroids import said_of_columns

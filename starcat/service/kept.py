@@ -11,13 +11,7 @@ T = TypeVar("T")
 
 
 class Kept(Generic[T]):
-    """Results by what they depend on, of which all together take so much memory at the most.
-
-    Parameters
-    ----------
-    most_bytes : int
-        Of all; one that takes more alone is not kept.
-    """
+    """Results by what they depend on, of which all together take so much memory at the most."""
 
     def __init__(self, most_bytes: int) -> None:
         self._most_bytes = most_bytes
@@ -26,18 +20,7 @@ class Kept(Generic[T]):
         self._lock = threading.Lock()
 
     def get(self, key: Hashable) -> T | None:
-        """Return a result.
-
-        Parameters
-        ----------
-        key : hashable
-            What it depends on.
-
-        Returns
-        -------
-        T or None
-            None where it is not kept.
-        """
+        """Return a result."""
         with self._lock:
             if key not in self._found:
                 return None
@@ -45,17 +28,7 @@ class Kept(Generic[T]):
             return self._found[key][0]
 
     def put(self, key: Hashable, result: T, nbytes: int) -> None:
-        """Keep a result.
-
-        Parameters
-        ----------
-        key : hashable
-            What it depends on.
-        result : T
-            Not changed by anybody.
-        nbytes : int
-            Memory that it takes.
-        """
+        """Keep a result."""
         with self._lock:
             if key in self._found:
                 self._bytes -= self._found.pop(key)[1]

@@ -71,88 +71,23 @@ class Places:
         return self.root / "scratch"
 
     def database(self, database_id: str) -> Path:
-        """Return the folder that the folder of a database lies in.
-
-        Parameters
-        ----------
-        database_id : str
-            Sixteen hexadecimal digits.
-
-        Returns
-        -------
-        Path
-            Which need not exist.
-
-        Raises
-        ------
-        TargetMissing
-            If the text is no id, and so nothing that a path may be made of.
-        """
+        """Return the folder that the folder of a database lies in."""
         return self.databases / checked(database_id, DATABASE_ID, "database")
 
     def job(self, job_id: str) -> Path:
-        """Return the folder of a job.
-
-        Parameters
-        ----------
-        job_id : str
-            Thirty-two hexadecimal digits.
-
-        Returns
-        -------
-        Path
-            Which need not exist.
-
-        Raises
-        ------
-        TargetMissing
-            If the text is no id.
-        """
+        """Return the folder of a job."""
         return self.jobs / checked(job_id, JOB_ID, "job")
 
     def job_lock(self, job_id: str) -> Path:
-        """Return what the process of a job holds while it lives.
-
-        Parameters
-        ----------
-        job_id : str
-            Thirty-two hexadecimal digits.
-
-        Returns
-        -------
-        Path
-            Which need not exist.
-        """
+        """Return what the process of a job holds while it lives."""
         return self.job(job_id) / "lock"
 
     def job_work(self, job_id: str) -> Path:
-        """Return the folder of what a job makes before it is whole.
-
-        Parameters
-        ----------
-        job_id : str
-            Thirty-two hexadecimal digits.
-
-        Returns
-        -------
-        Path
-            Which exists only while an attempt lasts.
-        """
+        """Return the folder of what a job makes before it is whole."""
         return self.job(job_id) / "work"
 
     def job_stderr(self, job_id: str) -> Path:
-        """Return the file of what the processes of a job said of their troubles.
-
-        Parameters
-        ----------
-        job_id : str
-            Thirty-two hexadecimal digits.
-
-        Returns
-        -------
-        Path
-            For the operator; no request gets it.
-        """
+        """Return the file of what the processes of a job said of their troubles."""
         return self.job(job_id) / "stderr.txt"
 
     def make(self) -> None:
@@ -163,27 +98,7 @@ class Places:
 
 
 def checked(text: str, pattern: re.Pattern[str], kind: str) -> str:
-    """Return an id that is of the form that it must have.
-
-    Parameters
-    ----------
-    text : str
-        As a request has it.
-    pattern : re.Pattern
-        What it must be in full.
-    kind : str
-        For the message.
-
-    Returns
-    -------
-    str
-        The same.
-
-    Raises
-    ------
-    TargetMissing
-        If it is not.
-    """
+    """Return an id that is of the form that it must have."""
     if not pattern.fullmatch(text):
         raise TargetMissing(f"no {kind} has the id {text[:80]!r}; the list of them tells theirs")
     return text

@@ -63,19 +63,7 @@ class ProblemDetails(BaseModel):
 
 
 class Problem(Exception):  # noqa: N818 - the name is that of RFC 9457
-    """What the service refuses by itself.
-
-    Parameters
-    ----------
-    status : int
-        Status of the answer.
-    detail : str
-        What was found, what was expected, what to do next.
-    headers : mapping of str to str, optional
-        Of the answer.
-    key : str, optional
-        The parameter that is wrong.
-    """
+    """What the service refuses by itself."""
 
     def __init__(
         self,
@@ -93,18 +81,7 @@ class Problem(Exception):  # noqa: N818 - the name is that of RFC 9457
 
 
 def problem_of(error: Exception) -> ProblemDetails:
-    """Return what to say of an exception.
-
-    Parameters
-    ----------
-    error : Exception
-        Whatever a handler raised.
-
-    Returns
-    -------
-    ProblemDetails
-        Of a defect no more than that it is one: the log of the server has the rest.
-    """
+    """Return what to say of an exception."""
     if isinstance(error, Problem):
         title = HTTPStatus(error.status).phrase
         return ProblemDetails(title=title, status=error.status, detail=error.detail, key=error.key)
@@ -134,16 +111,6 @@ _FOLDERS = re.compile(r"(?<![\w.:/])/(?:[^\s/:;,'\"()]+/)+")
 def without_folders(message: str) -> str:
     """Return a message in which files have their names only: where they lie is the operator's.
 
-    Parameters
-    ----------
-    message : str
-        Words of an error.
-
-    Returns
-    -------
-    str
-        The same, without the folders of full paths.
-
     Examples
     --------
     >>> without_folders("/srv/starcat/catalogs/sao.dat: line 3; see http://host/docs/errors.html")
@@ -153,32 +120,13 @@ def without_folders(message: str) -> str:
 
 
 def problem_response(problem: ProblemDetails, headers: Mapping[str, str] | None = None) -> Response:
-    """Return the answer that tells a problem.
-
-    Parameters
-    ----------
-    problem : ProblemDetails
-        What is wrong.
-    headers : mapping of str to str, optional
-        Of the answer.
-
-    Returns
-    -------
-    Response
-        Of type ``application/problem+json``.
-    """
+    """Return the answer that tells a problem."""
     content = problem.model_dump(exclude_none=True)
     return JSONResponse(content, problem.status, dict(headers or {}), MEDIA_TYPE)
 
 
 def add_problem_handlers(app: FastAPI) -> None:
-    """Make an application tell all of its errors as problem details.
-
-    Parameters
-    ----------
-    app : FastAPI
-        The application.
-    """
+    """Make an application tell all of its errors as problem details."""
 
     @app.exception_handler(StarcatError)
     @app.exception_handler(Problem)

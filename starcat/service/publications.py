@@ -34,29 +34,13 @@ class Publication:
 
 
 class Publications:
-    """The publications of a service.
-
-    Parameters
-    ----------
-    records : Records
-        Where they are kept.
-    """
+    """The publications of a service."""
 
     def __init__(self, records: Records) -> None:
         self._records = records
 
     def add(self, published: Published, database: str, note: str, owner: str) -> None:
-        """Remember a publication; one that is known keeps its first note.
-
-        Parameters
-        ----------
-        published : Published
-            What became of it.
-        database : str
-            Id of the database.
-        note, owner : str
-            What was said about it, and who published it.
-        """
+        """Remember a publication; one that is known keeps its first note."""
         release = published.release
         with self._records.writing() as connection:
             connection.execute(
@@ -66,13 +50,7 @@ class Publications:
             )
 
     def all(self) -> dict[tuple[str, str], Publication]:
-        """Return all publications.
-
-        Returns
-        -------
-        dict of (str, str) to Publication
-            By name and version.
-        """
+        """Return all publications."""
         with self._records.reading() as connection:
             rows = connection.execute(
                 "SELECT name, version, database, note, owner, published_s FROM publications"

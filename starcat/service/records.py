@@ -106,18 +106,7 @@ WAIT_S = 20.0
 
 
 class Records:
-    """The SQLite file, opened once by each thread.
-
-    Parameters
-    ----------
-    path : Path
-        The file; made and brought to the newest version if need be.
-
-    Raises
-    ------
-    SchemaVersionError
-        If a newer starcat has written it.
-    """
+    """The SQLite file, opened once by each thread."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -126,24 +115,12 @@ class Records:
 
     @contextmanager
     def reading(self) -> Iterator[sqlite3.Connection]:
-        """Give the connection of this thread, to read.
-
-        Yields
-        ------
-        sqlite3.Connection
-            Rows are `sqlite3.Row`.
-        """
+        """Give the connection of this thread, to read."""
         yield self._connection()
 
     @contextmanager
     def writing(self) -> Iterator[sqlite3.Connection]:
-        """Give the connection of this thread within a transaction that nobody else writes in.
-
-        Yields
-        ------
-        sqlite3.Connection
-            What was done is on disk when the context ends, or not at all where it raises.
-        """
+        """Give the connection of this thread within a transaction that nobody else writes in."""
         connection = self._connection()
         connection.execute("BEGIN IMMEDIATE")
         try:

@@ -15,22 +15,7 @@ ALL_JOBS = 1 << 31
 
 
 def remove_database(service: Service, database_id: str) -> None:
-    """Remove a database; what was published of it stays in the registry.
-
-    Parameters
-    ----------
-    service : Service
-        The service.
-    database_id : str
-        Sixteen hexadecimal digits.
-
-    Raises
-    ------
-    TargetMissing
-        If there is none.
-    Problem
-        With status 409, if a job that has not ended makes it or uses it.
-    """
+    """Remove a database; what was published of it stays in the registry."""
     database = service.shelf.database(checked(database_id, DATABASE_ID, "database"))
     for state in ACTIVE:
         for job in service.jobs.all(state=state, most=ALL_JOBS):

@@ -41,23 +41,7 @@ Announce = Callable[[str], None]
 
 
 def run_server(settings: Settings, announce: Announce) -> None:
-    """Serve until a signal ends it.
-
-    Parameters
-    ----------
-    settings : Settings
-        What the operator set.
-    announce : callable
-        Called with the address, such as ``http://127.0.0.1:8000/``, when the server listens.
-
-    Raises
-    ------
-    ConfigError
-        If another server runs with the same root, if others than this machine are to reach it and
-        nobody has a token, or if the port is taken.
-    OutputError
-        If the root cannot be written to.
-    """
+    """Serve until a signal ends it."""
     places = Places(settings.root)
     if not settings.is_private and not places.records.exists():
         raise _without_token(settings)  # before anything is made
@@ -135,23 +119,7 @@ def _address(settings: Settings, port: int) -> str:
 
 
 def listen(settings: Settings) -> socket.socket:
-    """Return the socket that the server listens at.
-
-    Parameters
-    ----------
-    settings : Settings
-        What the operator set.
-
-    Returns
-    -------
-    socket.socket
-        It listens, and nobody answers yet.
-
-    Raises
-    ------
-    ConfigError
-        If the port is taken, or the address is not one of this machine.
-    """
+    """Return the socket that the server listens at."""
     try:
         [(family, _, _, _, address), *_] = socket.getaddrinfo(
             settings.host, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE

@@ -69,25 +69,7 @@ class Service:
 
 
 def open_service(settings: Settings) -> Service:
-    """Open a service: its folders and its records.
-
-    Parameters
-    ----------
-    settings : Settings
-        What the operator set.
-
-    Returns
-    -------
-    Service
-        Nothing runs yet.
-
-    Raises
-    ------
-    OutputError
-        If the root cannot be written to.
-    SchemaVersionError
-        If a newer starcat has written it.
-    """
+    """Open a service: its folders and its records."""
     places = Places(settings.root)
     places.make()
     records = Records(places.records)

@@ -42,11 +42,6 @@ class _Open:
 class Sessions:
     """A bounded number of open sessions; any thread may ask for one.
 
-    Parameters
-    ----------
-    settings : Settings
-        How many answer at the same time, and what each query may take.
-
     Attributes
     ----------
     run : coroutine function
@@ -68,27 +63,7 @@ class Sessions:
     def session(
         self, targets: Sequence[str | Path], time_s: float | None = None
     ) -> Iterator[Session]:
-        """Give a session about some targets, which nobody else uses meanwhile.
-
-        Parameters
-        ----------
-        targets : sequence of str or Path
-            Folders and files of the service's own; never what a request says.
-        time_s : float, optional
-            Seconds that a query may take; by default what the operator set.
-
-        Yields
-        ------
-        Session
-            It is kept for the next question about the same targets, unless its process was ended.
-
-        Raises
-        ------
-        Problem
-            With status 503, if others take too long.
-        QueryError, ProductError, SourceError
-            If a target cannot be read, and whatever is raised within the context.
-        """
+        """Give a session about some targets, which nobody else uses meanwhile."""
         if not self._places.acquire(timeout=turns.WAIT_S):
             raise busy()
         try:
@@ -108,13 +83,7 @@ class Sessions:
             self._places.release()
 
     def forget(self, target: str | Path) -> None:
-        """Close the sessions about a target that is to be removed and that nobody uses.
-
-        Parameters
-        ----------
-        target : str or Path
-            As `session` was given it.
-        """
+        """Close the sessions about a target that is to be removed and that nobody uses."""
         name = str(target)
         with self._lock:
             gone = [one for one in self._idle if name in [text for text, *_ in one.key]]

@@ -96,25 +96,7 @@ class Settings(BaseModel):
 
 
 def read_settings(root: Path, **options: object) -> Settings:
-    """Read the settings of a service.
-
-    Parameters
-    ----------
-    root : Path
-        Its folder; ``service.toml`` in it is optional.
-    **options
-        What takes the place of the file's values; None says nothing.
-
-    Returns
-    -------
-    Settings
-        Checked.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read, or a value is unknown or out of range.
-    """
+    """Read the settings of a service."""
     path = root / FILE_NAME
     content: dict[str, object] = {}
     if path.exists():

@@ -64,26 +64,14 @@ class Database:
 
 
 class Shelf:
-    """All databases there are.
-
-    Parameters
-    ----------
-    places : Places
-        Where they lie.
-    """
+    """All databases there are."""
 
     def __init__(self, places: Places) -> None:
         self._places = places
         self._known: dict[Path, tuple[int, Database]] = {}
 
     def databases(self) -> list[Database]:
-        """Return all databases.
-
-        Returns
-        -------
-        list of Database
-            By name, then by version, then by id. A folder without a readable manifest is none.
-        """
+        """Return all databases."""
         found = []
         for path in self._places.databases.glob(f"*/*/{MANIFEST_NAME}"):
             if not DATABASE_ID.fullmatch(path.parents[1].name):
@@ -95,23 +83,7 @@ class Shelf:
         return sorted(found, key=lambda one: (one.name, version_numbers(one.version), one.id))
 
     def database(self, database_id: str) -> Database:
-        """Return a database.
-
-        Parameters
-        ----------
-        database_id : str
-            Its id.
-
-        Returns
-        -------
-        Database
-            With its manifest read.
-
-        Raises
-        ------
-        TargetMissing
-            If there is none.
-        """
+        """Return a database."""
         for path in self._places.database(database_id).glob(f"*/{MANIFEST_NAME}"):
             return self._at(path)
         raise TargetMissing(

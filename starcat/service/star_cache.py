@@ -67,30 +67,13 @@ class CatalogRead:
 
 
 class StarCache:
-    """The folder of catalogs that were read.
-
-    Parameters
-    ----------
-    folder : Path
-        Made when the first is kept.
-    """
+    """The folder of catalogs that were read."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def load(self, key: str) -> StarsRead | None:
-        """Return the catalogs that were kept under a key.
-
-        Parameters
-        ----------
-        key : str
-            Hexadecimal digits.
-
-        Returns
-        -------
-        StarsRead or None
-            None where there are none, or what is there cannot be read: then it is removed.
-        """
+        """Return the catalogs that were kept under a key."""
         folder = self._folder / key
         if not (folder / FACTS).is_file():
             return None
@@ -109,17 +92,7 @@ class StarCache:
             return None
 
     def keep(self, key: str, read: StarsRead, catalog: CatalogRead) -> None:
-        """Keep catalogs; a disk that is full is no failure.
-
-        Parameters
-        ----------
-        key : str
-            Hexadecimal digits.
-        read : StarsRead
-            What was read.
-        catalog : CatalogRead
-            What to tell of it.
-        """
+        """Keep catalogs; a disk that is full is no failure."""
         final = self._folder / key
         facts: dict[str, Any] = {name: getattr(read, name) for name in FIGURES}
         facts |= {"has_motions": read.motions is not None, "catalog": asdict(catalog)}
@@ -135,13 +108,7 @@ class StarCache:
         self._remove_oldest()
 
     def catalogs(self) -> dict[str, CatalogRead]:
-        """Return what is known of all catalogs that are kept.
-
-        Returns
-        -------
-        dict of str to CatalogRead
-            By key, the most recently used last.
-        """
+        """Return what is known of all catalogs that are kept."""
         found = {}
         for _, folder in self._by_age():
             with suppress(OSError, ValueError, KeyError, TypeError):

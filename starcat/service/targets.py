@@ -17,18 +17,7 @@ CATALOG = re.compile(r"(?P<source>[a-z0-9_]{1,64})-[0-9a-f]{16}(\.parquet)?", re
 
 
 def catalog_names(service: Service) -> list[str]:
-    """Return the names of the catalogs that can be asked about.
-
-    Parameters
-    ----------
-    service : Service
-        The service.
-
-    Returns
-    -------
-    list of str
-        Sorted; a suffix says that it is one file.
-    """
+    """Return the names of the catalogs that can be asked about."""
     if not service.places.catalogs.is_dir():
         return []
     return sorted(
@@ -37,53 +26,12 @@ def catalog_names(service: Service) -> list[str]:
 
 
 def target_paths(service: Service, names: Sequence[str]) -> list[Path]:
-    """Return what the targets of a query are on disk.
-
-    Parameters
-    ----------
-    service : Service
-        The service.
-    names : sequence of str
-        For each target the id of a database, its title such as ``gaia-12deg-1.0.0``, the name of
-        a catalog, or that of its source for the one that was read last.
-
-    Returns
-    -------
-    list of Path
-        Each made from what is there, never from the text.
-
-    Raises
-    ------
-    TargetMissing
-        If there is no such thing.
-    Problem
-        With status 409, if several databases have the title.
-    """
+    """Return what the targets of a query are on disk."""
     return [_target(service, name) for name in names]
 
 
 def database_of(service: Service, name: str) -> Database:
-    """Return a database by its id or its title.
-
-    Parameters
-    ----------
-    service : Service
-        The service.
-    name : str
-        Sixteen hexadecimal digits, or such as ``gaia-12deg-1.0.0``.
-
-    Returns
-    -------
-    Database
-        The database.
-
-    Raises
-    ------
-    TargetMissing
-        If there is none.
-    Problem
-        With status 409, if several have the title.
-    """
+    """Return a database by its id or its title."""
     titled = [] if DATABASE_ID.fullmatch(name) else _titled(service, name)
     return titled[0] if titled else service.shelf.database(name)
 

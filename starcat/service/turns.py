@@ -19,37 +19,13 @@ T = TypeVar("T")
 
 
 class Turns:
-    """Threads for what takes long; handlers that only read have all others for themselves.
-
-    Parameters
-    ----------
-    count : int
-        How many at the same time.
-    """
+    """Threads for what takes long; handlers that only read have all others for themselves."""
 
     def __init__(self, count: int) -> None:
         self._turns = CapacityLimiter(count)
 
     async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function in a thread when it is its turn.
-
-        Parameters
-        ----------
-        function : callable
-            What takes long.
-        *args, **kwargs
-            Its arguments.
-
-        Returns
-        -------
-        object
-            What the function returns.
-
-        Raises
-        ------
-        Problem
-            With status 503, if the others take too long.
-        """
+        """Call a function in a thread when it is its turn."""
         turn = object()
         with anyio.move_on_after(WAIT_S) as waiting:
             await self._turns.acquire_on_behalf_of(turn)
@@ -65,13 +41,7 @@ class Turns:
 
 
 def busy() -> Problem:
-    """Return what is said to somebody who waited too long.
-
-    Returns
-    -------
-    Problem
-        With status 503 and the time to ask again.
-    """
+    """Return what is said to somebody who waited too long."""
     return Problem(
         503,
         f"all that may run at the same time was busy for {WAIT_S:g} s; ask again later",

@@ -19,18 +19,7 @@ _UNUSUAL = re.compile(r"[^A-Za-z0-9_-]+", re.ASCII)
 
 @contextmanager
 def scratch_folder(places: Places) -> Iterator[Path]:
-    """Give a new folder, which is removed afterwards.
-
-    Parameters
-    ----------
-    places : Places
-        Where scratch is.
-
-    Yields
-    ------
-    Path
-        Empty.
-    """
+    """Give a new folder, which is removed afterwards."""
     folder = places.scratch / secrets.token_hex(16)
     folder.mkdir(mode=0o700)
     try:
@@ -41,20 +30,6 @@ def scratch_folder(places: Places) -> Iterator[Path]:
 
 def safe_name(given: str | None, suffixes: tuple[str, ...], default: str) -> str:
     """Return a file name that an upload may be kept under.
-
-    Parameters
-    ----------
-    given : str, optional
-        As somebody sent it.
-    suffixes : tuple of str
-        Suffixes that mean something.
-    default : str
-        The name where nothing is left of what was given.
-
-    Returns
-    -------
-    str
-        Letters, digits, hyphens and underscores, and one of the suffixes if it had one.
 
     Examples
     --------
@@ -71,20 +46,7 @@ def safe_name(given: str | None, suffixes: tuple[str, ...], default: str) -> str
 
 
 def sent_once(path: Path) -> tuple[Iterator[bytes], int]:
-    """Open a file to be sent, which needs its name no longer.
-
-    Parameters
-    ----------
-    path : Path
-        The file; it may be removed at once.
-
-    Returns
-    -------
-    chunks : iterator of bytes
-        The content.
-    size : int
-        Bytes.
-    """
+    """Open a file to be sent, which needs its name no longer."""
     file = path.open("rb")
     return _chunks(file), path.stat().st_size
 

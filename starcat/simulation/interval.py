@@ -9,16 +9,6 @@ Z95 = 1.959963984540054
 def wilson_interval(hits: int, count: int) -> tuple[float, float]:
     """Return Wilson's interval of 95 % of a share.
 
-    Parameters
-    ----------
-    hits, count : int
-        Successes and tries.
-
-    Returns
-    -------
-    least, most : float
-        From 0 to 1; all of it where nothing was tried.
-
     References
     ----------
     Wilson 1927, Journal of the American Statistical Association 22, 209.

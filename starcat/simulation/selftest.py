@@ -71,13 +71,7 @@ class Rates:
         return wilson_interval(self.identified, self.identifiable)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the rates as the report holds them.
-
-        Returns
-        -------
-        dict
-            Plain values.
-        """
+        """Return the rates as the report holds them."""
         content = asdict(self)
         del content["missed"]
         least, most = (round(end, 6) for end in self.interval)
@@ -90,18 +84,7 @@ class Rates:
 
 
 def rates_of(content: Mapping[str, Any]) -> Rates:
-    """Return the rates that a report tells.
-
-    Parameters
-    ----------
-    content : mapping
-        What `Rates.as_dict` returned.
-
-    Returns
-    -------
-    Rates
-        Without the frames that were missed.
-    """
+    """Return the rates that a report tells."""
     names = [field.name for field in fields(Rates) if field.name in content]
     return Rates(**{name: content[name] for name in names})
 
@@ -116,32 +99,7 @@ def self_test(
     noise_mag: float = NOISE_MAG,
     without_magnitudes: int | None = None,
 ) -> tuple[Rates, ...]:
-    """Identify simulated fields with the database that they were simulated from.
-
-    Parameters
-    ----------
-    matcher : Matcher
-        The matcher, with the database open.
-    frames : int
-        Fields of each kind.
-    noise_px : float
-        Standard deviation of a centroid, each axis.
-    seed : int
-        Seed of the attitudes and the noise.
-    progress : Progress
-        Called with ("self-test", frames done, frames in all).
-    noise_mag : float
-        Standard deviation of the magnitudes that are given with the centroids. False spots have
-        those of stars drawn from the database.
-    without_magnitudes : int, optional
-        So many of the same frames are also identified without magnitudes; all by default.
-
-    Returns
-    -------
-    tuple of Rates
-        Clean frames, which have noise only, and hard ones, with stars missing and false ones
-        beside it; then the same two without magnitudes.
-    """
+    """Identify simulated fields with the database that they were simulated from."""
     kinds = {"clean": Noise(noise_px), "hard": Noise(noise_px, **HARD)}  # type: ignore[arg-type]
     bare = frames if without_magnitudes is None else min(frames, without_magnitudes)
     with_mag, without = [], []
@@ -208,23 +166,7 @@ class _Count:
 
 
 def answers_rightly(result: MatchResult, frame: Frame, matcher: Matcher) -> bool:
-    """Return whether an answer is right.
-
-    Parameters
-    ----------
-    result : MatchResult
-        The answer to the frame, which is identified.
-    frame : Frame
-        The truth.
-    matcher : Matcher
-        The matcher, whose camera and tolerance say how near is near.
-
-    Returns
-    -------
-    bool
-        True if the attitude puts every star that is in the frame within the tolerance of its
-        true place. A false spot that lies on a star's place may carry that star's name.
-    """
+    """Return whether an answer is right."""
     camera, database = matcher.database.camera, matcher.database
     star = frame.star_index[frame.star_index >= 0]
     q = result.q_body_from_icrs

@@ -85,28 +85,7 @@ def simulate_frames(
     seed: int,
     mag: Array | None = None,
 ) -> Iterator[Frame]:
-    """Simulate frames of guide stars at attitudes uniform over all rotations.
-
-    Parameters
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        ICRS directions of the stars that the camera can see.
-    camera : Camera
-        The camera.
-    count : int
-        Number of frames.
-    noise : Noise
-        What they suffer.
-    seed : int
-        Seed of all that is random; the same seed gives the same frames.
-    mag : ndarray of float64, shape (N,), optional
-        Magnitudes of the stars; 0 each by default.
-
-    Yields
-    ------
-    Frame
-        Frames, each as `simulate_frame` makes it.
-    """
+    """Simulate frames of guide stars at attitudes uniform over all rotations."""
     generator = np.random.default_rng(seed)
     stars = np.arange(len(directions), dtype=np.int32)
     sky = Sky(directions, np.zeros(len(directions)) if mag is None else mag, stars)
@@ -117,26 +96,7 @@ def simulate_frames(
 def simulate_frame(
     sky: Sky, camera: Camera, matrix: Array, noise: Noise, generator: np.random.Generator
 ) -> Frame:
-    """Simulate one frame.
-
-    Parameters
-    ----------
-    sky : Sky
-        All that shines.
-    camera : Camera
-        The camera as it is, which may differ from what a matcher is told.
-    matrix : ndarray of float64, shape (3, 3)
-        Attitude, ``body = matrix @ icrs``.
-    noise : Noise
-        What the frame suffers.
-    generator : numpy.random.Generator
-        Source of randomness.
-
-    Returns
-    -------
-    Frame
-        Centroids that noise moves off the detector are lost, as they would be.
-    """
+    """Simulate one frame."""
     near = sky.zones.near(matrix[2], 1.05 * camera.radius_rad)
     centroids = camera.pixels_from_directions(sky.directions[near] @ matrix.T)
     inside = camera.contains(centroids)

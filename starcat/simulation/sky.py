@@ -41,17 +41,6 @@ class Sky:
         return zones_of(self.directions)
 
     def brighter(self, limit_mag: float) -> Sky:
-        """Return the points up to a magnitude.
-
-        Parameters
-        ----------
-        limit_mag : float
-            Itself included.
-
-        Returns
-        -------
-        Sky
-            Stars that are left, in the same order.
-        """
+        """Return the points up to a magnitude."""
         seen = self.mag <= limit_mag
         return Sky(self.directions[seen], self.mag[seen], self.star_index[seen])

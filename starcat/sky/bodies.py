@@ -90,18 +90,7 @@ class Bodies:
 
 @lru_cache(maxsize=4)
 def bodies_seen(observer: Observer) -> Bodies:
-    """Return the bodies of the solar system as an observer sees them.
-
-    Parameters
-    ----------
-    observer : Observer
-        Time, place and velocity.
-
-    Returns
-    -------
-    Bodies
-        All of them, above a horizon or not; the same object for the same observer.
-    """
+    """Return the bodies of the solar system as an observer sees them."""
     names = ["Sun", "Moon", *_PLANETS, *(["Earth"] if observer.is_placed else [])]
     seen = np.array([_light_time_corrected(name, observer) for name in names])
     distance = np.sqrt(np.einsum("ij,ij->i", seen, seen))

@@ -27,21 +27,7 @@ _URANUS_POLE = np.array([-0.21199958, -0.94155916, -0.26176809])
 
 
 def apparent_magnitude(name: str, from_sun_au: Array, from_observer_au: Array) -> float:
-    """Return how bright a body of the solar system is.
-
-    Parameters
-    ----------
-    name : str
-        A planet, ``Sun`` or ``Moon``.
-    from_sun_au, from_observer_au : ndarray of float64, shape (3,)
-        Where it is, ICRS axes, au.
-
-    Returns
-    -------
-    float
-        Magnitude, V. Saturn beyond a phase angle of 6.5 deg, which is not seen from near the
-        Earth, is taken for what it is at that angle.
-    """
+    """Return how bright a body of the solar system is."""
     distance = float(np.sqrt(from_observer_au @ from_observer_au))
     if name == "Sun":
         return SUN_MAG + 5.0 * float(np.log10(distance))

@@ -72,18 +72,7 @@ class NamedStars:
         return [self._row_of[hip] for hip in hips]
 
     def label_of(self, designation: str) -> str | None:
-        """Return the name of a star whose designation is a Hipparcos number.
-
-        Parameters
-        ----------
-        designation : str
-            Such as ``HIP 27989``.
-
-        Returns
-        -------
-        str or None
-            None for a number that is not in the list, or another designation.
-        """
+        """Return the name of a star whose designation is a Hipparcos number."""
         catalog, _, number = designation.partition(" ")
         row = self._row_of.get(int(number)) if catalog == "HIP" and number.isdecimal() else None
         return None if row is None else self.labels[row]
@@ -91,13 +80,7 @@ class NamedStars:
 
 @cache
 def named_stars() -> NamedStars:
-    """Return the stars that have names, read once.
-
-    Returns
-    -------
-    NamedStars
-        All 9,932 of them.
-    """
+    """Return the stars that have names, read once."""
     rows = list(csv.DictReader(_lines_of("star_names.csv")))
     ra, dec, pm_ra, pm_dec, mag = (
         np.array([float(row[name]) for row in rows])
@@ -115,13 +98,7 @@ def named_stars() -> NamedStars:
 
 @cache
 def constellation_lines() -> tuple[tuple[int, ...], ...]:
-    """Return the lines of all constellations, read once.
-
-    Returns
-    -------
-    tuple of tuple of int
-        Hipparcos numbers of the stars that each line leads along.
-    """
+    """Return the lines of all constellations, read once."""
     rows = csv.DictReader(_lines_of("constellation_lines.csv"))
     return tuple(tuple(int(hip) for hip in row["hips"].split()) for row in rows)
 
@@ -129,26 +106,7 @@ def constellation_lines() -> tuple[tuple[int, ...], ...]:
 def common_names(
     designations: Sequence[str], directions: Array, mag: Array, epoch_jyear: float
 ) -> list[str | None]:
-    """Return the names that people know stars by.
-
-    Parameters
-    ----------
-    designations : sequence of str, length N
-        As their catalog names them.
-    directions : ndarray of float64, shape (N, 3)
-        ICRS unit vectors.
-    mag : ndarray of float64, shape (N,)
-        Magnitudes of any band from B to Ks.
-    epoch_jyear : float
-        Epoch of the directions.
-
-    Returns
-    -------
-    list of str or None, length N
-        Proper name of the IAU, else Bayer letter with constellation, else Hipparcos number;
-        None for a star that is not in the list. Of two stars within 20 arcsec, the one has the
-        name whose magnitude is the nearer.
-    """
+    """Return the names that people know stars by."""
     known = named_stars()
     places = known.at(epoch_jyear)
     chord = chord_from_separation(np.radians(REACH_ARCSEC / 3600.0))

@@ -165,13 +165,7 @@ class CameraSpec(Section):
         return 0.5 * min(camera.fov_x_deg, camera.fov_y_deg)
 
     def camera(self) -> Camera:
-        """Return the camera.
-
-        Returns
-        -------
-        Camera
-            With its focal length in pixels.
-        """
+        """Return the camera."""
         if self.fov_x_deg is not None:
             return Camera(self.width_px, self.height_px, fov_x_deg=self.fov_x_deg)
         focal_length_px = (self.focal_length_mm or 1.0) * 1000.0 / (self.pixel_um or 1.0)
@@ -285,15 +279,7 @@ class BuildSpec(Section):
         return self
 
     def recorded(self) -> dict[str, Any]:
-        """Return what an artifact says of its spec.
-
-        Returns
-        -------
-        dict
-            All keys as JSON has them, but not those of ``products.levels`` and
-            ``catalog.motions`` where there are none: artifacts are the same as before there was
-            such a thing.
-        """
+        """Return what an artifact says of its spec."""
         content = self.model_dump(mode="json")
         if self.products.levels == Levels():
             del content["products"]["levels"]

@@ -32,24 +32,7 @@ COEFFICIENTS = tuple(field.name for field in fields(Distortion))
 
 
 def read_camera(path: Path) -> Camera:
-    """Read a camera from a TOML file.
-
-    Parameters
-    ----------
-    path : Path
-        A camera file, or a build spec, of which the table ``[camera]`` is read.
-
-    Returns
-    -------
-    Camera
-        Checked.
-
-    Raises
-    ------
-    ConfigError
-        If the file is missing or not TOML, or a key is unknown, missing, contradicted by
-        another or out of range.
-    """
+    """Read a camera from a TOML file."""
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -68,16 +51,6 @@ def read_camera(path: Path) -> Camera:
 
 def camera_toml(camera: Camera) -> str:
     """Return the TOML text that `read_camera` reads the same camera from.
-
-    Parameters
-    ----------
-    camera : Camera
-        To be written.
-
-    Returns
-    -------
-    str
-        With all digits of the numbers.
 
     Examples
     --------

@@ -89,11 +89,6 @@ class SpecSection:
 def spec_sections() -> tuple[SpecSection, ...]:
     """Return all tables of a spec, a table before those inside it.
 
-    Returns
-    -------
-    tuple of SpecSection
-        The top first.
-
     Examples
     --------
     >>> spec_sections()[1].path
@@ -105,16 +100,6 @@ def spec_sections() -> tuple[SpecSection, ...]:
 
 def unit_of(name: str) -> str:
     """Return the unit that a key's name ends with.
-
-    Parameters
-    ----------
-    name : str
-        Such as ``radius_deg``.
-
-    Returns
-    -------
-    str
-        Empty where it has none.
 
     Examples
     --------

@@ -39,26 +39,7 @@ Changes = Mapping[str, str]
 
 
 def read_spec(path: PathLike, changes: Changes | None = None) -> BuildSpec:
-    """Read a build spec from a TOML file.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-    changes : mapping of str to str, optional
-        Values by dotted key that take the place of the file's, as TOML writes them. A text that
-        is no TOML value is itself the value; an empty one removes the key.
-
-    Returns
-    -------
-    BuildSpec
-        Checked.
-
-    Raises
-    ------
-    ConfigError
-        If the file is missing or not TOML, or a key is unknown, missing or out of range.
-    """
+    """Read a build spec from a TOML file."""
     path = Path(path)
     try:
         text = path.read_text(encoding="utf-8")
@@ -73,23 +54,6 @@ def read_spec(path: PathLike, changes: Changes | None = None) -> BuildSpec:
 
 def content_of_toml(text: str, origin: str) -> dict[str, Any]:
     """Read the text of a spec.
-
-    Parameters
-    ----------
-    text : str
-        TOML.
-    origin : str
-        Where it is from, for messages.
-
-    Returns
-    -------
-    dict
-        What it says, not checked yet.
-
-    Raises
-    ------
-    ConfigError
-        If it is not TOML, or no spec can be as long or as deep.
 
     Notes
     -----
@@ -115,25 +79,7 @@ def content_of_toml(text: str, origin: str) -> dict[str, Any]:
 
 
 def changed(content: dict[str, Any], changes: Changes) -> dict[str, Any]:
-    """Change what a spec says, key by key.
-
-    Parameters
-    ----------
-    content : dict
-        Keys as in the TOML file; changed in place.
-    changes : mapping of str to str
-        As `read_spec` takes them.
-
-    Returns
-    -------
-    dict
-        The same.
-
-    Raises
-    ------
-    ConfigError
-        If a key leads through a value.
-    """
+    """Change what a spec says, key by key."""
     for key, text in changes.items():
         _change(content, key, text)
     return content
@@ -159,25 +105,7 @@ def _value(text: str) -> Any:
 
 
 def spec_from_dict(content: dict[str, Any], origin: str) -> BuildSpec:
-    """Check a spec that is already parsed.
-
-    Parameters
-    ----------
-    content : dict
-        Keys as in the TOML file.
-    origin : str
-        Where it is from, for messages.
-
-    Returns
-    -------
-    BuildSpec
-        Checked.
-
-    Raises
-    ------
-    ConfigError
-        Naming the first wrong key, what was found and what is allowed.
-    """
+    """Check a spec that is already parsed."""
     try:
         return BuildSpec.model_validate(content)
     except ValidationError as error:
@@ -185,20 +113,7 @@ def spec_from_dict(content: dict[str, Any], origin: str) -> BuildSpec:
 
 
 def what_is_wrong(error: ValidationError, origin: str) -> ConfigError:
-    """Return what to tell somebody whose spec, or part of one, was refused.
-
-    Parameters
-    ----------
-    error : ValidationError
-        What pydantic found wrong.
-    origin : str
-        Where the values are from.
-
-    Returns
-    -------
-    ConfigError
-        About the first wrong key; a misspelt one comes first, since it is missing too.
-    """
+    """Return what to tell somebody whose spec, or part of one, was refused."""
     wrong = sorted(error.errors(), key=lambda entry: entry["type"] != "extra_forbidden")
     first = wrong[0]
     key = ".".join(_shown_key(str(part)) for part in first["loc"]) or "spec"
@@ -233,11 +148,6 @@ def _known_keys(location: tuple[Any, ...]) -> list[str]:
 def preset_names() -> tuple[str, ...]:
     """Return the names of the presets that ship with starcat, the default first.
 
-    Returns
-    -------
-    tuple of str
-        Names.
-
     Examples
     --------
     >>> preset_names()[0]
@@ -248,25 +158,7 @@ def preset_names() -> tuple[str, ...]:
 
 
 def preset(name: str, changes: Changes | None = None) -> BuildSpec:
-    """Return a preset.
-
-    Parameters
-    ----------
-    name : str
-        One of `preset_names`.
-    changes : mapping of str to str, optional
-        As for `read_spec`.
-
-    Returns
-    -------
-    BuildSpec
-        Checked.
-
-    Raises
-    ------
-    ConfigError
-        If there is none of that name, with the nearest that there is.
-    """
+    """Return a preset."""
     if name not in preset_names():
         hint = suggest(name, preset_names())
         raise ConfigError(

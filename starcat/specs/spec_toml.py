@@ -13,19 +13,7 @@ _WIDTH = 96
 
 
 def spec_toml(spec: BuildSpec) -> str:
-    """Return a spec as a commented TOML file.
-
-    Parameters
-    ----------
-    spec : BuildSpec
-        Checked.
-
-    Returns
-    -------
-    str
-        All tables and keys. A key that is as by default is a comment, to be changed by whoever
-        wants another value; reading the text gives the same spec.
-    """
+    """Return a spec as a commented TOML file."""
     content = spec.model_dump(mode="json")
     parts = []
     for section in spec_sections():
@@ -43,16 +31,6 @@ def spec_toml(spec: BuildSpec) -> str:
 
 def toml_value(value: Any) -> str:
     """Return a value as TOML writes it.
-
-    Parameters
-    ----------
-    value : bool, int, float, str or list of these
-        A value that a spec may have.
-
-    Returns
-    -------
-    str
-        On one line.
 
     Examples
     --------

@@ -15,16 +15,6 @@ VERSION_PATTERN = rf"^{_NUMBER}\.{_NUMBER}\.{_NUMBER}$"
 def version_numbers(version: str) -> tuple[int, int, int]:
     """Return what versions are sorted by, as semantic versions go.
 
-    Parameters
-    ----------
-    version : str
-        Of the form `VERSION_PATTERN`.
-
-    Returns
-    -------
-    tuple of int
-        Major, minor and patch.
-
     Examples
     --------
     >>> version_numbers("1.10.0") > version_numbers("1.9.0")

@@ -39,23 +39,7 @@ _WRITING_FAILED = {
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Give a file to write to, which gets its final name when all of it is there.
-
-    Parameters
-    ----------
-    path : Path
-        The final name; its folder is made, and a file of that name is replaced.
-
-    Yields
-    ------
-    Path
-        Hidden, in the same folder; removed if the writing fails.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
+    """Give a file to write to, which gets its final name when all of it is there."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with _renamed(unique(path.parent, path.name), path) as partial:
@@ -69,47 +53,19 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def placed(path: Path) -> Iterator[Path]:
-    """Give a file to write to, which gets its name at the end; the system's errors pass.
-
-    Parameters
-    ----------
-    path : Path
-        The final name. Two processes that write the same file do not disturb each other, nor who
-        reads it.
-
-    Yields
-    ------
-    Path
-        ``.<name>.*.partial`` in the same folder; removed if the writing fails.
-    """
+    """Give a file to write to, which gets its name at the end; the system's errors pass."""
     with _renamed(unique(path.parent, path.name), path) as partial:
         yield partial
 
 
 def remove_partial(folder: Path) -> None:
-    """Remove what processes that were killed have not finished in a folder and those below it.
-
-    Parameters
-    ----------
-    folder : Path
-        Nobody writes in it any more.
-    """
+    """Remove what processes that were killed have not finished in a folder and those below it."""
     for path in sorted(folder.rglob(".*.partial")):
         path.unlink()
 
 
 def replace_file(path: Path, data: bytes, beside: Path) -> None:
-    """Give a file other content, at once and for good.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    data : bytes
-        All of it.
-    beside : Path
-        Folder of the same file system for what is not finished.
-    """
+    """Give a file other content, at once and for good."""
     with _renamed(unique(beside, path.name), path) as new:
         new.write_bytes(data)
         sync(new)
@@ -129,23 +85,7 @@ def _renamed(partial: Path, final: Path) -> Iterator[Path]:
 
 @contextmanager
 def whole_folder(final: Path) -> Iterator[Path]:
-    """Give a folder to write into, beside the final one, and remove it afterwards.
-
-    Parameters
-    ----------
-    final : Path
-        The name that `move_into_place` will give it.
-
-    Yields
-    ------
-    Path
-        An empty folder ``.<name>.*.partial`` on the same file system.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be made, or the disk is full.
-    """
+    """Give a folder to write into, beside the final one, and remove it afterwards."""
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
         made = Path(tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".partial", dir=final.parent))
@@ -165,25 +105,7 @@ def whole_folder(final: Path) -> Iterator[Path]:
 
 @contextmanager
 def writing(folder: Path, advice: str) -> Iterator[None]:
-    """Turn a refusal of the operating system into the error that says so.
-
-    Parameters
-    ----------
-    folder : Path
-        The folder that something is written into.
-    advice : str
-        What to do, or what has become of the work.
-
-    Yields
-    ------
-    None
-        To the work.
-
-    Raises
-    ------
-    OutputError
-        If the folder cannot be written to, or the disk is full.
-    """
+    """Turn a refusal of the operating system into the error that says so."""
     try:
         yield
     except OSError as error:
@@ -195,27 +117,7 @@ def writing(folder: Path, advice: str) -> Iterator[None]:
 
 
 def move_into_place(partial: Path, final: Path, *, replace: bool) -> Outcome:
-    """Give a complete folder its final name; its files can only be read from then on.
-
-    Parameters
-    ----------
-    partial : Path
-        Complete and checked.
-    final : Path
-        The name to give it.
-    replace : bool
-        Whether a different folder of that name may be replaced.
-
-    Returns
-    -------
-    {"written", "unchanged", "replaced"}
-        ``unchanged`` where the final folder already held the same files.
-
-    Raises
-    ------
-    OutputError
-        If something else is there and ``replace`` is false.
-    """
+    """Give a complete folder its final name; its files can only be read from then on."""
     for path in sorted(partial.rglob("*")):
         if path.is_file():
             path.chmod(READ_ONLY)
@@ -263,30 +165,12 @@ def _holds_all(final: Path, partial: Path) -> bool:
 
 
 def unique(folder: Path, name: str) -> Path:
-    """Return a hidden path that nobody else uses.
-
-    Parameters
-    ----------
-    folder : Path
-        The folder that it is in.
-    name : str
-        The name that is being written.
-
-    Returns
-    -------
-    Path
-        ``.<name>.*.partial``, of no file.
-    """
+    """Return a hidden path that nobody else uses."""
     return folder / f".{name}.{secrets.token_hex(8)}.partial"
 
 
 def sync(path: Path) -> None:
     """Have the content of a file, or the names in a folder, on disk.
-
-    Parameters
-    ----------
-    path : Path
-        A file or a folder.
 
     Notes
     -----
@@ -303,13 +187,7 @@ def sync(path: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder whose name is on disk, and those above it.
-
-    Parameters
-    ----------
-    folder : Path
-        May exist.
-    """
+    """Make a folder whose name is on disk, and those above it."""
     if not folder.is_dir():
         make_folder(folder.parent)
         folder.mkdir(exist_ok=True)

@@ -104,31 +104,7 @@ _WORTH_A_RETRY = (_Broken, OSError, HTTPError, EOFError, ftplib.Error)
 
 
 def download(url: str, path: Path, options: DownloadOptions) -> Arrival:
-    """Bring one address to ``<name>.part``, trying again after a short wait.
-
-    Parameters
-    ----------
-    url : str
-        An address of http, https or ftp.
-    path : Path
-        The name that the caller will give to the file.
-    options : DownloadOptions
-        How to download.
-
-    Returns
-    -------
-    {"downloaded", "resumed"}
-        Whether an earlier part was continued.
-
-    Raises
-    ------
-    NotFound
-        If the server has no such file.
-    DownloadError
-        If it did not come; what has arrived is kept for the next attempt.
-    OutputError
-        If the part cannot be written.
-    """
+    """Bring one address to ``<name>.part``, trying again after a short wait."""
     reason: Exception | None = None
     attempts = 1 + max(0, options.retries)
     is_ftp = url.lower().startswith("ftp:")
@@ -330,36 +306,12 @@ def _output(path: Path) -> Iterator[None]:
 
 
 def beside(path: Path, suffix: str) -> Path:
-    """Return the path of the same name with something behind it.
-
-    Parameters
-    ----------
-    path : Path
-        A file.
-    suffix : str
-        The text to append to its name.
-
-    Returns
-    -------
-    Path
-        In the same folder.
-    """
+    """Return the path of the same name with something behind it."""
     return path.with_name(path.name + suffix)
 
 
 def part_of(path: Path) -> Path:
-    """Return where the body of a file is until it is whole and checked.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    Path
-        ``<name>.part``.
-    """
+    """Return where the body of a file is until it is whole and checked."""
     return beside(path, ".part")
 
 
@@ -383,35 +335,13 @@ def _write_state(path: Path, state: _PartState) -> None:
 
 
 def rename(path: Path, target: Path) -> None:
-    """Rename a file, replacing what has the name.
-
-    Parameters
-    ----------
-    path, target : Path
-        Its name now, and the one to give it.
-
-    Raises
-    ------
-    OutputError
-        If that is not possible.
-    """
+    """Rename a file, replacing what has the name."""
     with _output(target):
         path.replace(target)
 
 
 def forget_part(path: Path) -> None:
-    """Drop the part of a file, then its state: a state without a part is harmless.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Raises
-    ------
-    OutputError
-        If that is not possible.
-    """
+    """Drop the part of a file, then its state: a state without a part is harmless."""
     for file in (part_of(path), beside(path, ".part.json")):
         with _output(file):
             file.unlink(missing_ok=True)

@@ -16,25 +16,7 @@ NUMBERS_AND_TEXTS = "iufS"
 
 
 def own_group(file: Any, name: str) -> Any:
-    """Return a group of a file.
-
-    Parameters
-    ----------
-    file : h5py.File
-        Open for reading.
-    name : str
-        A name that the file has.
-
-    Returns
-    -------
-    h5py.Group
-        The group.
-
-    Raises
-    ------
-    ProductError
-        If the name is a link to somewhere else, or something else than a group.
-    """
+    """Return a group of a file."""
     group = _own(file, name)
     if not hasattr(group, "keys"):
         raise _refused(group.name, "no group")
@@ -42,28 +24,7 @@ def own_group(file: Any, name: str) -> Any:
 
 
 def own_dataset(group: Any, name: str, file_bytes: int) -> Any:
-    """Return a dataset whose values lie in the file, one behind the other.
-
-    Parameters
-    ----------
-    group : h5py.Group
-        A group of `own_group`.
-    name : str
-        A name that the group has.
-    file_bytes : int
-        Size of the file.
-
-    Returns
-    -------
-    h5py.Dataset
-        One-dimensional, contiguous, of integers, floats or texts of a fixed width. Nothing of it
-        has been read.
-
-    Raises
-    ------
-    ProductError
-        If it is anything else; the message names it.
-    """
+    """Return a dataset whose values lie in the file, one behind the other."""
     dataset = _own(group, name)
     place = f"{group.name}/{name}"
     if not hasattr(dataset, "shape"):

@@ -27,26 +27,7 @@ _WITHOUT_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EBADF}
 
 @contextmanager
 def locked(path: Path, *, wait: bool = True) -> Iterator[bool]:
-    """Hold a lock that ends with the process, however it ends.
-
-    Parameters
-    ----------
-    path : Path
-        A folder, or a file that is made if need be, with its folder. Who holds the lock may
-        remove it.
-    wait : bool, default True
-        Whether to wait for who holds it.
-
-    Yields
-    ------
-    bool
-        Whether nobody else holds it; False where the system or the file system has no locks.
-
-    Raises
-    ------
-    BlockingIOError
-        If it is held and ``wait`` is false.
-    """
+    """Hold a lock that ends with the process, however it ends."""
     if fcntl is None:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield False

@@ -44,29 +44,7 @@ class Written:
 
 
 def make_manifest(name: str, how: Reading, written: Written, notes: Sequence[str] = ()) -> Facts:
-    """Return what a store says of itself, after checking that no record is missing.
-
-    Parameters
-    ----------
-    name : str
-        The store.
-    how : Reading
-        What was read, and how.
-    written : Written
-        Results of all tasks.
-    notes : sequence of str
-        What a user should know of the inputs.
-
-    Returns
-    -------
-    dict
-        Content of ``store.json``.
-
-    Raises
-    ------
-    BuildError
-        If not every record that was read is kept or rejected.
-    """
+    """Return what a store says of itself, after checking that no record is missing."""
     rejected = {Reason.duplicate_record.name: written.repeated}
     for part in written.parts:
         for reason, count in part["rejected"].items():
@@ -105,21 +83,7 @@ def make_manifest(name: str, how: Reading, written: Written, notes: Sequence[str
 def describe_store(
     folder: Path, name: str, manifest: Facts, written: Written, options: StoreOptions
 ) -> None:
-    """Write what makes a folder a HATS collection, and the store's own account.
-
-    Parameters
-    ----------
-    folder : Path
-        With the partitions of catalog and margin.
-    name : str
-        Name of the catalog, and of its folder; that of the margin has ``_margin`` behind it.
-    manifest : dict
-        The account.
-    written : Written
-        Results of all tasks.
-    options : StoreOptions
-        Size of the partitions, and reach of the margin.
-    """
+    """Write what makes a folder a HATS collection, and the store's own account."""
     schema = store_schema()
     full = [(pixel, facts) for pixel, facts in written.partitions if facts["rows"]]
     more = {"hats_skymap_order": SKYMAP_ORDER, **_provenance(manifest)}

@@ -28,20 +28,7 @@ _LEAST_ROWS = 1024
 
 
 def bright_first(stars: pa.Table) -> tuple[pa.Table, tuple[int, ...]]:
-    """Return the stars of a partition in the order in which they are written.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        Ordered by pixel and star_id.
-
-    Returns
-    -------
-    stars : pyarrow.Table
-        By group of brightness, pixel and star_id; stars without magnitude are the last group.
-    rows : tuple of int
-        How many each group has.
-    """
+    """Return the stars of a partition in the order in which they are written."""
     group = _groups(floats_of(stars, "mag"))
     order = np.argsort(group, kind="stable")
     counts = np.bincount(group)
@@ -59,17 +46,7 @@ def _groups(mag: NDArray[np.float64]) -> NDArray[np.int8]:
 
 
 def write_partition(stars: pa.Table, rows: tuple[int, ...], path: Path) -> None:
-    """Write a partition, the same bytes for the same stars and library.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        As `bright_first` orders them.
-    rows : tuple of int
-        Stars of each group of brightness; a row group has stars of one of them.
-    path : Path
-        Overwritten; its folder is made.
-    """
+    """Write a partition, the same bytes for the same stars and library."""
     path.parent.mkdir(parents=True, exist_ok=True)
     begin = 0
     encodings = _encodings(stars.schema)

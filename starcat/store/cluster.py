@@ -36,29 +36,7 @@ each worker a hundred times a second."""
 def cluster(
     workers: int = 2, scheduler: str | None = None, *, is_small: bool = False
 ) -> Iterator[Client]:
-    """Give a client of a Dask cluster.
-
-    Parameters
-    ----------
-    workers : int, default 2
-        Processes of a cluster of this machine, which is made here and ended afterwards.
-    scheduler : str, optional
-        Address of a cluster that is there, such as ``tcp://10.0.0.1:8786``. Its workers need the
-        same starcat, and the inputs and the output under the same paths.
-    is_small : bool, default False
-        Whether the work is done before processes would have started: the workers are threads.
-
-    Yields
-    ------
-    distributed.Client
-        Connected.
-
-    Raises
-    ------
-    ConfigError
-        If Dask is not installed, nobody answers at the address, or its workers run another
-        version of starcat.
-    """
+    """Give a client of a Dask cluster."""
     try:
         import dask
         import distributed
@@ -122,13 +100,7 @@ def _check_versions(client: Client) -> None:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of what decides about the bytes of a store.
-
-    Returns
-    -------
-    dict of str to str
-        By package.
-    """
+    """Return the versions of what decides about the bytes of a store."""
     found = {name: version(name) for name in ("cdshealpix", "numpy", "pyarrow", "scipy")}
     return {"starcat": __version__, **found}
 
@@ -143,31 +115,7 @@ def run_tasks(
     items: Sequence[Any],
     report: Callable[[int, Any], None] | None = None,
 ) -> list[Any]:
-    """Call a function with each of some items on the workers of a cluster.
-
-    Parameters
-    ----------
-    client : distributed.Client
-        The cluster.
-    function : callable
-        Of a module; called again for an item whose worker died, so it must bear that.
-    items : sequence of object
-        What to call it with.
-    report : callable, optional
-        Called with the number of an item and its result when that is done.
-
-    Returns
-    -------
-    list of object
-        Results in the order of the items, whatever order they arrived in.
-
-    Raises
-    ------
-    BuildError
-        If an item killed its worker again and again.
-    Exception
-        What the function raised: of the first item that failed. The others are dropped.
-    """
+    """Call a function with each of some items on the workers of a cluster."""
     from distributed import KilledWorker, as_completed
 
     futures = client.map(function, list(items), pure=False, retries=0)

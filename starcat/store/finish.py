@@ -71,20 +71,7 @@ class Finish:
 
 
 def finish(asked: Finish) -> tuple[dict[str, Any], Digests]:
-    """Write a partition.
-
-    Parameters
-    ----------
-    asked : Finish
-        Which, and where everything is.
-
-    Returns
-    -------
-    result : dict
-        Stars and repeated records in it, its digest and size, and its share of the map of counts.
-    written : dict of Path to str
-        All files that were written, with digests.
-    """
+    """Write a partition."""
     index = read_index(asked.index)
     repeated = _read_places(asked.repeated)
     pixel = asked.pixel
@@ -117,13 +104,7 @@ def finish(asked: Finish) -> tuple[dict[str, Any], Digests]:
 
 @lru_cache(maxsize=1)
 def store_schema() -> pa.Schema:
-    """Return the columns of a store.
-
-    Returns
-    -------
-    pyarrow.Schema
-        ``_healpix_29`` in front of the released stars schema, which it names.
-    """
+    """Return the columns of a store."""
     schema = product_schema("stars").arrow_schema
     return pa.schema([pixel_field(), *schema], metadata=schema.metadata)
 
@@ -194,22 +175,7 @@ def _empty(schema: pa.Schema) -> pa.RecordBatch:
 
 
 def rows_within(pixels: Pixels, order: int, wanted: Pixels, but: Pixel) -> NDArray[np.int64]:
-    """Return the stars that lie in some pixels.
-
-    Parameters
-    ----------
-    pixels : ndarray of int64, shape (N,)
-        Their pixels of order 29, ascending.
-    order, wanted : int, ndarray of int64, shape (M,)
-        The pixels, ascending.
-    but : Pixel
-        Stars in this one are left out.
-
-    Returns
-    -------
-    ndarray of int64, shape (K,)
-        Rows, ascending.
-    """
+    """Return the stars that lie in some pixels."""
     shift = 2 * (MAX_ORDER - order)
     begins = np.searchsorted(pixels, wanted << shift)
     ends = np.searchsorted(pixels, (wanted + 1) << shift)
@@ -221,18 +187,7 @@ def rows_within(pixels: Pixels, order: int, wanted: Pixels, but: Pixel) -> NDArr
 
 
 def border_path(folder: Path, pixel: Pixel) -> Path:
-    """Return the file of the stars of a partition that border on others.
-
-    Parameters
-    ----------
-    folder, pixel : Path, Pixel
-        Folder of such files, and the partition.
-
-    Returns
-    -------
-    Path
-        An Arrow file.
-    """
+    """Return the file of the stars of a partition that border on others."""
     return folder / f"{pixel.order}-{pixel.number}.arrow"
 
 
@@ -256,20 +211,7 @@ class Margin:
 
 
 def write_margin(asked: Margin) -> tuple[dict[str, Any], Digests]:
-    """Write the margin of a partition.
-
-    Parameters
-    ----------
-    asked : Margin
-        Which, and where its stars are.
-
-    Returns
-    -------
-    result : dict
-        Stars in it, and its size where there are any.
-    written : dict of Path to str
-        What was written, with its digest: nothing for no star.
-    """
+    """Write the margin of a partition."""
     stars = _read_borders(asked.batches)
     if not len(stars):
         return {"rows": 0}, {}

@@ -40,35 +40,11 @@ class RunIndex:
     buckets: NDArray[np.int64]
 
     def shares(self, pixel: Pixel) -> list[Share]:
-        """Return the batches that hold the stars of a pixel.
-
-        Parameters
-        ----------
-        pixel : Pixel
-            Of any order.
-
-        Returns
-        -------
-        list of Share
-            One for each run that has any.
-        """
+        """Return the batches that hold the stars of a pixel."""
         return self.shares_of(pixel.order, np.array([pixel.number]))
 
     def shares_of(self, order: int, pixels: Pixels) -> list[Share]:
-        """Return the batches that hold the stars of several pixels.
-
-        Parameters
-        ----------
-        order : int
-            Order of the pixels.
-        pixels : ndarray of int64, shape (N,)
-            Their numbers.
-
-        Returns
-        -------
-        list of Share
-            One for each run that has any.
-        """
+        """Return the batches that hold the stars of several pixels."""
         coarse = at_order(order, pixels, self.order)
         begins = np.searchsorted(self.pixels, coarse)
         ends = np.searchsorted(self.pixels, coarse, side="right")
@@ -84,20 +60,7 @@ class RunIndex:
 
 
 def read_runs(path: Path, count: int) -> list[Run]:
-    """Read what the runs of a file hold.
-
-    Parameters
-    ----------
-    path : Path
-        As splitting wrote it, beside the runs.
-    count : int
-        Number of runs.
-
-    Returns
-    -------
-    list of Run
-        In reading order.
-    """
+    """Read what the runs of a file hold."""
     with np.load(path) as held:
         return [
             Run(
@@ -112,17 +75,7 @@ def read_runs(path: Path, count: int) -> list[Run]:
 
 
 def write_index(path: Path, order: int, runs: Sequence[Run]) -> None:
-    """Write the index of all runs.
-
-    Parameters
-    ----------
-    path : Path
-        Overwritten.
-    order : int
-        Order of the coarse pixels.
-    runs : sequence of Run
-        In reading order.
-    """
+    """Write the index of all runs."""
     empty = np.empty(0, dtype=np.int64)
     pixels = np.concatenate([empty, *(run.pixels for run in runs)])
     number = np.repeat(np.arange(len(runs)), [len(run.pixels) for run in runs])
@@ -141,18 +94,7 @@ def write_index(path: Path, order: int, runs: Sequence[Run]) -> None:
 
 @lru_cache(maxsize=2)
 def read_index(path: Path) -> RunIndex:
-    """Read the index of all runs; a worker does so once.
-
-    Parameters
-    ----------
-    path : Path
-        As `write_index` wrote it.
-
-    Returns
-    -------
-    RunIndex
-        The index.
-    """
+    """Read the index of all runs; a worker does so once."""
     with np.load(path) as held:
         paths = tuple(Path(text) for text in held["paths"].tolist())
         names = ("pixels", "runs", "batches", "buckets")
@@ -160,18 +102,7 @@ def read_index(path: Path) -> RunIndex:
 
 
 def find_repeated(asked: tuple[Path, int]) -> NDArray[np.int64]:
-    """Return the records of a bucket of numbers whose star was read before.
-
-    Parameters
-    ----------
-    asked : (Path, int)
-        File of the index, and number of the bucket.
-
-    Returns
-    -------
-    ndarray of int64, shape (N,)
-        Places, ascending: of each star all records but the first in reading order.
-    """
+    """Return the records of a bucket of numbers whose star was read before."""
     index = read_index(asked[0])
     ranges = index.buckets[:, asked[1] : asked[1] + 2].tolist()
     files = [path.with_suffix(".places") for path in index.paths]

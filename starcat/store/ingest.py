@@ -136,41 +136,7 @@ def ingest_to_store(
     options: StoreOptions | None = None,
     progress: Progress = no_progress,
 ) -> Stored:
-    """Read a star catalog of any size into a catalog store.
-
-    Parameters
-    ----------
-    source_name : str
-        A star catalog of ``data_sources``.
-    paths : sequence of Path
-        Its files or the folders that hold them.
-    output : Path
-        The folder that the store becomes, when all of it is there.
-    band : str, optional
-        Band of ``mag``; the source's first by default.
-    epoch_jyear : float, optional
-        Julian year to move positions to; by default every star stays at its own epoch.
-    read_limit_mag : float, optional
-        Fainter records are counted and left out.
-    options : StoreOptions, optional
-        Partitions, memory and workers.
-    progress : Progress
-        Called with (stage, done, total).
-
-    Returns
-    -------
-    Stored
-        The store and what is worth telling about it.
-
-    Raises
-    ------
-    ConfigError
-        If the source is no star catalog, has no such band, or an option cannot be met.
-    SourceError
-        If a file is missing, damaged, or not of this archive. What is done is kept for --resume.
-    OutputError
-        If the store cannot be written, or another is there.
-    """
+    """Read a star catalog of any size into a catalog store."""
     options = options or StoreOptions()
     source = star_catalog(source_name)
     how = Reading(source_name, check_band(source, band), epoch_jyear, read_limit_mag)
@@ -321,20 +287,7 @@ def _finish_all(
 
 
 def bordering(pixels: Sequence[Pixel], margin_rad: float) -> Bordering:
-    """Return for each partition those whose margins reach into it.
-
-    Parameters
-    ----------
-    pixels : sequence of Pixel
-        All partitions, by their place on the sky.
-    margin_rad : float
-        How far margins reach.
-
-    Returns
-    -------
-    dict of Pixel to tuple of Pixel
-        In the order of the partitions.
-    """
+    """Return for each partition those whose margins reach into it."""
     firsts = np.array([pixel.first for pixel in pixels])
     ends = np.array([pixel.end for pixel in pixels])
     found: dict[Pixel, list[Pixel]] = {pixel: [] for pixel in pixels}

@@ -107,41 +107,12 @@ class Store:
 
 
 def is_store(folder: Path) -> bool:
-    """Return whether a folder is a HATS collection or catalog.
-
-    Parameters
-    ----------
-    folder : Path
-        Any path.
-
-    Returns
-    -------
-    bool
-        True where one of the files is there that say so.
-    """
+    """Return whether a folder is a HATS collection or catalog."""
     return any((folder / name).is_file() for name in (COLLECTION_NAME, *PROPERTIES_NAMES))
 
 
 def open_store(folder: Path) -> Store:
-    """Open a catalog store; no star is read.
-
-    Parameters
-    ----------
-    folder : Path
-        A HATS collection or catalog, of starcat or of others.
-
-    Returns
-    -------
-    Store
-        Its partitions.
-
-    Raises
-    ------
-    TargetMissing
-        If the folder does not exist.
-    ProductError
-        If it is no such folder, or a file or partition is missing.
-    """
+    """Open a catalog store; no star is read."""
     if not folder.exists():
         raise TargetMissing(f"{folder}: does not exist; give the folder of a HATS catalog")
     if not (folder / COLLECTION_NAME).is_file():
@@ -226,23 +197,7 @@ def _partition(folder: Path, pixel: Pixel, suffix: str) -> Partition:
 
 
 def read_properties(path: Path) -> dict[str, str]:
-    """Read a file of properties.
-
-    Parameters
-    ----------
-    path : Path
-        Lines of ``key=value``; empty lines and those that begin with # or ! are comments.
-
-    Returns
-    -------
-    dict of str to str
-        In the order of the file.
-
-    Raises
-    ------
-    ProductError
-        If it cannot be read.
-    """
+    """Read a file of properties."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -252,14 +207,6 @@ def read_properties(path: Path) -> dict[str, str]:
 
 
 def write_properties(path: Path, known: Mapping[str, Any]) -> None:
-    """Write a file of properties, the same bytes for the same content.
-
-    Parameters
-    ----------
-    path : Path
-        Overwritten.
-    known : mapping of str to object
-        Keys and values in their order.
-    """
+    """Write a file of properties, the same bytes for the same content."""
     text = "".join(f"{key}={value}\n" for key, value in known.items())
     path.write_text(text, encoding="utf-8", newline="\n")

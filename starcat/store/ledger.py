@@ -31,18 +31,7 @@ Task = Callable[[Any], tuple[dict[str, Any], Digests]]
 
 
 def digests_of(files: Iterable[Path]) -> Digests:
-    """Return the digests of files.
-
-    Parameters
-    ----------
-    files : iterable of Path
-        What a task has written.
-
-    Returns
-    -------
-    dict of Path to str
-        SHA-256, hexadecimal.
-    """
+    """Return the digests of files."""
     return {file: file_sha256(file) for file in files}
 
 
@@ -60,18 +49,7 @@ class Work:
 
     @classmethod
     def of(cls, final: Path) -> Work:
-        """Return the folder for a store.
-
-        Parameters
-        ----------
-        final : Path
-            Where the store will be.
-
-        Returns
-        -------
-        Work
-            Not made yet.
-        """
+        """Return the folder for a store."""
         return cls(final.absolute().parent / f".{final.name}.work")
 
     def __truediv__(self, name: str) -> Path:
@@ -79,22 +57,7 @@ class Work:
         return self.folder / name
 
     def begin(self, options: Mapping[str, Any], *, resume: bool) -> None:
-        """Make the folder, or take up the run that was begun in it.
-
-        Parameters
-        ----------
-        options : mapping of str to object
-            All that the result depends on, as plain values.
-        resume : bool
-            Whether to go on where a run was.
-
-        Raises
-        ------
-        OutputError
-            If a run was begun and is not to be resumed.
-        ConfigError
-            If it was begun with other options.
-        """
+        """Make the folder, or take up the run that was begun in it."""
         path = self / OPTIONS_NAME
         if path.is_file() and not resume:
             raise OutputError(
@@ -122,19 +85,7 @@ class Work:
                 )
 
     def done(self, name: str) -> dict[str, Any] | None:
-        """Return the result of a task that is done.
-
-        Parameters
-        ----------
-        name : str
-            Name of the task.
-
-        Returns
-        -------
-        dict or None
-            None where it has to be done, for the first time or again: a file that it wrote is
-            missing, or is not what it wrote.
-        """
+        """Return the result of a task that is done."""
         path = self._record(name)
         try:
             record = json.loads(path.read_bytes())
@@ -147,17 +98,7 @@ class Work:
         return None
 
     def record(self, name: str, result: Mapping[str, Any], written: Digests) -> None:
-        """Record that a task is done.
-
-        Parameters
-        ----------
-        name : str
-            Name of the task.
-        result : mapping of str to object
-            Plain values.
-        written : dict of Path to str
-            All that it wrote, with digests.
-        """
+        """Record that a task is done."""
         digests = {
             file.relative_to(self.folder).as_posix(): digest for file, digest in written.items()
         }
@@ -200,18 +141,7 @@ class Job:
     is_valid: Callable[[Any, dict[str, Any]], bool] = _always
 
     def run(self) -> dict[str, Any]:
-        """Do the task and record it, if it is not done.
-
-        Returns
-        -------
-        dict
-            Its result.
-
-        Raises
-        ------
-        OutputError
-            If its files cannot be written, as on a full disk.
-        """
+        """Do the task and record it, if it is not done."""
         before = self.work.done(self.name)
         if before is not None and self.is_valid(self.asked, before):
             return before

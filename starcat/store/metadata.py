@@ -54,24 +54,7 @@ class Described:
 def write_slices(
     stars: pa.Table, partitions: Sequence[Pixel], folder: Path, row_group_rows: int
 ) -> int:
-    """Write the partitions of a table that is held in memory.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        With ``_healpix_29``, ascending.
-    partitions : sequence of Pixel
-        Each becomes a file, with or without stars.
-    folder : Path
-        Of the HATS catalog; made.
-    row_group_rows : int
-        Stars of a row group at most.
-
-    Returns
-    -------
-    int
-        Size of the files.
-    """
+    """Write the partitions of a table that is held in memory."""
     pixels = stars[HEALPIX_COLUMN].to_numpy()
     size = 0
     for pixel in partitions:
@@ -85,31 +68,13 @@ def write_slices(
 
 
 def write_pixel_list(folder: Path, partitions: Sequence[Pixel]) -> None:
-    """Write which partitions a HATS catalog has.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the catalog.
-    partitions : sequence of Pixel
-        By their place on the sky.
-    """
+    """Write which partitions a HATS catalog has."""
     lines = "".join(f"{pixel.order},{pixel.number}\n" for pixel in partitions)
     (folder / PARTITIONS_NAME).write_text(f"Norder,Npix\n{lines}", encoding="utf-8", newline="\n")
 
 
 def describe_catalog(folder: Path, catalog: Described, schema: pa.Schema) -> None:
-    """Write what a HATS catalog has beside its partitions.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder with the partitions under ``dataset/``.
-    catalog : Described
-        Its name and counts.
-    schema : pyarrow.Schema
-        Columns, with units and meanings.
-    """
+    """Write what a HATS catalog has beside its partitions."""
     dataset = folder / DATASET
     footers = []
     for pixel in catalog.pixels:
@@ -143,17 +108,7 @@ def _properties(catalog: Described) -> dict[str, Any]:
 
 
 def write_skymap(path: Path, order: int, counts: NDArray[np.int64]) -> None:
-    """Write how many stars each pixel has, as a HEALPix map in a FITS file.
-
-    Parameters
-    ----------
-    path : Path
-        Overwritten.
-    order : int
-        Order of the pixels.
-    counts : ndarray of int64, shape (12 * 4**order,)
-        Stars, by nested pixel.
-    """
+    """Write how many stars each pixel has, as a HEALPix map in a FITS file."""
     from astropy.io import fits
 
     column = fits.Column("PIXELS", "K", array=counts)
@@ -174,20 +129,7 @@ def write_skymap(path: Path, order: int, counts: NDArray[np.int64]) -> None:
 
 
 def sum_maps(order: int, maps: Sequence[Sequence[Sequence[int]]]) -> NDArray[np.int64]:
-    """Return the sum of maps that list the pixels that have stars.
-
-    Parameters
-    ----------
-    order : int
-        Order of the pixels.
-    maps : sequence of (sequence of int, sequence of int)
-        Pixels, and how many stars each has.
-
-    Returns
-    -------
-    ndarray of int64, shape (12 * 4**order,)
-        Stars, by nested pixel.
-    """
+    """Return the sum of maps that list the pixels that have stars."""
     counts = np.zeros(12 * 4**order, dtype=np.int64)
     for pixels, found in maps:
         np.add.at(counts, pixels, found)

@@ -55,25 +55,7 @@ class _Nearest:
 
 
 def add_neighbours(stars: pa.Table, pixel: Pixel, around: Around, is_alone: bool) -> pa.Table:
-    """Return the stars of a partition with the columns of the nearest neighbour filled in.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        All stars in the pixel, each once, with the columns `COLUMNS`.
-    pixel : Pixel
-        The partition.
-    around : callable
-        Gives the stars within a distance of the partition.
-    is_alone : bool
-        Whether the catalog has no other star.
-
-    Returns
-    -------
-    pyarrow.Table
-        The same rows, with two more columns, which have the values that `add_nearest_neighbours`
-        gives the whole catalog.
-    """
+    """Return the stars of a partition with the columns of the nearest neighbour filled in."""
     if is_alone or not len(stars):
         return stars
     reach = _first_reach(pixel, len(stars))

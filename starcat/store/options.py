@@ -47,23 +47,7 @@ class StoreOptions:
 
 
 def rows_of_a_run(options: StoreOptions) -> int:
-    """Return how many stars a run may have within the memory that is allowed.
-
-    Parameters
-    ----------
-    options : StoreOptions
-        Memory, workers and size of the partitions.
-
-    Returns
-    -------
-    int
-        Stars.
-
-    Raises
-    ------
-    ConfigError
-        If a worker has too little for a partition.
-    """
+    """Return how many stars a run may have within the memory that is allowed."""
     each = (options.memory_bytes - _BASE_BYTES) // options.workers - _BASE_BYTES
     needed = options.max_partition_rows * _BYTES_A_PARTITION_ROW
     if options.scheduler is None and each < needed:

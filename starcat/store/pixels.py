@@ -70,36 +70,12 @@ class Pixel:
         return Path(f"Norder={self.order}") / f"Dir={folder}" / f"Npix={self.number}.parquet"
 
     def at(self, order: int) -> Pixels:
-        """Return the pixels of another order that it has a part in.
-
-        Parameters
-        ----------
-        order : int
-            Any.
-
-        Returns
-        -------
-        ndarray of int64, shape (N,)
-            Ascending: those within it, or the one that it lies in.
-        """
+        """Return the pixels of another order that it has a part in."""
         return at_order(self.order, np.array([self.number], dtype=np.int64), order)
 
 
 def at_order(order: int, pixels: Pixels, other: int) -> Pixels:
-    """Return the pixels of another order that some pixels have a part in.
-
-    Parameters
-    ----------
-    order, pixels : int, ndarray of int64, shape (N,)
-        The pixels.
-    other : int
-        The other order.
-
-    Returns
-    -------
-    ndarray of int64, shape (M,)
-        Ascending, each once: those within them, or the ones that they lie in.
-    """
+    """Return the pixels of another order that some pixels have a part in."""
     if other <= order:
         return np.unique(pixels >> 2 * (order - other))
     shift = 2 * (other - order)
@@ -107,55 +83,20 @@ def at_order(order: int, pixels: Pixels, other: int) -> Pixels:
 
 
 def runs_of(pixels: Pixels, order: int) -> tuple[Pixels, Pixels, Pixels]:
-    """Return which pixels of an order stars are in, where each begins, and how many it has.
-
-    Parameters
-    ----------
-    pixels : ndarray of int64, shape (N,)
-        Pixels of order 29, ascending.
-    order : int
-        A lower order.
-
-    Returns
-    -------
-    numbers, begins, counts : ndarray of int64, shape (M,)
-        Pixels, ascending; row of the first star; number of stars.
-    """
+    """Return which pixels of an order stars are in, where each begins, and how many it has."""
     lower = pixels >> 2 * (MAX_ORDER - order)
     begins = np.flatnonzero(np.diff(lower, prepend=-1))
     return lower[begins], begins, np.diff(begins, append=len(pixels))
 
 
 def pixel_field() -> pa.Field:
-    """Return the column of the stars' pixels.
-
-    Returns
-    -------
-    pyarrow.Field
-        With its meaning.
-    """
+    """Return the column of the stars' pixels."""
     meaning = {"description": "Nested HEALPix pixel of order 29, ICRS", "ucd": "pos.healpix"}
     return pa.field(HEALPIX_COLUMN, pa.int64(), nullable=False, metadata=meaning)
 
 
 def healpix_29(ra_deg: NDArray[np.float64], dec_deg: NDArray[np.float64]) -> Pixels:
-    """Return the nested HEALPix pixels of order 29 that positions lie in.
-
-    Parameters
-    ----------
-    ra_deg, dec_deg : ndarray of float64, shape (N,)
-        Positions, degrees, finite.
-
-    Returns
-    -------
-    ndarray of int64, shape (N,)
-        Pixels as LSDB computes them, which uses the same library.
-
-    Raises
-    ------
-    ConfigError
-        If cdshealpix is not installed.
-    """
+    """Return the nested HEALPix pixels of order 29 that positions lie in."""
     from astropy import units
     from astropy.coordinates import Latitude, Longitude
 
@@ -168,23 +109,7 @@ def healpix_29(ra_deg: NDArray[np.float64], dec_deg: NDArray[np.float64]) -> Pix
 
 
 def border_of(pixel: Pixel, width_rad: float) -> tuple[int, Pixels]:
-    """Return pixels that hold everything within a distance of a pixel.
-
-    Parameters
-    ----------
-    pixel : Pixel
-        The pixel.
-    width_rad : float
-        The distance, radians.
-
-    Returns
-    -------
-    order : int
-        Their order: the highest of which no pixel is narrower than the distance, or somewhat lower.
-    pixels : ndarray of int64, shape (N,)
-        Ascending. The ring of them around the pixel, where they are no larger than it; else the
-        one that it lies in and those around that one.
-    """
+    """Return pixels that hold everything within a distance of a pixel."""
     order = min(border_order(width_rad), pixel.order + _DEEPEST)
     if width_rad > _FIRST_WIDTH_RAD:
         return 0, np.arange(12, dtype=np.int64)
@@ -198,54 +123,18 @@ def border_of(pixel: Pixel, width_rad: float) -> tuple[int, Pixels]:
 
 
 def neighbours_of(pixels: Pixels, order: int) -> Pixels:
-    """Return the pixels that touch others, at an edge or a corner.
-
-    Parameters
-    ----------
-    pixels : ndarray of int64, shape (N,)
-        Pixels of one order.
-    order : int
-        That order.
-
-    Returns
-    -------
-    ndarray of int64, shape (M,)
-        Ascending; pixels given are among them where they touch each other.
-    """
+    """Return the pixels that touch others, at an edge or a corner."""
     return _valid(_nested().neighbours(pixels, order))
 
 
 def border_order(width_rad: float) -> int:
-    """Return the highest order of which no pixel is narrower than a width.
-
-    Parameters
-    ----------
-    width_rad : float
-        Radians.
-
-    Returns
-    -------
-    int
-        0 to 29; 0 also where no order has pixels that wide.
-    """
+    """Return the highest order of which no pixel is narrower than a width."""
     widths = least_width_rad(np.arange(MAX_ORDER + 1))
     return max(0, int(np.searchsorted(-widths, -width_rad, side="right")) - 1)
 
 
 def least_width_rad(order: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
-    """Return a width that no pixel of an order falls short of.
-
-    Parameters
-    ----------
-    order : ndarray of int, shape (N,)
-        Orders.
-
-    Returns
-    -------
-    ndarray of float64, shape (N,)
-        Radians: 0.45 times the square root of a pixel's area. The narrowest pixels, near the
-        poles, have 0.480 of it between opposite edges (all pixels of orders 0 to 8 measured).
-    """
+    """Return a width that no pixel of an order falls short of."""
     return np.asarray(_FIRST_WIDTH_RAD / 2.0 ** np.asarray(order, dtype=np.float64))
 
 

@@ -20,27 +20,6 @@ def partition_pixels(
 ) -> tuple[Pixel, ...]:
     """Return the largest pixels that hold no more stars than allowed and cover all of them.
 
-    Parameters
-    ----------
-    pixels, counts : ndarray of int64, shape (N,)
-        Pixels that have stars, ascending, and how many.
-    order : int
-        Order of the pixels.
-    max_rows : int
-        Stars that a partition may hold.
-    name : str
-        The catalog, for messages.
-
-    Returns
-    -------
-    tuple of Pixel
-        By their place on the sky; each is as large as it can be.
-
-    Raises
-    ------
-    ConfigError
-        If one of the pixels given holds more by itself.
-
     Examples
     --------
     >>> partition_pixels(np.array([0, 1, 40]), np.array([5, 5, 3]), 2, 5, "some")
@@ -65,17 +44,6 @@ def partition_pixels(
 
 
 def spill_order(rows: int) -> int:
-    """Return the order of the coarse pixels that runs have batches of.
-
-    Parameters
-    ----------
-    rows : int
-        About how many stars there are.
-
-    Returns
-    -------
-    int
-        Such that a batch has some thousands of them.
-    """
+    """Return the order of the coarse pixels that runs have batches of."""
     least, most = _SPILL_ORDERS
     return next((k for k in range(least, most) if rows <= 12 * 4**k * _ROWS_A_BATCH), most)

@@ -55,31 +55,7 @@ def read_catalog(
     workers: int = 2,
     progress: Progress = no_progress,
 ) -> Ingested:
-    """Read a star catalog from a store or from archive files.
-
-    Parameters
-    ----------
-    source_name : str
-        A star catalog of ``data_sources``.
-    paths : sequence of Path
-        A store, or the archive's files and the folders that hold them.
-    band, epoch_jyear, read_limit_mag, neighbours, workers, progress
-        As `starcat.catalog.ingest.ingest` has them.
-
-    Returns
-    -------
-    Ingested
-        The same from either.
-
-    Raises
-    ------
-    ConfigError
-        If a store was made of another catalog or otherwise, or is one of several inputs.
-    SourceError, ProductError, SchemaError
-        If a file is missing, damaged, or not of this catalog.
-    BuildError
-        If the records read are not all kept or rejected.
-    """
+    """Read a star catalog from a store or from archive files."""
     if not any(path.is_dir() and is_store(path) for path in paths):
         return ingest(
             source_name,
@@ -173,25 +149,7 @@ def _joined(
 
 
 def read_manifest(store: Store) -> dict[str, Any] | None:
-    """Return what a store says of itself.
-
-    Parameters
-    ----------
-    store : Store
-        A store, or a catalog of others.
-
-    Returns
-    -------
-    dict or None
-        None for a catalog of others.
-
-    Raises
-    ------
-    ProductError
-        If it cannot be read.
-    SchemaVersionError
-        If another version of starcat wrote it in another way.
-    """
+    """Return what a store says of itself."""
     if not store.is_ours:
         return None
     path = store.folder / MANIFEST_NAME

@@ -62,18 +62,7 @@ class Region:
         return tuple(sorted([(self.core.first, self.core.end), *both]))
 
     def level_of(self, pixels: Pixels) -> Levels:
-        """Return which ring places are in.
-
-        Parameters
-        ----------
-        pixels : ndarray of int64, shape (M,)
-            Pixels of order 29.
-
-        Returns
-        -------
-        ndarray of int64, shape (M,)
-            0 for the pixel in the middle, then the number of the ring; -1 outside.
-        """
+        """Return which ring places are in."""
         if self.core is None:
             return np.zeros(len(pixels), dtype=np.int64)
         found = np.full(len(pixels), -1, dtype=np.int64)
@@ -86,22 +75,7 @@ class Region:
 
 
 def region_around(pixel: Pixel, hop_rad: float, rings: int) -> Region:
-    """Return the region with so many rings around a pixel.
-
-    Parameters
-    ----------
-    pixel : Pixel
-        In the middle. Where it is narrower than a hop, the pixel above it that is not is there.
-    hop_rad : float
-        What no ring is narrower than, radians.
-    rings : int
-        Number of rings, at least 1.
-
-    Returns
-    -------
-    Region
-        The whole sky where a hop is wider than any pixel.
-    """
+    """Return the region with so many rings around a pixel."""
     widest, finest = least_width_rad(np.array([0, min(pixel.order + FINEST_RINGS, MAX_ORDER)]))
     nothing = np.empty(0, dtype=np.int64)
     if not hop_rad <= widest:

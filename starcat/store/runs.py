@@ -80,41 +80,13 @@ class Share:
 
 
 def places_of(stars: pa.Table) -> NDArray[np.int64]:
-    """Return file and line of every star as one number, in reading order.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        With ``source_file`` and ``source_line``.
-
-    Returns
-    -------
-    ndarray of int64, shape (N,)
-        The number of the file above 40 bits of the line's.
-    """
+    """Return file and line of every star as one number, in reading order."""
     file = stars["source_file"].to_numpy().astype(np.int64)
     return np.asarray((file << _PLACE_BITS) | stars["source_line"].to_numpy())
 
 
 def write_run(stars: pa.Table, order: int, folder: Path, name: str) -> tuple[Run, Pixels]:
-    """Write stars as a run.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        Table of the stars schema, in reading order.
-    order : int
-        Order of the coarse pixels.
-    folder, name : Path, str
-        Where, and what its files are called.
-
-    Returns
-    -------
-    run : Run
-        As written.
-    pixels : ndarray of int64, shape (N,)
-        Pixel of order 29 of every star, ascending.
-    """
+    """Write stars as a run."""
     pixels = healpix_29(floats_of(stars, "ra_deg"), floats_of(stars, "dec_deg"))
     ascending = np.argsort(pixels, kind="stable")
     pixels = pixels[ascending]
@@ -169,18 +141,7 @@ def _by_bucket(stars: pa.Table) -> tuple[NDArray[Any], NDArray[np.int64]]:
 
 
 def repeated_places(ranges: Sequence[tuple[Path, Sequence[int]]]) -> NDArray[np.int64]:
-    """Return the records whose star was read before.
-
-    Parameters
-    ----------
-    ranges : sequence of (Path, (int, int))
-        Files of `PLACES`, and which records of each: first, and the one behind the last.
-
-    Returns
-    -------
-    ndarray of int64, shape (N,)
-        Places, ascending: of each star all records but the first in reading order.
-    """
+    """Return the records whose star was read before."""
     parts = []
     for path, (begin, end) in ranges:
         offset = begin * PLACES.itemsize
@@ -199,23 +160,7 @@ def repeated_places(ranges: Sequence[tuple[Path, Sequence[int]]]) -> NDArray[np.
 def read_shares(
     shares: Sequence[Share], first: int, end: int, names: Sequence[str] | None = None
 ) -> pa.Table:
-    """Read the stars of some pixels from their runs.
-
-    Parameters
-    ----------
-    shares : sequence of Share
-        Batches to read.
-    first, end : int
-        Stars below the first or from the second pixel of order 29 on are left out.
-    names : sequence of str, optional
-        Columns of the stars schema to read; all by default.
-
-    Returns
-    -------
-    pyarrow.Table
-        ``_healpix_29`` and the columns, in the order of the shares. Columns of one value are in
-        the metadata: `with_constants` puts them back.
-    """
+    """Read the stars of some pixels from their runs."""
     schema = product_schema("stars").arrow_schema
     wanted = list(schema.names if names is None else names)
     parts: list[pa.Table] = []
@@ -264,20 +209,7 @@ def _joined(
 
 
 def with_constants(stars: pa.Table, schema: pa.Schema) -> pa.Table:
-    """Return stars with the columns of one value put back.
-
-    Parameters
-    ----------
-    stars : pyarrow.Table
-        As `read_shares` returns them: any rows, and values of other columns too.
-    schema : pyarrow.Schema
-        All columns.
-
-    Returns
-    -------
-    pyarrow.Table
-        Of that schema.
-    """
+    """Return stars with the columns of one value put back."""
     constants = json.loads((stars.schema.metadata or {}).get(_CONSTANTS, b"{}"))
     columns = [
         stars[field.name]

@@ -110,26 +110,7 @@ class _Written:
 
 
 def split(asked: Split) -> tuple[dict[str, Any], Digests]:
-    """Split a file.
-
-    Parameters
-    ----------
-    asked : Split
-        The file and what to make of it.
-
-    Returns
-    -------
-    result : dict
-        What was read, as plain values: the file's facts, counts by reason, the first malformed
-        records, and how many runs there are.
-    written : dict of Path to str
-        All files that were written, with digests.
-
-    Raises
-    ------
-    SourceError
-        If the file is damaged, or not of this archive.
-    """
+    """Split a file."""
     (asked.rejected / f"{asked.name}.parquet").unlink(missing_ok=True)
     written = _Written(asked)
     reading = FileReading(asked.file, asked.number, data_source(asked.how.source_name), asked.how)
@@ -159,20 +140,7 @@ def split(asked: Split) -> tuple[dict[str, Any], Digests]:
 
 
 def is_unchanged(asked: Split, result: dict[str, Any]) -> bool:
-    """Return whether a file is still what it was when it was split.
-
-    Parameters
-    ----------
-    asked : Split
-        The file.
-    result : dict
-        What splitting it gave.
-
-    Returns
-    -------
-    bool
-        By the digest of the file.
-    """
+    """Return whether a file is still what it was when it was split."""
     return bool(file_sha256(asked.file.path) == result["file"]["sha256"])
 
 

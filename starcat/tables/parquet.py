@@ -17,32 +17,13 @@ ROW_GROUP_ROWS = 1 << 17
 
 
 def write_parquet(table: pa.Table, path: Path) -> None:
-    """Write a table, the same bytes for the same table and library.
-
-    Parameters
-    ----------
-    table : pyarrow.Table
-        The product; units and meanings are in its field metadata.
-    path : Path
-        Overwritten if it exists.
-    """
+    """Write a table, the same bytes for the same table and library."""
     with _writer(table, path) as writer:
         writer.write_table(table.replace_schema_metadata(None), row_group_size=ROW_GROUP_ROWS)
 
 
 def write_parts(parts: Iterable[pa.Table], example: pa.Table, path: Path) -> None:
-    """Write a table that is there part by part, the same bytes however it is divided.
-
-    Parameters
-    ----------
-    parts : iterable of pyarrow.Table
-        The rows, in order.
-    example : pyarrow.Table
-        Of the same columns, with texts as long as the longest of each: the footer says how long
-        they are.
-    path : Path
-        Overwritten if it exists.
-    """
+    """Write a table that is there part by part, the same bytes however it is divided."""
     waiting = example.schema.empty_table()
     groups = 0
     with _writer(example, path) as writer:
@@ -62,18 +43,7 @@ def _write_group(writer: pq.ParquetWriter, rows: pa.Table) -> None:
 
 
 def parquet_bytes(table: pa.Table) -> int:
-    """Return how large the file of a table will be.
-
-    Parameters
-    ----------
-    table : pyarrow.Table
-        As for `write_parquet`.
-
-    Returns
-    -------
-    int
-        Bytes, to the last one: they are counted and thrown away.
-    """
+    """Return how large the file of a table will be."""
     counted = pa.MockOutputStream()
     with _writer(table, counted) as writer:
         writer.write_table(table.replace_schema_metadata(None), row_group_size=ROW_GROUP_ROWS)
@@ -105,36 +75,12 @@ def _writer(table: pa.Table, path: Path | pa.NativeFile) -> Iterator[pq.ParquetW
 
 
 def read_parquet(path: Path) -> pa.Table:
-    """Read a whole Parquet file.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    pyarrow.Table
-        With its field metadata.
-    """
+    """Read a whole Parquet file."""
     with pq.ParquetFile(path) as file:
         return file.read()
 
 
 def write_table(table: pa.Table, path: Path) -> None:
-    """Write a table as a Parquet file.
-
-    Parameters
-    ----------
-    table : pyarrow.Table
-        Units and meanings are in its field metadata.
-    path : Path
-        Replaced when the new file is whole.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
+    """Write a table as a Parquet file."""
     with whole_file(path) as partial:
         write_parquet(table, partial)

@@ -114,18 +114,7 @@ class ProductSchema:
         return pa.schema([column.arrow_field for column in self.columns], metadata)
 
     def check(self, table: pa.Table) -> None:
-        """Check that a table has exactly the columns of the schema.
-
-        Parameters
-        ----------
-        table : pyarrow.Table
-            The table.
-
-        Raises
-        ------
-        SchemaError
-            If a column is missing, unknown, of another type or wrongly null.
-        """
+        """Check that a table has exactly the columns of the schema."""
         expected = [column.name for column in self.columns]
         if table.column_names != expected:
             odd = sorted(set(table.column_names) ^ set(expected)) or table.column_names
@@ -156,18 +145,7 @@ class ProductSchema:
 
 
 def read_schema(path: Path) -> ProductSchema:
-    """Read a schema file, with the columns of the schema that it extends.
-
-    Parameters
-    ----------
-    path : Path
-        A file of ``schemas/``.
-
-    Returns
-    -------
-    ProductSchema
-        The contract.
-    """
+    """Read a schema file, with the columns of the schema that it extends."""
     content = json.loads(path.read_text(encoding="utf-8"))
     columns: list[SchemaColumn] = []
     if "extends" in content:
@@ -203,23 +181,6 @@ def read_schema(path: Path) -> ProductSchema:
 @cache
 def product_schema(product: str, version: str | None = None) -> ProductSchema:
     """Return the schema of a product.
-
-    Parameters
-    ----------
-    product : str
-        Name of the product.
-    version : str, optional
-        Semantic version; the newest known by default.
-
-    Returns
-    -------
-    ProductSchema
-        The contract.
-
-    Raises
-    ------
-    SchemaVersionError
-        If this starcat does not know the product or the version.
 
     Examples
     --------

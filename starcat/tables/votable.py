@@ -29,16 +29,6 @@ _DATATYPES = {
 def votable_metadata(table: pa.Table) -> dict[str, str]:
     """Return what makes a Parquet file a VOParquet file.
 
-    Parameters
-    ----------
-    table : pyarrow.Table
-        With unit, description and ucd in its field metadata.
-
-    Returns
-    -------
-    dict of str to str
-        For the file's key-value metadata.
-
     References
     ----------
     VOParquet 1.0, IVOA Note, January 2025.
@@ -50,18 +40,7 @@ def votable_metadata(table: pa.Table) -> dict[str, str]:
 
 
 def astropy_metadata(table: pa.Table) -> dict[str, str]:
-    """Return what astropy's reader of Parquet looks for in the metadata of the schema.
-
-    Parameters
-    ----------
-    table : pyarrow.Table
-        With unit and description in its field metadata.
-
-    Returns
-    -------
-    dict of str to str
-        Units and descriptions, and the length of the longest text of each text column.
-    """
+    """Return what astropy's reader of Parquet looks for in the metadata of the schema."""
     columns = []
     for field in table.schema:
         known = {key: text for key, text in _facts(field).items() if key != "ucd"}
@@ -73,18 +52,7 @@ def astropy_metadata(table: pa.Table) -> dict[str, str]:
 
 
 def votable_xml(table: pa.Table) -> str:
-    """Return a VOTable without data that describes the columns of a table.
-
-    Parameters
-    ----------
-    table : pyarrow.Table
-        With unit, description and ucd in its field metadata.
-
-    Returns
-    -------
-    str
-        XML, VOTable 1.4.
-    """
+    """Return a VOTable without data that describes the columns of a table."""
     root = ElementTree.Element("VOTABLE", {"version": "1.4", "xmlns": VOTABLE_NAMESPACE})
     fields = ElementTree.SubElement(ElementTree.SubElement(root, "RESOURCE"), "TABLE")
     longest = _longest_texts(table)

@@ -12,37 +12,12 @@ Content = dict[str, Any]
 
 
 def answer_content(frame: MeasuredFrame, result: MatchResult) -> Content:
-    """Return a frame's answer as JSON has it.
-
-    Parameters
-    ----------
-    frame : MeasuredFrame
-        What was asked.
-    result : MatchResult
-        The answer.
-
-    Returns
-    -------
-    dict
-        ``frame``, what `facts` returns, and ``stars``: an object a centroid. What is unknown is
-        null. Star numbers are texts, as many languages lose the last digits of 64 bits.
-    """
+    """Return a frame's answer as JSON has it."""
     return {"frame": frame.name, **facts(result), "stars": _stars(frame, result)}
 
 
 def facts(result: MatchResult) -> Content:
-    """Return what an answer says of the whole frame.
-
-    Parameters
-    ----------
-    result : MatchResult
-        The answer.
-
-    Returns
-    -------
-    dict
-        Attitude and certainty where it is identified, else why it is not, and the time.
-    """
+    """Return what an answer says of the whole frame."""
     found: Content = {"status": result.status, "origin": result.origin}
     found["n_matched"] = result.n_matched
     if result.ok:

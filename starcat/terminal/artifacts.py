@@ -15,15 +15,7 @@ MAX_STARS = 20
 
 
 def print_verification(found: Verification, *, as_json: bool) -> None:
-    """Print what a verification found.
-
-    Parameters
-    ----------
-    found : Verification
-        What `verify_artifact` returned.
-    as_json : bool
-        Whether to print JSON.
-    """
+    """Print what a verification found."""
     if as_json:
         print_json(found.as_dict())
         return
@@ -38,17 +30,7 @@ def print_verification(found: Verification, *, as_json: bool) -> None:
 
 
 def print_difference(found: Difference, names: tuple[str, str], *, as_json: bool) -> None:
-    """Print what differs between two artifacts.
-
-    Parameters
-    ----------
-    found : Difference
-        What `diff_artifacts` returned.
-    names : tuple of str
-        Names of A and B, for the headings.
-    as_json : bool
-        Whether to print JSON, with every star.
-    """
+    """Print what differs between two artifacts."""
     if as_json:
         print_json({"a": names[0], "b": names[1], **found.as_dict()})
         return
@@ -96,15 +78,7 @@ def _print_moved(stars: Sequence[Moved]) -> None:
 
 
 def print_rebuilt(rebuilt: Rebuilt, *, as_json: bool) -> None:
-    """Print the outcome of a rebuild.
-
-    Parameters
-    ----------
-    rebuilt : Rebuilt
-        What `rebuild` returned.
-    as_json : bool
-        Whether to print JSON.
-    """
+    """Print the outcome of a rebuild."""
     if as_json:
         print_json(rebuilt.as_dict())
         return

@@ -43,26 +43,7 @@ class Wish:
 
 
 def answer(targets: Sequence[str], wish: Wish, limits: Limits, rows: int) -> None:
-    """Answer a question, or ask for questions where there is none.
-
-    Parameters
-    ----------
-    targets : sequence of str
-        What the question is about, as `open_session` takes it.
-    wish : Wish
-        The question.
-    limits : Limits
-        What each query may take.
-    rows : int
-        Rows of a table to show.
-
-    Raises
-    ------
-    QueryError
-        If the question cannot be answered.
-    ConfigError, OutputError
-        If the answer cannot be written so, or there.
-    """
+    """Answer a question, or ask for questions where there is none."""
     form = format_of_wish(wish)
     query, values = _query(wish, len(targets))
     with _opened(targets, limits) as session:
@@ -81,29 +62,13 @@ def answer(targets: Sequence[str], wish: Wish, limits: Limits, rows: int) -> Non
 
 
 def show(targets: Sequence[str], limits: Limits, *, as_json: bool) -> None:
-    """Print the views of targets.
-
-    Parameters
-    ----------
-    targets : sequence of str
-        What the question is about, as `open_session` takes it.
-    limits : Limits
-        What each query may take.
-    as_json : bool
-        Whether as JSON, with all columns.
-    """
+    """Print the views of targets."""
     with _opened(targets, limits) as session:
         print_views(session, as_json=as_json)
 
 
 def print_preamble(targets: Sequence[str]) -> None:
-    """Print the SQL that makes the views and macros, for any DuckDB.
-
-    Parameters
-    ----------
-    targets : sequence of str
-        Artifacts and Parquet files; archive files would have to be read first.
-    """
+    """Print the SQL that makes the views and macros, for any DuckDB."""
     sys.stdout.write(preamble_of(targets) + "\n")
 
 
@@ -117,23 +82,7 @@ def _opened(targets: Sequence[str], limits: Limits) -> Iterator[Session]:
 
 
 def format_of_wish(wish: Wish) -> str:
-    """Return the format that an answer is wanted in.
-
-    Parameters
-    ----------
-    wish : Wish
-        The question.
-
-    Returns
-    -------
-    str
-        ``table``, or one of the formats of `starcat.exchange.formats`.
-
-    Raises
-    ------
-    QueryError
-        If there is no such format, or it does not go where the answer is to go.
-    """
+    """Return the format that an answer is wanted in."""
     if wish.form in (None, "table") and wish.output is None:
         return "table"
     from starcat.exchange.formats import FORMATS, TEXT_FORMATS, format_of

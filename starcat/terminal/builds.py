@@ -21,13 +21,7 @@ if TYPE_CHECKING:
 
 
 def print_sources(*, as_json: bool) -> None:
-    """Print the data sources and where each would be read from.
-
-    Parameters
-    ----------
-    as_json : bool
-        Whether to print JSON.
-    """
+    """Print the data sources and where each would be read from."""
     from starcat.catalog.fetching.locate import locate
     from starcat.catalog.source import data_source, source_names
 
@@ -72,15 +66,7 @@ def print_sources(*, as_json: bool) -> None:
 
 
 def print_fetched(report: FetchReport, *, as_json: bool) -> None:
-    """Print what was fetched.
-
-    Parameters
-    ----------
-    report : FetchReport
-        What `fetch_source` returned.
-    as_json : bool
-        Whether to print JSON.
-    """
+    """Print what was fetched."""
     rows = [
         {
             "name": file.name,
@@ -100,17 +86,7 @@ def print_fetched(report: FetchReport, *, as_json: bool) -> None:
 
 
 def print_ingested(read: Ingested, output: Path, *, as_json: bool) -> None:
-    """Print what became of the records of a catalog.
-
-    Parameters
-    ----------
-    read : Ingested
-        What `ingest` returned.
-    output : Path
-        File of the star table.
-    as_json : bool
-        Whether to print JSON.
-    """
+    """Print what became of the records of a catalog."""
     from starcat.catalog.star_files import rejected_path
 
     facts = {
@@ -130,15 +106,7 @@ def print_ingested(read: Ingested, output: Path, *, as_json: bool) -> None:
 
 
 def print_stored(made: Stored, *, as_json: bool) -> None:
-    """Print what became of the records of a catalog that was read into a store.
-
-    Parameters
-    ----------
-    made : Stored
-        What `ingest_to_store` returned.
-    as_json : bool
-        Whether to print JSON.
-    """
+    """Print what became of the records of a catalog that was read into a store."""
     manifest = made.manifest
     facts = {
         "source": manifest["source"],
@@ -170,13 +138,7 @@ def _print_records(facts: dict[str, Any], told: str, *, as_json: bool) -> None:
 
 
 def print_problems(problems: Sequence[str]) -> None:
-    """Print the first malformed records on stderr.
-
-    Parameters
-    ----------
-    problems : sequence of str
-        Each with file, line and bytes.
-    """
+    """Print the first malformed records on stderr."""
     for problem in problems[:5]:
         say(f"malformed: {problem}")
 
@@ -198,15 +160,7 @@ def _balance(facts: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def print_built(built: Built, *, as_json: bool) -> None:
-    """Print what a build made.
-
-    Parameters
-    ----------
-    built : Built
-        What `pipeline.build` returned.
-    as_json : bool
-        Whether to print JSON.
-    """
+    """Print what a build made."""
     manifest, report = built.manifest, built.folder / "report" / "index.html"
     for warning in built.warnings:
         say(f"warning: {warning}")
@@ -234,15 +188,7 @@ def print_built(built: Built, *, as_json: bool) -> None:
 
 
 def print_refused(built: Built, *, as_json: bool) -> None:
-    """Print what a build made that failed its self-test, and what it warns of.
-
-    Parameters
-    ----------
-    built : Built
-        What the error carries.
-    as_json : bool
-        Whether JSON is wanted: tables are then left out, as what failed has no result.
-    """
+    """Print what a build made that failed its self-test, and what it warns of."""
     for warning in built.warnings:
         say(f"warning: {warning}")
     if not as_json:
@@ -280,24 +226,12 @@ def _print_contents(built: Built) -> None:
 
 
 def print_cost(cost: Cost) -> None:
-    """Print on stderr what a build will cost.
-
-    Parameters
-    ----------
-    cost : Cost
-        The estimate.
-    """
+    """Print on stderr what a build will cost."""
     say(cost.in_words)
 
 
 def print_products(manifest: dict[str, Any]) -> None:
-    """Print the products of an artifact.
-
-    Parameters
-    ----------
-    manifest : dict
-        Manifest of the artifact.
-    """
+    """Print the products of an artifact."""
     files = manifest["files"]
     rows = [
         (
@@ -314,15 +248,7 @@ def print_products(manifest: dict[str, Any]) -> None:
 
 
 def print_rates(rates: Sequence[Rates], *, as_json: bool) -> None:
-    """Print the rates of a self-test.
-
-    Parameters
-    ----------
-    rates : sequence of Rates
-        What `self_test` returned.
-    as_json : bool
-        Whether to print JSON.
-    """
+    """Print the rates of a self-test."""
     if as_json:
         print_json([rate.as_dict() for rate in rates])
         return
@@ -350,15 +276,7 @@ def print_rates(rates: Sequence[Rates], *, as_json: bool) -> None:
 
 
 def print_artifact(artifact: Artifact, *, as_json: bool) -> None:
-    """Print what an artifact holds.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        Open.
-    as_json : bool
-        Whether to print the manifest as JSON.
-    """
+    """Print what an artifact holds."""
     from starcat.specs.build_spec import CameraSpec
 
     manifest = artifact.manifest

@@ -24,17 +24,7 @@ _SHORT = {
 
 
 def print_calibration(calibration: Calibration, output: Path, *, as_json: bool) -> None:
-    """Print a calibration: the camera with its errors, the comparison of models, the frames.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        Of some frames.
-    output : Path
-        The camera file that was written.
-    as_json : bool
-        Whether to print JSON, with the covariance.
-    """
+    """Print a calibration: the camera with its errors, the comparison of models, the frames."""
     if as_json:
         print_json(_as_dict(calibration, output))
         return

@@ -29,36 +29,18 @@ MAX_WIDTH = 100
 
 
 def out() -> Console:
-    """Return the console for results.
-
-    Returns
-    -------
-    rich.console.Console
-        On stdout, at most 100 columns wide, plain where it is not a terminal.
-    """
+    """Return the console for results."""
     width = min(Console().width, MAX_WIDTH) if sys.stdout.isatty() else MAX_WIDTH
     return Console(highlight=False, markup=False, width=width)
 
 
 def print_json(content: Any) -> None:
-    """Print a value as JSON on stdout.
-
-    Parameters
-    ----------
-    content : object
-        Plain values.
-    """
+    """Print a value as JSON on stdout."""
     sys.stdout.write(json.dumps(content, indent=2, ensure_ascii=False) + "\n")
 
 
 def print_json_line(content: Any) -> None:
-    """Print a value as JSON on a line of its own, and see that it arrives at once.
-
-    Parameters
-    ----------
-    content : object
-        Plain values.
-    """
+    """Print a value as JSON on a line of its own, and see that it arrives at once."""
     sys.stdout.write(json.dumps(content, ensure_ascii=False) + "\n")
     sys.stdout.flush()
 
@@ -66,19 +48,7 @@ def print_json_line(content: Any) -> None:
 def print_table(
     title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], numbers: Sequence[int] = ()
 ) -> None:
-    """Print a table on stdout.
-
-    Parameters
-    ----------
-    title : str
-        Above the table; none if empty.
-    columns : sequence of str
-        Headings.
-    rows : sequence of sequence
-        Cells; anything that prints.
-    numbers : sequence of int
-        Columns to align at the right.
-    """
+    """Print a table on stdout."""
     # Texts, not strings: rich takes strings for markup, and brackets are units and folders here.
     heading = Text(title, style="italic") if title else None
     table = Table(title=heading, title_justify="left", box=None, pad_edge=False)
@@ -90,13 +60,7 @@ def print_table(
 
 
 def say(text: str) -> None:
-    """Print a message on stderr.
-
-    Parameters
-    ----------
-    text : str
-        One or more lines.
-    """
+    """Print a message on stderr."""
     sys.stderr.write(text + "\n")
 
 
@@ -105,11 +69,6 @@ def progress_bars() -> Iterator[Progress]:
     """Draw a bar a stage on stderr while work goes on; nothing where it is not a terminal.
 
     An exception that passes gets a note with the stage that it was raised in.
-
-    Yields
-    ------
-    Progress
-        The callback to hand to the work.
     """
     console = Console(stderr=True, markup=False)
     reached = [""]
@@ -130,13 +89,7 @@ def progress_bars() -> Iterator[Progress]:
 
 
 class StageBars(Bars):
-    """A bar a stage, one below the other.
-
-    Parameters
-    ----------
-    console : rich.console.Console
-        Console to draw on.
-    """
+    """A bar a stage, one below the other."""
 
     def __init__(self, console: Console) -> None:
         columns = (
@@ -150,15 +103,7 @@ class StageBars(Bars):
         self.stages: dict[str, TaskID] = {}
 
     def show(self, stage: str, done: int, total: int | None) -> None:
-        """Draw an event.
-
-        Parameters
-        ----------
-        stage : str
-            A new one ends those before it that do not know their total, as nothing else does.
-        done, total : int
-            Counts, as `Progress` describes them.
-        """
+        """Draw an event."""
         if stage not in self.stages:
             self.end_open()
             self.stages[stage] = self.add_task(stage, total=total)
@@ -176,18 +121,7 @@ class AmountColumn(ProgressColumn):
     """How much of a stage is done: bytes with units, other things with separators."""
 
     def render(self, task: Task) -> Text:
-        """Return the amount.
-
-        Parameters
-        ----------
-        task : rich.progress.Task
-            Task of a stage.
-
-        Returns
-        -------
-        rich.text.Text
-            Empty where nothing is counted.
-        """
+        """Return the amount."""
         done, total = int(task.completed), task.total
         if task.fields.get("is_uncounted"):
             return Text("done" if done == 1 else f"{done:,}")
@@ -202,18 +136,7 @@ class RateColumn(ProgressColumn):
     """How fast rows go, and the time that is left; empty for other stages."""
 
     def render(self, task: Task) -> Text:
-        """Return rate and time.
-
-        Parameters
-        ----------
-        task : rich.progress.Task
-            Task of a stage.
-
-        Returns
-        -------
-        rich.text.Text
-            Such as ``310,000/s, 2:10 left``.
-        """
+        """Return rate and time."""
         elapsed, total = task.finished_time or task.elapsed, task.total
         if task.description.split(" ")[0] != ROW_STAGE or not elapsed or not task.completed:
             return Text("")

@@ -17,17 +17,7 @@ _BARS, _BAR_WIDTH = 20, 50
 
 
 def print_coverage(artifact: Artifact, folder: Path | None, *, as_json: bool) -> None:
-    """Print the coverage of an artifact, and write its tables and plots where asked to.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        Open.
-    folder : Path, optional
-        Folder to write CSV, JSON, PNG and SVG to.
-    as_json : bool
-        Whether to print JSON.
-    """
+    """Print the coverage of an artifact, and write its tables and plots where asked to."""
     from starcat.pipeline.facts import artifact_coverage
     from starcat.report.coverage_report import holes_warning, write_coverage
 
@@ -48,13 +38,7 @@ def print_coverage(artifact: Artifact, folder: Path | None, *, as_json: bool) ->
 
 
 def print_coverage_table(report: CoverageReport) -> None:
-    """Print the coverage in a few numbers.
-
-    Parameters
-    ----------
-    report : CoverageReport
-        Coverage of a build or an artifact.
-    """
+    """Print the coverage in a few numbers."""
     summary, gap = report.summary, report.gap
     spreads = {"stars": summary.stars, "pairs": summary.pairs, "triangles": summary.triangles}
     rows = [
@@ -83,19 +67,7 @@ def print_coverage_table(report: CoverageReport) -> None:
 
 
 def histogram_rows(report: CoverageReport) -> list[tuple[str, str, str]]:
-    """Return the histogram of stars in a field as rows of text.
-
-    Parameters
-    ----------
-    report : CoverageReport
-        Coverage with the histogram.
-
-    Returns
-    -------
-    list of (str, str, str)
-        Range of stars, number of fields and a bar; at most 20 rows of the same width, from the
-        fewest stars on.
-    """
+    """Return the histogram of stars in a field as rows of text."""
     least = report.summary.stars.minimum
     counts = report.summary.histogram[least:]
     width = -(-len(counts) // _BARS)

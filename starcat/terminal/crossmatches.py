@@ -23,19 +23,7 @@ MEANINGS = {
 def print_crossmatch(
     found: Summary, names: tuple[str, str], output: Path, *, as_json: bool
 ) -> None:
-    """Print the summary of a cross-identification.
-
-    Parameters
-    ----------
-    found : Summary
-        What `match_files` returned.
-    names : tuple of str
-        What the two tables are called.
-    output : Path
-        The file written.
-    as_json : bool
-        Whether to print JSON.
-    """
+    """Print the summary of a cross-identification."""
     if as_json:
         print_json({"a": names[0], "b": names[1], **found.as_dict(), "output": str(output)})
         return

@@ -12,15 +12,7 @@ if TYPE_CHECKING:
 
 
 def print_estimate(found: Estimate, *, as_json: bool) -> None:
-    """Print what a spec will give.
-
-    Parameters
-    ----------
-    found : Estimate
-        The estimate.
-    as_json : bool
-        Whether to print JSON.
-    """
+    """Print what a spec will give."""
     cost, stars = found.cost, found.coverage.stars
     if as_json:
         print_json(

@@ -20,15 +20,7 @@ if TYPE_CHECKING:
 
 
 def print_evaluation(evaluation: Evaluation, *, as_json: bool) -> None:
-    """Print what was measured.
-
-    Parameters
-    ----------
-    evaluation : Evaluation
-        The evaluation, with its report written.
-    as_json : bool
-        Whether to print JSON, with every trial in full.
-    """
+    """Print what was measured."""
     if as_json:
         print_json(list(evaluation.contents))
     else:

@@ -7,15 +7,7 @@ from starcat.terminal.console import print_json, print_table, say
 
 
 def print_exported(exported: Exported, *, as_json: bool) -> None:
-    """Print what was written where; rows left out are told on stderr.
-
-    Parameters
-    ----------
-    exported : Exported
-        What `export_tables` returned.
-    as_json : bool
-        Whether to print JSON.
-    """
+    """Print what was written where; rows left out are told on stderr."""
     for file in exported.files:
         if file.left_out:
             say(f"{file.product}: {file.left_out:,} rows without a position are left out")

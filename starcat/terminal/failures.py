@@ -49,23 +49,11 @@ class Failure:
     hint: str | None = None
 
     def as_text(self) -> str:
-        """Return what people read.
-
-        Returns
-        -------
-        str
-            One line, with its end.
-        """
+        """Return what people read."""
         return f"starcat: error: {self.message}\n"
 
     def as_json(self) -> str:
-        """Return what programs read.
-
-        Returns
-        -------
-        str
-            An object on one line, with a line end.
-        """
+        """Return what programs read."""
         content = {
             "code": self.code,
             "kind": self.kind,
@@ -76,20 +64,7 @@ class Failure:
 
 
 def failure_of(error: Exception, doing: str) -> Failure:
-    """Return what is to be said of an exception.
-
-    Parameters
-    ----------
-    error : Exception
-        Whatever a command raised.
-    doing : str
-        The command that ran, such as ``starcat build``.
-
-    Returns
-    -------
-    Failure
-        With a message of bounded length and without control characters.
-    """
+    """Return what is to be said of an exception."""
     if isinstance(error, Abort) and isinstance(error.__cause__, Exception):
         error = error.__cause__  # an EOFError of a library, which typer takes for Ctrl-D
     kind = type(error).__name__
@@ -116,18 +91,6 @@ def failure_of(error: Exception, doing: str) -> Failure:
 def shown(text: str, most: int) -> str:
     """Return a text as a terminal may show it.
 
-    Parameters
-    ----------
-    text : str
-        Perhaps with what a file held in it.
-    most : int
-        Characters that are left; of a longer text the middle is left out.
-
-    Returns
-    -------
-    str
-        Control characters but line ends are written as escapes.
-
     Examples
     --------
     >>> shown("a" * 50 + "b" * 50, 11)
@@ -143,16 +106,6 @@ def shown(text: str, most: int) -> str:
 
 def hint_in(message: str) -> str | None:
     """Return the part of a message that says what to do.
-
-    Parameters
-    ----------
-    message : str
-        Message of one of starcat's own errors, which end with the hint.
-
-    Returns
-    -------
-    str or None
-        What stands behind the last semicolon or full stop outside of brackets; None without.
 
     Examples
     --------

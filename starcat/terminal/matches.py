@@ -68,27 +68,7 @@ def print_answers(
     as_lines: bool = False,
     observer: Observer | None = None,
 ) -> Told:
-    """Print the answers to the frames of a file.
-
-    Parameters
-    ----------
-    answered : iterable of (MeasuredFrame, MatchResult)
-        What was asked, and the answers.
-    database : Database
-        For its name.
-    as_json : bool
-        Whether to print JSON: always a list, with an object a frame.
-    as_lines : bool, default False
-        Whether to print such an object on a line of its own as soon as a frame is done; then
-        no frame is kept, however many there are.
-    observer : Observer, optional
-        When and where the frames were taken: what that adds is printed too.
-
-    Returns
-    -------
-    Told
-        How many were identified.
-    """
+    """Print the answers to the frames of a file."""
     kept: list[Answered] = []
     first: Answered | None = None
     count = identified = 0
@@ -117,24 +97,7 @@ def print_answers(
 def print_contents(
     contents: Sequence[dict[str, Any]], database: str, *, as_json: bool, as_lines: bool = False
 ) -> Told:
-    """Print the answers that a service gives to the frames of a file.
-
-    Parameters
-    ----------
-    contents : sequence of dict
-        What `answer_content` returned there.
-    database : str
-        Its name.
-    as_json : bool
-        Whether to print JSON: always a list, with an object a frame.
-    as_lines : bool, default False
-        Whether to print such an object on a line of its own.
-
-    Returns
-    -------
-    Told
-        How many were identified.
-    """
+    """Print the answers that a service gives to the frames of a file."""
     if as_lines:
         for one in contents:
             print_json_line(one)
@@ -227,17 +190,7 @@ def _print_many(answered: Sequence[Answered], database: Database) -> None:
 
 
 def print_simulated(frame: Frame, output: Path, *, as_json: bool) -> None:
-    """Print the truth about a simulated frame, as JSON; nothing for people, who want to guess.
-
-    Parameters
-    ----------
-    frame : Frame
-        Centroids and the true attitude.
-    output : Path
-        The file that was written.
-    as_json : bool
-        Whether to print JSON, with the names that `print_matches` gives an answer.
-    """
+    """Print the truth about a simulated frame, as JSON; nothing for people, who want to guess."""
     if not as_json:
         return
     ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(frame.matrix)
@@ -256,13 +209,7 @@ def print_simulated(frame: Frame, output: Path, *, as_json: bool) -> None:
 
 
 def print_methods(*, as_json: bool) -> None:
-    """Print the ways to identify stars.
-
-    Parameters
-    ----------
-    as_json : bool
-        Whether to print JSON.
-    """
+    """Print the ways to identify stars."""
     rows = [
         {"method": name, "needs": list(method.products), "description": method.description}
         for name, method in METHODS.items()

@@ -14,15 +14,7 @@ _ARCSEC_QUANTUM = 206264.80624709636 / DIRECTION_SCALE
 
 
 def print_exported_image(exported: ExportedImage, *, as_json: bool) -> None:
-    """Print what was written, and say what was left out on stderr.
-
-    Parameters
-    ----------
-    exported : ExportedImage
-        What `export_image` returned.
-    as_json : bool
-        Whether to print JSON.
-    """
+    """Print what was written, and say what was left out on stderr."""
     fitted, made = exported.fitted, exported.made
     noun = _features(fitted.contents.method)
     if fitted.features < fitted.features_before:
@@ -51,15 +43,7 @@ def print_exported_image(exported: ExportedImage, *, as_json: bool) -> None:
 
 
 def print_image(image: OnboardImage, *, as_json: bool) -> None:
-    """Print what an image holds.
-
-    Parameters
-    ----------
-    image : OnboardImage
-        As `read_image` returns it.
-    as_json : bool
-        Whether to print JSON.
-    """
+    """Print what an image holds."""
     if as_json:
         print_json(image.as_dict())
         return

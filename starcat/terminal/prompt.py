@@ -27,29 +27,13 @@ HISTORY_LINES = 2000
 
 
 def history_path() -> Path:
-    """Return the file that keeps the queries of earlier prompts.
-
-    Returns
-    -------
-    Path
-        ``starcat/sql_history`` in ``$XDG_STATE_HOME``, or in ``~/.local/state``.
-    """
+    """Return the file that keeps the queries of earlier prompts."""
     state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
     return Path(state) / "starcat" / "sql_history"
 
 
 def prompt(session: Session, rows: int, read: Callable[[str], str] = input) -> None:
-    """Ask for queries and answer them, until there are no more.
-
-    Parameters
-    ----------
-    session : Session
-        About some targets.
-    rows : int
-        Rows of a table to show.
-    read : callable
-        Given a prompt, returns a line; raises EOFError at the end.
-    """
+    """Ask for queries and answer them, until there are no more."""
     _complete(session)
     say("starcat sql: .help tells more, .quit or Ctrl-D ends")
     shell = _Shell(session, rows)
@@ -112,18 +96,7 @@ class _Shell:
 
 
 def words(session: Session) -> list[str]:
-    """Return what a prompt completes.
-
-    Parameters
-    ----------
-    session : Session
-        About some targets.
-
-    Returns
-    -------
-    list of str
-        Views, columns, macros, named queries and commands, sorted.
-    """
+    """Return what a prompt completes."""
     known = {".help", ".views", ".macros", ".list", ".named ", ".rows ", ".quit", *gallery()}
     known |= {f"{macro.name}(" for macro in macros() if not macro.name.startswith("_")}
     for target in session.targets:

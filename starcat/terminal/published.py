@@ -17,15 +17,7 @@ DIGEST_LETTERS = 16
 
 
 def print_published(published: Published, *, as_json: bool) -> None:
-    """Print what became of a publication.
-
-    Parameters
-    ----------
-    published : Published
-        What `publish_artifact` returned.
-    as_json : bool
-        Whether to print JSON.
-    """
+    """Print what became of a publication."""
     release = published.release
     if as_json:
         print_json(published.as_dict())
@@ -45,15 +37,7 @@ def print_published(published: Published, *, as_json: bool) -> None:
 
 
 def print_pulled(pulled: Sequence[Pulled], *, as_json: bool) -> None:
-    """Print what became of pulls.
-
-    Parameters
-    ----------
-    pulled : sequence of Pulled
-        What `pull_wanted` or `pull_pinned` returned.
-    as_json : bool
-        Whether to print JSON.
-    """
+    """Print what became of pulls."""
     if as_json:
         print_json([one.as_dict() for one in pulled])
         return
@@ -72,15 +56,7 @@ def print_pulled(pulled: Sequence[Pulled], *, as_json: bool) -> None:
 
 
 def print_releases(releases: Sequence[Listed], *, as_json: bool) -> None:
-    """Print what a registry lists.
-
-    Parameters
-    ----------
-    releases : sequence of Listed
-        Releases by name, then by version.
-    as_json : bool
-        Whether to print JSON.
-    """
+    """Print what a registry lists."""
     highest = {release.name: release for release in releases}
     if as_json:
         marked = [r.model_dump() | {"is_latest": highest[r.name] is r} for r in releases]

@@ -24,19 +24,7 @@ SHOWN_ITEMS = 6
 
 
 def print_first_rows(session: Session, query: str, values: Mapping[str, Any], rows: int) -> None:
-    """Ask a query, with a bar while it runs, and print the first rows of its answer.
-
-    Parameters
-    ----------
-    session : Session
-        About some targets.
-    query : str
-        SQL.
-    values : mapping of str to object
-        The values of the ``$name`` in it.
-    rows : int
-        How many at most.
-    """
+    """Ask a query, with a bar while it runs, and print the first rows of its answer."""
     with progress_bars() as progress, session.ask(query, values, progress) as answer:
         found = answer.rows(rows + 1)
     print_answer(answer, found, rows)
@@ -92,17 +80,7 @@ class Told:
 
 
 def print_answer(answer: Described, found: Sequence[Sequence[Any]], rows: int) -> None:
-    """Print the first rows of an answer: as a table, or one below the other if that is too wide.
-
-    Parameters
-    ----------
-    answer : Described
-        What a query finds.
-    found : sequence of sequence
-        Its first rows, one more than to print where there are more.
-    rows : int
-        How many to print at most.
-    """
+    """Print the first rows of an answer: as a table, or one below the other if that is too wide."""
     cells = [[cell_text(value) for value in row] for row in found[:rows]]
     units = [facts.unit for facts in answer.facts]
     headings = [
@@ -121,16 +99,6 @@ def print_answer(answer: Described, found: Sequence[Sequence[Any]], rows: int) -
 
 def cell_text(value: Any) -> str:
     """Return a value as a table shows it.
-
-    Parameters
-    ----------
-    value : object
-        A value of a row.
-
-    Returns
-    -------
-    str
-        Empty for none; numbers with ten digits; long lists by their first items.
 
     Examples
     --------
@@ -165,15 +133,7 @@ def _numbers(types: Sequence[str]) -> list[int]:
 
 
 def print_views(session: Session, *, as_json: bool) -> None:
-    """Print the views that a query can use.
-
-    Parameters
-    ----------
-    session : Session
-        About some targets.
-    as_json : bool
-        Whether as JSON, with all columns.
-    """
+    """Print the views that a query can use."""
     views = [(target, view) for target in session.targets for view in target.views]
     if as_json:
         print_json([_view_facts(target, view) for target, view in views])
@@ -213,13 +173,7 @@ def _row_count(session: Session, view: str) -> int:
 
 
 def print_macros(*, as_json: bool) -> None:
-    """Print the macros, each with an example.
-
-    Parameters
-    ----------
-    as_json : bool
-        Whether as JSON.
-    """
+    """Print the macros, each with an example."""
     from starcat.query.macros import macros
 
     listed = sorted((m for m in macros()), key=lambda m: (m.is_table, m.name))
@@ -239,13 +193,7 @@ def _print_entry(title: str, paragraphs: Sequence[str]) -> None:
 
 
 def print_gallery(*, as_json: bool) -> None:
-    """Print the named queries with their values.
-
-    Parameters
-    ----------
-    as_json : bool
-        Whether as JSON, with their SQL.
-    """
+    """Print the named queries with their values."""
     from starcat.query.gallery import gallery
 
     queries = gallery().values()

@@ -11,33 +11,14 @@ from starcat.terminal.console import print_table
 
 
 def sky_as_dict(sky: SkyInTime | None) -> dict[str, Any] | None:
-    """Return what a time adds to an answer, as JSON has it under the key ``in_time``.
-
-    Parameters
-    ----------
-    sky : SkyInTime or None
-        Of one frame.
-
-    Returns
-    -------
-    dict or None
-        Plain numbers, lists and texts.
-    """
+    """Return what a time adds to an answer, as JSON has it under the key ``in_time``."""
     if sky is None:
         return None
     return {**asdict(sky), "q_body_from_icrs": sky.q_body_from_icrs.tolist()}
 
 
 def print_sky_in_time(names: Sequence[str], skies: Sequence[SkyInTime | None]) -> None:
-    """Print true attitudes, exclusion angles and the bodies in the frames.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Names of the frames.
-    skies : sequence of SkyInTime or None
-        In the same order; None for a frame that was not identified.
-    """
+    """Print true attitudes, exclusion angles and the bodies in the frames."""
     known = [(name, sky) for name, sky in zip(names, skies, strict=True) if sky is not None]
     if not known:
         return

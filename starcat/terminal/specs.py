@@ -14,13 +14,7 @@ if TYPE_CHECKING:
 
 
 def print_presets(*, as_json: bool) -> None:
-    """Print the presets.
-
-    Parameters
-    ----------
-    as_json : bool
-        Whether to print JSON, with every key of every spec.
-    """
+    """Print the presets."""
     from starcat.specs.reading import preset, preset_names
 
     specs = [preset(name) for name in preset_names()]
@@ -32,15 +26,7 @@ def print_presets(*, as_json: bool) -> None:
 
 
 def print_preset(spec: BuildSpec, *, as_json: bool) -> None:
-    """Print one preset in a few lines.
-
-    Parameters
-    ----------
-    spec : BuildSpec
-        The preset.
-    as_json : bool
-        Whether to print JSON, with every key.
-    """
+    """Print one preset in a few lines."""
     if as_json:
         print_json(spec.model_dump(mode="json"))
         return
@@ -59,17 +45,7 @@ def print_preset(spec: BuildSpec, *, as_json: bool) -> None:
 
 
 def print_starter(starter: Starter, path: Path, *, as_json: bool) -> None:
-    """Print what a first spec gives, and what to think of before it is kept.
-
-    Parameters
-    ----------
-    starter : Starter
-        The spec and its limits.
-    path : Path
-        The file that was written.
-    as_json : bool
-        Whether to print JSON.
-    """
+    """Print what a first spec gives, and what to think of before it is kept."""
     from starcat.pipeline.starter import ENOUGH_STARS, STARS_A_FIELD, advice
 
     told = advice(starter)

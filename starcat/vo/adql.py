@@ -50,25 +50,7 @@ class Translation:
 
 
 def translate(text: str, tables: Tables) -> Translation:
-    """Return a query in ADQL as SQL.
-
-    Parameters
-    ----------
-    text : str
-        ADQL 2.1.
-    tables : Tables
-        The tables that it may name.
-
-    Returns
-    -------
-    Translation
-        SQL that gives what the query asks for.
-
-    Raises
-    ------
-    QueryError
-        If the text is no ADQL, or names what is not there; the message has the place.
-    """
+    """Return a query in ADQL as SQL."""
     tree = parse_adql(text)
     try:
         return _Translator(text, tables, tree).translation()

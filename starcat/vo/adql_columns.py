@@ -31,17 +31,7 @@ class Source:
 
 
 class Names:
-    """What the names in a query mean.
-
-    Parameters
-    ----------
-    tables : Tables
-        The tables that may be named.
-    text : str
-        The query, for messages.
-    tree : sqlglot.exp.Expr
-        Its syntax tree, as it was read.
-    """
+    """What the names in a query mean."""
 
     def __init__(self, tables: Tables, text: str, tree: exp.Expr) -> None:
         self._tables = tables
@@ -54,18 +44,7 @@ class Names:
             self._select[id(part)] = part if isinstance(part, exp.Select) else above
 
     def resolve(self, table: exp.Table) -> None:
-        """Write the full name of a table, as the session has it, in its place.
-
-        Parameters
-        ----------
-        table : sqlglot.exp.Table
-            A part of the query.
-
-        Raises
-        ------
-        QueryError
-            If there is no such table, or several.
-        """
+        """Write the full name of a table, as the session has it, in its place."""
         if not table.db and self._common(table, table.name) is not None:
             return
         found = self._tables.find(table.db, table.name)
@@ -85,30 +64,13 @@ class Names:
         table.set("db", exp.to_identifier(found.schema, quoted=True))
 
     def shorten(self, column: exp.Column) -> None:
-        """Leave the schema out of the name of a column whose view has another name than its table.
-
-        Parameters
-        ----------
-        column : sqlglot.exp.Column
-            A part of the query.
-        """
+        """Drop the schema of a column whose view has another name than its table."""
         found = self._tables.find(column.db, column.table) if column.db else None
         if found is not None and found.view:
             column.set("db", None)
 
     def columns(self, query: exp.Expr) -> Columns | None:
-        """Return the columns that a query gives.
-
-        Parameters
-        ----------
-        query : sqlglot.exp.Expr
-            A SELECT, or several that are united.
-
-        Returns
-        -------
-        tuple of Column or None
-            None where they are not known before the query runs.
-        """
+        """Return the columns that a query gives."""
         while isinstance(query, (exp.SetOperation, exp.Subquery)):
             query = query.this
         if not isinstance(query, exp.Select):
@@ -122,18 +84,7 @@ class Names:
         return tuple(found)
 
     def column(self, column: exp.Column) -> Column | None:
-        """Return what is known of a column that is named in a query.
-
-        Parameters
-        ----------
-        column : sqlglot.exp.Column
-            A part of the query.
-
-        Returns
-        -------
-        Column or None
-            None where that is not known.
-        """
+        """Return what is known of a column that is named in a query."""
         for select in self._around(column):
             found = self._in(select, column)
             if found is not None:
@@ -141,18 +92,7 @@ class Names:
         return None
 
     def check(self, column: exp.Column) -> None:
-        """Check that a column is one of those that the query can see.
-
-        Parameters
-        ----------
-        column : sqlglot.exp.Column
-            A part of the query.
-
-        Raises
-        ------
-        QueryError
-            If there is none of the name.
-        """
+        """Check that a column is one of those that the query can see."""
         if isinstance(column.this, exp.Star) or self.column(column) is not None:
             return
         known: set[str] = set()
@@ -186,18 +126,7 @@ class Names:
         return found
 
     def sources(self, select: exp.Select) -> list[Source]:
-        """Return what stands after FROM in a query.
-
-        Parameters
-        ----------
-        select : sqlglot.exp.Select
-            The query.
-
-        Returns
-        -------
-        list of Source
-            In order.
-        """
+        """Return what stands after FROM in a query."""
         if id(select) not in self._sources_of:
             parts = [select.args["from_"], *select.args.get("joins", ())]
             found = [source for part in parts for source in self._sources(part.this)]
@@ -282,20 +211,7 @@ class Names:
 
 
 def default_name(value: exp.Expr, number: int) -> str:
-    """Return the name of a column of an answer that the query gives none.
-
-    Parameters
-    ----------
-    value : sqlglot.exp.Expr
-        What is selected.
-    number : int
-        Its place in the list, from 1.
-
-    Returns
-    -------
-    str
-        The column's name, that of the function, or ``col_`` and the number.
-    """
+    """Return the name of a column of an answer that the query gives none."""
     if isinstance(value, exp.Column):
         return value.name
     if isinstance(value, exp.Anonymous):

@@ -139,18 +139,7 @@ Shape = Point | Circle | Polygon
 
 
 def contains(inner: Shape, outer: Shape) -> str:
-    """Return SQL of whether a shape is within another.
-
-    Parameters
-    ----------
-    inner, outer : Shape
-        The second is a circle or a polygon; a place contains equal places only.
-
-    Returns
-    -------
-    str
-        True, false, or null where a number is missing. The edge of a circle is within it.
-    """
+    """Return SQL of whether a shape is within another."""
     if isinstance(outer, Point):
         return compared(_apart(inner, outer), "=", 0.0) if isinstance(inner, Point) else "false"
     if isinstance(outer, Circle):
@@ -172,18 +161,7 @@ def contains(inner: Shape, outer: Shape) -> str:
 
 
 def intersects(one: Shape, other: Shape) -> str:
-    """Return SQL of whether two shapes have a place in common.
-
-    Parameters
-    ----------
-    one, other : Shape
-        The shapes.
-
-    Returns
-    -------
-    str
-        True, false, or null where a number is missing.
-    """
+    """Return SQL of whether two shapes have a place in common."""
     if isinstance(one, Point):
         return contains(one, other)
     if isinstance(other, Point):
@@ -243,18 +221,7 @@ def centroid(shape: Shape) -> Point:
 
 
 def characters(shapes: Sequence[Shape]) -> int:
-    """Return how much SQL it takes, roughly, to find something out about shapes.
-
-    Parameters
-    ----------
-    shapes : sequence of Shape
-        One or two.
-
-    Returns
-    -------
-    int
-        Characters. What is known when the query is read takes few.
-    """
+    """Return how much SQL it takes, roughly, to find something out about shapes."""
     parts = [_parts(shape) for shape in shapes]
     sides = [len(shape.corners) if isinstance(shape, Polygon) else 1 for shape in shapes]
     unknown = [sum(len(text) for text in texts if number_in(text) is None) for texts in parts]
@@ -273,20 +240,7 @@ def _parts(shape: Shape) -> tuple[str, ...]:
 
 
 def box(centre: Point, width: str, height: str) -> Polygon:
-    """Return the polygon with the corners of a box around a place.
-
-    Parameters
-    ----------
-    centre : Point
-        Its middle.
-    width, height : str
-        SQL of the differences of right ascension and declination between corners, degrees.
-
-    Returns
-    -------
-    Polygon
-        With four corners, as ADQL 2.1 says in section 4.2.9.
-    """
+    """Return the polygon with the corners of a box around a place."""
     corners = tuple(
         Point(_folded(centre.lon, right, width), _folded(centre.lat, up, height))
         for right, up in (("-", "-"), ("+", "-"), ("+", "+"), ("-", "+"))

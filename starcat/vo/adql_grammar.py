@@ -155,21 +155,6 @@ class Adql(Dialect):
 def parse_adql(text: str) -> exp.Expr:
     """Return the syntax tree of a query in ADQL.
 
-    Parameters
-    ----------
-    text : str
-        One query; a semicolon may stand behind it.
-
-    Returns
-    -------
-    sqlglot.exp.Expr
-        A SELECT, or several that are united. Every part of it is one that ADQL 2.1 has.
-
-    Raises
-    ------
-    QueryError
-        If the text is no ADQL; the message has the place.
-
     Examples
     --------
     >>> parse_adql("SELECT TOP 3 ra FROM stars").sql()
@@ -214,18 +199,7 @@ def parse_adql(text: str) -> exp.Expr:
 
 
 def place_of(node: exp.Expr) -> int | None:
-    """Return where a part of a query begins.
-
-    Parameters
-    ----------
-    node : sqlglot.exp.Expr
-        A part of a tree that `parse_adql` gave.
-
-    Returns
-    -------
-    int or None
-        Characters before it; None where the parser noted none in it.
-    """
+    """Return where a part of a query begins."""
     for part in node.walk():
         if "start" in part.meta:
             return int(part.meta["start"])
@@ -233,20 +207,7 @@ def place_of(node: exp.Expr) -> int | None:
 
 
 def pointer(text: str, place: int | None) -> str:
-    """Return the line of a place with a mark under it.
-
-    Parameters
-    ----------
-    text : str
-        The query.
-    place : int or None
-        Characters before the place.
-
-    Returns
-    -------
-    str
-        To be put behind a message; empty without a place.
-    """
+    """Return the line of a place with a mark under it."""
     if place is None or not 0 <= place <= len(text):
         return ""
     before = text[:place]
@@ -260,22 +221,7 @@ def pointer(text: str, place: int | None) -> str:
 
 
 def refuse(message: str, node: exp.Expr, text: str) -> QueryError:
-    """Return the error that tells what is wrong with a part of a query.
-
-    Parameters
-    ----------
-    message : str
-        What was found, what was expected.
-    node : sqlglot.exp.Expr
-        The part.
-    text : str
-        The query.
-
-    Returns
-    -------
-    QueryError
-        To be raised.
-    """
+    """Return the error that tells what is wrong with a part of a query."""
     return QueryError(f"{message}{pointer(text, place_of(node))}")
 
 

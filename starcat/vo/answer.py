@@ -22,32 +22,7 @@ def ask(
     max_rows: int | None = None,
     progress: Progress = no_progress,
 ) -> pa.RecordBatchReader:
-    """Return the rows that a query finds.
-
-    Parameters
-    ----------
-    session : Session
-        With the tables that the query was translated for.
-    asked : Translation
-        The query.
-    max_rows : int, optional
-        How many rows are wanted at most; one more is given, so that it shows that there are more.
-    progress : Progress
-        Called with ("query", percent, 100) while it runs.
-
-    Returns
-    -------
-    pyarrow.RecordBatchReader
-        Names differ; types are those that VOTable has; units, UCDs and meanings are in the field
-        metadata. The first rows are there already, and no other query may be asked before the last.
-
-    Raises
-    ------
-    QueryError
-        If the query asks for what is not there.
-    QueryLimitError
-        If it takes longer, or more memory and disk, than it may; also while reading.
-    """
+    """Return the rows that a query finds."""
     import pyarrow as pa
 
     with session.ask(asked.sql) as described:

@@ -68,24 +68,7 @@ class ConeRequest:
 
 
 def cone_request(parameters: Iterable[tuple[str, str]]) -> ConeRequest:
-    """Check the parameters of a request.
-
-    Parameters
-    ----------
-    parameters : iterable of (str, str)
-        Names, of which capitals do not matter, and values. Others than those of the standard are
-        passed over.
-
-    Returns
-    -------
-    ConeRequest
-        What is asked for.
-
-    Raises
-    ------
-    ConfigError
-        If one is missing, given twice, or out of its range.
-    """
+    """Check the parameters of a request."""
     given: dict[str, str] = {}
     known = {*_RANGES, "VERB", "MAXREC", "RESPONSEFORMAT"}
     for name, value in parameters:
@@ -106,23 +89,7 @@ def cone_request(parameters: Iterable[tuple[str, str]]) -> ConeRequest:
 
 
 def star_view(session: Session) -> View:
-    """Return the view of a session that has the stars.
-
-    Parameters
-    ----------
-    session : Session
-        About one target.
-
-    Returns
-    -------
-    View
-        The one named ``stars``, else the first with places.
-
-    Raises
-    ------
-    TargetMissing
-        If no view has places.
-    """
+    """Return the view of a session that has the stars."""
     placed = [view for view in session.views if set(view.position or POSITION) <= set(view.columns)]
     for view in sorted(placed, key=lambda view: view.name != "stars"):
         return view
@@ -130,22 +97,7 @@ def star_view(session: Session) -> View:
 
 
 def cone_query(view: View, asked: ConeRequest, maxrec: int) -> str:
-    """Return the SQL of a search.
-
-    Parameters
-    ----------
-    view : View
-        The stars.
-    asked : ConeRequest
-        Which of them.
-    maxrec : int
-        Rows that are wanted at most.
-
-    Returns
-    -------
-    str
-        A query whose rows are ordered by separation; one row more than wanted where there are more.
-    """
+    """Return the SQL of a search."""
     chosen = [_selected(view, name) for name in _columns(view, asked.verbosity)]
     place = f"{asked.ra_deg!r}, {asked.dec_deg!r}, {asked.radius_deg!r}"
     order = ", ".join([SEPARATION, *(quoted_name(n) for n in NAMES if n in view.columns)])
@@ -157,20 +109,7 @@ def cone_query(view: View, asked: ConeRequest, maxrec: int) -> str:
 
 
 def with_ucds(batches: pa.RecordBatchReader, view: View) -> pa.RecordBatchReader:
-    """Return rows whose columns have the UCDs that the standard asks for.
-
-    Parameters
-    ----------
-    batches : pyarrow.RecordBatchReader
-        The rows of `cone_query`.
-    view : View
-        The stars.
-
-    Returns
-    -------
-    pyarrow.RecordBatchReader
-        The same rows.
-    """
+    """Return rows whose columns have the UCDs that the standard asks for."""
     import pyarrow as pa
 
     ra, dec = view.position or POSITION
@@ -190,19 +129,7 @@ def with_ucds(batches: pa.RecordBatchReader, view: View) -> pa.RecordBatchReader
 
 
 def cone_error(text: str) -> bytes:
-    """Return the document that tells why a search has no answer.
-
-    Parameters
-    ----------
-    text : str
-        What was found, what was expected, what to do next.
-
-    Returns
-    -------
-    bytes
-        A VOTable with an ``INFO`` named ``Error``, and one named ``QUERY_STATUS`` for readers that
-        know DALI.
-    """
+    """Return the document that tells why a search has no answer."""
     return error_document(text).encode()
 
 

@@ -91,20 +91,7 @@ class _Column(TableParam, tag="column"):
 
 
 def capabilities(base_url: str, limits: ServiceLimits) -> bytes:
-    """Return what the service can do.
-
-    Parameters
-    ----------
-    base_url : str
-        Its address, without a slash at the end.
-    limits : ServiceLimits
-        What it grants.
-
-    Returns
-    -------
-    bytes
-        A document of VOSI.
-    """
+    """Return what the service can do."""
     others = [
         (f"{_VOSI}capabilities", "capabilities", None),
         (f"{_VOSI}availability", "availability", None),
@@ -170,74 +157,27 @@ def _interface(
 
 
 def availability(up_since: datetime) -> bytes:
-    """Return that the service is there.
-
-    Parameters
-    ----------
-    up_since : datetime
-        When it was started, UTC.
-
-    Returns
-    -------
-    bytes
-        A document of VOSI.
-    """
+    """Return that the service is there."""
     return _document(
         Availability(available=True, up_since=UTCTimestamp.fromisoformat(_utc(up_since)))
     )
 
 
 def tableset(tables: Tables, with_columns: bool = True) -> bytes:
-    """Return all schemas and tables.
-
-    Parameters
-    ----------
-    tables : Tables
-        What there is.
-    with_columns : bool, default True
-        Whether columns are told too.
-
-    Returns
-    -------
-    bytes
-        A document of VOSI.
-    """
+    """Return all schemas and tables."""
     schemas = [_schema(schema, with_columns) for schema in tables.schemas]
     return _document(VOSITableSet(tableset_schema=schemas))
 
 
 def for_tap_plus(document: bytes) -> bytes:
-    """Return a document of tables as TapPlus of astroquery reads it.
-
-    Parameters
-    ----------
-    document : bytes
-        What `tableset` gave.
-
-    Returns
-    -------
-    bytes
-        The same, with an attribute at every column that the schema of VOSI does not allow and that
-        TapPlus does not read a column without.
-    """
+    """Return a document of tables as TapPlus of astroquery reads it."""
     space = b'<vosi:tableset xmlns:esatapplus="http://esa.int/xml/EsaTapPlus" '
     named = document.replace(b"<vosi:tableset ", space, 1)
     return named.replace(b"<column>", b'<column esatapplus:flags="0">')
 
 
 def table_document(table: Table) -> bytes:
-    """Return a table with its columns.
-
-    Parameters
-    ----------
-    table : Table
-        The table.
-
-    Returns
-    -------
-    bytes
-        A document of VOSI.
-    """
+    """Return a table with its columns."""
     return _document(_described(VOSITable(**_about(table, True)), table.description))
 
 
@@ -296,18 +236,7 @@ def _flags(column: Column) -> tuple[tuple[str, bool], ...]:
 
 
 def error_votable(message: str) -> bytes:
-    """Return an error as DALI has it.
-
-    Parameters
-    ----------
-    message : str
-        What went wrong.
-
-    Returns
-    -------
-    bytes
-        A VOTable without a table.
-    """
+    """Return an error as DALI has it."""
     return (
         '<?xml version="1.0" encoding="UTF-8"?>\n'
         '<VOTABLE version="1.4" xmlns="http://www.ivoa.net/xml/VOTable/v1.3">\n'

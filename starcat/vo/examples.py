@@ -16,18 +16,7 @@ POSITION = ("ra_deg", "dec_deg")
 
 
 def examples(tables: Tables) -> list[tuple[str, str, str]]:
-    """Return queries that run on the tables that there are.
-
-    Parameters
-    ----------
-    tables : Tables
-        What there is.
-
-    Returns
-    -------
-    list of (str, str, str)
-        A name of letters and digits, what it finds, and ADQL.
-    """
+    """Return queries that run on the tables that there are."""
     found = [
         (
             "tables",
@@ -68,18 +57,7 @@ def examples(tables: Tables) -> list[tuple[str, str, str]]:
 
 
 def examples_page(tables: Tables) -> str:
-    """Return a page with the examples.
-
-    Parameters
-    ----------
-    tables : Tables
-        What there is.
-
-    Returns
-    -------
-    str
-        XHTML with RDFa.
-    """
+    """Return a page with the examples."""
     parts = "\n".join(
         f'<div typeof="example" id="{name}" resource="#{name}">\n'
         f'<h2 property="name">{escape(told)}</h2>\n'

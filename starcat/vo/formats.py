@@ -70,21 +70,6 @@ FORMATS = (
 def format_named(text: str | None) -> Format:
     """Return the format that a request asks for.
 
-    Parameters
-    ----------
-    text : str or None
-        Value of RESPONSEFORMAT or FORMAT: a short name or a media type, in any case.
-
-    Returns
-    -------
-    Format
-        The first of all where none is asked for.
-
-    Raises
-    ------
-    ConfigError
-        If there is none of the name.
-
     Examples
     --------
     >>> format_named("text/csv; header=present").name

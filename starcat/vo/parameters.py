@@ -69,13 +69,7 @@ class Question:
 
 
 class Parameters:
-    """Parameters of a request, in the order in which they came.
-
-    Parameters
-    ----------
-    given : iterable of (str, str)
-        Names and values, as the request has them.
-    """
+    """Parameters of a request, in the order in which they came."""
 
     def __init__(self, given: Iterable[tuple[str, str]]) -> None:
         self._given = [(name.upper(), value) for name, value in given]
@@ -85,23 +79,7 @@ class Parameters:
         return [value for one, value in self._given if one == name and value != ""]
 
     def one(self, name: str) -> str | None:
-        """Return the value of a parameter.
-
-        Parameters
-        ----------
-        name : str
-            In capitals.
-
-        Returns
-        -------
-        str or None
-            None where it is not given.
-
-        Raises
-        ------
-        ConfigError
-            If it has several values that differ.
-        """
+        """Return the value of a parameter."""
         values = list(dict.fromkeys(self.all(name)))
         if len(values) > 1:
             raise ConfigError(
@@ -118,25 +96,7 @@ class Parameters:
 
 
 def question(given: Parameters, most_rows: int) -> Question:
-    """Return what a request asks.
-
-    Parameters
-    ----------
-    given : Parameters
-        Of the request, or of the job.
-    most_rows : int
-        Rows that the service gives at most.
-
-    Returns
-    -------
-    Question
-        Checked but for the query itself.
-
-    Raises
-    ------
-    ConfigError
-        If a parameter is missing or has a value that it must not have.
-    """
+    """Return what a request asks."""
     request = given.one("REQUEST")
     if request not in (None, "doQuery"):
         raise ConfigError(
@@ -167,25 +127,7 @@ def question(given: Parameters, most_rows: int) -> Question:
 
 
 def max_rows(text: str | None, most: int) -> int:
-    """Return how many rows are wanted.
-
-    Parameters
-    ----------
-    text : str or None
-        Value of MAXREC.
-    most : int
-        Rows that the service gives at most.
-
-    Returns
-    -------
-    int
-        At most that.
-
-    Raises
-    ------
-    ConfigError
-        If it is no whole number from 0 on.
-    """
+    """Return how many rows are wanted."""
     if text is None:
         return most
     if not (text.isascii() and text.isdigit()):
@@ -196,24 +138,7 @@ def max_rows(text: str | None, most: int) -> int:
 
 
 def uploads(given: list[str]) -> tuple[Upload, ...]:
-    """Return the tables that a request brings.
-
-    Parameters
-    ----------
-    given : list of str
-        Values of UPLOAD: ``name,param:part`` or ``name,`` and the address of an answer of this
-        service; several with semicolons between them.
-
-    Returns
-    -------
-    tuple of Upload
-        In order.
-
-    Raises
-    ------
-    ConfigError
-        If one is named wrongly or twice, or is not in the request.
-    """
+    """Return the tables that a request brings."""
     found: list[Upload] = []
     for pair in (pair for value in given for pair in value.split(";") if pair.strip()):
         name, comma, place = (word.strip() for word in pair.partition(","))

@@ -35,34 +35,7 @@ def result_chunks(
     label: Label = UNLABELLED,
     maxrec: int | None = None,
 ) -> Iterator[bytes]:
-    """Begin an answer.
-
-    Parameters
-    ----------
-    batches : pyarrow.RecordBatchReader
-        The rows; one more than `maxrec` where there are more.
-    form : Format
-        How to write them.
-    folder : Path
-        Where FITS and Parquet files are made, which are gone when the chunks were read.
-    label : Label
-        What VOTable and FITS say of the table as a whole.
-    maxrec : int, optional
-        The largest number of rows to give; a VOTable says where there were more.
-
-    Returns
-    -------
-    iterator of bytes
-        To be read once. The first rows were read already. What goes wrong later breaks it off, but
-        for a VOTable, which says so at its end.
-
-    Raises
-    ------
-    SchemaError
-        If a column cannot be said in the format.
-    StarcatError
-        What goes wrong with reading the first rows.
-    """
+    """Begin an answer."""
     chunks: Iterator[bytes]
     if form.is_votable:
         serialization: Serialization = "tabledata" if form.name == "votable/td" else "binary2"

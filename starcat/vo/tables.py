@@ -123,13 +123,7 @@ class Schema:
 
 
 class Tables:
-    """All tables that a query may name.
-
-    Parameters
-    ----------
-    schemas : tuple of Schema
-        Names differ, whatever their case.
-    """
+    """All tables that a query may name."""
 
     def __init__(self, schemas: tuple[Schema, ...]) -> None:
         self.schemas = schemas
@@ -145,18 +139,7 @@ class Tables:
         return Tables((*self.schemas, schema))
 
     def chosen(self, names: Sequence[str]) -> Tables:
-        """Return some of the tables.
-
-        Parameters
-        ----------
-        names : sequence of str
-            Full names, with or without quotes, in any case; those of no table are left out.
-
-        Returns
-        -------
-        Tables
-            In the order of all.
-        """
+        """Return some of the tables."""
         wanted = {name.strip().replace('"', "").lower() for name in names}
         schemas = []
         for schema in self.schemas:
@@ -166,18 +149,7 @@ class Tables:
         return Tables(tuple(schemas))
 
     def find(self, schema: str, name: str) -> Table | None:
-        """Return a table.
-
-        Parameters
-        ----------
-        schema, name : str
-            In any case; a schema may be left out where only one has a table of that name.
-
-        Returns
-        -------
-        Table or None
-            None where there is none, or several.
-        """
+        """Return a table."""
         if schema:
             return self._found.get((schema.lower(), name.lower()))
         named = [table for (_, one), table in self._found.items() if one == name.lower()]
@@ -191,16 +163,6 @@ class Tables:
 def full_name(table: Table) -> str:
     """Return the name of a table as ADQL writes it.
 
-    Parameters
-    ----------
-    table : Table
-        The table.
-
-    Returns
-    -------
-    str
-        Schema and name, quoted where ADQL needs it.
-
     Examples
     --------
     >>> full_name(Table("_2mass", "stars", ()))
@@ -210,18 +172,7 @@ def full_name(table: Table) -> str:
 
 
 def adql_name(name: str) -> str:
-    """Return a name as ADQL writes it: in quotes where it is a word of ADQL, or no plain name.
-
-    Parameters
-    ----------
-    name : str
-        Without quotes.
-
-    Returns
-    -------
-    str
-        Such as ``ra_deg`` or ``"catalog"``.
-    """
+    """Return a name as ADQL writes it: in quotes where it is a word of ADQL, or no plain name."""
     from vo_models.adql.misc import ADQL_SQL_KEYWORDS
 
     is_plain = name.isascii() and name.isidentifier() and not name.startswith("_")

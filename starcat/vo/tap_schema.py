@@ -95,13 +95,7 @@ _KEYS = {
 
 
 def own_schema() -> Schema:
-    """Return TAP_SCHEMA itself, as it says of itself.
-
-    Returns
-    -------
-    Schema
-        With its five tables.
-    """
+    """Return TAP_SCHEMA itself, as it says of itself."""
     tables = tuple(
         Table(
             NAME,
@@ -120,20 +114,7 @@ def own_schema() -> Schema:
 
 
 def session_schemas(session: Session, about: Mapping[str, str]) -> tuple[Schema, ...]:
-    """Return the schemas of the targets of a session.
-
-    Parameters
-    ----------
-    session : Session
-        Open; its views are looked at.
-    about : mapping of str to str
-        What a schema is, by its name.
-
-    Returns
-    -------
-    tuple of Schema
-        In the order of the targets.
-    """
+    """Return the schemas of the targets of a session."""
     return tuple(
         Schema(
             target.name,
@@ -180,15 +161,7 @@ def _unit(column: str, text: str) -> str:
 
 
 def write_tap_schema(tables: Tables, folder: Path) -> None:
-    """Write the tables of TAP_SCHEMA as Parquet files.
-
-    Parameters
-    ----------
-    tables : Tables
-        What they are to say, TAP_SCHEMA itself among it.
-    folder : Path
-        Made if it is not there; a file for each table, which has its name.
-    """
+    """Write the tables of TAP_SCHEMA as Parquet files."""
     import pyarrow as pa
 
     folder.mkdir(parents=True, exist_ok=True)

@@ -40,16 +40,6 @@ _TIMES = ("DATE", "TIMESTAMP", "TIMESTAMP_S", "TIMESTAMP_MS", "TIMESTAMP_NS")
 def votable_type(kind: str) -> tuple[str, str]:
     """Return what VOTable calls a type of DuckDB after `cast`.
 
-    Parameters
-    ----------
-    kind : str
-        DuckDB's name.
-
-    Returns
-    -------
-    tuple of str
-        Datatype and arraysize; the second is empty for single numbers.
-
     Examples
     --------
     >>> votable_type("INTEGER[]"), votable_type("DECIMAL(4,1)"), votable_type("DATE")
@@ -66,36 +56,12 @@ def votable_type(kind: str) -> tuple[str, str]:
 
 
 def is_time(kind: str) -> bool:
-    """Return whether a type of DuckDB is a time that is written as a text.
-
-    Parameters
-    ----------
-    kind : str
-        DuckDB's name.
-
-    Returns
-    -------
-    bool
-        False for times with a zone, and for times of day.
-    """
+    """Return whether a type of DuckDB is a time that is written as a text."""
     return kind in _TIMES
 
 
 def cast(value: str, kind: str) -> str:
-    """Return SQL of a value in a type that VOTable has.
-
-    Parameters
-    ----------
-    value : str
-        SQL of the value.
-    kind : str
-        DuckDB's name of its type.
-
-    Returns
-    -------
-    str
-        SQL; the same where the type need not change.
-    """
+    """Return SQL of a value in a type that VOTable has."""
     found = _LIST.fullmatch(kind)
     if found:
         item = _plain(found[1])

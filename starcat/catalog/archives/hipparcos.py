@@ -46,20 +46,7 @@ CLASS_LOWER_BOUND_MAG = {b"2": 0.06, b"3": 0.61}
 
 
 def stars(records: Records, band: str) -> StarBlock:
-    """Return the star-table columns of Hipparcos records.
-
-    Parameters
-    ----------
-    records : Records
-        Columns as `COLUMNS` lists them.
-    band : {"V", "Hp", "BT", "VT"}
-        Which magnitude.
-
-    Returns
-    -------
-    StarBlock
-        Columns and verdicts.
-    """
+    """Return the star-table columns of Hipparcos records."""
     number = records.integers("hip")
     verdicts = Verdicts(len(records))
     verdicts.reject(np.isnan(records["ra_deg"]) | np.isnan(records["de_deg"]), Reason.no_position)
@@ -108,19 +95,7 @@ def stars(records: Records, band: str) -> StarBlock:
 
 
 def amplitudes(records: Records) -> NDArray[np.float64]:
-    """Return the amplitude in Hp of each record.
-
-    Parameters
-    ----------
-    records : Records
-        With ``hp_max``, ``hp_min`` and ``var_flag``.
-
-    Returns
-    -------
-    ndarray of float64, shape (N,)
-        Magnitudes; the range between percentiles, raised to the lower bound of the class
-        where the archive's class says more. NaN where nothing is known.
-    """
+    """Return the amplitude in Hp of each record."""
     amplitude: NDArray[np.float64] = records["hp_min"] - records["hp_max"]
     for flag, bound in CLASS_LOWER_BOUND_MAG.items():
         amplitude = np.where(records["var_flag"] == flag, np.fmax(amplitude, bound), amplitude)

@@ -49,20 +49,7 @@ PRINTED_PM_DEC_ARCSEC_YR = {208759: -0.180, 208795: -0.042, 212470: -0.072}
 
 
 def stars(records: Records, band: str) -> StarBlock:
-    """Return the star-table columns of SAO records.
-
-    Parameters
-    ----------
-    records : Records
-        Columns as `COLUMNS` lists them.
-    band : {"V", "P"}
-        Visual or photographic magnitude.
-
-    Returns
-    -------
-    StarBlock
-        Columns and verdicts.
-    """
+    """Return the star-table columns of SAO records."""
     number = records.integers("sao")
     ra_deg, dec_deg = _positions(records)
     pm_ra, pm_dec = _proper_motions(records, number, dec_deg)
@@ -104,18 +91,6 @@ def icrs_from_fk5(
     ra_deg: Array, dec_deg: Array, pm_ra: Array, pm_dec: Array
 ) -> tuple[Array, Array, Array, Array]:
     """Turn FK5 positions and proper motions at J2000 into ICRS ones.
-
-    Parameters
-    ----------
-    ra_deg, dec_deg : ndarray of float64, shape (N,)
-        Degrees, FK5, equinox and epoch J2000.
-    pm_ra, pm_dec : ndarray of float64, shape (N,)
-        mas/yr, FK5, the first with cos(dec).
-
-    Returns
-    -------
-    tuple of four ndarray of float64, shape (N,)
-        The same four, ICRS.
 
     Notes
     -----

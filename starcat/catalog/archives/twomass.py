@@ -41,20 +41,7 @@ _BANDS = {"J": (0, "j_m"), "H": (1, "h_m"), "Ks": (2, "k_m")}
 
 
 def stars(records: Records, band: str) -> StarBlock:
-    """Return the star-table columns of 2MASS records.
-
-    Parameters
-    ----------
-    records : Records
-        Columns as `COLUMNS` lists them.
-    band : str
-        ``Ks``, ``J``, ``H``, ``(J+H)/2`` or a weighted sum.
-
-    Returns
-    -------
-    StarBlock
-        Columns and verdicts.
-    """
+    """Return the star-table columns of 2MASS records."""
     weights = blend_weights(band)
     mags = {name: _measured(records, name) for name in _BANDS}
     mag = np.sum([weight * mags[name] for name, weight in weights.items()], axis=0)
@@ -102,20 +89,7 @@ def stars(records: Records, band: str) -> StarBlock:
 
 
 def magnitudes(records: Records, band: str) -> NDArray[np.float64]:
-    """Return the magnitudes of 2MASS records.
-
-    Parameters
-    ----------
-    records : Records
-        Columns as `COLUMNS` lists them.
-    band : str
-        As for `stars`.
-
-    Returns
-    -------
-    ndarray of float64, shape (N,)
-        NaN where a band was not measured, or has an upper limit of the brightness only.
-    """
+    """Return the magnitudes of 2MASS records."""
     weights = blend_weights(band)
     return np.asarray(np.sum([weight * _measured(records, n) for n, weight in weights.items()], 0))
 

@@ -54,20 +54,7 @@ _MAGNITUDES = {"V": "v_mag", "BT": "bt_mag", "VT": "vt_mag"}
 
 
 def stars(records: Records, band: str) -> StarBlock:
-    """Return the star-table columns of Tycho-1 records.
-
-    Parameters
-    ----------
-    records : Records
-        Columns as `COLUMNS` lists them.
-    band : {"V", "BT", "VT"}
-        Which magnitude; V is the archive's own Johnson V.
-
-    Returns
-    -------
-    StarBlock
-        Columns and verdicts.
-    """
+    """Return the star-table columns of Tycho-1 records."""
     number, designation = tycho_identity(records)
     verdicts = Verdicts(len(records))
     verdicts.reject(np.isnan(records["ra_deg"]) | np.isnan(records["de_deg"]), Reason.no_position)
@@ -137,20 +124,7 @@ def _variability(records: Records) -> dict[str, Values]:
 
 
 def tycho_identity(records: Records) -> tuple[NDArray[np.int64], pa.Array]:
-    """Return the packed number and the designation of Tycho records.
-
-    Parameters
-    ----------
-    records : Records
-        With ``tyc1``, ``tyc2`` and ``tyc3``.
-
-    Returns
-    -------
-    number : ndarray of int64, shape (N,)
-        ``TYC1 * 1000000 + TYC2 * 10 + TYC3``, unique and in the archive's order.
-    designation : pyarrow.Array
-        Strings such as ``TYC 1-13-1``.
-    """
+    """Return the packed number and the designation of Tycho records."""
     parts = [records.integers(name) for name in ("tyc1", "tyc2", "tyc3")]
     number = parts[0] * 1_000_000 + parts[1] * 10 + parts[2]
     region = _REGION_TEXTS.take(pa.array(parts[0]))

@@ -63,20 +63,7 @@ PROX_BEYOND = 999
 
 
 def stars(records: Records, band: str) -> StarBlock:
-    """Return the star-table columns of Tycho-2 records.
-
-    Parameters
-    ----------
-    records : Records
-        Columns as `COLUMNS` lists them, of either file.
-    band : {"V", "BT", "VT"}
-        Which magnitude; V is computed from BT and VT.
-
-    Returns
-    -------
-    StarBlock
-        Columns and verdicts.
-    """
+    """Return the star-table columns of Tycho-2 records."""
     place = _place_tyc2(records) if records.layout == "tyc2" else _place_suppl(records)
     number, designation = tycho_identity(records)
     verdicts = Verdicts(len(records))
@@ -112,18 +99,7 @@ def stars(records: Records, band: str) -> StarBlock:
 
 
 def place_is_double(parts: dict[str, Any]) -> NDArray[np.bool_]:
-    """Return where any of a record's position flags means a double star.
-
-    Parameters
-    ----------
-    parts : dict of str to (ndarray of bool, ndarray of bytes or None)
-        As `join_flags` takes them.
-
-    Returns
-    -------
-    ndarray of bool, shape (N,)
-        True where at least one applies.
-    """
+    """Return where any of a record's position flags means a double star."""
     return np.asarray(np.logical_or.reduce([where for where, _ in parts.values()]))
 
 

@@ -93,27 +93,7 @@ class ExpectedFile:
 
 
 def expected_files(source: DataSource, parts: Sequence[str] = ()) -> list[ExpectedFile]:
-    """List the files of a source that are to be fetched.
-
-    Parameters
-    ----------
-    source : DataSource
-        The source.
-    parts : sequence of str
-        Parts of the files that are in several, if not all of them. Single files always count.
-
-    Returns
-    -------
-    list of ExpectedFile
-        In the order of the source; optional files without an address are left out.
-
-    Raises
-    ------
-    ConfigError
-        If a part is unknown or an address is not http, https or ftp.
-    SourceMissing
-        If there is no address to fetch from.
-    """
+    """List the files of a source that are to be fetched."""
     known = [part for file in source.files for part in file.parts]
     for part in parts:
         if part not in known:
@@ -191,23 +171,7 @@ _ENTRIES = TypeAdapter(dict[str, LockEntry])
 
 
 def read_lock(folder: Path) -> dict[str, LockEntry]:
-    """Read the lock file of a data folder.
-
-    Parameters
-    ----------
-    folder : Path
-        The data folder.
-
-    Returns
-    -------
-    dict of str to LockEntry
-        By file name; empty where there is no lock file yet.
-
-    Raises
-    ------
-    SourceError
-        If the lock file is damaged.
-    """
+    """Read the lock file of a data folder."""
     path = folder / LOCK_NAME
     if not path.exists():
         return {}
@@ -224,37 +188,7 @@ def read_lock(folder: Path) -> dict[str, LockEntry]:
 
 
 def examine(expected: ExpectedFile, path: Path, final: Path, url: str) -> LockEntry:
-    """Check digest, records and their number; record a first arrival in the lock file.
-
-    Parameters
-    ----------
-    expected : ExpectedFile
-        What the file should be.
-    path : Path
-        Where it is; it may still have a temporary name.
-    final : Path
-        The name that it has or is to have.
-    url : str
-        Where it came from, for the lock file.
-
-    Returns
-    -------
-    LockEntry
-        What it is.
-
-    Raises
-    ------
-    ChecksumMismatch
-        If its digest is not the committed one, or else not that of its first arrival.
-    ParseError
-        If a record is too short or too long, or their number is wrong. Carriage returns
-        before the line feed are accepted. The number of a file in parts is checked once all
-        are there.
-    SourceError
-        If the gzip stream or the lock file is damaged.
-    OutputError
-        If the lock file cannot be written.
-    """
+    """Check digest, records and their number; record a first arrival in the lock file."""
     lock = read_lock(final.parent)
     entry = lock.get(final.name)
     digest: str = pooch.file_hash(str(path), alg="sha256")

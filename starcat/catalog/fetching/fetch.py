@@ -97,14 +97,7 @@ class FetchReport:
 
 
 def cache_folder() -> Path:
-    """Return the folder that downloads go to by default.
-
-    Returns
-    -------
-    Path
-        ``$STARCAT_CACHE`` if it is set, else the cache folder of the operating system. It
-        need not exist.
-    """
+    """Return the folder that downloads go to by default."""
     chosen = os.environ.get("STARCAT_CACHE")
     return Path(chosen).expanduser() if chosen else Path(pooch.os_cache("starcat"))
 
@@ -120,42 +113,6 @@ def fetch_source(
     progress: Progress = no_progress,
 ) -> FetchReport:
     """Get the files of a source into a folder and check them.
-
-    Parameters
-    ----------
-    source : DataSource
-        What to get.
-    folder : Path
-        Where to; made if need be.
-    parts : sequence of str
-        Parts of the files that are in several, if not all of them. Single files always come.
-    retries : int
-        Further attempts at an address after the first has failed, before the next address.
-    timeout_s : float
-        Seconds to wait for a connection, and for each block of data.
-    backoff_s : float
-        Seconds before the second attempt; doubled for each further one, up to 60.
-    progress : Progress
-        Called with file name, bytes there are, and bytes in all or None.
-
-    Returns
-    -------
-    FetchReport
-        Every file, with its digest, records and what was done.
-
-    Raises
-    ------
-    ConfigError
-        If a part is unknown or an address is not http, https or ftp.
-    SourceMissing
-        If the source has no address.
-    OutputError
-        If the folder cannot be written to.
-    DownloadError
-        If a file came from none of its addresses.
-    ChecksumMismatch, ParseError, SourceError
-        If a file has another digest than the one committed or recorded at its first arrival, its
-        records are not those expected, or it or the lock file is damaged.
 
     Notes
     -----

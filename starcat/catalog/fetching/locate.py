@@ -16,27 +16,7 @@ CATALOGS_VARIABLE = "STARCAT_CATALOGS"
 
 
 def locate(source_name: str, given: Mapping[str, Sequence[Path]]) -> list[Path]:
-    """Return the paths to read a source from.
-
-    Parameters
-    ----------
-    source_name : str
-        A name of ``data_sources``.
-    given : mapping of str to sequence of Path
-        Inputs that the caller named, by source.
-
-    Returns
-    -------
-    list of Path
-        The inputs given for the source; else the first folder that holds all of it, of: the
-        folders of the inputs given for other sources, ``$STARCAT_CATALOGS``, the download cache;
-        for ``gaia`` at last the embedded sky.
-
-    Raises
-    ------
-    SourceMissing
-        Naming every place that was searched, and what those lack that hold a part of it.
-    """
+    """Return the paths to read a source from."""
     source = data_source(source_name)
     if given.get(source_name):
         return list(given[source_name])

@@ -13,24 +13,7 @@ from starcat.catalog.source import RecordFile
 def parse_binary(
     data: bytes, layout: RecordFile, names: Sequence[str], first_line: int = 1
 ) -> Records:
-    """Parse a block of packed little-endian records.
-
-    Parameters
-    ----------
-    data : bytes
-        Whole records; a cut-off last one is reported, not read.
-    layout : RecordFile
-        Record length and columns.
-    names : sequence of str
-        Columns to parse.
-    first_line : int, default 1
-        Number of the first record.
-
-    Returns
-    -------
-    Records
-        The good records, and a problem for each of the others, such as a last one cut off.
-    """
+    """Parse a block of packed little-endian records."""
     size = layout.record_bytes or 1
     columns = [layout.column(name) for name in names]
     packed = np.dtype(

@@ -32,24 +32,7 @@ from starcat.errors import quoted
 def parse_delimited(
     data: bytes, layout: RecordFile, names: Sequence[str], first_line: int = 1
 ) -> Records:
-    """Parse a block of delimited lines.
-
-    Parameters
-    ----------
-    data : bytes
-        Whole lines, LF or CRLF. Empty lines and comments are skipped.
-    layout : RecordFile
-        Delimiter, comment mark and columns in order.
-    names : sequence of str
-        Columns to parse.
-    first_line : int, default 1
-        Line number of the first line.
-
-    Returns
-    -------
-    Records
-        The good records and the problems of the others.
-    """
+    """Parse a block of delimited lines."""
     chosen = [layout.column(name) for name in names]
     records = _parse_regular(data, layout, chosen, first_line)
     if records is None:

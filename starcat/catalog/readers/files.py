@@ -64,13 +64,7 @@ class Block:
 
 
 class DigestReader(io.RawIOBase):
-    """A binary file that hashes what is read from it.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    """
+    """A binary file that hashes what is read from it."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("rb", buffering=0)
@@ -82,18 +76,7 @@ class DigestReader(io.RawIOBase):
         return True
 
     def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
-        """Read into a buffer and hash what was read.
-
-        Parameters
-        ----------
-        buffer : memoryview
-            Filled from its start.
-
-        Returns
-        -------
-        int
-            Bytes read; 0 at the end.
-        """
+        """Read into a buffer and hash what was read."""
         count = self._file.readinto(buffer)
         self._hash.update(memoryview(buffer)[:count])
         self.bytes_read += count
@@ -111,25 +94,7 @@ class DigestReader(io.RawIOBase):
 
 
 def find_files(source: DataSource, paths: Sequence[Path]) -> list[InputFile]:
-    """Find the files of a source.
-
-    Parameters
-    ----------
-    source : DataSource
-        What to look for.
-    paths : sequence of Path
-        Files, or folders that hold them under the archive's names with or without ``.gz``.
-
-    Returns
-    -------
-    list of InputFile
-        In reading order.
-
-    Raises
-    ------
-    SourceMissing
-        If a path does not exist, or a folder lacks a file or a part that is not optional.
-    """
+    """Find the files of a source."""
     found: list[InputFile] = []
     for path in paths:
         if path.is_dir():
@@ -147,21 +112,7 @@ def find_files(source: DataSource, paths: Sequence[Path]) -> list[InputFile]:
 
 
 def lacking(source: DataSource, folder: Path) -> tuple[str, ...] | None:
-    """Return what a folder lacks of a source.
-
-    Parameters
-    ----------
-    source : DataSource
-        What to look for.
-    folder : Path
-        Where.
-
-    Returns
-    -------
-    tuple of str or None
-        Names and parts of the files that are not there, without the optional ones: empty where
-        the source can be read from the folder, None where the folder has no file of it at all.
-    """
+    """Return what a folder lacks of a source."""
     lacks: list[str] = []
     has_some = False
     for layout in source.files:
@@ -197,18 +148,7 @@ def _existing(folder: Path, name: str) -> Path | None:
 
 
 def source_of_file(path: Path) -> str | None:
-    """Return the source whose archive name a file has.
-
-    Parameters
-    ----------
-    path : Path
-        The file, with or without ``.gz``.
-
-    Returns
-    -------
-    str or None
-        A name of ``data_sources``; None where no archive has a file of that name.
-    """
+    """Return the source whose archive name a file has."""
     named = (name for name in source_names() if named_layout(data_source(name), path))
     return next(named, None)
 
@@ -219,20 +159,7 @@ def _layout_of(source: DataSource, path: Path) -> RecordFile:
 
 
 def named_layout(source: DataSource, path: Path) -> RecordFile | None:
-    """Return the layout of a source whose archive name a file has.
-
-    Parameters
-    ----------
-    source : DataSource
-        The source.
-    path : Path
-        The file, with or without ``.gz``.
-
-    Returns
-    -------
-    RecordFile or None
-        None where the archive has no file of that name.
-    """
+    """Return the layout of a source whose archive name a file has."""
     name = path.name.removesuffix(".gz")
     for layout in source.files:
         for pattern in layout.file_names:
@@ -280,23 +207,7 @@ def _layout_in_folder(source: DataSource, layout: RecordFile, folder: Path) -> l
 
 
 def open_input(path: Path) -> tuple[DigestReader, Readable]:
-    """Open a plain or gzipped file for reading, with the digest of its raw bytes.
-
-    Parameters
-    ----------
-    path : Path
-        The file; compression is recognised by content, not by name.
-
-    Returns
-    -------
-    tuple of DigestReader and binary stream
-        The digest is complete once the stream has been read to its end.
-
-    Raises
-    ------
-    SourceError
-        If the file cannot be opened.
-    """
+    """Open a plain or gzipped file for reading, with the digest of its raw bytes."""
     try:
         with path.open("rb") as file:
             is_gzip = file.read(2) == MAGIC
@@ -310,27 +221,7 @@ def open_input(path: Path) -> tuple[DigestReader, Readable]:
 def read_blocks(
     file: InputFile, source_name: str, on_end: Callable[[DigestReader], None]
 ) -> Iterator[Block]:
-    """Read a file in blocks of whole lines or whole binary records.
-
-    Parameters
-    ----------
-    file : InputFile
-        The file.
-    source_name : str
-        For messages.
-    on_end : callable
-        Called with the reader when the last byte has been read.
-
-    Yields
-    ------
-    Block
-        In file order.
-
-    Raises
-    ------
-    ParseError
-        If the compressed data is truncated or damaged, or the file is empty.
-    """
+    """Read a file in blocks of whole lines or whole binary records."""
     raw, stream = open_input(file.path)
     line, tail = 1, b""
     try:
@@ -382,22 +273,7 @@ def _endless_line(file: InputFile, source_name: str, line: int) -> ParseError:
 
 
 def check_magic(header: bytes, file: InputFile, source_name: str) -> None:
-    """Check the first bytes of a binary file.
-
-    Parameters
-    ----------
-    header : bytes
-        The bytes before the first record.
-    file : InputFile
-        The file.
-    source_name : str
-        For the message.
-
-    Raises
-    ------
-    ParseError
-        If the header is cut off or does not begin with the layout's magic text.
-    """
+    """Check the first bytes of a binary file."""
     magic = file.layout.magic.encode()
     if len(header) < file.layout.header_bytes or not header.startswith(magic):
         raise ParseError(
@@ -431,22 +307,7 @@ def _count(data: bytes, layout: RecordFile) -> int:
 def map_in_order(
     function: Callable[[_Item], _Result], items: Iterator[_Item], workers: int = 2
 ) -> Iterator[_Result]:
-    """Apply a function to items with a few threads, keeping their order.
-
-    Parameters
-    ----------
-    function : callable
-        Applied to every item; numpy and pyarrow release the interpreter while they work.
-    items : iterator
-        Read by the calling thread, a few items ahead of the results.
-    workers : int, default 2
-        Number of threads; with none, the calling thread does the work.
-
-    Yields
-    ------
-    object
-        Results in the order of the items.
-    """
+    """Apply a function to items with a few threads, keeping their order."""
     if not workers:
         yield from map(function, items)
         return

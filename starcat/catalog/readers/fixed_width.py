@@ -33,22 +33,6 @@ def parse_fixed_width(
 ) -> Records:
     """Parse a block of fixed-width lines.
 
-    Parameters
-    ----------
-    data : bytes
-        Whole lines, LF or CRLF; the last may lack its line end. Empty lines are skipped.
-    layout : RecordFile
-        Record length, separators and columns.
-    names : sequence of str
-        Columns to parse.
-    first_line : int, default 1
-        Line number of the first line.
-
-    Returns
-    -------
-    Records
-        The good records and the problems of the others.
-
     Examples
     --------
     >>> from starcat.catalog.source import data_source

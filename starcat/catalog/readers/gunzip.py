@@ -30,13 +30,7 @@ class Readable(Protocol):
 
 
 class GzipReader:
-    """The decompressed content of a gzip file.
-
-    Parameters
-    ----------
-    raw : Readable
-        The compressed file, at its beginning.
-    """
+    """The decompressed content of a gzip file."""
 
     def __init__(self, raw: Readable) -> None:
         self._raw = raw
@@ -44,25 +38,7 @@ class GzipReader:
         self._pending = b""
 
     def read(self, size: int) -> bytes:
-        """Return the next bytes.
-
-        Parameters
-        ----------
-        size : int
-            How many; fewer only at the end.
-
-        Returns
-        -------
-        bytes
-            Empty at the end.
-
-        Raises
-        ------
-        EOFError
-            If the file ends within a member.
-        gzip.BadGzipFile
-            If the data is damaged, or something else follows a member.
-        """
+        """Return the next bytes."""
         parts: list[bytes] = []
         while size > 0:
             if not self._pending:

@@ -21,22 +21,7 @@ MAX_MALFORMED_FRACTION = 0.01
 def malformed_rows(
     problems: Sequence[Problem], number: int, source_name: str, band: str
 ) -> pa.Table:
-    """Return malformed records as rows of the rejected table.
-
-    Parameters
-    ----------
-    problems : sequence of Problem
-        The problems of one file.
-    number : int
-        The file's number.
-    source_name, band : str
-        What it was read as.
-
-    Returns
-    -------
-    pyarrow.Table
-        Table of the rejected schema; only place, reason and detail are known.
-    """
+    """Return malformed records as rows of the rejected table."""
     return table_from_columns(
         "rejected",
         {
@@ -54,22 +39,7 @@ def malformed_rows(
 def not_this_archive(
     file: InputFile, source: DataSource, problems: Sequence[Problem]
 ) -> ParseError:
-    """Return the error for a file in whose first block no record is good.
-
-    Parameters
-    ----------
-    file : InputFile
-        The file.
-    source : DataSource
-        What it was taken for.
-    problems : sequence of Problem
-        The problems of its first records.
-
-    Returns
-    -------
-    ParseError
-        To be raised.
-    """
+    """Return the error for a file in whose first block no record is good."""
     first = problems[0]
     return ParseError(
         f"{file.path}: none of the first {len(problems)} records is one of {source.name} "
@@ -85,24 +55,7 @@ def not_this_archive(
 def check_malformed(
     file: InputFile, rows: int, malformed: int, problems: Sequence[Problem], source: DataSource
 ) -> None:
-    """Refuse a file without records or with too many malformed ones.
-
-    Parameters
-    ----------
-    file : InputFile
-        What was read.
-    rows, malformed : int
-        Records in it, and how many of them are malformed.
-    problems : sequence of Problem
-        The first of the malformed ones.
-    source : DataSource
-        What it belongs to.
-
-    Raises
-    ------
-    ParseError
-        If the file has no record, or more than 10 of them and 1 % are malformed.
-    """
+    """Refuse a file without records or with too many malformed ones."""
     if not rows:
         raise ParseError(
             f"{file.path}: no record in the file; expected records of {source.name} "

@@ -22,18 +22,7 @@ _NUMBER = re.compile(rb"[+-]?(\d+(\.\d*)?|\.\d+)([eEdD][+-]?\d+)?")
 
 
 def line_ends(data: bytes) -> int:
-    """Return how many line ends are in a block.
-
-    Parameters
-    ----------
-    data : bytes
-        Any bytes.
-
-    Returns
-    -------
-    int
-        The count of LF, found by numpy several times as fast as by ``bytes.count``.
-    """
+    """Return how many line ends are in a block."""
     return int(np.count_nonzero(np.frombuffer(data, dtype=np.uint8) == ord("\n")))
 
 
@@ -94,68 +83,22 @@ class Records:
         return self.columns[name]
 
     def integers(self, name: str) -> NDArray[np.int64]:
-        """Return a required column as int64.
-
-        Parameters
-        ----------
-        name : str
-            A column without blanks.
-
-        Returns
-        -------
-        ndarray of int64, shape (N,)
-            The values.
-        """
+        """Return a required column as int64."""
         return self.columns[name].astype(np.int64)
 
     def is_blank(self, name: str) -> NDArray[np.bool_]:
-        """Return where a text column is blank.
-
-        Parameters
-        ----------
-        name : str
-            A text column.
-
-        Returns
-        -------
-        ndarray of bool, shape (N,)
-            True where the field holds only spaces.
-        """
+        """Return where a text column is blank."""
         text = self.columns[name]
         chars = text.view(np.uint8).reshape(len(text), text.dtype.itemsize)
         return np.asarray((chars <= 32).all(axis=1))
 
     def where(self, chosen: NDArray[np.bool_]) -> Records:
-        """Return some of the records, with all problems.
-
-        Parameters
-        ----------
-        chosen : ndarray of bool, shape (N,)
-            Rows to keep.
-
-        Returns
-        -------
-        Records
-            In the same order.
-        """
+        """Return some of the records, with all problems."""
         columns = {name: values[chosen] for name, values in self.columns.items()}
         return replace(self, line=self.line[chosen], columns=columns)
 
     def without(self, bad: NDArray[np.bool_], problems: Sequence[Problem]) -> Records:
-        """Return the records that are not bad, with more problems listed.
-
-        Parameters
-        ----------
-        bad : ndarray of bool, shape (N,)
-            Rows to leave out.
-        problems : sequence of Problem
-            Why; merged with the earlier ones in line order.
-
-        Returns
-        -------
-        Records
-            The rest.
-        """
+        """Return the records that are not bad, with more problems listed."""
         merged = sorted([*self.problems, *problems], key=lambda problem: problem.line)
         if not bad.any():
             return replace(self, problems=merged)
@@ -163,20 +106,7 @@ class Records:
 
 
 def reject_impossible_numbers(records: Records, layout: RecordFile) -> Records:
-    """Leave out the records with a number that its column cannot hold.
-
-    Parameters
-    ----------
-    records : Records
-        What a reader has parsed.
-    layout : RecordFile
-        The layout; the range of each column says what it can hold.
-
-    Returns
-    -------
-    Records
-        The others, and a problem for each that is left out.
-    """
+    """Leave out the records with a number that its column cannot hold."""
     bad = np.zeros(len(records), dtype=bool)
     problems: list[Problem] = []
     for column in layout.columns:
@@ -199,23 +129,7 @@ def reject_impossible_numbers(records: Records, layout: RecordFile) -> Records:
 
 
 def number_from_text(text: bytes) -> float:
-    """Return the number that a field holds.
-
-    Parameters
-    ----------
-    text : bytes
-        The field, with or without blanks around it.
-
-    Returns
-    -------
-    float
-        The value; NaN for a blank field.
-
-    Raises
-    ------
-    ValueError
-        If the text is neither blank nor a finite decimal number.
-    """
+    """Return the number that a field holds."""
     stripped = text.strip()
     if not stripped:
         return float("nan")
@@ -228,35 +142,14 @@ def number_from_text(text: bytes) -> float:
 
 
 def apply_nulls(values: NDArray[np.float64], column: Column) -> None:
-    """Set the numbers that stand for "no value" to NaN, in place.
-
-    Parameters
-    ----------
-    values : ndarray of float64, shape (N,)
-        Numbers of the column.
-    column : Column
-        Its description; ``null`` lists the texts.
-    """
+    """Set the numbers that stand for "no value" to NaN, in place."""
     for text in column.null:
         if _NUMBER.fullmatch(text.encode()):
             values[values == float(text)] = np.nan
 
 
 def reject_required_blanks(records: Records, layout: RecordFile) -> Records:
-    """Leave out the records in which a required field is blank.
-
-    Parameters
-    ----------
-    records : Records
-        What a reader has parsed.
-    layout : RecordFile
-        The layout; its columns say which are required.
-
-    Returns
-    -------
-    Records
-        The records with all that they need, and a problem for each of the others.
-    """
+    """Leave out the records in which a required field is blank."""
     bad = np.zeros(len(records), dtype=bool)
     problems: list[Problem] = []
     for column in layout.columns:

@@ -28,36 +28,14 @@ WAYS = {
 
 
 def camera_of_scale(scale: float) -> tuple[Camera, Camera]:
-    """Return a camera whose image is larger than the matcher is told.
-
-    Parameters
-    ----------
-    scale : float
-        Factor that the image is magnified by, about its centre.
-
-    Returns
-    -------
-    as_it_is, as_told : Camera
-        A camera with the same detector, which shows the same field at every scale.
-    """
+    """Return a camera whose image is larger than the matcher is told."""
     size = round(1024 * scale)
     told = Camera(1024, 1024, fov_x_deg=6.0).focal_length_px
     return Camera(size, size, told * size / 1024), Camera(size, size, told)
 
 
 def rows(quick: bool) -> list[Row]:
-    """Return the rows of S1.
-
-    Parameters
-    ----------
-    quick : bool
-        One image of 10.
-
-    Returns
-    -------
-    list of Row
-        Both norms over roll and scale, and starcat's identification over the whole library.
-    """
+    """Return the rows of S1."""
     count = 20 if quick else 200
     made = []
     for roll_deg in ROLLS_DEG:
@@ -119,20 +97,7 @@ def _trial(
 
 
 def statistics(artifacts: dict[str, Path], quick: bool) -> list[Statistic]:
-    """Return the size of the reference sets.
-
-    Parameters
-    ----------
-    artifacts : dict of str to Path
-        Folders by preset.
-    quick : bool
-        Makes no difference.
-
-    Returns
-    -------
-    list of Statistic
-        Mebibytes in the HDF5 file.
-    """
+    """Return the size of the reference sets."""
     return [
         Statistic("Storage", "hausdorff_l2", product_mib(artifacts[PRESET], "hausdorff_l2"), "MiB")
     ]

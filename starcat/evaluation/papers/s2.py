@@ -46,18 +46,7 @@ third of what can be seen."""
 
 
 def rows(quick: bool) -> list[Row]:
-    """Return the rows of S2.
-
-    Parameters
-    ----------
-    quick : bool
-        One image of 90.
-
-    Returns
-    -------
-    list of Row
-        Table 3, the three noises, table 4.
-    """
+    """Return the rows of S2."""
     grid = Attitudes("grid", 180, 2.0) if quick else GRID
     fewer = Attitudes("grid", 180, 2.0) if quick else FEWER
     return [
@@ -184,20 +173,7 @@ def _distorted(grid: Attitudes, fewer: Attitudes) -> list[Row]:
 
 
 def statistics(artifacts: dict[str, Path], quick: bool) -> list[Statistic]:
-    """Return S2's numbers that need no trial: there are none.
-
-    Parameters
-    ----------
-    artifacts : dict of str to Path
-        Not looked at.
-    quick : bool
-        Not looked at.
-
-    Returns
-    -------
-    list of Statistic
-        Empty.
-    """
+    """Return S2's numbers that need no trial: there are none."""
     return []
 
 

@@ -33,21 +33,7 @@ _FIRST = ((0, 1, 2), (0, 1, 3), (0, 1, 4))
 
 
 def field_centroids(artifact: Path, step_deg: float) -> list[Array]:
-    """Return the stars of fields on a grid of boresights, brightest first.
-
-    Parameters
-    ----------
-    artifact : Path
-        The artifact whose catalog is used, doubles and all: S3 is about passing over doubles.
-    step_deg : float
-        Boresights lie at right ascensions 0, step, ... and in the middle of declination cells;
-        the roll is 0.
-
-    Returns
-    -------
-    list of ndarray of float64, shape (N, 2)
-        Noiseless pixels of each field.
-    """
+    """Return the stars of fields on a grid of boresights, brightest first."""
     sky = catalog_of_artifact(artifact).brighter(LIMIT_MAG)
     made = []
     rows = round(180.0 / step_deg)
@@ -63,41 +49,14 @@ def field_centroids(artifact: Path, step_deg: float) -> list[Array]:
 
 
 def passes(centroids_px: Array, triples: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Return which triangles of centroids meet S3's two constraints.
-
-    Parameters
-    ----------
-    centroids_px : ndarray of float64, shape (N, 2)
-        Pixels.
-    triples : ndarray of int, shape (T, 3)
-        Rows of ``centroids_px``.
-
-    Returns
-    -------
-    ndarray of bool, shape (T,)
-        Every side longer than d_min and every angle wider than theta_min.
-    """
+    """Return which triangles of centroids meet S3's two constraints."""
     u, v, w = (centroids_px[triples[:, n]] for n in range(3))
     a, b, c = (np.hypot(*(p - q).T) for p, q in ((v, w), (u, w), (u, v)))
     return is_well_shaped(a, b, c, MIN_SIDE_PX, float(np.radians(MIN_ANGLE_DEG)))
 
 
 def statistics(artifacts: dict[str, Path], quick: bool) -> list[Statistic]:
-    """Count the triangles that pass, as the paper's tables do.
-
-    Parameters
-    ----------
-    artifacts : dict of str to Path
-        Folders by preset.
-    quick : bool
-        A grid of 9 instead of 3 degrees.
-
-    Returns
-    -------
-    list of Statistic
-        Failing triangles of the brightest six, fields that fail with the first, second and
-        third choice, and the fields whose first triangle can be used.
-    """
+    """Count the triangles that pass, as the paper's tables do."""
     fields = field_centroids(artifacts[PRESET], 9.0 if quick else 3.0)
     scale = 7200.0 / len(fields)
     six = np.array([t for t in np.ndindex(BRIGHTEST, BRIGHTEST, BRIGHTEST) if t[0] < t[1] < t[2]])

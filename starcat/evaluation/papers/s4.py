@@ -19,18 +19,7 @@ MIXED = Noise(noise_px=1.0, noise_mag=0.5, false_share=0.2, limit_mag=LIMIT_MAG)
 
 
 def rows(quick: bool) -> list[Row]:
-    """Return the rows of S4.
-
-    Parameters
-    ----------
-    quick : bool
-        One image of 20.
-
-    Returns
-    -------
-    list of Row
-        The rows of its three curves and of the mixed test.
-    """
+    """Return the rows of S4."""
     count = 50 if quick else 1000
     return [
         *_curve("Position noise", "px", (0.2, 0.5, 1.0, 1.5, 2.0), (96.5, 83.5), 99.0, count),
@@ -108,20 +97,7 @@ def _mixed(count: int) -> list[Row]:
 
 
 def statistics(artifacts: dict[str, Path], quick: bool) -> list[Statistic]:
-    """Return the sizes of the two feature bases.
-
-    Parameters
-    ----------
-    artifacts : dict of str to Path
-        Folders by preset.
-    quick : bool
-        Makes no difference.
-
-    Returns
-    -------
-    list of Statistic
-        Mebibytes in the HDF5 file, K-vectors included.
-    """
+    """Return the sizes of the two feature bases."""
     folder = artifacts[PRESET]
     group = "Storage"
     return [

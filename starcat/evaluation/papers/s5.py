@@ -22,18 +22,7 @@ WAYS = {
 
 
 def rows(quick: bool) -> list[Row]:
-    """Return the rows of S5.
-
-    Parameters
-    ----------
-    quick : bool
-        One image of 25.
-
-    Returns
-    -------
-    list of Row
-        Position noise, false stars, missing stars, and the time.
-    """
+    """Return the rows of S5."""
     count = 40 if quick else 1000
     made = []
     for value in (0.0, 0.5, 1.0, 1.5, 2.0):
@@ -85,20 +74,7 @@ def _point(
 
 
 def statistics(artifacts: dict[str, Path], quick: bool) -> list[Statistic]:
-    """Return the sizes of the feature bases.
-
-    Parameters
-    ----------
-    artifacts : dict of str to Path
-        Folders by preset.
-    quick : bool
-        Makes no difference.
-
-    Returns
-    -------
-    list of Statistic
-        Kibibytes in the HDF5 file.
-    """
+    """Return the sizes of the feature bases."""
     published = {"hausdorff_angular": None, "grid": 312.0, "triangles": None}
     return [
         Statistic("Storage", name, 1024.0 * product_mib(artifacts[PRESET], name), "KiB", size)

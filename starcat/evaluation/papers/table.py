@@ -13,23 +13,7 @@ PAPERS: dict[str, Paper] = {
 
 
 def papers_named(name: str) -> list[Paper]:
-    """Return the papers that a user asks for.
-
-    Parameters
-    ----------
-    name : str
-        Name of one paper, in any case, or ``all``.
-
-    Returns
-    -------
-    list of Paper
-        The papers, in the order of their names.
-
-    Raises
-    ------
-    ConfigError
-        If there is none of that name, listing those there are.
-    """
+    """Return the papers that a user asks for."""
     if name.lower() == "all":
         return [PAPERS[known] for known in sorted(PAPERS)]
     try:

@@ -31,33 +31,12 @@ class Column:
 
 
 def percent(value: float | None) -> str:
-    """Return a percentage as text.
-
-    Parameters
-    ----------
-    value : float or None
-        Percent.
-
-    Returns
-    -------
-    str
-        Two decimals; empty for None.
-    """
+    """Return a percentage as text."""
     return "" if value is None else f"{value:.2f}"
 
 
 def milliseconds(value: float | None) -> str:
     """Return a time as text: two digits, as a second run would not agree in the third.
-
-    Parameters
-    ----------
-    value : float or None
-        Milliseconds.
-
-    Returns
-    -------
-    str
-        Empty for None.
 
     Examples
     --------
@@ -73,35 +52,13 @@ def milliseconds(value: float | None) -> str:
 
 
 def method_of(line: Line) -> str:
-    """Return how the frames of a row were identified.
-
-    Parameters
-    ----------
-    line : mapping
-        A row.
-
-    Returns
-    -------
-    str
-        The method; and the way to answer, if that is not the matcher's own.
-    """
+    """Return how the frames of a row were identified."""
     method, answer = line["trial"]["method"], line["trial"]["answer"]
     return str(method if answer == "matcher" else f"{method} ({answer.replace('_', ' ')})")
 
 
 def difference(line: Line) -> str:
-    """Return measured less published.
-
-    Parameters
-    ----------
-    line : mapping
-        A row.
-
-    Returns
-    -------
-    str
-        Percentage points with a sign; empty where the paper prints nothing.
-    """
+    """Return measured less published."""
     published, measured = line["published_percent"], line["by_rule"]["percent"]
     return "" if None in (published, measured) else f"{measured - published:+.2f}"
 
@@ -128,34 +85,12 @@ def _goal(line: Line) -> str:
 
 
 def verdict(line: Line) -> str:
-    """Return whether a goal is reached.
-
-    Parameters
-    ----------
-    line : mapping
-        A row or a statistic.
-
-    Returns
-    -------
-    str
-        ``yes`` or ``no``; empty where there is none.
-    """
+    """Return whether a goal is reached."""
     return {None: "", True: "yes", False: "no"}[line["is_goal_reached"]]
 
 
 def marked_verdict(line: Line) -> str:
-    """Return whether a goal is reached, with a sign that catches the eye.
-
-    Parameters
-    ----------
-    line : mapping
-        A row or a statistic.
-
-    Returns
-    -------
-    str
-        Empty where there is none.
-    """
+    """Return whether a goal is reached, with a sign that catches the eye."""
     return {None: "", True: "✓ yes", False: "✗ no"}[line["is_goal_reached"]]
 
 

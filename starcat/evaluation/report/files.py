@@ -31,24 +31,7 @@ RESULTS = "results.json"
 def write_evaluation(
     folder: Path, title: str, contents: Sequence[Mapping[str, Any]], machine: str
 ) -> Path:
-    """Write all files of an evaluation.
-
-    Parameters
-    ----------
-    folder : Path
-        Made if it is not there.
-    title : str
-        Title of the page.
-    contents : sequence of mapping
-        Evaluations as `Outcome.as_dict` returns them.
-    machine : str
-        What the times were measured on.
-
-    Returns
-    -------
-    Path
-        The page, ``index.html``.
-    """
+    """Write all files of an evaluation."""
     folder.mkdir(parents=True, exist_ok=True)
     results = {"title": title, "machine": machine, "evaluations": list(contents)}
     (folder / RESULTS).write_text(_json(results, indent=2), encoding="utf-8")
@@ -69,18 +52,7 @@ def write_evaluation(
 
 
 def rates_csv(lines: Sequence[Line]) -> str:
-    """Return rows as CSV.
-
-    Parameters
-    ----------
-    lines : sequence of mapping
-        Rows of `Outcome.as_dict`, one at least.
-
-    Returns
-    -------
-    str
-        A line a row; every share as percent with its interval, and as a number of frames.
-    """
+    """Return rows as CSV."""
     flat = [_flat(line) for line in lines]
     return _csv(tuple(flat[0]), flat)
 
@@ -115,26 +87,7 @@ def _csv(heads: Sequence[str], lines: Iterable[Line]) -> str:
 
 
 def write_reproduction(results: Path, docs: Path) -> Path:
-    """Write the page of the documentation that holds all tables and curves.
-
-    Parameters
-    ----------
-    results : Path
-        ``results.json`` of an evaluation, or ``reproduction.json`` of the documentation.
-    docs : Path
-        Folder; gets ``reproduction.md``, ``reproduction.json``, which the page can be made
-        from again, and ``figures/``.
-
-    Returns
-    -------
-    Path
-        The page.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such evaluation.
-    """
+    """Write the page of the documentation that holds all tables and curves."""
     try:
         stored = json.loads(results.read_bytes())
     except OSError as error:
@@ -158,18 +111,7 @@ def write_reproduction(results: Path, docs: Path) -> Path:
 
 
 def reproduction_page(results: Path) -> str:
-    """Return the page of the documentation from a stored evaluation.
-
-    Parameters
-    ----------
-    results : Path
-        ``reproduction.json``.
-
-    Returns
-    -------
-    str
-        Markdown.
-    """
+    """Return the page of the documentation from a stored evaluation."""
     stored = json.loads(results.read_bytes())
     return reproduction_markdown(stored["evaluations"], stored["machine"], "figures")
 

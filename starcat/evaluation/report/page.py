@@ -35,24 +35,7 @@ body { max-width: 72rem; }
 def evaluation_page(
     title: str, contents: Sequence[Content], plots: Mapping[str, bytes], machine: str
 ) -> str:
-    """Return an evaluation as an HTML page.
-
-    Parameters
-    ----------
-    title : str
-        Title of the page.
-    contents : sequence of mapping
-        Evaluations as `Outcome.as_dict` returns them.
-    plots : mapping of str to bytes
-        SVG by name.
-    machine : str
-        What the times were measured on.
-
-    Returns
-    -------
-    str
-        HTML5; the plots and the style are inside.
-    """
+    """Return an evaluation as an HTML page."""
     summary = summary_table(contents)
     parts = [
         f"<h1>{escape(title)}</h1>",
@@ -74,18 +57,7 @@ def evaluation_page(
 
 
 def legend(contents: Sequence[Content]) -> list[tuple[str, str]]:
-    """Return what the columns mean.
-
-    Parameters
-    ----------
-    contents : sequence of mapping
-        Evaluations as `Outcome.as_dict` returns them.
-
-    Returns
-    -------
-    list of tuple of str
-        Column and meaning, of the columns that some table has.
-    """
+    """Return what the columns mean."""
     used = {
         head for content in contents for one in rate_tables(content, LONG) for head in one.heads
     }
@@ -99,18 +71,7 @@ def legend(contents: Sequence[Content]) -> list[tuple[str, str]]:
 
 
 def rules_of(contents: Sequence[Content]) -> list[tuple[str, str]]:
-    """Return the rules that rows are judged by.
-
-    Parameters
-    ----------
-    contents : sequence of mapping
-        Evaluations as `Outcome.as_dict` returns them.
-
-    Returns
-    -------
-    list of tuple of str
-        Rule and meaning, with the papers that use it.
-    """
+    """Return the rules that rows are judged by."""
     users: dict[str, list[str]] = {}
     for content in contents:
         for rule in dict.fromkeys(line["rule"] for line in content["rows"]):
@@ -149,22 +110,7 @@ def _html(one: Table) -> str:
 
 
 def reproduction_markdown(contents: Sequence[Content], machine: str, figures: str) -> str:
-    """Return an evaluation as Markdown.
-
-    Parameters
-    ----------
-    contents : sequence of mapping
-        Evaluations as `Outcome.as_dict` returns them.
-    machine : str
-        What the times were measured on.
-    figures : str
-        Folder of the curves' SVG files, as the page sees it.
-
-    Returns
-    -------
-    str
-        The same bytes for the same evaluation.
-    """
+    """Return an evaluation as Markdown."""
     summary = summary_table(contents)
     parts = [
         "<!-- Generated from reproduction.json by `make docs`; no figure is typed by hand. -->",

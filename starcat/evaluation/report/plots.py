@@ -24,22 +24,7 @@ MARKERS = "osD^vP*X"
 
 
 def curves(content: Mapping[str, Any]) -> Iterator[tuple[str, str, list[Line]]]:
-    """Give the groups of rows that are curves.
-
-    Parameters
-    ----------
-    content : mapping
-        An evaluation as `Outcome.as_dict` returns it.
-
-    Yields
-    ------
-    name : str
-        Name of a file, without a suffix; no two are the same.
-    group : str
-        The title.
-    lines : list of mapping
-        Rows with an abscissa, of two places at least.
-    """
+    """Give the groups of rows that are curves."""
     for number, (group, lines) in enumerate(groups_of(content["rows"]).items(), start=1):
         points = [line for line in lines if line["x"] is not None]
         if len({line["x"] for line in points}) > 1:
@@ -48,55 +33,17 @@ def curves(content: Mapping[str, Any]) -> Iterator[tuple[str, str, list[Line]]]:
 
 
 def series_of(line: Line) -> str:
-    """Return which curve a row belongs to.
-
-    Parameters
-    ----------
-    line : mapping
-        A row.
-
-    Returns
-    -------
-    str
-        What its label has before the last comma; without a comma, its method.
-    """
+    """Return which curve a row belongs to."""
     return str(line["label"]).rpartition(", ")[0] or method_of(line)
 
 
 def series_order(content: Mapping[str, Any]) -> list[str]:
-    """Return all curves of an evaluation: each keeps its colour in all plots.
-
-    Parameters
-    ----------
-    content : mapping
-        An evaluation as `Outcome.as_dict` returns it.
-
-    Returns
-    -------
-    list of str
-        Names of the curves, in the order of the rows.
-    """
+    """Return all curves of an evaluation: each keeps its colour in all plots."""
     return list(dict.fromkeys(series_of(x) for _, _, lines in curves(content) for x in lines))
 
 
 def draw_rates(title: str, lines: Sequence[Line], series: Sequence[str]) -> Figure:
-    """Draw rates against an abscissa.
-
-    Parameters
-    ----------
-    title : str
-        Title of the group.
-    lines : sequence of mapping
-        Rows with an abscissa.
-    series : sequence of str
-        All curves of the evaluation.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Curves with Wilson's intervals; hollow signs are the paper's figures, the
-        grey line is the share of frames with at least four guide stars.
-    """
+    """Draw rates against an abscissa."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
@@ -194,15 +141,7 @@ def _limits(lines: Sequence[Line]) -> tuple[float, float]:
 
 
 def save_small_svg(figure: Figure, path: Path) -> None:
-    """Write a drawing as an SVG file whose letters are text: a sixth of the bytes.
-
-    Parameters
-    ----------
-    figure : matplotlib.figure.Figure
-        The drawing.
-    path : Path
-        The file. It has the same bytes every time, but looks as the reader's fonts do.
-    """
+    """Write a drawing as an SVG file whose letters are text: a sixth of the bytes."""
     import matplotlib
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 

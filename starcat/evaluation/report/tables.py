@@ -39,18 +39,7 @@ class Table:
 
 
 def groups_of(lines: Iterable[Line]) -> dict[str, list[Line]]:
-    """Return lines by their group.
-
-    Parameters
-    ----------
-    lines : iterable of mapping
-        Rows or statistics.
-
-    Returns
-    -------
-    dict of str to list
-        Lines by group, in the order of the first line of each.
-    """
+    """Return lines by their group."""
     groups: dict[str, list[Line]] = {}
     for line in lines:
         groups.setdefault(line["group"], []).append(line)
@@ -58,20 +47,7 @@ def groups_of(lines: Iterable[Line]) -> dict[str, list[Line]]:
 
 
 def rate_tables(content: Mapping[str, Any], columns: Sequence[Column]) -> list[Table]:
-    """Return a table of rates a group.
-
-    Parameters
-    ----------
-    content : mapping
-        An evaluation as `Outcome.as_dict` returns it.
-    columns : sequence of Column
-        `SHORT` or `LONG`; those without content are left out.
-
-    Returns
-    -------
-    list of Table
-        Tables with the rows' notes.
-    """
+    """Return a table of rates a group."""
     tables = []
     for group, lines in groups_of(content["rows"]).items():
         shown = [column for column in columns if column.is_wanted(lines)]
@@ -86,20 +62,7 @@ def rate_tables(content: Mapping[str, Any], columns: Sequence[Column]) -> list[T
 def statistic_tables(
     content: Mapping[str, Any], reached: Callable[[Line], str] = marked_verdict
 ) -> list[Table]:
-    """Return a table of the numbers that need no trial, a group.
-
-    Parameters
-    ----------
-    content : mapping
-        An evaluation as `Outcome.as_dict` returns it.
-    reached : callable
-        Says of a line whether its goal is reached.
-
-    Returns
-    -------
-    list of Table
-        Tables with their notes.
-    """
+    """Return a table of the numbers that need no trial, a group."""
     tables = []
     for group, lines in groups_of(content["statistics"]).items():
         has_goal = any(line["goal"] is not None for line in lines)
@@ -133,18 +96,7 @@ def _number(value: float | None) -> str:
 
 
 def failure_table(content: Mapping[str, Any]) -> Table | None:
-    """Return why frames failed, for the rows that miss their goal.
-
-    Parameters
-    ----------
-    content : mapping
-        An evaluation as `Outcome.as_dict` returns it.
-
-    Returns
-    -------
-    Table or None
-        Frames by cause; None if every goal is reached.
-    """
+    """Return why frames failed, for the rows that miss their goal."""
     lines = [line for line in content["rows"] if line["is_goal_reached"] is False]
     if not lines:
         return None
@@ -163,18 +115,7 @@ def failure_table(content: Mapping[str, Any]) -> Table | None:
 
 
 def summary_table(contents: Sequence[Mapping[str, Any]]) -> Table | None:
-    """Return what each paper came to.
-
-    Parameters
-    ----------
-    contents : sequence of mapping
-        Evaluations as `Outcome.as_dict` returns them.
-
-    Returns
-    -------
-    Table or None
-        One row a paper; None where nothing is published or wanted.
-    """
+    """Return what each paper came to."""
     rows, has_any = [], False
     for content in contents:
         lines = [*content["rows"], *content["statistics"]]

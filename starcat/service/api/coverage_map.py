@@ -60,18 +60,7 @@ def coverage_answer(found: Estimate) -> CoverageMap:
 
 
 def coverage_svg(found: Estimate) -> str:
-    """Return the map of an estimate.
-
-    Parameters
-    ----------
-    found : Estimate
-        The estimate.
-
-    Returns
-    -------
-    str
-        SVG of less than 300 kB.
-    """
+    """Return the map of an estimate."""
     count = found.fields.count
     dots = min(len(count), MOST_DOTS)
     group = _groups(len(count), dots)

@@ -65,18 +65,7 @@ class CoverageAnswer(BaseModel):
 
 
 def facts_of(database: Database) -> DatabaseFacts:
-    """Return what is said of a database.
-
-    Parameters
-    ----------
-    database : Database
-        With its manifest.
-
-    Returns
-    -------
-    DatabaseFacts
-        Read from the manifest alone.
-    """
+    """Return what is said of a database."""
     manifest = database.manifest
     products = {name: int(facts["rows"]) for name, facts in manifest["products"].items()}
     return DatabaseFacts(

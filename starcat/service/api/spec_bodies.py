@@ -61,18 +61,7 @@ class GivenSpec(BaseModel):
         return self
 
     def checked(self) -> BuildSpec:
-        """Return the spec.
-
-        Returns
-        -------
-        BuildSpec
-            Checked.
-
-        Raises
-        ------
-        ConfigError
-            In the words of the command line.
-        """
+        """Return the spec."""
         if self.preset is not None:
             return preset(self.preset, self.changes)
         content = self.spec if self.toml is None else content_of_toml(self.toml, ORIGIN)

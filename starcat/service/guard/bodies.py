@@ -26,15 +26,7 @@ FILLING = ("/tap/async",)
 
 
 class Bodies(Guard):
-    """Refuses bodies that are too large, too slow, or for which the disk has no room.
-
-    Parameters
-    ----------
-    app : ASGIApp
-        What comes behind.
-    settings : Settings
-        What the operator set.
-    """
+    """Refuses bodies that are too large, too slow, or for which the disk has no room."""
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
         super().__init__(app)
@@ -69,18 +61,7 @@ class Bodies(Guard):
 
 
 def lack_of_room(settings: Settings) -> Problem | None:
-    """Return why nothing may be added to the disk.
-
-    Parameters
-    ----------
-    settings : Settings
-        What the operator set.
-
-    Returns
-    -------
-    Problem or None
-        None where there is room.
-    """
+    """Return why nothing may be added to the disk."""
     if free_gib(settings.root) >= settings.free_gib:
         return None
     return Problem(

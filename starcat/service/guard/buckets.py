@@ -11,17 +11,7 @@ MOST = 10_000
 
 
 class Buckets:
-    """A bucket for each key: full at first, emptied by one each time, filled again steadily.
-
-    Parameters
-    ----------
-    per_minute : float
-        How often each key may in the long run.
-    most_at_once : float, optional
-        Size of a bucket; without, what a minute gives.
-    clock : callable, default `time.monotonic`
-        Seconds.
-    """
+    """A bucket for each key: full at first, emptied by one each time, filled again steadily."""
 
     def __init__(
         self,
@@ -35,18 +25,7 @@ class Buckets:
         self._left: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def take(self, key: str) -> float:
-        """Take one out of the bucket of a key.
-
-        Parameters
-        ----------
-        key : str
-            Such as an address.
-
-        Returns
-        -------
-        float
-            0, or the seconds until there will be one where the bucket is empty.
-        """
+        """Take one out of the bucket of a key."""
         now_s = self._clock()
         left, then_s = self._left.pop(key, (self._size, now_s))
         left = min(self._size, left + (now_s - then_s) * self._per_s)

@@ -8,13 +8,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 
 class Guard(ABC):
-    """Middleware that each request passes; the start and the end of the server pass it untouched.
-
-    Parameters
-    ----------
-    app : ASGIApp
-        What comes behind.
-    """
+    """Middleware for requests; the server's lifespan events pass it untouched."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -28,12 +22,4 @@ class Guard(ABC):
 
     @abstractmethod
     async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request, or have what comes behind answer it.
-
-        Parameters
-        ----------
-        scope : Scope
-            The request.
-        receive, send : callable
-            As ASGI has them.
-        """
+        """Answer a request, or have what comes behind answer it."""

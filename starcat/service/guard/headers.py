@@ -27,15 +27,7 @@ A_YEAR = "max-age=31536000"
 
 
 class SafeHeaders(Guard):
-    """Adds what browsers keep to. A handler's own policy stays as it is.
-
-    Parameters
-    ----------
-    app : ASGIApp
-        What comes behind.
-    settings : Settings
-        What the operator set.
-    """
+    """Adds what browsers keep to. A handler's own policy stays as it is."""
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
         super().__init__(app)

@@ -21,13 +21,7 @@ not succeed, and a colleague behind the same address is not to be locked out by 
 
 
 class Identities:
-    """Who there is: tokens and sign-ins.
-
-    Parameters
-    ----------
-    service : Service
-        What is served.
-    """
+    """Who there is: tokens and sign-ins."""
 
     def __init__(self, service: Service) -> None:
         self.tokens = TokenStore(service.records)

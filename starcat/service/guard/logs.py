@@ -48,18 +48,7 @@ class JsonFormatter(logging.Formatter):
 
 
 def log_settings(level: str = "INFO") -> dict[str, Any]:
-    """Return the configuration of `logging` for the server.
-
-    Parameters
-    ----------
-    level : str, default "INFO"
-        What is written at least.
-
-    Returns
-    -------
-    dict
-        For `logging.config.dictConfig`: everything goes to stderr as JSON.
-    """
+    """Return the configuration of `logging` for the server."""
     return {
         "version": 1,
         "disable_existing_loggers": False,
@@ -77,13 +66,7 @@ def log_settings(level: str = "INFO") -> dict[str, Any]:
 
 
 class RequestLog(Guard):
-    """Writes a line for each request when it has been answered.
-
-    Parameters
-    ----------
-    app : ASGIApp
-        What comes behind.
-    """
+    """Writes a line for each request when it has been answered."""
 
     async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
@@ -119,13 +102,7 @@ def _write(scope: Scope, status: int, sent: int, taken_s: float) -> None:
 
 
 class Defects(Guard):
-    """Answers what no handler foresaw: the log gets the traceback, the client gets none.
-
-    Parameters
-    ----------
-    app : ASGIApp
-        What comes behind.
-    """
+    """Answers what no handler foresaw: the log gets the traceback, the client gets none."""
 
     async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""

@@ -25,13 +25,7 @@ UNMATCHED = "unmatched"
 
 
 class Metrics:
-    """What is counted.
-
-    Parameters
-    ----------
-    service : Service
-        What is served.
-    """
+    """What is counted."""
 
     def __init__(self, service: Service) -> None:
         self.registry = CollectorRegistry()
@@ -94,15 +88,7 @@ class _State(Collector):
 
 
 class Counted(Guard):
-    """Counts requests and their time, by the route that answered.
-
-    Parameters
-    ----------
-    app : ASGIApp
-        What comes behind.
-    metrics : Metrics
-        What is counted.
-    """
+    """Counts requests and their time, by the route that answered."""
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
         super().__init__(app)

@@ -25,15 +25,7 @@ HOST = re.compile(r"(?P<name>\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9._-]{1,253})(:(?P
 
 
 class Origin(Guard):
-    """Refuses requests to other names, and those that other sites have made a browser send.
-
-    Parameters
-    ----------
-    app : ASGIApp
-        What comes behind.
-    settings : Settings
-        What the operator set.
-    """
+    """Refuses requests to other names, and those that other sites have made a browser send."""
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
         super().__init__(app)
@@ -84,19 +76,7 @@ class Origin(Guard):
 
 
 def known_names(settings: Settings) -> frozenset[str] | None:
-    """Return the names that the service may be called by.
-
-    Parameters
-    ----------
-    settings : Settings
-        What the operator set.
-
-    Returns
-    -------
-    frozenset of str or None
-        In small letters; None where every name is taken, because without a token nobody may do
-        anything and a browser has no cookie for a name of somebody else.
-    """
+    """Return the names that the service may be called by."""
     if not settings.is_loopback and settings.public_url is None:
         return None
     names = {"localhost", settings.host.lower()}

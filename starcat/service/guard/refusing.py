@@ -12,15 +12,7 @@ from starcat.service.problems import Problem, problem_of, problem_response
 
 
 async def refuse(scope: Scope, receive: Receive, send: Send, problem: Problem) -> None:
-    """Answer a request with what is wrong with it.
-
-    Parameters
-    ----------
-    scope, receive, send
-        Of the request.
-    problem : Problem
-        What is wrong.
-    """
+    """Answer a request with what is wrong with it."""
     await problem_response(problem_of(problem), problem.headers)(scope, receive, send)
 
 

@@ -19,13 +19,7 @@ request_id: ContextVar[str | None] = ContextVar("request_id", default=None)
 
 
 class RequestId(Guard):
-    """Names each request.
-
-    Parameters
-    ----------
-    app : ASGIApp
-        What comes behind.
-    """
+    """Names each request."""
 
     async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""

@@ -41,20 +41,7 @@ class Removed:
 
 
 def remove_old(service: Service, now_s: float) -> Removed:
-    """Remove what is older than the settings say.
-
-    Parameters
-    ----------
-    service : Service
-        What is served.
-    now_s : float
-        Seconds since 1970.
-
-    Returns
-    -------
-    Removed
-        How much it was.
-    """
+    """Remove what is older than the settings say."""
     settings, places = service.settings, service.places
     removed = Removed(
         _remove_jobs(service, now_s - settings.keep_jobs_days * DAY_S),
@@ -68,13 +55,7 @@ def remove_old(service: Service, now_s: float) -> Removed:
 
 
 async def keep_removing(service: Service) -> None:
-    """Remove what is old now and every hour, until it is cancelled.
-
-    Parameters
-    ----------
-    service : Service
-        What is served.
-    """
+    """Remove what is old now and every hour, until it is cancelled."""
     while True:
         try:
             await asyncio.to_thread(remove_old, service, time.time())

@@ -16,33 +16,14 @@ from starcat.service.settings import Settings
 
 
 class SessionStore:
-    """The sign-ins of a service.
-
-    Parameters
-    ----------
-    records : Records
-        Where they are kept.
-    hours : float
-        Time that each lasts.
-    """
+    """The sign-ins of a service."""
 
     def __init__(self, records: Records, hours: float) -> None:
         self._records = records
         self._lasts_s = hours * 3600.0
 
     def open(self, token: Token) -> str:
-        """Begin a session.
-
-        Parameters
-        ----------
-        token : Token
-            Whose rights it has, while that is valid.
-
-        Returns
-        -------
-        str
-            The secret of the cookie.
-        """
+        """Begin a session."""
         secret = secrets.token_urlsafe(32)
         now_s = time.time()
         with self._records.writing() as connection:
@@ -90,20 +71,7 @@ def cookie_name(settings: Settings) -> str:
 
 
 def session_in(cookies: str, settings: Settings) -> str | None:
-    """Return the secret of a session.
-
-    Parameters
-    ----------
-    cookies : str
-        The header ``Cookie``.
-    settings : Settings
-        What the operator set.
-
-    Returns
-    -------
-    str or None
-        None where there is none.
-    """
+    """Return the secret of a session."""
     name = cookie_name(settings)
     if name not in cookies:
         return None

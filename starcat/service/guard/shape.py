@@ -20,13 +20,7 @@ METHODS = ("GET", "HEAD", "OPTIONS", "POST", "PUT", "PATCH", "DELETE")
 
 
 class Shape(Guard):
-    """Refuses requests that are too long, hold control characters, or climb out of folders.
-
-    Parameters
-    ----------
-    app : ASGIApp
-        What comes behind.
-    """
+    """Refuses requests that are too long, hold control characters, or climb out of folders."""
 
     async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
@@ -38,18 +32,7 @@ class Shape(Guard):
 
 
 def misshapen(scope: Scope) -> Problem | None:
-    """Return what is wrong with the shape of a request.
-
-    Parameters
-    ----------
-    scope : Scope
-        The request.
-
-    Returns
-    -------
-    Problem or None
-        None where nothing is.
-    """
+    """Return what is wrong with the shape of a request."""
     headers: list[tuple[bytes, bytes]] = scope["headers"]
     path, query = scope["path"], scope["query_string"]
     if scope["method"] not in METHODS:

@@ -69,41 +69,13 @@ class Token:
 
 
 class TokenStore:
-    """The tokens of a service.
-
-    Parameters
-    ----------
-    records : Records
-        Where they are kept.
-    """
+    """The tokens of a service."""
 
     def __init__(self, records: Records) -> None:
         self._records = records
 
     def create(self, name: str, role: Role, expires_days: float | None = None) -> tuple[Token, str]:
-        """Make a token.
-
-        Parameters
-        ----------
-        name : str
-            Of who gets it: letters, digits and ``._@-``.
-        role : Role
-            What they may do.
-        expires_days : float, optional
-            Days that it is valid; without, until it is revoked.
-
-        Returns
-        -------
-        Token
-            What is remembered.
-        str
-            The token itself, which nobody can find out again.
-
-        Raises
-        ------
-        ConfigError
-            If the name is of another form, or that of a valid token.
-        """
+        """Make a token."""
         check_name(name)
         text = PREFIX + secrets.token_urlsafe(32)
         now_s = time.time()
@@ -137,23 +109,7 @@ class TokenStore:
         return any(token.state(now_s) == "valid" for token in self.all())
 
     def revoke(self, name: str) -> list[Token]:
-        """Make the valid tokens of a name, or the one of an id, worth nothing from now on.
-
-        Parameters
-        ----------
-        name : str
-            Name or id.
-
-        Returns
-        -------
-        list of Token
-            Those that were revoked.
-
-        Raises
-        ------
-        TargetMissing
-            If there is none that is valid.
-        """
+        """Make the valid tokens of a name, or the one of an id, worth nothing from now on."""
         now_s = time.time()
         found = [
             token
@@ -173,19 +129,7 @@ class TokenStore:
         return found
 
     def find(self, text: str) -> Token | None:
-        """Return the token of a text.
-
-        Parameters
-        ----------
-        text : str
-            As a request has it.
-
-        Returns
-        -------
-        Token or None
-            None where there is no valid one. What the index of digests takes to look one up
-            tells nothing of a token: nobody can choose the digest of what they guess.
-        """
+        """Return the token of a text."""
         if not text.startswith(PREFIX):
             return None
         with self._records.reading() as connection:
@@ -197,18 +141,7 @@ class TokenStore:
 
 
 def check_name(name: str) -> None:
-    """Check the name of a token.
-
-    Parameters
-    ----------
-    name : str
-        As somebody typed it.
-
-    Raises
-    ------
-    ConfigError
-        If no token can be called so.
-    """
+    """Check the name of a token."""
     if not NAME.fullmatch(name) or name in RESERVED:
         raise ConfigError(
             f"{name[:80]!r} cannot be the name of a token; expected 1 to 64 letters, digits and "

@@ -34,17 +34,7 @@ BEARER, BASIC = 'Bearer realm="starcat"', 'Basic realm="starcat", charset="UTF-8
 
 
 class Who(Guard):
-    """Finds the principal of each request, and refuses those who may not ask, or not so often.
-
-    Parameters
-    ----------
-    app : ASGIApp
-        What comes behind.
-    settings : Settings
-        What the operator set.
-    identities : Identities
-        Who there is.
-    """
+    """Finds the principal of each request, and refuses those who may not ask, or not so often."""
 
     def __init__(self, app: ASGIApp, settings: Settings, identities: Identities) -> None:
         super().__init__(app)
@@ -115,17 +105,6 @@ class Who(Guard):
 def token_in(authorization: str) -> str | None:
     """Return the token of a header.
 
-    Parameters
-    ----------
-    authorization : str
-        ``Bearer TOKEN``, or ``Basic`` with the token as the password, as TOPCAT and ``.netrc``
-        have it.
-
-    Returns
-    -------
-    str or None
-        None where it is neither.
-
     Examples
     --------
     >>> token_in("Bearer starcat_x"), token_in("Basic bWU6c3RhcmNhdF94"), token_in("Digest x")
@@ -145,16 +124,6 @@ def token_in(authorization: str) -> str | None:
 
 def network_of(address: str) -> str:
     """Return what is counted as one address: of IPv6 the network that one household has.
-
-    Parameters
-    ----------
-    address : str
-        As the server has it.
-
-    Returns
-    -------
-    str
-        The first 64 bits of IPv6; anything else as it is.
 
     Examples
     --------

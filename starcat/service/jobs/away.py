@@ -40,62 +40,27 @@ _logger = logging.getLogger(__name__)
 
 
 class Server:
-    """The server as its workers see it.
-
-    Parameters
-    ----------
-    address : str
-        Such as ``https://guide.example``.
-    token : str
-        Of a publisher: who sends databases is trusted.
-    """
+    """The server as its workers see it."""
 
     def __init__(self, address: str, token: str) -> None:
         self._address = f"{address.rstrip('/')}/api/v1"
         self._headers = {"Authorization": f"Bearer {token}"}
 
     def ask(self, method: str, path: str, **how: Any) -> requests.Response:
-        """Send a request.
-
-        Parameters
-        ----------
-        method, path : str
-            What is asked; the path begins behind ``/api/v1``.
-        **how
-            As `requests.request` has it.
-
-        Returns
-        -------
-        requests.Response
-            Whatever the status; raises an error of requests where there is none.
-        """
+        """Send a request."""
         how = {"timeout": ANSWER_S, "headers": self._headers, **how}
         return requests.request(method, f"{self._address}{path}", allow_redirects=False, **how)
 
 
 class AwaySlots(Slots):
-    """What the jobs that run on this machine for a server elsewhere have in common.
-
-    Parameters
-    ----------
-    settings : Settings
-        Of this worker: its folder, its limits and the queue.
-    server : Server
-        Whose jobs they are.
-    """
+    """What the jobs that run on this machine for a server elsewhere have in common."""
 
     def __init__(self, settings: Settings, server: Server) -> None:
         super().__init__(open_ground(settings))
         self._server = server
 
     def run_job(self, job_id: str) -> None:
-        """Begin a job and see it to its end, if this worker can and nobody else does.
-
-        Parameters
-        ----------
-        job_id : str
-            Its id.
-        """
+        """Begin a job and see it to its end, if this worker can and nobody else does."""
         try:
             job = self._begun(job_id)
         except (requests.RequestException, SourceMissing) as error:
@@ -138,17 +103,7 @@ class AwaySlots(Slots):
 
 
 class AwayAttempt:
-    """An attempt here, of which the server is told.
-
-    Parameters
-    ----------
-    slots : AwaySlots
-        Of this worker.
-    server : Server
-        Whose job it is.
-    job : Job
-        As the server gave it.
-    """
+    """An attempt here, of which the server is told."""
 
     def __init__(self, slots: AwaySlots, server: Server, job: Job) -> None:
         self.job = job
@@ -248,15 +203,7 @@ def _words(answer: requests.Response) -> str:
 
 
 def pack(folder: Path, archive: Path) -> None:
-    """Write the files of a folder into a tar archive.
-
-    Parameters
-    ----------
-    folder : Path
-        Of a database: with the artifact's own folder in it.
-    archive : Path
-        The file to write; not compressed, since the files are.
-    """
+    """Write the files of a folder into a tar archive."""
     with tarfile.open(archive, "w", format=tarfile.PAX_FORMAT) as tar:
         for path in sorted(folder.rglob("*")):
             if path.is_file():
@@ -264,17 +211,7 @@ def pack(folder: Path, archive: Path) -> None:
 
 
 def work_away(settings: Settings, address: str, token: str) -> None:
-    """Do the builds of a server elsewhere until a signal ends it.
-
-    Parameters
-    ----------
-    settings : Settings
-        Of this worker: its folder, its limits, and ``queue_url``.
-    address : str
-        Of the server.
-    token : str
-        Of a publisher.
-    """
+    """Do the builds of a server elsewhere until a signal ends it."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     slots = AwaySlots(settings, Server(address, token))
     try:

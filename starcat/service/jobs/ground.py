@@ -54,18 +54,7 @@ class WorkerGround:
 
 
 def open_ground(settings: Settings) -> WorkerGround:
-    """Open what a worker needs.
-
-    Parameters
-    ----------
-    settings : Settings
-        What the operator set.
-
-    Returns
-    -------
-    WorkerGround
-        Of the same root as the service that started the worker.
-    """
+    """Open what a worker needs."""
     places = Places(settings.root)
     places.make()
     records = Records(places.records)

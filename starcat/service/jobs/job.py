@@ -98,13 +98,7 @@ class Event:
 
 
 class JobStore:
-    """The jobs of a service.
-
-    Parameters
-    ----------
-    records : Records
-        Where they are kept.
-    """
+    """The jobs of a service."""
 
     def __init__(self, records: Records) -> None:
         self._records = records
@@ -112,46 +106,13 @@ class JobStore:
     def add(
         self, kind: Kind, request: Mapping[str, Any], *, key: str, title: str, owner: str
     ) -> Job:
-        """Remember a new job.
-
-        Parameters
-        ----------
-        kind : {"build", "ingest", "evaluate"}
-            What is to be done.
-        request : mapping
-            What was asked for, as JSON has it.
-        key : str
-            SHA-256 of all that the result depends on.
-        title, owner : str
-            For people, and who asked.
-
-        Returns
-        -------
-        Job
-            Queued.
-        """
+        """Remember a new job."""
         with self._records.writing() as connection:
             job_id = insert_job(connection, kind, request, key=key, title=title, owner=owner)
         return self.get(job_id)
 
     def get(self, job_id: str) -> Job:
-        """Return a job.
-
-        Parameters
-        ----------
-        job_id : str
-            Its id.
-
-        Returns
-        -------
-        Job
-            As it is now.
-
-        Raises
-        ------
-        TargetMissing
-            If there is none.
-        """
+        """Return a job."""
         checked(job_id, JOB_ID, "job")
         with self._records.reading() as connection:
             row = connection.execute("SELECT * FROM jobs WHERE id = ?", (job_id,)).fetchone()
@@ -168,22 +129,7 @@ class JobStore:
         most: int = 100,
         skip: int = 0,
     ) -> list[Job]:
-        """Return the jobs, the newest first.
-
-        Parameters
-        ----------
-        state, kind, owner : str, optional
-            Only those that are so.
-        most : int, default 100
-            So many at most.
-        skip : int, default 0
-            So many of the newest are left out.
-
-        Returns
-        -------
-        list of Job
-            As they are now.
-        """
+        """Return the jobs, the newest first."""
         where, values = _where(state=state, kind=kind, owner=owner)
         with self._records.reading() as connection:
             rows = connection.execute(
@@ -195,38 +141,14 @@ class JobStore:
     def count(
         self, *, state: State | None = None, kind: Kind | None = None, owner: str | None = None
     ) -> int:
-        """Return how many jobs there are.
-
-        Parameters
-        ----------
-        state, kind, owner : str, optional
-            Only those that are so.
-
-        Returns
-        -------
-        int
-            However many `all` would return.
-        """
+        """Return how many jobs there are."""
         where, values = _where(state=state, kind=kind, owner=owner)
         with self._records.reading() as connection:
             [found] = connection.execute(f"SELECT count(*) FROM jobs {where}", values).fetchone()
         return int(found)
 
     def events(self, job_id: str, after: int = 0) -> list[Event]:
-        """Return what happened to a job.
-
-        Parameters
-        ----------
-        job_id : str
-            Its id.
-        after : int, default 0
-            Only later ones than the event of this number.
-
-        Returns
-        -------
-        list of Event
-            In order.
-        """
+        """Return what happened to a job."""
         with self._records.reading() as connection:
             rows = connection.execute(
                 "SELECT * FROM job_events WHERE job = ? AND number > ? ORDER BY number",
@@ -252,20 +174,7 @@ def insert_job(
     title: str,
     owner: str,
 ) -> str:
-    """Remember a new job within a transaction.
-
-    Parameters
-    ----------
-    connection : sqlite3.Connection
-        Within a transaction.
-    kind, request, key, title, owner
-        As `JobStore.add` has them.
-
-    Returns
-    -------
-    str
-        Its id.
-    """
+    """Remember a new job within a transaction."""
     job_id = secrets.token_hex(16)
     connection.execute(
         "INSERT INTO jobs (id, kind, key, owner, title, state, request, created_s) "
@@ -279,19 +188,7 @@ def insert_job(
 def add_event(
     connection: sqlite3.Connection, job_id: str, kind: str, data: Mapping[str, Any]
 ) -> None:
-    """Remember that something happened to a job.
-
-    Parameters
-    ----------
-    connection : sqlite3.Connection
-        Within a transaction.
-    job_id : str
-        The job.
-    kind : {"state", "stage", "log"}
-        What changed.
-    data : mapping
-        As `Event` has it.
-    """
+    """Remember that something happened to a job."""
     connection.execute(
         "INSERT INTO job_events (job, number, at_s, kind, data) SELECT ?, "
         "1 + coalesce(max(number), 0), ?, ?, ? FROM job_events WHERE job = ?",

@@ -27,68 +27,19 @@ LARGE_BYTES = 2 << 30
 
 
 def build_key(records: Records, spec: BuildSpec) -> str:
-    """Return the key of a build.
-
-    Parameters
-    ----------
-    records : Records
-        Where digests of files are remembered.
-    spec : BuildSpec
-        Checked.
-
-    Returns
-    -------
-    str
-        SHA-256, hexadecimal.
-
-    Raises
-    ------
-    SourceMissing
-        If the files of a source are not here.
-    """
+    """Return the key of a build."""
     inputs = {name: source_digests(records, name) for name in spec.sources}
     return key_of("build", {"spec": spec.recorded(), "inputs": inputs})
 
 
 def key_of(kind: Kind, content: Mapping[str, Any]) -> str:
-    """Return the key of a job of any kind.
-
-    Parameters
-    ----------
-    kind : {"build", "ingest", "evaluate"}
-        What is done.
-    content : mapping
-        All that its result depends on, but for starcat itself; plain values.
-
-    Returns
-    -------
-    str
-        SHA-256, hexadecimal.
-    """
+    """Return the key of a job of any kind."""
     whole = {"kind": kind, "starcat": __version__, **content}
     return hashlib.sha256(json_bytes(whole)).hexdigest()
 
 
 def source_digests(records: Records, name: str) -> list[str]:
-    """Return what tells the files of a source from others.
-
-    Parameters
-    ----------
-    records : Records
-        Where digests of files are remembered.
-    name : str
-        A name of ``data_sources``.
-
-    Returns
-    -------
-    list of str
-        A digest for each file, in reading order.
-
-    Raises
-    ------
-    SourceMissing
-        If they are not here, or cannot be read.
-    """
+    """Return what tells the files of a source from others."""
     paths = locate(name, {})
     try:
         return file_digests(records, source_files(name, paths))
@@ -101,20 +52,7 @@ def source_digests(records: Records, name: str) -> list[str]:
 
 
 def source_files(name: str, paths: Iterable[Path]) -> list[Path]:
-    """Return the files that a source is read from.
-
-    Parameters
-    ----------
-    name : str
-        A name of ``data_sources``.
-    paths : iterable of Path
-        Where it was located.
-
-    Returns
-    -------
-    list of Path
-        In reading order; of a store those that name its partitions.
-    """
+    """Return the files that a source is read from."""
     found: list[Path] = []
     for path in paths:
         if path.is_dir() and is_store(path):
@@ -126,20 +64,7 @@ def source_files(name: str, paths: Iterable[Path]) -> list[Path]:
 
 
 def file_digests(records: Records, paths: Iterable[Path]) -> list[str]:
-    """Return the digests of files, read once while they do not change.
-
-    Parameters
-    ----------
-    records : Records
-        Where digests are remembered.
-    paths : iterable of Path
-        The files.
-
-    Returns
-    -------
-    list of str
-        SHA-256, hexadecimal.
-    """
+    """Return the digests of files, read once while they do not change."""
     return [_digest(records, path.resolve()) for path in paths]
 
 

@@ -13,21 +13,7 @@ GIB = 2**30
 
 
 def check_room(service: Ground, owner: str) -> None:
-    """Check that there is room for what a user wants to have made.
-
-    Parameters
-    ----------
-    service : Ground
-        Its settings say how much there has to be.
-    owner : str
-        The user.
-
-    Raises
-    ------
-    Problem
-        With status 507, if the disk is nearly full; with 409, if the user's databases take all
-        that they may.
-    """
+    """Check that there is room for what a user wants to have made."""
     short = disk_shortage(service)
     if short is not None:
         raise Problem(507, short)
@@ -37,18 +23,7 @@ def check_room(service: Ground, owner: str) -> None:
 
 
 def disk_shortage(service: Ground) -> str | None:
-    """Return what to say where the disk is nearly full.
-
-    Parameters
-    ----------
-    service : Ground
-        Its settings say what has to be free.
-
-    Returns
-    -------
-    str or None
-        None where there is room.
-    """
+    """Return what to say where the disk is nearly full."""
     free_gib = shutil.disk_usage(service.places.root).free / GIB
     if free_gib >= service.settings.free_gib:
         return None
@@ -59,22 +34,7 @@ def disk_shortage(service: Ground) -> str | None:
 
 
 def owner_excess(service: Ground, owner: str, more_bytes: int = 0) -> str | None:
-    """Return what to say where a user's databases take more of the disk than they may.
-
-    Parameters
-    ----------
-    service : Ground
-        Its settings say how much that is.
-    owner : str
-        The user.
-    more_bytes : int, default 0
-        What is being made beside them.
-
-    Returns
-    -------
-    str or None
-        None where there is room.
-    """
+    """Return what to say where a user's databases take more of the disk than they may."""
     taken_gib = (owned_bytes(service, owner) + more_bytes) / GIB
     if taken_gib < service.settings.disk_gib:
         return None
@@ -85,20 +45,7 @@ def owner_excess(service: Ground, owner: str, more_bytes: int = 0) -> str | None
 
 
 def owned_bytes(service: Ground, owner: str) -> int:
-    """Return how much of the disk the databases of a user take.
-
-    Parameters
-    ----------
-    service : Ground
-        Where they are.
-    owner : str
-        Whose builds are counted.
-
-    Returns
-    -------
-    int
-        Bytes of the files that their manifests name, each database once.
-    """
+    """Return how much of the disk the databases of a user take."""
     with service.records.reading() as connection:
         rows = connection.execute(
             "SELECT DISTINCT json_extract(result, '$.database') FROM jobs "
@@ -116,18 +63,7 @@ def owned_bytes(service: Ground, owner: str) -> int:
 
 
 def folder_bytes(folder: Path) -> int:
-    """Return how much of the disk a folder takes, with all below it.
-
-    Parameters
-    ----------
-    folder : Path
-        Others may write in it meanwhile.
-
-    Returns
-    -------
-    int
-        Bytes that are allocated.
-    """
+    """Return how much of the disk a folder takes, with all below it."""
     taken = 0
     for path in folder.rglob("*"):
         try:

@@ -27,13 +27,7 @@ _logger = logging.getLogger(__name__)
 
 
 class WorkerPool:
-    """The worker of a service, with all of its slots.
-
-    Parameters
-    ----------
-    service : Ground
-        Whose jobs it does.
-    """
+    """The worker of a service, with all of its slots."""
 
     def __init__(self, service: Ground) -> None:
         self._service = service

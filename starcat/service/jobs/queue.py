@@ -38,11 +38,6 @@ class JsonMessages(Serializer):  # type: ignore[misc]
 class JobQueue:
     """A queue of jobs.
 
-    Parameters
-    ----------
-    huey : huey.Huey
-        With its store; workers take from it what is sent.
-
     Attributes
     ----------
     is_used : threading.Event
@@ -61,28 +56,11 @@ class JobQueue:
         self._send: Callable[[str], object] = huey.task()(run_job)
 
     def on_job(self, run: Callable[[str], None]) -> None:
-        """Say what a worker does with a job that waits.
-
-        Parameters
-        ----------
-        run : callable
-            Called with the id of the job.
-        """
+        """Say what a worker does with a job that waits."""
         self._run = run
 
     def send(self, job_id: str) -> bool:
-        """Tell the workers that a job waits.
-
-        Parameters
-        ----------
-        job_id : str
-            Its id.
-
-        Returns
-        -------
-        bool
-            Whether the message is on its way; where not, it is sent again later.
-        """
+        """Tell the workers that a job waits."""
         self.is_used.set()
         try:
             self._send(job_id)
@@ -92,13 +70,7 @@ class JobQueue:
         return True
 
     def send_again(self, job_ids: Iterable[str]) -> None:
-        """Forget all messages, and send those of the jobs that wait.
-
-        Parameters
-        ----------
-        job_ids : iterable of str
-            In the order in which they are to be begun.
-        """
+        """Forget all messages, and send those of the jobs that wait."""
         try:
             self.huey.flush()
         except Exception:
@@ -120,25 +92,7 @@ class JobQueue:
 
 
 def open_queue(settings: Settings, places: Places) -> JobQueue:
-    """Open the queue of a service.
-
-    Parameters
-    ----------
-    settings : Settings
-        ``queue_url`` says whether it is in Redis.
-    places : Places
-        Where the file is, else.
-
-    Returns
-    -------
-    JobQueue
-        Nobody has to answer yet.
-
-    Raises
-    ------
-    ConfigError
-        If the address is none.
-    """
+    """Open the queue of a service."""
     options = {"results": False, "serializer": JsonMessages(), "utc": True}
     if settings.queue_url is None:
         huey = SqliteHuey(NAME, filename=str(places.queue), strict_fifo=True, **options)

@@ -20,14 +20,7 @@ _logger = logging.getLogger(__name__)
 
 
 def recover(service: Ground) -> None:
-    """Take up the jobs of a service where nobody runs any on this machine.
-
-    Parameters
-    ----------
-    service : Ground
-        Jobs that ran wait again, and those that wait get a message each, in their order. Folders
-        of what was not finished are removed.
-    """
+    """Take up the jobs of a service where nobody runs any on this machine."""
     for job_id, attempt in running_here(service.records):
         _wait_for_end(service.places, job_id)
         _logger.warning("job %s was interrupted in attempt %d", job_id, attempt)
@@ -37,13 +30,7 @@ def recover(service: Ground) -> None:
 
 
 def give_up_silent(service: Ground) -> None:
-    """Have jobs wait again whose workers, on other machines, have been silent for long.
-
-    Parameters
-    ----------
-    service : Ground
-        Its settings say how long that is.
-    """
+    """Have jobs wait again whose workers, on other machines, have been silent for long."""
     then_s = time.time() - service.settings.worker_silence_s
     for job_id, attempt in silent_since(service.records, then_s):
         _logger.warning("job %s: nobody hears of its worker; attempt %d is over", job_id, attempt)
@@ -51,13 +38,7 @@ def give_up_silent(service: Ground) -> None:
 
 
 def send_waiting(service: Ground) -> None:
-    """Send a message for each job that waits, and forget all others.
-
-    Parameters
-    ----------
-    service : Ground
-        Whose jobs they are.
-    """
+    """Send a message for each job that waits, and forget all others."""
     waiting = _all(service, "queued")
     service.queue.send_again(job.id for job in reversed(waiting))
 

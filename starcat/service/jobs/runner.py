@@ -88,13 +88,7 @@ class Slots:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def run_job(self, job_id: str) -> None:
-        """Begin a job and see it to its end, unless it does not wait any more.
-
-        Parameters
-        ----------
-        job_id : str
-            Its id.
-        """
+        """Begin a job and see it to its end, unless it does not wait any more."""
         if self.stop_at_s is not None:
             return  # it goes on waiting; its message is sent again at the next start
         job = claim(self.service.records, job_id)
@@ -112,18 +106,7 @@ class Slots:
 
     @contextmanager
     def process(self, job: Job) -> Iterator[subprocess.Popen[bytes]]:
-        """Start the process of a job, in a group of its own, and see that it has ended.
-
-        Parameters
-        ----------
-        job : Job
-            Which.
-
-        Yields
-        ------
-        subprocess.Popen
-            With pipes for its input and output, and its order sent.
-        """
+        """Start the process of a job, in a group of its own, and see that it has ended."""
         places = self.service.places
         make_folder(places.job(job.id))
         with places.job_stderr(job.id).open("wb") as stderr:
@@ -171,27 +154,13 @@ class Slots:
 
 
 def end_group(group: int) -> None:
-    """End a process and those that it has started.
-
-    Parameters
-    ----------
-    group : int
-        Their group, which is the number of the first.
-    """
+    """End a process and those that it has started."""
     with suppress(ProcessLookupError, PermissionError):
         os.killpg(group, signal.SIGKILL)
 
 
 class Run:
-    """An attempt that runs.
-
-    Parameters
-    ----------
-    slots : Slots
-        Of the worker that it runs in.
-    attempt : Attempt
-        Who remembers what becomes of it.
-    """
+    """An attempt that runs."""
 
     def __init__(self, slots: Slots, attempt: Told) -> None:
         self._slots, self._attempt = slots, attempt
@@ -287,20 +256,7 @@ def _tail(path: Path) -> str:
 
 
 def lines_of(pipe: IO[bytes], tick_s: float) -> Iterator[bytes | None]:
-    """Return the lines that arrive in a pipe until its other end is closed.
-
-    Parameters
-    ----------
-    pipe : file
-        The end that is read.
-    tick_s : float
-        Seconds.
-
-    Yields
-    ------
-    bytes or None
-        A whole line; None at least each ``tick_s`` seconds.
-    """
+    """Return the lines that arrive in a pipe until its other end is closed."""
     with selectors.DefaultSelector() as selector:
         selector.register(pipe, selectors.EVENT_READ)
         held, tick_at_s = b"", time.monotonic() + tick_s

@@ -42,29 +42,7 @@ class Submitted:
 
 
 def submit_build(service: Service, spec: BuildSpec, owner: str) -> Submitted:
-    """Have a database built.
-
-    Parameters
-    ----------
-    service : Service
-        Whose workers do it.
-    spec : BuildSpec
-        Checked.
-    owner : str
-        Who asks.
-
-    Returns
-    -------
-    Submitted
-        The job; its result names the database.
-
-    Raises
-    ------
-    SourceMissing
-        If the files of a source are not here.
-    Problem
-        If there is no room for it, or too many jobs of the owner wait.
-    """
+    """Have a database built."""
     key = build_key(service.records, spec)
     title = f"{spec.name} {spec.version}"
     return _submit(service, "build", {"spec": spec.recorded()}, key, title, owner)
@@ -80,39 +58,7 @@ def submit_ingest(
     read_limit_mag: float | None = None,
     to: Format = "parquet",
 ) -> Submitted:
-    """Have a catalog read.
-
-    Parameters
-    ----------
-    service : Service
-        Whose workers do it.
-    source : str
-        A star catalog of ``data_sources``.
-    owner : str
-        Who asks.
-    band : str, optional
-        Band of the magnitudes; the catalog's first by default.
-    epoch_jyear : float, optional
-        Julian year to move positions to; by default every star stays at its own epoch.
-    read_limit_mag : float, optional
-        Fainter records are counted and left out.
-    to : {"parquet", "hats"}
-        A star table in one file, or a store of any size.
-
-    Returns
-    -------
-    Submitted
-        The job; its result names what lies among the catalogs.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such catalog or band.
-    SourceMissing
-        If the files of the source are not here.
-    Problem
-        If there is no room for it, or too many jobs of the owner wait.
-    """
+    """Have a catalog read."""
     request = {
         "source": source,
         "band": check_band(star_catalog(source), band),
@@ -135,35 +81,7 @@ def submit_evaluation(
     noise_mag: float | None = None,
     seed: int | None = None,
 ) -> Submitted:
-    """Have it measured how often frames are identified with a database.
-
-    Parameters
-    ----------
-    service : Service
-        Whose workers do it.
-    database_id : str
-        The database.
-    owner : str
-        Who asks.
-    frames : int, default 500
-        Frames of each kind.
-    noise_px, noise_mag : float, optional
-        Standard deviation of a centroid and of a magnitude; by default those of its spec.
-    seed : int, optional
-        Same seed, same frames; by default that of its spec.
-
-    Returns
-    -------
-    Submitted
-        The job; its result has the rates.
-
-    Raises
-    ------
-    TargetMissing
-        If there is no such database.
-    Problem
-        If there is no room for it, or too many jobs of the owner wait.
-    """
+    """Have it measured how often frames are identified with a database."""
     database = service.shelf.database(database_id)
     test = spec_from_dict(database.manifest["spec"], database.title).self_test
     request = {
@@ -197,20 +115,7 @@ def _submit(
 
 
 def has_result(service: Service, job: Job) -> bool:
-    """Return whether what a job has made is still there.
-
-    Parameters
-    ----------
-    service : Service
-        Where it would be.
-    job : Job
-        One that is done.
-
-    Returns
-    -------
-    bool
-        Whether it is.
-    """
+    """Return whether what a job has made is still there."""
     result = job.result or {}
     if job.kind == "evaluate":
         return "rates" in result
@@ -225,59 +130,14 @@ def has_result(service: Service, job: Job) -> bool:
 
 
 def cancel_job(service: Service, job_id: str, principal: Principal) -> Job:
-    """End a job.
-
-    Parameters
-    ----------
-    service : Service
-        Whose workers do it.
-    job_id : str
-        Its id.
-    principal : Principal
-        Who asks: its owner, or a publisher.
-
-    Returns
-    -------
-    Job
-        Cancelled; one that ran a moment ago may still do so.
-
-    Raises
-    ------
-    TargetMissing
-        If there is none.
-    Problem
-        With status 403, if it is another's; with 409, if it has ended otherwise.
-    """
+    """End a job."""
     _check_may(service.jobs.get(job_id), principal)
     cancel(service.records, job_id)
     return service.jobs.get(job_id)
 
 
 def retry_job(service: Service, job_id: str, principal: Principal) -> Job:
-    """Have a job that failed or was cancelled done once more.
-
-    Parameters
-    ----------
-    service : Service
-        Whose workers do it.
-    job_id : str
-        Its id.
-    principal : Principal
-        Who asks: its owner, or a publisher.
-
-    Returns
-    -------
-    Job
-        Queued.
-
-    Raises
-    ------
-    TargetMissing
-        If there is none.
-    Problem
-        With status 403, if it is another's; with 409, if it need not be done; with 429 or 507, if
-        there is no room for it.
-    """
+    """Have a job that failed or was cancelled done once more."""
     job = service.jobs.get(job_id)
     _check_may(job, principal)
     check_room(service, job.owner)

@@ -45,13 +45,7 @@ PROGRAM = (
 
 
 class Teller:
-    """Says what happens, as lines of JSON.
-
-    Parameters
-    ----------
-    output : file
-        Where to.
-    """
+    """Says what happens, as lines of JSON."""
 
     def __init__(self, output: IO[str]) -> None:
         self._output = output
@@ -165,18 +159,7 @@ def _told(error: Exception, order: Order) -> dict[str, Any]:
 
 
 def memory_problem(memory_bytes: int) -> dict[str, Any]:
-    """Return what to say of a job that wanted more memory than it may take.
-
-    Parameters
-    ----------
-    memory_bytes : int
-        How much that is.
-
-    Returns
-    -------
-    dict
-        Problem details.
-    """
+    """Return what to say of a job that wanted more memory than it may take."""
     detail = (
         f"the job took more than the {memory_bytes / 2**30:.3g} GiB of memory that it may "
         "(job_memory_gib); ask for less, or ask the operator for more"

@@ -36,33 +36,7 @@ def add_once(
     has_result: Callable[[Job], bool],
     check: Callable[[], None],
 ) -> tuple[str, bool]:
-    """Remember a job, unless one is there that does the same.
-
-    Parameters
-    ----------
-    records : Records
-        Where jobs are kept.
-    kind, request, key, title, owner
-        As `starcat.service.jobs.job.JobStore.add` has them.
-    most_waiting : int
-        Jobs that the owner may have waiting.
-    has_result : callable
-        Whether what a job that is done has made is still there.
-    check : callable
-        Raises if there is no room for a new job.
-
-    Returns
-    -------
-    job_id : str
-        Its id.
-    is_new : bool
-        Whether it was not there before.
-
-    Raises
-    ------
-    Problem
-        With status 429, if too many jobs of the owner wait.
-    """
+    """Remember a job, unless one is there that does the same."""
     with records.writing() as connection:
         there = _same(connection, key, has_result)
         if there is not None:
@@ -99,22 +73,7 @@ def _check_waiting(connection: sqlite3.Connection, owner: str, most: int) -> Non
 
 
 def claim(records: Records, job_id: str, *, is_away: bool = False) -> Job | None:
-    """Begin a job.
-
-    Parameters
-    ----------
-    records : Records
-        Where jobs are kept.
-    job_id : str
-        Its id, as a message had it.
-    is_away : bool, default False
-        Whether it runs on another machine, which has to be heard of from time to time.
-
-    Returns
-    -------
-    Job or None
-        Running, with the number of this attempt; None where it does not wait.
-    """
+    """Begin a job."""
     with records.writing() as connection:
         row = connection.execute(
             "UPDATE jobs SET state = 'running', started_s = ?, heard_s = ?, "
@@ -130,18 +89,7 @@ def claim(records: Records, job_id: str, *, is_away: bool = False) -> Job | None
 
 
 def running_here(records: Records) -> list[tuple[str, int]]:
-    """Return the jobs that run on this machine.
-
-    Parameters
-    ----------
-    records : Records
-        Where jobs are kept.
-
-    Returns
-    -------
-    list of (str, int)
-        Ids and attempts.
-    """
+    """Return the jobs that run on this machine."""
     with records.reading() as connection:
         rows = connection.execute(
             "SELECT id, attempt FROM jobs WHERE state = 'running' AND heard_s IS NULL "
@@ -151,20 +99,7 @@ def running_here(records: Records) -> list[tuple[str, int]]:
 
 
 def silent_since(records: Records, then_s: float) -> list[tuple[str, int]]:
-    """Return the jobs on other machines that nobody has heard of.
-
-    Parameters
-    ----------
-    records : Records
-        Where jobs are kept.
-    then_s : float
-        Since then, seconds since 1970.
-
-    Returns
-    -------
-    list of (str, int)
-        Ids and attempts.
-    """
+    """Return the jobs on other machines that nobody has heard of."""
     with records.reading() as connection:
         rows = connection.execute(
             "SELECT id, attempt FROM jobs WHERE state = 'running' AND heard_s < ?", (then_s,)
@@ -173,22 +108,7 @@ def silent_since(records: Records, then_s: float) -> list[tuple[str, int]]:
 
 
 def cancel(records: Records, job_id: str) -> None:
-    """End a job that waits, and ask for the end of one that runs.
-
-    Parameters
-    ----------
-    records : Records
-        Where jobs are kept.
-    job_id : str
-        Its id.
-
-    Raises
-    ------
-    TargetMissing
-        If there is none.
-    Problem
-        With status 409, if it has ended.
-    """
+    """End a job that waits, and ask for the end of one that runs."""
     with records.writing() as connection:
         job = _job(connection, job_id)
         if job.state == "queued":
@@ -202,27 +122,7 @@ def cancel(records: Records, job_id: str) -> None:
 def retry(
     records: Records, job_id: str, *, most_waiting: int, has_result: Callable[[Job], bool]
 ) -> None:
-    """Have a job wait once more.
-
-    Parameters
-    ----------
-    records : Records
-        Where jobs are kept.
-    job_id : str
-        Its id.
-    most_waiting : int
-        Jobs that its owner may have waiting.
-    has_result : callable
-        Whether what a job that is done has made is still there.
-
-    Raises
-    ------
-    TargetMissing
-        If there is none.
-    Problem
-        With status 409, if it has not ended, or another one does the same; with 429, if too many
-        wait.
-    """
+    """Have a job wait once more."""
     with records.writing() as connection:
         job = _job(connection, job_id)
         there = _same(connection, job.key, has_result)
@@ -239,17 +139,7 @@ def retry(
 
 
 def interrupt(records: Records, job_id: str, attempt: int) -> None:
-    """Say that whoever ran a job is gone: it waits again, unless that was too often.
-
-    Parameters
-    ----------
-    records : Records
-        Where jobs are kept.
-    job_id : str
-        The job.
-    attempt : int
-        The attempt that is over.
-    """
+    """Say that whoever ran a job is gone: it waits again, unless that was too often."""
     with records.writing() as connection:
         row = connection.execute(
             "UPDATE jobs SET interrupted = interrupted + 1 "
@@ -272,15 +162,7 @@ def interrupt(records: Records, job_id: str, attempt: int) -> None:
 
 
 class Attempt:
-    """An attempt at a job: what it has to say is remembered while the job is its own.
-
-    Parameters
-    ----------
-    records : Records
-        Where jobs are kept.
-    job : Job
-        As `claim` returned it.
-    """
+    """An attempt at a job: what it has to say is remembered while the job is its own."""
 
     def __init__(self, records: Records, job: Job) -> None:
         self._records = records
@@ -301,17 +183,7 @@ class Attempt:
             return self._update(connection, "heard_s = ?", time.time())
 
     def tell_stage(self, stage: str, done: int, total: int | None) -> None:
-        """Say how far it is; of each stage the last event is kept.
-
-        Parameters
-        ----------
-        stage : str
-            Name of the stage.
-        done : int
-            How much of it is done.
-        total : int, optional
-            Of how much, where that is known.
-        """
+        """Say how far it is; of each stage the last event is kept."""
         with self._records.writing() as connection:
             changed = self._update(connection, "stage = ?, done = ?, total = ?", stage, done, total)
             if not changed:
@@ -329,15 +201,7 @@ class Attempt:
             )
 
     def tell(self, level: str, text: str) -> None:
-        """Say a line of the log.
-
-        Parameters
-        ----------
-        level : {"info", "warning", "error"}
-            How much it matters.
-        text : str
-            The line.
-        """
+        """Say a line of the log."""
         with self._records.writing() as connection:
             if not self._is_mine(connection):
                 return
@@ -351,23 +215,11 @@ class Attempt:
                 add_event(connection, self.job.id, "log", {"level": "warning", "text": text})
 
     def succeed(self, result: Mapping[str, Any]) -> None:
-        """Say that it is done.
-
-        Parameters
-        ----------
-        result : mapping
-            What it has made.
-        """
+        """Say that it is done."""
         self._close("done", result=result)
 
     def fail(self, error: Mapping[str, Any]) -> None:
-        """Say that it has failed.
-
-        Parameters
-        ----------
-        error : mapping
-            Problem details.
-        """
+        """Say that it has failed."""
         self._close("failed", error=error)
 
     def be_cancelled(self) -> None:

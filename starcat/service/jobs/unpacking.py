@@ -18,23 +18,7 @@ _NAME = re.compile(r"(?!.*\.\.)[A-Za-z0-9_][A-Za-z0-9._-]*(/[A-Za-z0-9_][A-Za-z0
 
 
 def unpack_database(archive: Path, job: Job, into: Path) -> None:
-    """Unpack the database that a job was to make, and check it.
-
-    Parameters
-    ----------
-    archive : Path
-        A tar archive, not compressed, as `starcat.service.jobs.away.pack` writes it.
-    job : Job
-        The job: the database has to be of its spec.
-    into : Path
-        A folder to make.
-
-    Raises
-    ------
-    ProductError
-        If it is no such archive, has anything in it but plain files, is damaged, or is another
-        database.
-    """
+    """Unpack the database that a job was to make, and check it."""
     into.mkdir()
     try:
         with tarfile.open(archive, "r:") as tar:

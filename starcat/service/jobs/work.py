@@ -59,39 +59,13 @@ class Order:
 
 
 def prepare(kind: Kind) -> None:
-    """Load what a kind of job needs: programs do not count as memory that a job takes.
-
-    Parameters
-    ----------
-    kind : {"build", "ingest", "evaluate"}
-        What is going to be done.
-    """
+    """Load what a kind of job needs: programs do not count as memory that a job takes."""
     for name in _NEEDS[kind]:
         import_module(name)
 
 
 def do_job(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
-    """Do a job.
-
-    Parameters
-    ----------
-    order : Order
-        What is to be done.
-    progress : Progress
-        Called with (stage, done, total).
-    tell : callable
-        Called with what is worth telling.
-
-    Returns
-    -------
-    dict
-        The result, of plain values.
-
-    Raises
-    ------
-    StarcatError
-        If it cannot be done.
-    """
+    """Do a job."""
     shutil.rmtree(order.work, ignore_errors=True)
     order.work.mkdir(parents=True)
     return _DOES[order.kind](order, progress, tell)
@@ -137,15 +111,7 @@ def _build(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
 
 
 def place_database(made: Path, final: Path) -> None:
-    """Give the folder of a database its name, in one step.
-
-    Parameters
-    ----------
-    made : Path
-        The folder that the artifact's own folder is in, whole and checked.
-    final : Path
-        Its name among the databases; a folder that holds no database makes way.
-    """
+    """Give the folder of a database its name, in one step."""
     if final.is_dir():
         aside = made.with_name("aside")
         final.rename(aside)
@@ -229,16 +195,5 @@ _NEEDS: Mapping[Kind, tuple[str, ...]] = {
 
 
 def threads_of(workers: int) -> int:
-    """Return how many threads a job may use where several run at the same time.
-
-    Parameters
-    ----------
-    workers : int
-        Jobs at the same time.
-
-    Returns
-    -------
-    int
-        At least 1.
-    """
+    """Return how many threads a job may use where several run at the same time."""
     return max(1, (os.cpu_count() or 1) // max(1, workers))

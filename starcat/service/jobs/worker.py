@@ -42,13 +42,7 @@ def main() -> None:
 
 
 def serve_queue(slots: Slots) -> None:
-    """Take jobs from the queue until somebody wants to stop, and see those that run to their end.
-
-    Parameters
-    ----------
-    slots : Slots
-        What is done with each.
-    """
+    """Take jobs from the queue until asked to stop, then wait for those that run."""
     settings = slots.service.settings
     slots.service.queue.on_job(slots.run_job)
     first_s, most_s = POLL_S

@@ -17,27 +17,6 @@ _SEPARATORS = re.compile(r"[\s,;]+")
 def centroid_file(text: str, brightness: Brightness = "light") -> tuple[str, str]:
     r"""Return pasted centroids as a centroid file.
 
-    Parameters
-    ----------
-    text : str
-        Lines of two or three numbers, which blanks, commas or semicolons separate; lines that
-        begin with ``#`` are left out. A text that begins with a bracket is JSON, one whose first
-        line names ``x_px`` is CSV: these are centroid files already.
-    brightness : {"light", "mag"}, default "light"
-        What the third number is: light, larger for a brighter star, or a magnitude.
-
-    Returns
-    -------
-    suffix : {".csv", ".json"}
-        The kind of file.
-    content : str
-        What is in it.
-
-    Raises
-    ------
-    ConfigError
-        If a line is something else, or the lines differ in their number of columns.
-
     Examples
     --------
     >>> centroid_file("10.5 20 3000\n30, 40, 1200")

@@ -170,29 +170,7 @@ async def answer_file(
 
 
 def question_of(service: Service, database_id: str, asked: Asked, most: int) -> Question:
-    """Return what is asked as the service answers it.
-
-    Parameters
-    ----------
-    service : Service
-        With its limits.
-    database_id : str
-        The first target.
-    asked : Asked
-        What the form says.
-    most : int
-        Rows at most.
-
-    Returns
-    -------
-    Question
-        The values of a query of the gallery that was not changed have the types that it declares.
-
-    Raises
-    ------
-    QueryError
-        If nothing is asked, or a value is not what the query declares.
-    """
+    """Return what is asked as the service answers it."""
     if not asked.query.strip():
         raise QueryError('the query is empty; try "SELECT count(*) FROM stars"')
     targets = [database_id, *([asked.other] if asked.other else [])]
@@ -253,22 +231,7 @@ def _chosen(name: str) -> NamedQuery | None:
 def values_in(
     text: str, chosen: NamedQuery | None, given: Mapping[str, str]
 ) -> list[tuple[str, str, str]]:
-    """Return the values that a query can be given.
-
-    Parameters
-    ----------
-    text : str
-        SQL.
-    chosen : NamedQuery, optional
-        The query of the gallery that it began as.
-    given : mapping of str to str
-        Texts by name.
-
-    Returns
-    -------
-    list of (str, str, str)
-        Name, text and meaning, in the order of the text.
-    """
+    """Return the values that a query can be given."""
     known = {value.name: value for value in chosen.values} if chosen else {}
     return [
         (

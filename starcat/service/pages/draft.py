@@ -117,18 +117,7 @@ class Draft:
 
 
 def draft_of_text(text: str) -> Draft:
-    """Return the draft that a text is.
-
-    Parameters
-    ----------
-    text : str
-        TOML, perhaps not yet.
-
-    Returns
-    -------
-    Draft
-        With the text as it is.
-    """
+    """Return the draft that a text is."""
     text = text.replace("\r\n", "\n")
     try:
         return _checked(content_of_toml(text, ORIGIN), text)
@@ -137,18 +126,7 @@ def draft_of_text(text: str) -> Draft:
 
 
 def draft_of_form(form: Mapping[str, str]) -> Draft:
-    """Return the draft that a form was sent as.
-
-    Parameters
-    ----------
-    form : mapping of str to str
-        Fields by key, the text, and the text as it was before.
-
-    Returns
-    -------
-    Draft
-        By the text, where that was edited; else the text before with the fields' values.
-    """
+    """Return the draft that a form was sent as."""
     text = form.get(TEXT, "").replace("\r\n", "\n")
     before = form.get(BEFORE, "").replace("\r\n", "\n")
     is_edited = text.strip() != before.strip()
@@ -178,33 +156,12 @@ def _with_fields_of(form: Mapping[str, str], draft: Draft) -> Draft:
 
 
 def draft_of_content(content: Mapping[str, Any]) -> Draft:
-    """Return the draft of a spec that is parsed.
-
-    Parameters
-    ----------
-    content : mapping
-        As TOML gives it.
-
-    Returns
-    -------
-    Draft
-        With its text written anew.
-    """
+    """Return the draft of a spec that is parsed."""
     return _checked(content, plain_toml(content))
 
 
 def plain_toml(content: Mapping[str, Any]) -> str:
     """Return TOML without comments.
-
-    Parameters
-    ----------
-    content : mapping
-        As TOML gives it.
-
-    Returns
-    -------
-    str
-        The values of a table before the tables in it.
 
     Examples
     --------
@@ -253,18 +210,7 @@ def _is_huge(value: Any) -> bool:
 
 
 def without_defaults(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of a spec that are not as by default.
-
-    Parameters
-    ----------
-    content : mapping
-        A spec as an artifact or a job records it.
-
-    Returns
-    -------
-    dict
-        Tables with values only.
-    """
+    """Return the values of a spec that are not as by default."""
     kept: dict[str, Any] = {}
     for path, key in _KEYS.items():
         value = _at(content, path)

@@ -96,71 +96,25 @@ class Product:
 
 
 def database_rows(service: Service) -> list[Row]:
-    """Return all databases as the list shows them.
-
-    Parameters
-    ----------
-    service : Service
-        With the shelf, the jobs and the registry.
-
-    Returns
-    -------
-    list of Row
-        In the order of the shelf.
-    """
+    """Return all databases as the list shows them."""
     released = released_digests(service.places)
     built = built_times(service.jobs.all(state="done", most=MAX_JOBS))
     return [_row(one, released, built) for one in service.shelf.databases()]
 
 
 def database_row(service: Service, database: Database) -> Row:
-    """Return one database as the list shows it.
-
-    Parameters
-    ----------
-    service : Service
-        With the jobs and the registry.
-    database : Database
-        The database.
-
-    Returns
-    -------
-    Row
-        The same as in `database_rows`.
-    """
+    """Return one database as the list shows it."""
     built = built_times(service.jobs.all(state="done", most=MAX_JOBS))
     return _row(database, released_digests(service.places), built)
 
 
 def released_digests(places: Places) -> dict[str, str]:
-    """Return what was published.
-
-    Parameters
-    ----------
-    places : Places
-        With the registry.
-
-    Returns
-    -------
-    dict of str to str
-        SHA-256 of the file ``manifest.json`` by title, such as ``gaia-12deg-1.0.0``.
-    """
+    """Return what was published."""
     return {release.title: release.manifest.sha256 for release in recorded(places.registry)}
 
 
 def built_times(jobs: Iterable[Job]) -> dict[str, float]:
-    """Return when databases were built.
-
-    Parameters
-    ----------
-    jobs : iterable of Job
-        Jobs that are done, the newest first.
-
-    Returns
-    -------
-    dict of str to float
-        Seconds since 1970 by the id of the database; of several jobs that gave it, the first.
-    """
+    """Return when databases were built."""
     times: dict[str, float] = {}
     for job in jobs:
         made = (job.result or {}).get("database")
@@ -204,18 +158,7 @@ def total_bytes(manifest: Mapping[str, Any]) -> int:
 
 
 def products_of(manifest: Mapping[str, Any]) -> list[Product]:
-    """Return the products of a database.
-
-    Parameters
-    ----------
-    manifest : mapping
-        Its manifest.
-
-    Returns
-    -------
-    list of Product
-        In the order of the manifest.
-    """
+    """Return the products of a database."""
     found = []
     for name, facts in manifest["products"].items():
         product, _, version = str(facts["schema"]).rpartition("-")
@@ -236,23 +179,7 @@ def products_of(manifest: Mapping[str, Any]) -> list[Product]:
 
 
 def report_of(database: Database) -> dict[str, Any]:
-    """Return the report of a build.
-
-    Parameters
-    ----------
-    database : Database
-        The database.
-
-    Returns
-    -------
-    dict
-        As `starcat.report.report.report_content` made it; empty where there is none.
-
-    Raises
-    ------
-    ProductError
-        If it cannot be read.
-    """
+    """Return the report of a build."""
     path = database.folder / REPORT
     if REPORT not in database.manifest["files"]:
         return {}

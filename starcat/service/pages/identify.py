@@ -129,31 +129,7 @@ def _page(request: Request, service: Service, given: dict[str, str], **answer: A
 
 
 def frame_of(form: FormData, given: dict[str, str], database: Database, service: Service) -> Frame:
-    """Return the frame that a form brings.
-
-    Parameters
-    ----------
-    form : FormData
-        With a file, or without.
-    given : dict of str to str
-        Its other fields.
-    database : Database
-        Whose camera a simulated frame has.
-    service : Service
-        With the limit of an upload.
-
-    Returns
-    -------
-    Frame
-        A simulated one where a seed is given, else the file, else what was pasted.
-
-    Raises
-    ------
-    ConfigError
-        If what was pasted is no list of centroids.
-    Problem
-        If there is none, or the file is too large.
-    """
+    """Return the frame that a form brings."""
     if given["seed"]:
         number = _number(given["seed"], "seed")
         seed = int(min(max(number or 0, 0), MAX_SEED))
@@ -178,23 +154,7 @@ def frame_of(form: FormData, given: dict[str, str], database: Database, service:
 
 
 def options_of(given: dict[str, str]) -> IdentifyOptions:
-    """Return how a frame is to be identified.
-
-    Parameters
-    ----------
-    given : dict of str to str
-        Fields of the form.
-
-    Returns
-    -------
-    IdentifyOptions
-        What is empty is not stated.
-
-    Raises
-    ------
-    Problem
-        If a value is no number, or out of range.
-    """
+    """Return how a frame is to be identified."""
     percent = _number(given["field_error"], "field_error")
     content = {
         "method": given["method"] or None,
@@ -212,31 +172,7 @@ def options_of(given: dict[str, str]) -> IdentifyOptions:
 def identified(
     service: Service, database: Database, frame: Frame, options: IdentifyOptions
 ) -> tuple[dict[str, Any], bytes]:
-    """Identify a frame and draw it, in a confined process.
-
-    Parameters
-    ----------
-    service : Service
-        With the processes and the limits.
-    database : Database
-        With which.
-    frame : Frame
-        What.
-    options : IdentifyOptions
-        How.
-
-    Returns
-    -------
-    found : dict
-        As `starcat.service.identifying.identify` returns it.
-    picture : bytes
-        PNG; empty where nothing was drawn.
-
-    Raises
-    ------
-    StarcatError
-        What the identification raised.
-    """
+    """Identify a frame and draw it, in a confined process."""
     limited = options.model_copy(update={"time_limit_s": service.settings.query_time_s})
     with scratch_folder(service.places) as folder:
         frame.keep(folder / frame.name)

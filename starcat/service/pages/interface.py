@@ -43,18 +43,7 @@ def interface(request: Request, reader: Reader) -> Response:
 
 
 def operations_of(schema: dict[str, Any]) -> dict[str, list[Operation]]:
-    """Return the operations of a schema.
-
-    Parameters
-    ----------
-    schema : dict
-        OpenAPI.
-
-    Returns
-    -------
-    dict of str to list of Operation
-        By their tag, in the order of the schema.
-    """
+    """Return the operations of a schema."""
     groups: dict[str, list[Operation]] = {}
     for path, methods in schema["paths"].items():
         for method, told in methods.items():

@@ -159,20 +159,7 @@ def facts_of(job: Job) -> list[tuple[str, str]]:
 
 
 def steps_of(job: Job, events: Sequence[Event]) -> list[Step]:
-    """Return the steps of a job.
-
-    Parameters
-    ----------
-    job : Job
-        The job.
-    events : sequence of Event
-        What happened to it.
-
-    Returns
-    -------
-    list of Step
-        Those before the one that it is in are done, all of them if the job is.
-    """
+    """Return the steps of a job."""
     begun = max(
         (event.number for event in events if event.data.get("state") == "running"), default=0
     )

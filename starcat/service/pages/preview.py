@@ -101,18 +101,7 @@ class Preview:
 
 
 def preview_of(estimate: Estimate) -> Preview:
-    """Return what the page shows of an estimate.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        Of a spec.
-
-    Returns
-    -------
-    Preview
-        The same for the same estimate.
-    """
+    """Return what the page shows of an estimate."""
     counts = estimate.fields.count.astype(np.int64)
     ra_deg, dec_deg = _tiling(len(counts))
     none = np.zeros_like(counts)
@@ -129,18 +118,7 @@ def preview_of(estimate: Estimate) -> Preview:
 
 
 def tiling_content(count: int) -> dict[str, Any]:
-    """Return where the fields of a tiling are.
-
-    Parameters
-    ----------
-    count : int
-        Number of boresights.
-
-    Returns
-    -------
-    dict
-        ``ra_deg`` and ``dec_deg`` of each, to a thousandth of a degree.
-    """
+    """Return where the fields of a tiling are."""
     ra_deg, dec_deg = _tiling(count)
     return {"ra_deg": np.round(ra_deg, 3).tolist(), "dec_deg": np.round(dec_deg, 3).tolist()}
 

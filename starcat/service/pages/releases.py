@@ -19,20 +19,7 @@ router = page_router()
 
 
 def address_of(request: Request, service: Service) -> str:
-    """Return the address of the service as whoever asks reaches it.
-
-    Parameters
-    ----------
-    request : Request
-        What was asked; its name was checked by the guard.
-    service : Service
-        With the address that the operator set, where a proxy stands before it.
-
-    Returns
-    -------
-    str
-        Without a slash at the end.
-    """
+    """Return the address of the service as whoever asks reaches it."""
     return (service.settings.public_url or str(request.base_url)).rstrip("/")
 
 

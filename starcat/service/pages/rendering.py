@@ -34,16 +34,6 @@ NAVIGATION = (
 def count_text(value: float | None) -> str:
     """Return a count with a thin space between thousands, such as ``4 999``.
 
-    Parameters
-    ----------
-    value : float or None
-        A whole number.
-
-    Returns
-    -------
-    str
-        A dash where there is none.
-
     Examples
     --------
     >>> count_text(4999) == "4\N{NARROW NO-BREAK SPACE}999", count_text(None)
@@ -54,16 +44,6 @@ def count_text(value: float | None) -> str:
 
 def size_text(value: float | None) -> str:
     """Return a size with its unit, such as ``4.2 MB``.
-
-    Parameters
-    ----------
-    value : float or None
-        Bytes.
-
-    Returns
-    -------
-    str
-        Powers of 1000, two digits at least.
 
     Examples
     --------
@@ -84,16 +64,6 @@ def size_text(value: float | None) -> str:
 def duration_text(value: float | None) -> str:
     """Return a duration, such as ``4.2 s`` or ``3 min 20 s``.
 
-    Parameters
-    ----------
-    value : float or None
-        Seconds.
-
-    Returns
-    -------
-    str
-        A dash where there is none.
-
     Examples
     --------
     >>> [duration_text(s).replace("\N{NO-BREAK SPACE}", " ") for s in (0.04, 4.21, 200, 7260)]
@@ -112,18 +82,7 @@ def duration_text(value: float | None) -> str:
 
 
 def time_text(value: float | None) -> str:
-    """Return a moment as ``2026-11-22 14:05:09``, UTC.
-
-    Parameters
-    ----------
-    value : float or None
-        Seconds since 1970.
-
-    Returns
-    -------
-    str
-        A dash where there is none.
-    """
+    """Return a moment as ``2026-11-22 14:05:09``, UTC."""
     return "–" if value is None else f"{datetime.fromtimestamp(value, UTC):%Y-%m-%d %H:%M:%S}"
 
 
@@ -159,24 +118,7 @@ ENVIRONMENT = _environment()
 
 
 def render(request: Request, template: str, *, status: int = 200, **content: Any) -> HTMLResponse:
-    """Return a page.
-
-    Parameters
-    ----------
-    request : Request
-        Whose principal and path the head of the page shows.
-    template : str
-        Name of the template.
-    status : int, default 200
-        Of the answer.
-    **content
-        What the template needs beside them.
-
-    Returns
-    -------
-    HTMLResponse
-        Never kept by a browser: what it shows changes.
-    """
+    """Return a page."""
     page = ENVIRONMENT.get_template(template).render(
         principal=principal_of(request), path=request.url.path, **content
     )
@@ -207,24 +149,12 @@ class _PageRoute(APIRoute):
 
 
 def page_router() -> APIRouter:
-    """Return a router for pages: not in the schema, and its errors are pages.
-
-    Returns
-    -------
-    APIRouter
-        Without a route.
-    """
+    """Return a router for pages: not in the schema, and its errors are pages."""
     return APIRouter(route_class=_PageRoute, include_in_schema=False)
 
 
 def add_missing_page(app: FastAPI) -> None:
-    """Make an application tell a browser on a page that there is nothing at an address.
-
-    Parameters
-    ----------
-    app : FastAPI
-        The application; programs are told as before.
-    """
+    """Make an application tell a browser on a page that there is nothing at an address."""
 
     @app.exception_handler(404)
     def tell_missing(request: Request, error: Exception) -> Response:
@@ -238,20 +168,7 @@ def add_missing_page(app: FastAPI) -> None:
 
 
 def error_page(request: Request, problem: ProblemDetails) -> Response:
-    """Return the page of an error; who only has to sign in is led there.
-
-    Parameters
-    ----------
-    request : Request
-        What could not be answered.
-    problem : ProblemDetails
-        Why.
-
-    Returns
-    -------
-    Response
-        With the status of the problem.
-    """
+    """Return the page of an error; who only has to sign in is led there."""
     if problem.status == 401 and request.method == "GET":
         asked = request.url.path + (f"?{request.url.query}" if request.url.query else "")
         return RedirectResponse(f"/sign-in?next={quote(asked, safe='')}", 303)

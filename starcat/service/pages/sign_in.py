@@ -23,40 +23,13 @@ def sign_in_page(
 def sign_in_form(
     request: Request, next_address: str, error: str | None = None, status: int = 200
 ) -> Response:
-    """Return the page to sign in at.
-
-    Parameters
-    ----------
-    request : Request
-        Who asks.
-    next_address : str
-        Where to go afterwards: a path of this service, else its start.
-    error : str, optional
-        Why the last attempt failed.
-    status : int, default 200
-        Of the answer.
-
-    Returns
-    -------
-    Response
-        The page.
-    """
+    """Return the page to sign in at."""
     address = own_path(next_address)
     return render(request, "sign_in.html", status=status, next=address, error=error)
 
 
 def own_path(address: str) -> str:
     """Return a path of this service that a browser may be led to.
-
-    Parameters
-    ----------
-    address : str
-        As a request has it.
-
-    Returns
-    -------
-    str
-        The same, or ``/`` where it may lead elsewhere.
 
     Examples
     --------

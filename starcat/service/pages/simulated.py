@@ -30,24 +30,7 @@ def frame_suffix(database: Database) -> str:
 
 
 def write_frame(path: Path, database: Database, seed: int) -> None:
-    """Write a simulated frame.
-
-    Parameters
-    ----------
-    path : Path
-        ``.png`` for a picture, ``.csv`` for centroids.
-    database : Database
-        Its stars are seen by its camera.
-    seed : int
-        Same seed, same frame.
-
-    Raises
-    ------
-    ProductError
-        If the database cannot be read.
-    OutputError
-        If the file cannot be written.
-    """
+    """Write a simulated frame."""
     stars = open_database(database.folder, ())
     frame = next(
         simulate_frames(stars.directions, stars.camera, 1, Noise(NOISE_PX), seed, mag=stars.mag)

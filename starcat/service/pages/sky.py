@@ -135,23 +135,7 @@ class Line:
 
 
 def fields_of(database: Database) -> Fields:
-    """Read the fields of a database.
-
-    Parameters
-    ----------
-    database : Database
-        With a report.
-
-    Returns
-    -------
-    Fields
-        Kept for the next request.
-
-    Raises
-    ------
-    ProductError
-        If there is no such file, or it cannot be read.
-    """
+    """Read the fields of a database."""
     path = database.folder / COVERAGE
     try:
         return _read_fields(path, path.stat().st_mtime_ns)
@@ -171,20 +155,7 @@ def _read_fields(path: Path, changed_ns: int) -> Fields:
 
 
 def bins_of(fields: Fields) -> tuple[Bin, ...]:
-    """Return what the colours of a map mean.
-
-    Parameters
-    ----------
-    fields : Fields
-        The fields.
-
-    Returns
-    -------
-    tuple of Bin
-        From few stars to many. The first is for fields with fewer stars than an identification
-        needs, where there are such; the last begins at the 99.5 % of the fields at most, so that
-        one cluster does not take all colours.
-    """
+    """Return what the colours of a map mean."""
     least = int(fields.stars.min())
     first = max(least, MIN_STARS)
     most = int(np.quantile(fields.stars, 0.995, method="inverted_cdf"))
@@ -199,22 +170,7 @@ def bins_of(fields: Fields) -> tuple[Bin, ...]:
 
 @lru_cache(maxsize=16)
 def map_png(database_id: str, fields: Fields, width: int = RASTER_WIDTH) -> bytes:
-    """Return the raster of a map: the stars of the field of the nearest boresight.
-
-    Parameters
-    ----------
-    database_id : str
-        Whose map it is; the map is kept for the next request.
-    fields : Fields
-        The fields, as `fields_of` gives them.
-    width : int, default `RASTER_WIDTH`
-        Columns; there are half as many rows.
-
-    Returns
-    -------
-    bytes
-        PNG, north at the top; nothing outside of the ellipse.
-    """
+    """Return the raster of a map: the stars of the field of the nearest boresight."""
     raster = nearest_raster(
         directions_from_radec(fields.ra_deg, fields.dec_deg), fields.stars, width
     )
@@ -222,20 +178,7 @@ def map_png(database_id: str, fields: Fields, width: int = RASTER_WIDTH) -> byte
 
 
 def coloured_png(raster: Array, bins: tuple[Bin, ...]) -> bytes:
-    """Return a raster of numbers of stars as a picture.
-
-    Parameters
-    ----------
-    raster : ndarray of float64, shape (rows, columns)
-        Stars of a field; NaN outside of the map.
-    bins : tuple of Bin
-        What the colours mean.
-
-    Returns
-    -------
-    bytes
-        PNG; nothing where there is no number.
-    """
+    """Return a raster of numbers of stars as a picture."""
     from PIL import Image
 
     found = np.searchsorted([one.least for one in bins], np.nan_to_num(raster), side="right")
@@ -248,18 +191,7 @@ def coloured_png(raster: Array, bins: tuple[Bin, ...]) -> bytes:
 
 
 def place(ra_deg: float, dec_deg: float) -> tuple[float, float]:
-    """Return the place of a direction in the drawing.
-
-    Parameters
-    ----------
-    ra_deg, dec_deg : float
-        Degrees.
-
-    Returns
-    -------
-    tuple of float
-        x to the right, y downwards, from the middle of the map.
-    """
+    """Return the place of a direction in the drawing."""
     x, y = project([ra_deg], [dec_deg])
     return round(float(x[0]) * UNIT, 1), round(float(-y[0]) * UNIT, 1)
 
@@ -330,38 +262,14 @@ class SkyMap:
 
 
 def sky_map(fields: Fields) -> SkyMap:
-    """Return what is drawn upon the raster of a map.
-
-    Parameters
-    ----------
-    fields : Fields
-        The fields.
-
-    Returns
-    -------
-    SkyMap
-        For the template.
-    """
+    """Return what is drawn upon the raster of a map."""
     size = round(HALF_WIDTH * UNIT, 1), round(HALF_HEIGHT * UNIT, 1)
     emptiest = field_at(fields, int(np.argmin(fields.stars)))
     return SkyMap(*size, bins_of(fields), meridians(), parallels(), milky_way(), emptiest)
 
 
 def ordered(fields: Fields, order: str) -> list[int]:
-    """Return the numbers of the fields in an order.
-
-    Parameters
-    ----------
-    fields : Fields
-        The fields.
-    order : {"fewest", "most", "number"}
-        By their stars, or as the tiling has them.
-
-    Returns
-    -------
-    list of int
-        Fields with the same stars stand as the tiling has them.
-    """
+    """Return the numbers of the fields in an order."""
     if order == "number":
         return list(range(len(fields)))
     stars = fields.stars if order == "fewest" else -fields.stars

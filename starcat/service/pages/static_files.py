@@ -30,23 +30,7 @@ router = APIRouter(include_in_schema=False)
 
 
 def static_address(name: str) -> str:
-    """Return the address of a static file.
-
-    Parameters
-    ----------
-    name : str
-        Such as ``starcat.css``.
-
-    Returns
-    -------
-    str
-        Another one whenever any of the files changes.
-
-    Raises
-    ------
-    KeyError
-        If there is no such file: a mistake in a template.
-    """
+    """Return the address of a static file."""
     if name not in FILES:
         raise KeyError(name)
     return f"/static/{DIGEST}/{name}"

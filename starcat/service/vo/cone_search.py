@@ -93,27 +93,7 @@ async def search(catalog: str, request: Request, service: TheService, reader: Re
 
 
 def target_of(service: Service, name: str) -> tuple[Path, Label]:
-    """Return the database or the catalog of a name.
-
-    Parameters
-    ----------
-    service : Service
-        What has them.
-    name : str
-        As a request says it: an id, ``name``, ``name-version``, or a catalog that was read.
-
-    Returns
-    -------
-    folder : Path
-        What a session opens.
-    label : Label
-        What a file says of it.
-
-    Raises
-    ------
-    TargetMissing
-        If there is none.
-    """
+    """Return the database or the catalog of a name."""
     named = [one for one in service.shelf.databases() if name in (one.id, one.name, one.title)]
     if named:
         newest = named[-1]

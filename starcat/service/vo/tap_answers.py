@@ -20,44 +20,14 @@ _LABEL = Label("result")
 
 
 class Answers:
-    """What makes bytes of answers.
-
-    Parameters
-    ----------
-    places : Places
-        Where what has to be a file is kept before it is sent.
-    confined : Confined
-        What makes files that are held in memory as a whole, in processes of their own.
-    """
+    """What makes bytes of answers."""
 
     def __init__(self, places: Places, confined: Confined) -> None:
         self._places = places
         self._confined = confined
 
     def chunks(self, batches: pa.RecordBatchReader, form: Format, max_rows: int) -> Iterator[bytes]:
-        """Yield an answer in a format.
-
-        Parameters
-        ----------
-        batches : pyarrow.RecordBatchReader
-            The rows; one more than `max_rows` where there are more.
-        form : Format
-            How to write them.
-        max_rows : int
-            Rows to give at most; VOTable says where there were more.
-
-        Yields
-        ------
-        bytes
-            In order.
-
-        Raises
-        ------
-        SchemaError
-            If a column cannot be said in the format.
-        QueryLimitError
-            If the query takes too long; also while reading.
-        """
+        """Yield an answer in a format."""
         if form.name == "fits":
             yield from self._fits(batches, max_rows)
         else:

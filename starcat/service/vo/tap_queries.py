@@ -27,21 +27,7 @@ _LABEL = Label("result")
 
 
 class TapQueries:
-    """What answers questions.
-
-    Parameters
-    ----------
-    places : Places
-        What lies where.
-    tables : TapTables
-        What may be asked.
-    sessions : Sessions
-        What runs queries, in processes of their own.
-    confined : Confined
-        What reads uploads and makes files, in processes of their own.
-    most_rows : int
-        Rows of an answer at most.
-    """
+    """What answers questions."""
 
     def __init__(
         self,
@@ -65,30 +51,7 @@ class TapQueries:
         time_s: float | None = None,
         progress: Progress = no_progress,
     ) -> Generator[bytes, None, None]:
-        """Yield the answer to a question.
-
-        Parameters
-        ----------
-        asked : Question
-            The question.
-        files : mapping of str to Path
-            Parts of the request that are files, by their names; only read.
-        time_s : float, optional
-            Seconds that the query may take; by default what the operator set.
-        progress : Progress
-            Called while the query runs; what it raises ends the query.
-
-        Yields
-        ------
-        bytes
-            In the format of the question. What is wrong with the question is raised before the
-            first.
-
-        Raises
-        ------
-        StarcatError
-            If it cannot be answered.
-        """
+        """Yield the answer to a question."""
         with self._uploaded(asked.uploads, files) as (folder, uploaded):
             state = self._tables.state()
             tables, targets = state.tables, list(state.targets)

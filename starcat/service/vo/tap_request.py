@@ -96,18 +96,7 @@ class TapRoute(APIRoute):
 
 
 def error_response(error: Exception) -> Response:
-    """Return an error as TAP has it.
-
-    Parameters
-    ----------
-    error : Exception
-        What a handler raised.
-
-    Returns
-    -------
-    Response
-        A VOTable; the status is that of the rest of the service.
-    """
+    """Return an error as TAP has it."""
     problem = problem_of(error)
     headers = error.headers if isinstance(error, Problem) else None
     return Response(error_votable(problem.detail), problem.status, headers, VOTABLE_TYPE)
@@ -129,18 +118,7 @@ class TapRequest:
     uploads: dict[str, UploadFile]
 
     def keep(self, folder: Path) -> dict[str, Path]:
-        """Copy the files of the request into a folder.
-
-        Parameters
-        ----------
-        folder : Path
-            Which is there.
-
-        Returns
-        -------
-        dict of str to Path
-            Names of our own, by the names of the parts.
-        """
+        """Copy the files of the request into a folder."""
         kept = {}
         for number, (name, upload) in enumerate(self.uploads.items()):
             kept[name] = folder / f"upload-{number}.vot"
@@ -152,18 +130,7 @@ class TapRequest:
 
 
 async def tap_request(request: Request) -> AsyncIterator[TapRequest]:
-    """Give what a request says; its files are there while it is answered.
-
-    Parameters
-    ----------
-    request : Request
-        GET, or POST with a form.
-
-    Yields
-    ------
-    TapRequest
-        Parameters of the address first.
-    """
+    """Give what a request says; its files are there while it is answered."""
     service = service_of(request)
     given = list(request.query_params.multi_items())
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
@@ -211,17 +178,6 @@ def _check_size(upload: UploadFile, service: Service) -> None:
 
 
 def base_url(request: Request) -> str:
-    """Return the address of TAP as the client sees it.
-
-    Parameters
-    ----------
-    request : Request
-        Any of its requests.
-
-    Returns
-    -------
-    str
-        Without a slash at the end.
-    """
+    """Return the address of TAP as the client sees it."""
     own = service_of(request).settings.public_url or str(request.base_url)
     return own.rstrip("/") + PREFIX

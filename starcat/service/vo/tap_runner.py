@@ -26,17 +26,7 @@ class _Unwanted(Exception):  # noqa: N818 - the name reads as the fact
 
 
 class TapRunner:
-    """A bounded number of threads that answer jobs.
-
-    Parameters
-    ----------
-    jobs : TapJobs
-        The jobs there are.
-    queries : TapQueries
-        What answers.
-    count : int
-        How many at the same time.
-    """
+    """A bounded number of threads that answer jobs."""
 
     def __init__(self, jobs: TapJobs, queries: TapQueries, count: int) -> None:
         self._jobs = jobs

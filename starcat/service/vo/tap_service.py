@@ -20,21 +20,6 @@ DAY_S = 86400
 class Tap:
     """The parts of TAP.
 
-    Parameters
-    ----------
-    settings : Settings
-        What the operator set.
-    places : Places
-        What lies where.
-    records : Records
-        What is remembered.
-    shelf : Shelf
-        The databases there are.
-    sessions : Sessions
-        What runs queries.
-    confined : Confined
-        What reads uploads and makes files.
-
     Attributes
     ----------
     limits : ServiceLimits

@@ -22,17 +22,7 @@ class ClientGone(Exception):  # noqa: N818 - the name reads as the fact
 
 
 class Spool:
-    """Parts of an answer, made in a thread of their own.
-
-    Parameters
-    ----------
-    parts : generator of bytes
-        Makes them; closed at the end.
-    scratch : Path
-        Folder for the file, which has no name there.
-    gone : threading.Event
-        Set by `close`; what makes the parts may look at it.
-    """
+    """Parts of an answer, made in a thread of their own."""
 
     def __init__(
         self, parts: Generator[bytes, None, None], scratch: Path, gone: threading.Event

@@ -30,17 +30,7 @@ ENDED_WITH_SERVER = (
 
 
 class TapJobs:
-    """The asynchronous queries there are.
-
-    Parameters
-    ----------
-    records : Records
-        What is remembered.
-    places : Places
-        Where answers and uploads lie.
-    limits : ServiceLimits
-        What is granted.
-    """
+    """The asynchronous queries there are."""
 
     def __init__(self, records: Records, places: Places, limits: ServiceLimits) -> None:
         self._records = records
@@ -48,25 +38,7 @@ class TapJobs:
         self._limits = limits
 
     def create(self, owner: str, parameters: Sequence[tuple[str, str]]) -> JobFacts:
-        """Make a job that waits to be run.
-
-        Parameters
-        ----------
-        owner : str
-            Who makes it.
-        parameters : sequence of (str, str)
-            As the request has them.
-
-        Returns
-        -------
-        JobFacts
-            Pending.
-
-        Raises
-        ------
-        ConfigError
-            If the owner has too many that are not at their end.
-        """
+        """Make a job that waits to be run."""
         self.sweep()
         job_id, now = secrets.token_hex(16), time.time()
         make_folder(self.folder(job_id))
@@ -90,25 +62,7 @@ class TapJobs:
         return self.job(job_id)
 
     def job(self, job_id: str, owner: str | None = None) -> JobFacts:
-        """Return a job.
-
-        Parameters
-        ----------
-        job_id : str
-            As a request has it.
-        owner : str, optional
-            Who asks; other people's jobs are not there for them.
-
-        Returns
-        -------
-        JobFacts
-            As it is now.
-
-        Raises
-        ------
-        TargetMissing
-            If there is none, or its time is over.
-        """
+        """Return a job."""
         checked(job_id, JOB_ID, "job")
         with self._records.reading() as connection:
             row = connection.execute("SELECT * FROM tap_jobs WHERE id = ?", (job_id,)).fetchone()
@@ -148,25 +102,7 @@ class TapJobs:
         return {part: folder / name for part, name in json.loads(row["files"]).items()}
 
     def answers(self, uploads: Sequence[Upload], owner: str) -> dict[str, Path]:
-        """Return the answers of other jobs that a question is about, by the ids of these.
-
-        Parameters
-        ----------
-        uploads : sequence of Upload
-            Of a question.
-        owner : str
-            Who asks it.
-
-        Returns
-        -------
-        dict of str to Path
-            Files, only to be read.
-
-        Raises
-        ------
-        TargetMissing
-            If a job is not there, or has no answer.
-        """
+        """Return the answers of other jobs that a question is about, by the ids of these."""
         found = {}
         for one in uploads:
             if one.job_id:
@@ -179,17 +115,7 @@ class TapJobs:
     def set_parameters(
         self, job_id: str, given: Sequence[tuple[str, str]], files: dict[str, Path]
     ) -> None:
-        """Set parameters of a job that has not been run; others keep their values.
-
-        Parameters
-        ----------
-        job_id : str
-            The job.
-        given : sequence of (str, str)
-            Names in capitals, and values.
-        files : dict of str to Path
-            Files in its folder, by the names of the parts.
-        """
+        """Set parameters of a job that has not been run; others keep their values."""
         names = {name for name, _ in given}
         before = self.job(job_id)
         kept = [(name, value) for name, value in before.parameters if name not in names]

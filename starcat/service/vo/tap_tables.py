@@ -41,17 +41,7 @@ class TapState:
 
 
 class TapTables:
-    """The tables of a service, as they are now.
-
-    Parameters
-    ----------
-    places : Places
-        What lies where.
-    shelf : Shelf
-        The databases there are.
-    sessions : Sessions
-        What tells the columns of tables.
-    """
+    """The tables of a service, as they are now."""
 
     def __init__(self, places: Places, shelf: Shelf, sessions: Sessions) -> None:
         self._places = places
@@ -61,14 +51,7 @@ class TapTables:
         self._state: tuple[str, TapState] | None = None
 
     def state(self) -> TapState:
-        """Return what there is to be asked.
-
-        Returns
-        -------
-        TapState
-            The same object until a database or a catalog comes or goes. What cannot be opened is
-            left out, and the log says so.
-        """
+        """Return what there is to be asked."""
         about = self._found()
         key = _digest(list(about))
         with self._looking:
