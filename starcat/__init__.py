@@ -17,10 +17,10 @@ TYPE_CHECKING = False  # as a type checker knows it, without importing typing fo
 if TYPE_CHECKING:
     from typing import Any
 
+    from starcat.api.artifact import open_artifact as open  # noqa: A004 - as numpy, gzip and PIL have it
+    from starcat.api.connection import connect
+    from starcat.api.functions import build, calibrate, ingest, verify
     from starcat.errors import StarcatError
-    from starcat.face.artifact import open_artifact as open  # noqa: A004 - as numpy, gzip and PIL have it
-    from starcat.face.connection import connect
-    from starcat.face.functions import build, calibrate, ingest, verify
     from starcat.geometry.camera import Camera
     from starcat.matcher.matcher import Matcher
     from starcat.matcher.tracking import Tracker
@@ -54,16 +54,16 @@ _HOMES = {
     "Observer": ("starcat.sky.observer", "Observer"),
     "StarcatError": ("starcat.errors", "StarcatError"),
     "Tracker": ("starcat.matcher.tracking", "Tracker"),
-    "build": ("starcat.face.functions", "build"),
-    "calibrate": ("starcat.face.functions", "calibrate"),
-    "connect": ("starcat.face.connection", "connect"),
+    "build": ("starcat.api.functions", "build"),
+    "calibrate": ("starcat.api.functions", "calibrate"),
+    "connect": ("starcat.api.connection", "connect"),
     "identify_in_time": ("starcat.sky.spots", "identify_in_time"),
-    "ingest": ("starcat.face.functions", "ingest"),
-    "open": ("starcat.face.artifact", "open_artifact"),
+    "ingest": ("starcat.api.functions", "ingest"),
+    "open": ("starcat.api.artifact", "open_artifact"),
     "preset": ("starcat.specs.reading", "preset"),
     "read_spec": ("starcat.specs.reading", "read_spec"),
     "sky_in_time": ("starcat.sky.in_time", "sky_in_time"),
-    "verify": ("starcat.face.functions", "verify"),
+    "verify": ("starcat.api.functions", "verify"),
 }
 """Module and name of what each public name is."""
 

@@ -1,5 +1,5 @@
 """``python -m starcat``: the same as the command ``starcat``."""
 
-from starcat.cli import main
+from starcat.cli.main import main
 
 main()

@@ -190,7 +190,7 @@ def starcat(
 
     It finds no catalog but those that it is given.
     """
-    from starcat.cli import main
+    from starcat.cli.main import main
 
     monkeypatch.setenv("STARCAT_CACHE", str(tmp_path / "no-cache"))
     monkeypatch.delenv("STARCAT_CATALOGS", raising=False)

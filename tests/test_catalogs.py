@@ -23,7 +23,7 @@ from starcat.catalog.source import data_source
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.errors import BuildError, ConfigError, ParseError, SourceMissing
 from starcat.geometry.sphere import directions_from_radec, separation
-from starcat.tables.schema import product_schema
+from starcat.storage.schema import product_schema
 
 MAS = 1.0 / 3.6e6  # degrees in a milliarcsecond
 ARCSEC_RAD = np.radians(1.0 / 3600.0)

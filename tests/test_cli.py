@@ -22,7 +22,7 @@ from starcat.catalog.source import source_names
 from starcat.matcher.fast import library_version
 from starcat.matcher.methods.table import METHODS
 from starcat.specs.reading import preset_names
-from starcat.tables.schema import product_schema
+from starcat.storage.schema import product_schema
 
 EVERY = every_command()
 COMMANDS = tuple(EVERY)

@@ -9,12 +9,12 @@ import pytest
 from rich.console import Console
 
 from starcat.artifact.verify import Finding, Verification
+from starcat.cli.terminal.artifacts import print_rebuilt, print_verification
+from starcat.cli.terminal.console import StageBars, print_table
+from starcat.cli.terminal.exports import print_exported
 from starcat.exchange.export import Exported
 from starcat.pipeline.rebuild import FileChange, Rebuilt
 from starcat.progress import BYTE_STAGES
-from starcat.terminal.artifacts import print_rebuilt, print_verification
-from starcat.terminal.console import StageBars, print_table
-from starcat.terminal.exports import print_exported
 
 BRACKETS = "/data/[old]/a[0] [bold]b[/bold] \\[c]"
 

@@ -42,8 +42,8 @@ from starcat.specs.build_spec import BuildSpec
 from starcat.specs.product_sections import Crossmatch, Products
 from starcat.specs.reading import spec_from_dict
 from starcat.storage.digests import file_sha256, json_bytes
-from starcat.tables.parquet import read_parquet, write_parquet
-from starcat.tables.schema import product_schema
+from starcat.storage.parquet import read_parquet, write_parquet
+from starcat.storage.schema import product_schema
 
 FIRST_ID = 1000
 

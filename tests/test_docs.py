@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "builders"))
 
 from docs import pages
-from starcat import cli
+from starcat.cli import main as cli
 
 
 @pytest.mark.parametrize("name", pages())

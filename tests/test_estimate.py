@@ -26,7 +26,7 @@ from starcat.pipeline.stars_read import StarsRead, read_stars, what_is_read
 from starcat.products.boresights import NominalField, stars_in_fields
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import content_of_toml, preset, preset_names, spec_from_dict
-from starcat.tables.parquet import parquet_bytes, read_parquet, write_parquet
+from starcat.storage.parquet import parquet_bytes, read_parquet, write_parquet
 
 FILES = {"2mass-8x6": {"2mass": "psc_estimated.gz"}}
 """Inputs that are not found by the names of their files."""

@@ -22,6 +22,7 @@ import pyarrow.parquet as pq
 import pytest
 from astropy.stats import binom_conf_interval
 
+from starcat.cli.terminal.evaluations import print_evaluation
 from starcat.errors import ConfigError, ProductError
 from starcat.evaluation import run as evaluate
 from starcat.evaluation import trial
@@ -63,7 +64,6 @@ from starcat.geometry.camera import Camera
 from starcat.matcher.methods.table import METHODS, Method
 from starcat.simulation.simulate import Noise
 from starcat.specs.reading import spec_from_dict
-from starcat.terminal.evaluations import print_evaluation
 
 FRAMES = Attitudes("random", 8)
 

@@ -21,7 +21,7 @@ from starcat.errors import OutputError
 from starcat.exchange.export import EXPORT_FORMATS, export_tables
 from starcat.exchange.formats import SUFFIXES
 from starcat.exchange.tables import in_memory, tables_of
-from starcat.tables.schema import product_schema
+from starcat.storage.schema import product_schema
 
 Run = Callable[[list[Any]], Any]
 

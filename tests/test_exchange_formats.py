@@ -37,7 +37,7 @@ from starcat.exchange.formats import (
 from starcat.exchange.label import Label
 from starcat.exchange.tables import tables_of
 from starcat.resources import resource_folder
-from starcat.tables.schema import product_schema
+from starcat.storage.schema import product_schema
 
 ASTROPY = ("votable", "fits", "ecsv")
 GAIA_ID = 4472832130942575872  # Barnard's star: 2^62 and more

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from starcat.errors import ConfigError, ParseError, SourceError, SourceMissing
 from starcat.exchange.peers import PEERS, cedar_solve_stars, peer_tables
-from starcat.tables.schema import product_schema
+from starcat.storage.schema import product_schema
 
 PROPS = [
     ("pattern_mode", "U64"),

@@ -21,7 +21,7 @@ from starcat.catalog.readers import files as files_module
 from starcat.catalog.readers.files import InputFile
 from starcat.catalog.source import data_source
 from starcat.errors import ParseError, SourceError
-from starcat.tables.schema import product_schema
+from starcat.storage.schema import product_schema
 
 SOURCE = data_source("2mass")
 PSC = SOURCE.files[0]

@@ -25,7 +25,7 @@ from starcat.catalog.ingest import ingest
 from starcat.catalog.source import Column, RecordFile, data_source
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.errors import StarcatError
-from starcat.tables.schema import product_schema
+from starcat.storage.schema import product_schema
 
 sys.path.insert(0, str(Path(__file__).parent / "builders"))
 from archives import archive_records, file_header, synthetic_sky

@@ -11,10 +11,10 @@ import pytest
 
 from starcat.pipeline.match_stores import match_stores
 from starcat.specs.product_sections import Crossmatch
+from starcat.storage.parquet import read_parquet
 from starcat.store.ingest import ingest_to_store
 from starcat.store.layout import open_store
 from starcat.store.options import StoreOptions
-from starcat.tables.parquet import read_parquet
 
 lsdb = pytest.importorskip("lsdb", reason="LSDB comes with the extra dev")
 

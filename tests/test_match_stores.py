@@ -34,10 +34,10 @@ from starcat.pipeline.match_summary import Summary
 from starcat.pipeline.medians import median_of, write_numbers
 from starcat.products.match_figures import ARCSEC
 from starcat.specs.product_sections import Crossmatch
+from starcat.storage.parquet import read_parquet, write_parquet, write_parts
+from starcat.storage.schema import product_schema
 from starcat.store.pixels import MAX_ORDER, Pixel, healpix_29
 from starcat.store.region import region_around
-from starcat.tables.parquet import read_parquet, write_parquet, write_parts
-from starcat.tables.schema import product_schema
 
 pytest.importorskip("cdshealpix")
 
@@ -345,7 +345,7 @@ def test_the_median_of_files_is_that_of_all_numbers(parts: list[list[float]]):
 
 
 def test_a_table_in_parts_is_the_same_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("starcat.tables.parquet.ROW_GROUP_ROWS", 1000)
+    monkeypatch.setattr("starcat.storage.parquet.ROW_GROUP_ROWS", 1000)
     generator = np.random.default_rng(2)
     stars = star_table(generator.uniform(0, 360, 4500), np.zeros(4500), generator)
     write_parquet(stars.combine_chunks(), tmp_path / "whole.parquet")

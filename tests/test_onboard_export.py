@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from starcat.artifact.reader import open_artifact
+from starcat.cli.terminal import onboard
 from starcat.exchange.onboard import contents_of
 from starcat.matcher.database import open_database
 from starcat.onboard.image import Contents, make_image
 from starcat.onboard.layout import DIRECTION_SCALE
 from starcat.onboard.reading import read_image
-from starcat.terminal import onboard
 
 Starcat = Callable[..., Any]
 

@@ -13,9 +13,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from starcat.artifact.reader import open_artifact
-from starcat.tables.parquet import read_parquet, write_parquet
-from starcat.tables.schema import product_schema
-from starcat.tables.votable import VOTABLE_NAMESPACE, votable_xml
+from starcat.storage.parquet import read_parquet, write_parquet
+from starcat.storage.schema import product_schema
+from starcat.storage.votable import VOTABLE_NAMESPACE, votable_xml
 
 
 @pytest.fixture(scope="module")

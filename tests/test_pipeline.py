@@ -300,7 +300,7 @@ def test_a_stopped_build_leaves_no_half_artifact(
 
 
 def test_termination_cleans_up(stars: Path, small_spec: str, tmp_path: Path) -> None:
-    from starcat.cli import _stop
+    from starcat.cli.main import _stop
 
     seen: list[list[str]] = []
 

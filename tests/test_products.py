@@ -26,7 +26,7 @@ from starcat.products.neighbours import find_neighbours, position_angles
 from starcat.products.pairs import find_pairs
 from starcat.products.radial import radial_patterns
 from starcat.products.triangles import distinct_triangles, find_triangles
-from starcat.tables.schema import product_schema
+from starcat.storage.schema import product_schema
 
 RADIUS, BUFFER = 0.6, 0.1
 # An odd grid has the alignment star in the middle of a row, not on an edge.

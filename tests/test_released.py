@@ -15,7 +15,7 @@ from release_schemas import LIST_NAME, SCHEMAS, broken, digests, release, releas
 
 from starcat.artifact.reader import open_artifact
 from starcat.errors import SchemaVersionError
-from starcat.tables.schema import product_schema
+from starcat.storage.schema import product_schema
 
 
 @pytest.fixture

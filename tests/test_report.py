@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 
 from starcat.artifact.reader import Artifact, open_artifact
+from starcat.cli.terminal.coverage_tables import histogram_rows
 from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars
 from starcat.pipeline.build import build
 from starcat.pipeline.facts import artifact_coverage
@@ -33,7 +34,6 @@ from starcat.report.report import count_magnitudes
 from starcat.report.sky_map import HALF_HEIGHT, HALF_WIDTH, nearest_raster, project
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import spec_from_dict
-from starcat.terminal.coverage_tables import histogram_rows
 
 FILES = {
     "coverage.csv",

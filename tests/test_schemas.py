@@ -17,7 +17,7 @@ from starcat.artifact.reader import open_artifact
 from starcat.catalog.source import UNITS
 from starcat.errors import SchemaError, SchemaVersionError
 from starcat.resources import resource_folder
-from starcat.tables.schema import ProductSchema, product_schema, read_schema
+from starcat.storage.schema import ProductSchema, product_schema, read_schema
 
 FOLDER = resource_folder("schemas")
 MANIFEST = FOLDER / f"manifest-{MANIFEST_VERSION}.json"
@@ -220,7 +220,7 @@ def test_the_newest_version_is_the_default(tmp_path: Path, monkeypatch: pytest.M
     for version in ("1.0.0", "1.9.0", "1.10.0"):
         changed = json.dumps({**content, "version": version})
         (tmp_path / f"pairs-{version}.json").write_text(changed)
-    monkeypatch.setattr("starcat.tables.schema.resource_folder", lambda name: tmp_path)
+    monkeypatch.setattr("starcat.storage.schema.resource_folder", lambda name: tmp_path)
     newest = product_schema.__wrapped__("pairs")
     assert newest.version == "1.10.0"
     assert product_schema.__wrapped__("pairs", "1.9.0").version == "1.9.0"

@@ -29,6 +29,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from starcat.cli.terminal.sky_in_time import print_sky_in_time, sky_as_dict
 from starcat.errors import ConfigError
 from starcat.geometry.aberration import LIGHT_KM_S, aberrated
 from starcat.geometry.attitude import (
@@ -49,7 +50,6 @@ from starcat.sky.in_time import earth_limb_angle_deg, sky_in_time
 from starcat.sky.magnitudes import PHASE_CURVES, apparent_magnitude
 from starcat.sky.observer import Observer, numbers_of
 from starcat.sky.spots import identify_in_time, planets_among
-from starcat.terminal.sky_in_time import print_sky_in_time, sky_as_dict
 
 Array = NDArray[np.float64]
 

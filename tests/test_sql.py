@@ -23,11 +23,11 @@ import pytest
 from astropy.table import Table
 
 from starcat.artifact.reader import open_artifact
+from starcat.cli.terminal.prompt import prompt, words
 from starcat.errors import ProductError, QueryError, SchemaVersionError, SourceError
 from starcat.query.gallery import gallery, guessed, named_query
 from starcat.query.names import identifier
 from starcat.query.session import Session, open_session
-from starcat.terminal.prompt import prompt, words
 
 Run = Callable[[list[Any]], Any]
 
@@ -532,7 +532,7 @@ def test_what_stdin_has_that_is_no_sql_is_told(small_artifact):
 def test_a_query_loads_nothing_heavy(small_artifact):
     code = (
         "import sys\nsys.argv = ['starcat', 'sql', sys.argv[1], 'SELECT 1']\n"
-        "from starcat.cli import main\ntry:\n    main()\nexcept SystemExit:\n    pass\n"
+        "from starcat.cli.main import main\ntry:\n    main()\nexcept SystemExit:\n    pass\n"
         "print(*{name.split('.')[0] for name in sys.modules})"
     )
     done = subprocess.run(

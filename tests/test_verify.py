@@ -24,7 +24,7 @@ from starcat.artifact.verify import Finding, check_artifact, verify_artifact
 from starcat.errors import ProductError
 from starcat.resources import resource_folder
 from starcat.storage.digests import file_sha256, json_bytes
-from starcat.tables.parquet import read_parquet, write_parquet
+from starcat.storage.parquet import read_parquet, write_parquet
 
 SCHEMAS = resource_folder("schemas")
 

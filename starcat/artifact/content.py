@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from starcat.tables.schema import ProductSchema
+from starcat.storage.schema import ProductSchema
 
 
 def content_sha256(table: pa.Table, schema: ProductSchema) -> str:

@@ -13,13 +13,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.catalog.proper_motion import MAS, Motion, propagate_directions
 from starcat.catalog.stars import floats_of
 from starcat.geometry.sphere import directions_from_radec, separation, tangent_axes
 from starcat.products.crossmatch import VERDICTS, Matches, MovingStars
-from starcat.tables.schema import product_schema
-
-Array = NDArray[np.float64]
+from starcat.storage.schema import product_schema
 
 NEEDED = (
     "star_id",

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from starcat.errors import SchemaError
 from starcat.products.index import Index
-from starcat.tables.schema import ProductSchema, SchemaColumn
+from starcat.storage.schema import ProductSchema, SchemaColumn
 
 LAYOUT_VERSION = "1.0.0"
 """The version of the arrangement of groups, datasets and attributes described above."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from starcat.artifact.database import INDICES, LAYOUT_VERSION, column_datasets, dataset_attributes
 from starcat.products.index import row_offsets
 from starcat.storage.hdf5 import own_dataset
-from starcat.tables.schema import ProductSchema
+from starcat.storage.schema import ProductSchema
 
 
 def root_problems(file: h5py.File, manifest: Mapping[str, Any]) -> Iterator[str]:

@@ -20,7 +20,7 @@ from starcat.version import __version__
 
 if TYPE_CHECKING:  # reading a manifest needs none of these
     from starcat.catalog.file_parts import FileFacts
-    from starcat.tables.schema import ProductSchema
+    from starcat.storage.schema import ProductSchema
 
 MANIFEST_NAME = "manifest.json"
 MANIFEST_VERSION = "1.1.0"

@@ -10,8 +10,8 @@ import pyarrow as pa
 
 from starcat.artifact.manifest import read_manifest
 from starcat.errors import ProductError
-from starcat.tables.parquet import read_parquet
-from starcat.tables.schema import ProductSchema, product_schema
+from starcat.storage.parquet import read_parquet
+from starcat.storage.schema import ProductSchema, product_schema
 
 
 @dataclass(frozen=True)

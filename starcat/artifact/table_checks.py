@@ -19,7 +19,7 @@ from starcat.artifact.crossmatch_table import counterpart_problems
 from starcat.artifact.motion_table import motion_problems
 from starcat.errors import SchemaError
 from starcat.geometry.sphere import directions_from_radec, separation
-from starcat.tables.schema import ProductSchema
+from starcat.storage.schema import ProductSchema
 
 UNIT_TOLERANCE = 1e-14
 """The length of a direction and its components are off by less: a few roundings of float64."""

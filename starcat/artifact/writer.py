@@ -23,8 +23,8 @@ from starcat.artifact.manifest import (
 )
 from starcat.products.index import Index
 from starcat.storage.digests import file_sha256, json_bytes
-from starcat.tables.parquet import write_parquet
-from starcat.tables.schema import product_schema
+from starcat.storage.parquet import write_parquet
+from starcat.storage.schema import product_schema
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.calibration.fit import Fit, fit_camera
 from starcat.calibration.lens import AXES, PARAMETERS, camera_of, values_of
 from starcat.calibration.models import COMPLETE, Trial, choose_model, chosen, is_enough, start_of
@@ -23,8 +23,6 @@ from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.progress import Progress, no_progress
-
-Array = NDArray[np.float64]
 
 MIN_FRAMES = 3
 """Fewest identified frames of a calibration: with fewer, leaving some out says nothing."""

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from starcat.arrays import Array
 from starcat.calibration.lens import (
     FOCAL,
     PARAMETERS,
@@ -22,8 +23,6 @@ from starcat.calibration.lens import (
     turn_derivatives,
     value_derivatives,
 )
-
-Array = NDArray[np.float64]
 
 BEND = 3.0
 """Where Huber's loss turns from a parabola to lines, in standard deviations of a centroid."""

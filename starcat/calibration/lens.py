@@ -12,10 +12,10 @@ from dataclasses import asdict
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 
-Array = NDArray[np.float64]
 Points = NDArray[np.complex128]
 
 FOCAL = ("focal_length_px",)

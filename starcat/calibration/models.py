@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
+from starcat.arrays import Array
 from starcat.calibration.fit import BEND, Fit, Seen, fit_camera, reduced_derivatives, turned_to
 from starcat.calibration.lens import CENTRE, FOCAL, PARAMETERS, RADIAL, TANGENTIAL, camera_of
 from starcat.errors import ConfigError
-
-Array = NDArray[np.float64]
 
 FOLDS = 5
 """Groups of frames that are left out in turn; each frame is its own where there are fewer."""

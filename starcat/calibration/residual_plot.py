@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.calibration.calibrate import Calibration
 from starcat.errors import ConfigError, OutputError, reason
 from starcat.report.plots import headline, own_style
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 
 KINDS = (".png", ".svg")
 _BLUE, _GREY, _RED = "#2c6e9e", "#b9c4cc", "#d1495b"

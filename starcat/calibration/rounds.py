@@ -16,6 +16,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.calibration.fit import Fit, Seen, fit_camera
 from starcat.calibration.lens import CENTRE, FOCAL, camera_of, cropped, values_of
 from starcat.calibration.models import choose_model, chosen, is_enough, start_of
@@ -27,8 +28,6 @@ from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.matcher import NOISE_DEVIATIONS, Matcher
 from starcat.matcher.result import MatchResult
 from starcat.progress import Progress
-
-Array = NDArray[np.float64]
 
 WIDE_PX = 6.0
 """Tolerance as long as the camera is hardly known."""

@@ -19,7 +19,7 @@ from starcat.catalog.readers.malformed import malformed_rows
 from starcat.catalog.readers.records import Problem, Records
 from starcat.catalog.stars import StarBlock, move_to_epoch, sort_rows, table_from_columns
 from starcat.catalog.verdict import Reason
-from starcat.tables.schema import product_schema
+from starcat.storage.schema import product_schema
 
 _PARSERS = {
     "fixed_width": parse_fixed_width,

@@ -29,7 +29,7 @@ from starcat.catalog.stars import floats_of
 from starcat.catalog.verdict import Reason
 from starcat.errors import BuildError, ConfigError, SourceMissing
 from starcat.progress import Progress, no_progress
-from starcat.tables.schema import product_schema
+from starcat.storage.schema import product_schema
 
 
 @dataclass(frozen=True)

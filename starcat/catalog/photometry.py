@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.errors import ConfigError
-
-Array = NDArray[np.float64]
 
 JOHNSON_COLOUR_RANGE_MAG = (-0.2, 1.8)
 """BT - VT between which the Johnson formula holds (ESA SP-1200, vol. 1, p. 57)."""

@@ -11,9 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from starcat.arrays import Array
 
 MAS = np.pi / (180.0 * 3600.0 * 1000.0)  # rad in a milliarcsecond
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from starcat.arrays import Array, Mask
 from starcat.catalog.blocks import reject_rows
 from starcat.catalog.photometry import combined_magnitude
 from starcat.catalog.quality import Quality
@@ -24,10 +25,7 @@ from starcat.errors import BuildError
 from starcat.geometry.proximity import pairs_within
 from starcat.geometry.sphere import radec_from_directions
 from starcat.specs.build_spec import Doubles, Selection, Variables
-from starcat.tables.schema import product_schema
-
-Flags = NDArray[np.bool_]
-Array = NDArray[np.float64]
+from starcat.storage.schema import product_schema
 
 MOST_PAIRS = 10_000_000
 """Close pairs that are looked at; they take half a gigabyte, and no camera has a tenth of them."""
@@ -128,7 +126,7 @@ def _check_pairs(stars: int, separation_deg: float) -> None:
         )
 
 
-def has_companion(stars: pa.Table, selection: Selection) -> Flags:
+def has_companion(stars: pa.Table, selection: Selection) -> Mask:
     """Return which stars have a companion that the sensor cannot tell apart."""
     pairs, mag = _companion_pairs(stars, selection)
     most = selection.doubles.max_delta_mag
@@ -191,7 +189,7 @@ def _with_photocentres(
     return with_columns(stars, columns)
 
 
-def is_unresolved_double(stars: pa.Table, doubles: Doubles) -> Flags:
+def is_unresolved_double(stars: pa.Table, doubles: Doubles) -> Mask:
     """Return which stars an archive's flags say to leave out as doubles."""
     flagged = np.array(stars["is_flagged_double"])
     if doubles.flags == "ignore" or doubles.action == "keep":
@@ -218,7 +216,7 @@ def reject_variables(stars: pa.Table, variables: Variables, verdicts: Verdicts) 
         verdicts.reject(flagged & np.isnan(amplitude), Reason.flagged_variable)
 
 
-def beyond_brightest(stars: pa.Table, kept: Flags, count: int) -> Flags:
+def beyond_brightest(stars: pa.Table, kept: Mask, count: int) -> Mask:
     """Return which stars are not among the brightest."""
     rows = np.flatnonzero(kept)
     order = np.lexsort((stars["star_id"].to_numpy()[rows], floats_of(stars, "mag")[rows]))

@@ -16,7 +16,7 @@ def rejected_path(output: Path) -> Path:
 
 def write_star_tables(read: Ingested, output: Path) -> None:
     """Write a star table, and its rejected rows beside it where there are any."""
-    from starcat.tables.parquet import write_table
+    from starcat.storage.parquet import write_table
 
     write_table(read.stars, output)
     beside = rejected_path(output)

@@ -19,7 +19,7 @@ from starcat.catalog.proper_motion import Motion, propagate_directions
 from starcat.catalog.quality import Quality
 from starcat.catalog.verdict import Verdicts
 from starcat.geometry.sphere import directions_from_radec
-from starcat.tables.schema import product_schema
+from starcat.storage.schema import product_schema
 
 Values: TypeAlias = NDArray[Any] | pa.Array | str | float | int | bool
 

@@ -11,13 +11,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.catalog.archives.gcvs import read_gcvs
 from starcat.catalog.file_parts import FileFacts
 from starcat.catalog.ingest import ingest
 from starcat.catalog.stars import floats_of, with_columns
 from starcat.progress import Progress, no_progress
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcat.arrays import Array, Rows
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
@@ -16,8 +16,6 @@ from starcat.matcher.methods.reference import references
 from starcat.matcher.observation import Observation, observe
 from starcat.matcher.result import MatchResult, unidentified
 
-Array = NDArray[np.float64]
-Rows = NDArray[np.intp]
 Name = Callable[[Observation, Database], Rows]
 Answerer = Callable[[Matcher, Array, Camera, "Array | None"], MatchResult]
 

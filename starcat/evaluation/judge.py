@@ -12,13 +12,12 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.geometry.attitude import matrix_from_quaternion
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
 from starcat.matcher.result import MatchResult
 from starcat.simulation.simulate import Frame
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from starcat.exchange.column_types import is_list, plain_batch, plain_schema
-from starcat.tables.parquet import ROW_GROUP_ROWS
-from starcat.tables.votable import astropy_metadata, votable_metadata
+from starcat.storage.parquet import ROW_GROUP_ROWS
+from starcat.storage.votable import astropy_metadata, votable_metadata
 
 _DESCRIBED = {
     pa.bool_(),

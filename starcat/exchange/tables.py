@@ -12,7 +12,7 @@ import pyarrow as pa
 from starcat.artifact.reader import open_artifact
 from starcat.errors import ConfigError, SourceError, SourceMissing, suggest
 from starcat.exchange.label import Label
-from starcat.tables.parquet import read_parquet
+from starcat.storage.parquet import read_parquet
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,8 @@ Earth, 5 arcsec more in a low orbit). Directions are unit vectors in ICRS axes, 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from starcat.arrays import Array
 
 LIGHT_KM_S = 299_792.458
 """Speed of light in vacuum (exact)."""

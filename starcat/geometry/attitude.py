@@ -11,9 +11,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from starcat.arrays import Array
 
 Quaternion = tuple[float, float, float, float]
 

@@ -15,11 +15,10 @@ from numbers import Integral
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.errors import ConfigError
 from starcat.geometry.distortion import NO_DISTORTION, Distortion, checked_number
 from starcat.geometry.sphere import separation
-
-Array = NDArray[np.float64]
 
 LARGEST_PX = 1_000_000
 """Largest width and height that is accepted: no detector has more pixels on a side."""

@@ -14,9 +14,9 @@ from numbers import Real
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.errors import ConfigError
 
-Array = NDArray[np.float64]
 Points = NDArray[np.complex128]
 
 HORIZON = 1e8

@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+from starcat.arrays import Array
+
 Whole = NDArray[np.int64]
 
 

@@ -8,9 +8,9 @@ Nothing here reads files or knows of catalogs.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from starcat.arrays import Array
 
 
 def directions_from_radec(ra_deg: ArrayLike, dec_deg: ArrayLike) -> Array:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from starcat.arrays import Array
 
 _ROUNDING = 1e-12
 """By so much a zone is wider than its cap: more than the sines are off by."""

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from starcat.arrays import Array
 from starcat.errors import ConfigError
 from starcat.images.background import (
     PIXEL_VARIANCE,
@@ -25,8 +26,6 @@ from starcat.images.background import (
 from starcat.images.detection import detect
 from starcat.images.spot_width import SIGMA_RANGE_PX, is_sharp, sigma_of_stars
 from starcat.images.trails import trail_px
-
-Array = NDArray[np.float64]
 
 _NARROWEST_WINDOW_PX = 1.0  # a narrower window follows the pixel grid (docs/decisions.md)
 _APERTURE_SIGMA, _EDGE_SIGMA = 2.0, 3.0

@@ -11,8 +11,8 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, separation
 from starcat.images.plate import LABEL_PT, LETTER_PT, SKY, Plate
@@ -21,7 +21,6 @@ from starcat.sky.names import constellation_lines, named_stars
 if TYPE_CHECKING:
     from starcat.sky.in_time import BodyInFrame
 
-Array = NDArray[np.float64]
 
 GRID, LINES, PLANET = "#3d6b86", "#8f86c9", "#ffe08a"
 _STEPS_DEG = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 30.0, 45.0)

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.images.labels import place_labels
 from starcat.images.stretch import stretch
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Array = NDArray[np.float64]
 
 SKY, STAR, LOST = "#0b1220", "#5ad1e6", "#ffb454"
 """Colours of the sky, of what is identified and of what is not."""

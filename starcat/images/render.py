@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-Array = NDArray[np.float64]
+from starcat.arrays import Array
 
 _REACH_SIGMA = 6.0
 """A star is drawn this far to each side: 4e-9 of its light falls outside."""

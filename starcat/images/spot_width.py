@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
+from starcat.arrays import Array
 from starcat.images.background import Levels
-
-Array = NDArray[np.float64]
 
 SIGMA_RANGE_PX = (0.3, 5.0)
 """Narrowest and widest spot that is looked for."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from starcat.arrays import Array
 
 _LONG_SIDE_PX = 900
 

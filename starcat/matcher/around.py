@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.geometry.zones import zones_of
 from starcat.matcher.database import Database
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 MANY_STARS = 15_000

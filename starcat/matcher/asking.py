@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from starcat.arrays import Array
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.matcher.budget import Budget
 from starcat.matcher.database import Database
 from starcat.matcher.methods.triangle_order import TriangleOrder
 from starcat.matcher.observation import Observation, observe
-
-Array = NDArray[np.float64]
 
 SCALE_FREE = ("triangle",)
 """Methods that find the focal length with the attitude."""

@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.matcher.asking import Asking, as_asked, check_scale_free
@@ -30,8 +31,6 @@ from starcat.matcher.pose import first_poses, pose_at
 from starcat.matcher.result import MatchResult, identified, unidentified
 from starcat.matcher.searching import certainty, refusal_of
 from starcat.matcher.verification import AT_ONCE, Agreement, BestOf, agree, agreeing_centroids
-
-Array = NDArray[np.float64]
 
 MOST_CENTROIDS = 40
 """Brightest centroids of a frame that are compared with a level, which has about 20 stars a field

@@ -18,11 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.errors import ConfigError, OutputError, reason
-
-Array = NDArray[np.float64]
 
 BRIGHTNESS = ("mag", "magnitude", "flux", "sum")
 """Names of a column of brightness; the first that a file has is used."""

@@ -12,13 +12,11 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.geometry.attitude import determinant
 from starcat.geometry.camera import Camera
 from starcat.matcher.ways import Compatible, log_compatible_ways, log_ways
-
-Array = NDArray[np.float64]
 
 _ALL_ATTITUDES = 8.0 * math.pi**2
 """Volume of the rotations, cubic radians."""

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.errors import ConfigError, ProductError
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
@@ -31,7 +32,6 @@ try:
 except ImportError:  # the wheel was built without a compiler
     _onboard = None
 
-Array = NDArray[np.float64]
 
 MAX_STEPS = 2_000_000_000
 """Steps for one frame: on the ground the limit is the matcher's patience, not a clock."""

@@ -16,9 +16,9 @@ from functools import partial
 from pathlib import Path
 from typing import Literal, get_args
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from starcat.arrays import Array
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import checked_number
@@ -47,8 +47,6 @@ NOISE_DEVIATIONS = 3.0
 A centroid farther than `REACH` times as many from its star, 4.5, is one of 25,000.
 """
 
-
-Array = NDArray[np.float64]
 
 Engine = Literal["auto", "c", "numpy"]
 

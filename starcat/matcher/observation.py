@@ -9,11 +9,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from starcat.arrays import Array
 from starcat.geometry.camera import Camera
 from starcat.matcher.budget import Budget
-
-Array = NDArray[np.float64]
-
 
 MIN_SHARE = 1.0 / 3.0
 """Smallest share of a frame that the attitude of an answer explains.

@@ -12,14 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import solve_wahba_near, solve_wahba_svd
 from starcat.geometry.camera import Camera
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.observation import Observation
 from starcat.matcher.spread import information
-
-Array = NDArray[np.float64]
 
 _SCALINGS = 2
 """Rounds that find the scale of a few stars; a second one, because angles are no tangents."""

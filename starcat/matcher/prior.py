@@ -11,8 +11,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from starcat.arrays import Array
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import matrix_from_quaternion, turn_between
 from starcat.geometry.camera import Camera
@@ -25,8 +26,6 @@ from starcat.matcher.pose import Pose
 from starcat.matcher.refusal import Refusal
 from starcat.matcher.result import MatchResult, withheld
 from starcat.matcher.verification import REACH, BestOf, agree, verify
-
-Array = NDArray[np.float64]
 
 WIDEST_PRIOR_DEG = 20.0
 """Largest error of a prior attitude."""

@@ -5,9 +5,7 @@ from __future__ import annotations
 from itertools import islice
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
+from starcat.arrays import Array
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.matcher.asking import Asking, as_asked
@@ -19,8 +17,6 @@ from starcat.matcher.prior import Prior, expected_near, search_near
 from starcat.matcher.refusal import Refusal
 from starcat.matcher.result import MatchResult, Origin, identified, unidentified
 from starcat.matcher.verification import Agreement, BestOf, verify
-
-Array = NDArray[np.float64]
 
 CERTAIN = 1e-9
 """Largest false-match probability of an answer, unless another one is asked for.

@@ -13,8 +13,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import radec_roll_from_matrix
 from starcat.geometry.camera import Camera
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from astropy.table import QTable
     from astropy.wcs import WCS
 
-Array = NDArray[np.float64]
 
 SIP_ORDERS = range(2, 10)
 """Orders of the polynomials of SIP: 9 is the highest that the convention has."""

@@ -11,13 +11,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.geometry.attitude import inverse
 from starcat.geometry.camera import Camera
 from starcat.matcher.observation import Observation
-
-Array = NDArray[np.float64]
 
 SCALE_DEVIATIONS = 3.0
 """Standard deviations above which a difference of scale is not taken for chance."""

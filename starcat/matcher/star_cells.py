@@ -13,9 +13,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.matcher.database import Database
-
-Array = NDArray[np.float64]
 
 MIN_SIDE = 0.02
 """Smallest side of a cell, in units of the sphere's radius: 1.1 degrees."""

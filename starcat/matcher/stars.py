@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import radec_from_directions, separation
 from starcat.matcher.database import Database
 from starcat.matcher.spread import information
-
-Array = NDArray[np.float64]
 
 ARCSEC = math.degrees(1.0) * 3600.0
 """Arcseconds in a radian."""

@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.matcher.around import stars_around
 from starcat.matcher.budget import AGREEMENT
 from starcat.matcher.chance import MIN_STARS, false_match_probability
@@ -25,8 +26,6 @@ from starcat.matcher.pose import Pose, first_poses, pose_at, refitted, scaled_di
 from starcat.matcher.spread import is_scaled, share_of_frame
 from starcat.matcher.star_cells import cells_for
 from starcat.matcher.ways import Compatible, compatible_pairs
-
-Array = NDArray[np.float64]
 
 Withheld = Literal["share_of_frame", "scale"] | None
 

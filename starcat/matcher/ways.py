@@ -11,7 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from starcat.arrays import Array
+
 Compatible = NDArray[np.bool_]
 
 MAG_DEVIATIONS = 3.5

@@ -10,13 +10,12 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.geometry.patterns import triangle_area
 from starcat.geometry.sphere import separation
 from starcat.onboard.image import Contents, quantised
 from starcat.onboard.layout import MAG_SCALE, RADIUS_STEPS, RADIUS_UNKNOWN
 from starcat.onboard.reading import OnboardImage
-
-Array = NDArray[np.float64]
 
 VALUE_TOLERANCE = 1e-12
 """What a machine may round otherwise than another one, square radians and radians."""

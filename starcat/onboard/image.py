@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.geometry.patterns import triangle_area
@@ -43,7 +44,6 @@ from starcat.onboard.layout import (
     in_order,
 )
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.integer[Any]]
 
 LINE_MARGIN = 1e-6

@@ -52,8 +52,8 @@ from starcat.report.report import write_report
 from starcat.simulation.selftest import Rates, self_test
 from starcat.specs.build_spec import BuildSpec
 from starcat.storage.atomic import Outcome, move_into_place, whole_folder
+from starcat.storage.schema import product_schema
 from starcat.store.reading import read_catalog
-from starcat.tables.schema import product_schema
 
 Inputs = Mapping[str, Sequence[Path]]
 

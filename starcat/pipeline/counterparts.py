@@ -36,9 +36,9 @@ from starcat.products.match_figures import ARCSEC, MatchModel
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.product_sections import Crossmatch
+from starcat.storage.parquet import write_table
+from starcat.storage.schema import product_schema
 from starcat.store.reading import read_catalog
-from starcat.tables.parquet import write_table
-from starcat.tables.schema import product_schema
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
+from starcat.arrays import Array
 from starcat.geometry.sphere import chord_from_separation
 from starcat.pipeline.recipes import RECIPES, Ingredients, field_size
 from starcat.products.boresights import FieldStars
 from starcat.products.levels import level_fields, thin_levels
 from starcat.specs.build_spec import BuildSpec
 
-Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
 
 SAMPLE = 2000

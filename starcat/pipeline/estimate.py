@@ -46,7 +46,7 @@ from starcat.products.levels import boresights_of_level, level_fields
 from starcat.progress import Progress, no_progress
 from starcat.report.coverage_report import holes_warning
 from starcat.specs.build_spec import BuildSpec, Selection
-from starcat.tables.schema import product_schema
+from starcat.storage.schema import product_schema
 
 MOST_FOR_GAPS = 50_000
 """Of more boresights than these the widest gap is not looked for."""

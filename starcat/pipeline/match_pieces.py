@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from starcat.arrays import Mask
 from starcat.artifact.crossmatch_table import NEEDED, moving_stars, table_from_matches
 from starcat.pipeline.counterparts import with_own_names
 from starcat.pipeline.match_plan import PLACED, Job, Piece, numbers_path, rows_path
@@ -35,8 +36,6 @@ from starcat.store.region import region_around
 MOST_RINGS = 2 * ROUNDS + 8
 """Messages of a cluster go no farther than two pairs in a round: with so many rings a piece has
 all that its probabilities depend on."""
-
-Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -74,12 +73,12 @@ class _Local:
         return np.asarray(self.star_rows[HEALPIX_COLUMN].to_numpy(), dtype=np.int64)
 
     @cached_property
-    def is_own(self) -> Flags:
+    def is_own(self) -> Mask:
         """Which stars are of the piece itself."""
         first, end = self.piece.pixel.first, self.piece.pixel.end
         return (self.pixels >= first) & (self.pixels < end)
 
-    def linked(self) -> tuple[Flags, bool]:
+    def linked(self) -> tuple[Mask, bool]:
         """Return which pairs are in a cluster with a star of the piece, and if these are whole.
 
         A cluster is whole where all its stars are before the last ring: whatever they are pairs

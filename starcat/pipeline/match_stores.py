@@ -42,9 +42,9 @@ from starcat.products.match_figures import ARCSEC, Measured, figures_of
 from starcat.progress import Progress, no_progress
 from starcat.specs.product_sections import Crossmatch
 from starcat.storage.atomic import whole_file, whole_folder
+from starcat.storage.parquet import write_parts
 from starcat.store.cluster import cluster, run_tasks
 from starcat.store.layout import is_store, open_store
-from starcat.tables.parquet import write_parts
 
 _SMALL_BYTES = 32 << 20
 """Catalogs that are done before processes would have started."""

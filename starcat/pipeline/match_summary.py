@@ -7,13 +7,11 @@ from typing import Any, Protocol
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.artifact.crossmatch_table import matched_stars
 from starcat.products.crossmatch import VERDICTS, Matches
 from starcat.products.match_figures import ARCSEC
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

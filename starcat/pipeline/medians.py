@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.storage.atomic import whole_file
 
-Array = NDArray[np.float64]
 Keys = NDArray[np.uint64]
 
 _STEP_BITS = 16

@@ -17,6 +17,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.artifact.manifest import SourceFacts
 from starcat.artifact.motion_table import JOINED, NO_CANDIDATE, NO_MOTION, OWN_MOTION
 from starcat.artifact.writer import Product
@@ -30,11 +31,8 @@ from starcat.geometry.sphere import separation
 from starcat.pipeline.counterparts import match_tables
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import BuildSpec
+from starcat.storage.schema import product_schema
 from starcat.store.reading import read_catalog
-from starcat.tables.schema import product_schema
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 OF_ENTRY = (
     "catalog",

@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.artifact.writer import Product
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.geometry.sphere import radec_from_directions
@@ -28,9 +29,7 @@ from starcat.products.pairs import find_pairs
 from starcat.products.radial import radial_patterns
 from starcat.products.triangles import find_triangles
 from starcat.specs.build_spec import BuildSpec
-from starcat.tables.schema import ProductSchema, product_schema
-
-Array = NDArray[np.float64]
+from starcat.storage.schema import ProductSchema, product_schema
 
 
 @dataclass(frozen=True)

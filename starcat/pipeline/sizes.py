@@ -16,8 +16,8 @@ import pyarrow as pa
 from starcat.artifact.database import INDICES, stored_dtype
 from starcat.pipeline.counts import Extent, LevelExtent
 from starcat.specs.build_spec import BuildSpec
-from starcat.tables.parquet import ROW_GROUP_ROWS, parquet_bytes
-from starcat.tables.schema import product_schema
+from starcat.storage.parquet import ROW_GROUP_ROWS, parquet_bytes
+from starcat.storage.schema import product_schema
 
 Curve = tuple[tuple[float, ...], tuple[float, ...]]
 """Bytes of a value, second, by a number that they depend on; between them along its logarithm."""

@@ -21,6 +21,7 @@ import pyarrow.parquet as pq
 from starcat.artifact.crossmatch_table import NEEDED
 from starcat.errors import ParseError, ProductError, SchemaError, reason
 from starcat.pipeline.counterparts import check_star_columns
+from starcat.storage.schema import product_schema
 from starcat.store.layout import (
     PROPERTIES_NAMES,
     Partition,
@@ -31,7 +32,6 @@ from starcat.store.layout import (
 from starcat.store.metadata import write_pixel_list, write_slices
 from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, Pixel, Pixels, healpix_29, runs_of
 from starcat.store.region import Region
-from starcat.tables.schema import product_schema
 
 _ALIKE = {
     "string": (

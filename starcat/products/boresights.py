@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from starcat.arrays import Array
 from starcat.geometry.sphere import (
     chord_from_separation,
     radec_from_directions,
@@ -16,8 +17,6 @@ from starcat.geometry.sphere import (
     separation,
     tangent_axes,
 )
-
-Array = NDArray[np.float64]
 
 
 class FieldSize(Protocol):

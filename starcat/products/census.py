@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from starcat.arrays import Array
 from starcat.geometry.sphere import saff_kuijlaars
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 TILES = 3072

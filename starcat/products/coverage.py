@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
+from starcat.arrays import Array
 from starcat.geometry.sphere import radec_from_directions, separation
 from starcat.products.boresights import FieldStars
 
-Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
 
 

@@ -15,15 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from starcat.arrays import Array, Mask
 from starcat.geometry.sphere import chord_from_separation, separation
 from starcat.products.census import Census
 from starcat.products.match_figures import Figures, MatchModel, figures_of, measure
 from starcat.products.match_odds import Odds, match_odds
 from starcat.products.match_probability import runs
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 
 VERDICTS = ("unique", "best", "ambiguous", "taken", "doubtful", "other")
 """What a candidate is to its star, in words; the numbers of `Matches.verdict` are places here."""
@@ -56,7 +55,7 @@ class MovingStars:
 
     directions: Array
     velocities: Array
-    has_motion: Flags
+    has_motion: Mask
     epoch_jyear: Array
     mag: Array
     error_rad: Array | None = None
@@ -104,7 +103,7 @@ class Pairs:
     epoch_jyear: Array
     unmoved_years: Array
 
-    def take(self, rows: Rows | Flags) -> Pairs:
+    def take(self, rows: Rows | Mask) -> Pairs:
         """Return some of the pairs.
 
         Parameters

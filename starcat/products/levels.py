@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.products.boresights import FieldSize, FieldStars, NominalField, tile_sphere
 from starcat.products.index import Index, Ragged
 from starcat.products.triangles import distinct_triangles
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.int32]
 
 FEWEST_BORESIGHTS = 1000

@@ -13,11 +13,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array, Mask
 from starcat.products.census import Census, MagnitudeCounts, PositionsAndMagnitudes
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 
 ARCSEC = np.pi / (180.0 * 3600.0)  # rad
 
@@ -106,7 +105,7 @@ class Measured:
     median_delta_mag: float
 
 
-def is_sure(star: Rows, counterpart: Rows) -> Flags:
+def is_sure(star: Rows, counterpart: Rows) -> Mask:
     """Return which pairs are sure: neither the star nor the candidate has another.
 
     Parameters

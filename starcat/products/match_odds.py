@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.products.census import PositionsAndMagnitudes, tiles_of
 from starcat.products.match_figures import CandidatePairs, Figures, MatchModel
 from starcat.products.match_probability import pair_probabilities
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 

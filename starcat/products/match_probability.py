@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-Array = NDArray[np.float64]
+from starcat.arrays import Array
+
 Rows = NDArray[np.int64]
 
 ROUNDS = 60

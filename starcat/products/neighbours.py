@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.geometry.patterns import bin_of
 from starcat.geometry.sphere import radec_from_directions, tangent_axes
 from starcat.products.hausdorff_angular import angular_reference_sets
 from starcat.products.index import Index, row_offsets
-
-Array = NDArray[np.float64]
 
 _TURN = 2.0 * np.pi
 

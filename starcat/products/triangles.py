@@ -13,13 +13,12 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.geometry.kvector import build_kvector
 from starcat.geometry.patterns import triangle_area
 from starcat.geometry.sphere import separation
 from starcat.products.boresights import FieldStars
 from starcat.products.index import Index, kvector_index
-
-Array = NDArray[np.float64]
 
 _PACKED_BITS = 21
 """Three row numbers of so many bits fit into one int64."""

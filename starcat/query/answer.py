@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 SHOWN_ROWS = 20
 """Rows that a notebook shows."""
 
+SHOWN_ITEMS = 6
+"""How many items of a list a cell shows."""
+
 
 class Answer:
     """What a query found.
@@ -106,3 +109,21 @@ class Answer:
         more = len(self) - SHOWN_ROWS
         rest = f"<p>and {more:,} more rows</p>" if more > 0 else ""
         return f"<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>{rest}"
+
+
+def cell_text(value: Any) -> str:
+    """Return a value as a table shows it.
+
+    Examples
+    --------
+    >>> cell_text(0.1 + 0.2), cell_text(None), cell_text([1, 2])
+    ('0.3', '', '[1, 2]')
+    """
+    if value is None:
+        return ""
+    if isinstance(value, float):
+        return f"{value:.10g}"
+    if isinstance(value, list):
+        more = [f"… {len(value)} in all"] if len(value) > SHOWN_ITEMS else []
+        return f"[{', '.join([cell_text(item) for item in value[:SHOWN_ITEMS]] + more)}]"
+    return str(value)

@@ -14,7 +14,7 @@ from starcat.errors import ProductError, QueryError, TargetMissing
 from starcat.progress import Progress, no_progress
 from starcat.query.engine import Engine
 from starcat.query.names import distinct, identifier, short_names
-from starcat.tables.schema import ProductSchema, product_schema
+from starcat.storage.schema import ProductSchema, product_schema
 
 if TYPE_CHECKING:
     from starcat.store.layout import Store
@@ -255,7 +255,7 @@ def _archive(source: str, inputs: list[Path], scratch: Path, progress: Progress)
     """Read an archive's files into Parquet files that a query can see."""
     from starcat.catalog.fetching.locate import locate
     from starcat.catalog.ingest import ingest
-    from starcat.tables.parquet import write_parquet
+    from starcat.storage.parquet import write_parquet
 
     read = ingest(source, locate(source, {source: inputs}), progress=progress)
     scratch.mkdir(parents=True)

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.products.coverage import Coverage, CoverageSummary
 from starcat.report.sky_map import (
     HALF_HEIGHT,
@@ -56,8 +56,6 @@ MAG_BIN = 0.5
 """Width of a bin of magnitudes."""
 _RASTER_WIDTH = 720
 _COLOURS = 24
-
-Array = NDArray[np.float64]
 
 
 @contextmanager

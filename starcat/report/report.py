@@ -11,14 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.report.coverage_report import CoverageReport, holes_warning, write_coverage
 from starcat.report.page import report_page
 from starcat.report.plots import MAG_BIN, draw_magnitudes, save_plot
 from starcat.storage.digests import json_bytes
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from starcat.arrays import Array
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions
-
-Array = NDArray[np.float64]
 
 HALF_WIDTH, HALF_HEIGHT = float(2.0 * np.sqrt(2.0)), float(np.sqrt(2.0))
 """Half axes of the ellipse, for a sphere of radius 1."""

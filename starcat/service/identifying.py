@@ -87,9 +87,9 @@ def identify(
     """Identify the frames of a file."""
     from starcat.images.answering import answer_each, camera_of_size, write_extras
     from starcat.images.identification import PictureOptions, measure
+    from starcat.matcher.answer_json import answer_content
     from starcat.matcher.centroids import said_of_columns
     from starcat.specs.camera_file import read_camera
-    from starcat.terminal.answers import answer_content
 
     os.chdir(folder)  # so that messages say the name of the file alone
     how = IdentifyOptions.model_validate(options)

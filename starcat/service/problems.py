@@ -27,7 +27,7 @@ from starcat.errors import (
     StarcatError,
     TargetMissing,
 )
-from starcat.terminal.failures import DEFECT, failure_of, shown
+from starcat.failures import DEFECT, failure_of, shown
 
 MEDIA_TYPE = "application/problem+json"
 

@@ -21,8 +21,8 @@ from starcat.errors import OutputError
 from starcat.pipeline.stars_read import StarsRead
 from starcat.storage.atomic import move_into_place, whole_folder
 from starcat.storage.digests import json_bytes
-from starcat.tables.parquet import read_parquet, write_parquet
-from starcat.tables.schema import product_schema
+from starcat.storage.parquet import read_parquet, write_parquet
+from starcat.storage.schema import product_schema
 
 FACTS, STARS, MOTIONS = "facts.json", "stars.parquet", "motions.parquet"
 

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.simulation.sky import Sky
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.geometry.zones import Zones, zones_of
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

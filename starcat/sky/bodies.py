@@ -11,13 +11,11 @@ from functools import lru_cache
 
 import erfa
 import numpy as np
-from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.geometry.aberration import AU_KM, LIGHT_KM_S, aberrated
 from starcat.sky.magnitudes import apparent_magnitude
 from starcat.sky.observer import DAY_S, Observer
-
-Array = NDArray[np.float64]
 
 RADII_KM = {
     "Sun": 695_700.0,

@@ -12,8 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from starcat.arrays import Array
 from starcat.geometry.aberration import AU_KM
 from starcat.geometry.attitude import (
     matrix_from_quaternion,
@@ -28,8 +29,6 @@ from starcat.matcher.observation import as_frame
 from starcat.matcher.result import MatchResult
 from starcat.sky.bodies import RADII_KM, Bodies, bodies_seen
 from starcat.sky.observer import Observer
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from starcat.arrays import Array
 
 SUN_MAG, MOON_MAG = -26.75, -12.74
 """V of the Sun from 1 au, and of the full Moon from its mean distance, with the Sun 1 au away."""

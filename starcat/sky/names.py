@@ -16,13 +16,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.geometry.sphere import (
     chord_from_separation,
     directions_from_radec,
     tangent_axes,
 )
-
-Array = NDArray[np.float64]
 
 REACH_ARCSEC = 20.0
 """Largest separation from the place that the list has for a star."""

@@ -16,8 +16,8 @@ from typing import Literal, get_args
 
 import erfa
 import numpy as np
-from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.errors import ConfigError
 from starcat.geometry.aberration import (
     AU_KM,
@@ -26,8 +26,6 @@ from starcat.geometry.aberration import (
     deflected,
     displaced_by_parallax,
 )
-
-Array = NDArray[np.float64]
 
 Origin = Literal["earth", "barycentre"]
 

@@ -11,8 +11,9 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from starcat.arrays import Array
 from starcat.geometry.attitude import matrix_from_quaternion, solve_wahba_svd
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
@@ -22,8 +23,6 @@ from starcat.matcher.result import MatchResult
 from starcat.matcher.searching import CERTAIN
 from starcat.sky.bodies import Bodies, bodies_seen
 from starcat.sky.observer import Observer
-
-Array = NDArray[np.float64]
 
 FAINTER_MAG = 1.0
 """A body is looked for if it is at most this much fainter than the database's faintest star."""

@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from starcat.storage.atomic import placed
+from starcat.storage.schema import product_schema
 from starcat.store.brightness import bright_first, write_partition
 from starcat.store.index import RunIndex, read_index
 from starcat.store.layout import DATASET, REPEATED
@@ -29,7 +30,6 @@ from starcat.store.pixels import (
     runs_of,
 )
 from starcat.store.runs import places_of, read_shares, with_constants
-from starcat.tables.schema import product_schema
 
 SKYMAP_ORDER = 6
 """Order of the map of star counts (55 arcmin)."""

@@ -12,9 +12,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from starcat.storage.votable import votable_metadata
 from starcat.store.layout import DATASET, PARTITIONS_NAME, write_properties
 from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, Pixel
-from starcat.tables.votable import votable_metadata
 from starcat.version import __version__
 
 HATS_VERSION = "v1.0"

@@ -36,9 +36,9 @@ from starcat.catalog.verdict import Reason
 from starcat.errors import ConfigError, ProductError, SchemaError, SchemaVersionError
 from starcat.progress import Progress, no_progress
 from starcat.storage.digests import file_sha256
+from starcat.storage.schema import product_schema
 from starcat.store.account import MANIFEST_VERSION
 from starcat.store.layout import MANIFEST_NAME, REJECTED, REPEATED, Store, is_store, open_store
-from starcat.tables.schema import product_schema
 
 NEEDED = ("star_id", "ra_deg", "dec_deg", "epoch_jyear", "mag")
 """Columns that a catalog of others must have; ``band`` is taken for the one asked for."""

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from starcat.catalog.stars import floats_of
 from starcat.storage.atomic import placed
+from starcat.storage.schema import product_schema
 from starcat.store.pixels import HEALPIX_COLUMN, Pixels, healpix_29, pixel_field, runs_of
-from starcat.tables.schema import product_schema
 
 BUCKETS = 64
 HISTOGRAM_ORDER = 9

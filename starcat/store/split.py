@@ -20,10 +20,10 @@ from starcat.catalog.source import data_source
 from starcat.catalog.verdict import Reason
 from starcat.storage.atomic import placed
 from starcat.storage.digests import file_sha256
+from starcat.storage.schema import product_schema
 from starcat.store.ledger import Digests, digests_of
 from starcat.store.pixels import runs_of
 from starcat.store.runs import HISTOGRAM_ORDER, Run, write_run
-from starcat.tables.schema import product_schema
 
 
 @dataclass(frozen=True)

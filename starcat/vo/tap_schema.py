@@ -17,7 +17,7 @@ from starcat.query.columns import Facts, column_facts
 from starcat.query.names import identifier
 from starcat.query.session import Session
 from starcat.query.targets import View
-from starcat.tables.parquet import write_parquet
+from starcat.storage.parquet import write_parquet
 from starcat.vo.tables import Column, Key, Schema, Table, Tables, adql_name, full_name
 from starcat.vo.types import is_time, votable_type
 

@@ -26,8 +26,8 @@ from starcat.catalog.stars import directions_of
 from starcat.pipeline.recipes import RECIPES, Ingredients, cook, tile_guide_stars
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset
-from starcat.tables.parquet import write_parquet
-from starcat.tables.schema import product_schema
+from starcat.storage.parquet import write_parquet
+from starcat.storage.schema import product_schema
 
 LIMITS_MAG = (6.0, 7.0, 8.0, 9.0)
 STARS_A_FIELD = 16

@@ -25,7 +25,7 @@ from starcat.catalog.stars import directions_of
 from starcat.pipeline.recipes import Ingredients, cook, tile_guide_stars
 from starcat.query.session import Session, open_session
 from starcat.specs.reading import preset, spec_from_dict
-from starcat.tables.parquet import write_parquet
+from starcat.storage.parquet import write_parquet
 
 LIMIT_MAG = 8.0
 ROUNDS = 15

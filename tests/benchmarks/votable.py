@@ -23,7 +23,7 @@ from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest
 from starcat.exchange.votable_stream import Serialization, votable_chunks
 from starcat.query.session import open_session
-from starcat.tables.parquet import write_parquet
+from starcat.storage.parquet import write_parquet
 
 ROUNDS = 5
 ASTROPY_ROWS = 5_000

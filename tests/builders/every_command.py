@@ -6,7 +6,7 @@ from typing import Any
 
 import typer
 
-from starcat.cli import app
+from starcat.cli.main import app
 
 
 def every_command() -> dict[str, Any]:

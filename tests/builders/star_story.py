@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from starcat.artifact.reader import Artifact, open_artifact
 from starcat.catalog.stars import directions_of
-from starcat.cli import app
+from starcat.cli.main import app
 from starcat.pipeline.build import Built, build
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset

@@ -11,12 +11,11 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.catalog.readers.records import Records
 from starcat.catalog.stars import StarBlock, join_flags, numbered
 from starcat.catalog.verdict import Reason, Verdicts
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, tangent_axes
-
-Array = NDArray[np.float64]
 
 COLUMNS = {
     "sao": [

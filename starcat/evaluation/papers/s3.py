@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.evaluation.catalog_sky import catalog_of_artifact
 from starcat.evaluation.paper import Paper, Row, Statistic
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
 from starcat.matcher.methods.triangle_order import is_well_shaped, optimised_triangle
-
-Array = NDArray[np.float64]
 
 PRESET = "sao-12deg-512"
 

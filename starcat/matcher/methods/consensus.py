@@ -12,16 +12,13 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array, Mask, Rows
 from starcat.geometry.sphere import separation
 from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.pairs import side_tolerance_rad
 from starcat.matcher.methods.reference import rows_between
 from starcat.matcher.observation import Observation
-
-Array = NDArray[np.float64]
-Rows = NDArray[np.intp]
-Flags = NDArray[np.bool_]
 
 BATCHES = (4, 16, 64)
 """Sizes of the first batches of pairs; all later batches have the last size."""
@@ -80,7 +77,7 @@ def consistent_candidates(
         done, step = done + size, step + 1
 
 
-def consistent(centroid: Rows, star: Rows, observation: Observation, database: Database) -> Flags:
+def consistent(centroid: Rows, star: Rows, observation: Observation, database: Database) -> Mask:
     """Return which names are as far apart as their centroids.
 
     Parameters
@@ -113,7 +110,7 @@ def consistent(centroid: Rows, star: Rows, observation: Observation, database: D
     return np.asarray(fits)
 
 
-def support(fits: Flags, centroid: Rows, count: int) -> NDArray[np.int64]:
+def support(fits: Mask, centroid: Rows, count: int) -> NDArray[np.int64]:
     """Count for each name the other centroids with a name that agrees with it.
 
     Parameters
@@ -144,7 +141,7 @@ def _names(ranked: NDArray[np.integer]) -> tuple[Rows, Rows]:
     return centroid, ranked[centroid, rank].astype(np.intp)
 
 
-def _all_agreeing(pair: Rows, fits: Flags, count: NDArray[np.int64]) -> Rows:
+def _all_agreeing(pair: Rows, fits: Mask, count: NDArray[np.int64]) -> Rows:
     """Return a pair and what agrees with it and each other, the best supported first."""
     chosen = list(pair)
     left = fits[pair[0]] & fits[pair[1]]

@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcat.arrays import Array, Rows
 from starcat.geometry.patterns import bin_of
 from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.methods.candidates import Candidates
@@ -22,9 +22,6 @@ from starcat.matcher.methods.reference import Surroundings, by_reference, rows_b
 from starcat.matcher.methods.small_fields import bases
 from starcat.matcher.methods.triangle_order import TriangleOrder
 from starcat.matcher.observation import Observation
-
-Array = NDArray[np.float64]
-Rows = NDArray[np.intp]
 
 PRODUCTS = ("neighbours",)
 

@@ -13,6 +13,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Rows
 from starcat.geometry.patterns import cell_of
 from starcat.geometry.sphere import separation
 from starcat.matcher.database import Database, ProductArrays
@@ -21,9 +22,6 @@ from starcat.matcher.methods.pairs import side_tolerance_rad
 from starcat.matcher.methods.reference import Surroundings, by_reference, rows_between, surroundings
 from starcat.matcher.methods.triangle_order import TriangleOrder
 from starcat.matcher.observation import Observation
-
-Array = NDArray[np.float64]
-Rows = NDArray[np.intp]
 
 PRODUCTS = ("grid",)
 

@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcat.arrays import Array, Rows
 from starcat.geometry.sphere import radec_from_directions, tangent_axes
 from starcat.matcher.database import Database
 from starcat.matcher.methods.candidates import Candidates
@@ -21,9 +21,6 @@ from starcat.matcher.methods.reference import by_reference, references, surround
 from starcat.matcher.methods.reference_sets import lowest, means_of_minima
 from starcat.matcher.methods.triangle_order import TriangleOrder
 from starcat.matcher.observation import Observation
-
-Array = NDArray[np.float64]
-Rows = NDArray[np.intp]
 
 PRODUCTS = ("hausdorff_l2",)
 

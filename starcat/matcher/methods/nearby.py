@@ -14,6 +14,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.geometry.attitude import determinant
 from starcat.matcher.budget import LOOKUP
 from starcat.matcher.chance import MIN_STARS
@@ -23,7 +24,6 @@ from starcat.matcher.methods.pairs import side_tolerance_rad
 from starcat.matcher.observation import Observation
 from starcat.matcher.ways import compatible_pairs
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 MOST_CENTROIDS = 12

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcat.arrays import Rows
 from starcat.geometry.kvector import KVector
 from starcat.geometry.sphere import separation
 from starcat.matcher.budget import LOOKUP
@@ -19,8 +19,6 @@ from starcat.matcher.database import Database
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.triangle_order import TriangleOrder, select_triangles
 from starcat.matcher.observation import Observation
-
-Rows = NDArray[np.intp]
 
 PRODUCTS = ("pairs",)
 

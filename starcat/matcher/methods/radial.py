@@ -12,6 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array, Rows
 from starcat.geometry.patterns import cyclic_shifts, ring_of, sector_of
 from starcat.matcher.budget import LOOKUP
 from starcat.matcher.database import Database, ProductArrays
@@ -20,9 +21,6 @@ from starcat.matcher.methods.consensus import consistent_candidates
 from starcat.matcher.methods.reference import Surroundings, references, rows_between, surroundings
 from starcat.matcher.methods.triangle_order import TriangleOrder
 from starcat.matcher.observation import Observation
-
-Array = NDArray[np.float64]
-Rows = NDArray[np.intp]
 
 PRODUCTS = ("radial",)
 

@@ -15,12 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array, Rows
 from starcat.matcher.budget import LOOKUP
 from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.observation import Observation
-
-Array = NDArray[np.float64]
-Rows = NDArray[np.intp]
 
 RANKS = (1, 5, 20)
 """Number of candidates of each reference star that have been tried after each round."""

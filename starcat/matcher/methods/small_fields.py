@@ -12,8 +12,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcat.arrays import Array, Rows
 from starcat.geometry.sphere import separation
 from starcat.matcher.budget import LOOKUP
 from starcat.matcher.database import Database
@@ -21,9 +21,6 @@ from starcat.matcher.methods.candidates import Candidates
 from starcat.matcher.methods.pairs import side_tolerance_rad
 from starcat.matcher.observation import Observation
 from starcat.matcher.star_cells import cells_for
-
-Array = NDArray[np.float64]
-Rows = NDArray[np.intp]
 
 LEAST_OTHERS = 2
 """Centroids beside the base that have to be near a star: four in all, as an answer needs."""

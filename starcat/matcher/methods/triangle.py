@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.geometry.kvector import KVector
 from starcat.matcher.budget import LOOKUP
 from starcat.matcher.database import Database, ProductArrays
@@ -27,8 +28,6 @@ from starcat.matcher.methods.triangle_shape import (
     similar_triangles,
 )
 from starcat.matcher.observation import Observation
-
-Array = NDArray[np.float64]
 
 PRODUCTS = ("triangles",)
 

@@ -17,9 +17,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.matcher.observation import Observation
 
-Array = NDArray[np.float64]
 Triple = tuple[int, int, int]
 
 

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.matcher.database import Database
 from starcat.matcher.observation import Observation
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 CURVATURE = 2.0 / 3.0

@@ -138,8 +138,8 @@ def _order(content: dict[str, Any]) -> Order:
 
 def _told(error: Exception, order: Order) -> dict[str, Any]:
     """Return what to say of an exception: details for whoever asked, the rest for the operator."""
+    from starcat.failures import failure_of
     from starcat.service.problems import ProblemDetails, problem_of, without_folders
-    from starcat.terminal.failures import failure_of
 
     if isinstance(error, MemoryError) or NO_THREAD in str(error):
         return memory_problem(order.memory_bytes)

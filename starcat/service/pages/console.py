@@ -12,6 +12,7 @@ from fastapi.responses import Response, StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
 from starcat.errors import QueryError, StarcatError, TargetMissing
+from starcat.query.answer import cell_text
 from starcat.query.gallery import NamedQuery, gallery, guessed, named_query
 from starcat.query.macros import macros
 from starcat.service.access import Reader
@@ -21,7 +22,6 @@ from starcat.service.pages.facts import database_row, products_of
 from starcat.service.pages.rendering import page_router, render
 from starcat.service.problems import Problem, ProblemDetails, problem_of
 from starcat.service.service import Service, TheService
-from starcat.terminal.queries import cell_text
 
 router = page_router()
 

@@ -17,7 +17,7 @@ from starcat.service.places import Places
 from starcat.service.service import Service
 from starcat.service.shelf import Database
 from starcat.specs.build_spec import CameraSpec
-from starcat.tables.schema import product_schema
+from starcat.storage.schema import product_schema
 
 REPORT = "report/report.json"
 

@@ -15,10 +15,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from starlette.exceptions import HTTPException
 
 from starcat.errors import StarcatError
+from starcat.failures import shown
 from starcat.service.access import principal_of
 from starcat.service.pages.static_files import static_address
 from starcat.service.problems import Problem, ProblemDetails, problem_of, problem_response
-from starcat.terminal.failures import shown
 from starcat.version import __version__
 
 NAVIGATION = (

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.errors import ProductError
 from starcat.geometry.sphere import directions_from_radec
 from starcat.matcher.chance import MIN_STARS
@@ -26,7 +27,6 @@ from starcat.report.sky_map import (
 )
 from starcat.service.shelf import Database
 
-Array = NDArray[np.float64]
 Counts = NDArray[np.int64]
 
 COVERAGE = "report/coverage.csv"

@@ -1,0 +1,24 @@
+"""Types of arrays, named by what their rows are."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+"""Real numbers of any shape."""
+
+Directions = NDArray[np.float64]
+"""Unit vectors, ICRS unless said otherwise, shape (N, 3)."""
+
+Pixels = NDArray[np.float64]
+"""Pixel coordinates x, y from the outer corner of the top-left pixel, shape (N, 2)."""
+
+Matrix = NDArray[np.float64]
+"""A rotation, body from ICRS unless said otherwise, shape (3, 3)."""
+
+Rows = NDArray[np.intp]
+"""Row numbers, from 0, shape (N,)."""
+
+Mask = NDArray[np.bool_]
+"""One bool a row, shape (N,)."""

@@ -1,0 +1,156 @@
+"""The command line: parse, call one function, print, exit code.
+
+Results go to stdout as tables or, with ``--json``, as JSON; messages and progress bars go to
+stderr, and so does the one object that an error is under ``--json``. The exit codes are in
+``docs/errors.md``, the commands themselves in ``starcat.cli.commands``.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from starcat.cli.commands import (
+    artifacts,
+    catalogs,
+    evaluating,
+    exchanging,
+    matching,
+    querying,
+    releasing,
+    serving,
+    specs,
+)
+from starcat.cli.commands.there import there
+from starcat.failures import failure_of
+from starcat.version import __version__
+
+INTERRUPTED = 128 + signal.SIGINT
+"""Exit code after Ctrl-C, as the shells have it."""
+
+
+class WholeSummaries(TyperGroup):
+    """The commands in the help, each with its first sentence and no dots for the rest."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write a line or more a command."""
+        rows = [(name, one.get_short_help_str(limit=1000)) for name, one in self.commands.items()]
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
+
+
+app = typer.Typer(
+    cls=WholeSummaries,
+    name="starcat",
+    help="Guide-star databases for star trackers, built from star catalogs.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["--help", "-h"]},
+)
+PARTS = (catalogs, specs, artifacts, querying, exchanging, releasing, matching, evaluating, serving)
+"""In the order of --help."""
+
+for part in PARTS:
+    app.add_typer(part.app)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from starcat.matcher.fast import library_version
+
+        library = library_version()
+        typer.echo(f"starcat {__version__}")
+        typer.echo(f"matcher: {f'C library {library}' if library else 'numpy, no C library'}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    context: typer.Context,
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_version, is_eager=True, help="Print the versions."),
+    ] = False,
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show the traceback of errors; anywhere on the line.")
+    ] = False,
+    server: Annotated[
+        str | None,
+        typer.Option(metavar="URL", help="A service that builds, asks or identifies instead."),
+    ] = None,
+    token: Annotated[
+        str | None,
+        typer.Option(envvar="STARCAT_TOKEN", show_envvar=False, help="Or in STARCAT_TOKEN."),
+    ] = None,
+) -> None:
+    """Guide-star databases for star trackers, built from star catalogs."""
+    if server is not None:
+        context.obj = there(server, token, context.invoked_subcommand or "")
+
+
+def _stop(number: int, frame: Any) -> None:
+    """Turn a termination signal into an exit that cleans up."""
+    sys.exit(128 + number)
+
+
+def main() -> None:
+    """Run the command line, and turn every exception into a message and an exit code.
+
+    ``--debug`` shows the traceback before the message, wherever on the line it stands; the exit
+    code stays the same.
+    """
+    signal.signal(signal.SIGTERM, _stop)
+    logging.getLogger("starcat").addHandler(logging.NullHandler())  # the commands print their own
+    arguments, behind = _parted(sys.argv[1:])
+    is_debug = "--debug" in arguments
+    arguments = [argument for argument in arguments if argument != "--debug"]
+    try:
+        code = _run([*arguments, *behind])
+    except Exception as error:
+        if is_debug:
+            traceback.print_exc()
+        code = _tell(error, arguments)
+    except KeyboardInterrupt:
+        code = INTERRUPTED
+    sys.exit(code)
+
+
+def _parted(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return what stands before ``--``, where options are, and the rest."""
+    end = list(arguments).index("--") if "--" in arguments else len(arguments)
+    return list(arguments[:end]), list(arguments[end:])
+
+
+def _run(arguments: Sequence[str]) -> int:
+    """Run a command, and see that all that it printed has arrived."""
+    try:
+        command = typer.main.get_command(app)
+        code = command.main(list(arguments), "starcat", standalone_mode=False)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # The reader of the output is gone: what is left goes nowhere, and nothing is said.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    return code if isinstance(code, int) else 0
+
+
+def _tell(error: Exception, arguments: Sequence[str]) -> int:
+    """Say what went wrong on stderr and return the exit code."""
+    named = [argument for argument in arguments if not argument.startswith("-")]
+    failure = failure_of(error, " ".join(["starcat", *named[:1]]))
+    if "--json" in arguments or "--ndjson" in arguments:
+        sys.stderr.write(failure.as_json())
+    elif hasattr(error, "show"):  # a usage error, with the usage above the message
+        error.show()
+    else:
+        sys.stderr.write(failure.as_text())
+    return failure.code

@@ -1,0 +1,187 @@
+"""What `starcat sql` prints: answers, views, macros and named queries."""
+
+from __future__ import annotations
+
+import re
+import sys
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+from starcat.cli.terminal.console import MAX_WIDTH, print_json, print_table, progress_bars, say
+from starcat.query.answer import cell_text
+
+if TYPE_CHECKING:
+    from starcat.query.columns import Facts
+    from starcat.query.session import Session
+    from starcat.query.targets import Target, View
+
+FOLDED_CHARACTERS = 28
+"""A column of longer texts is folded rather than given all the room it wants."""
+
+
+def print_first_rows(session: Session, query: str, values: Mapping[str, Any], rows: int) -> None:
+    """Ask a query, with a bar while it runs, and print the first rows of its answer."""
+    with progress_bars() as progress, session.ask(query, values, progress) as answer:
+        found = answer.rows(rows + 1)
+    print_answer(answer, found, rows)
+
+
+class Described(Protocol):
+    """What is known of an answer: names and types of its columns, their units and meanings."""
+
+    @property
+    def columns(self) -> Sequence[str]:
+        """Names."""
+        ...
+
+    @property
+    def types(self) -> Sequence[str]:
+        """DuckDB's names of their types."""
+        ...
+
+    @property
+    def facts(self) -> Sequence[Facts]:
+        """Unit and meaning of each."""
+        ...
+
+
+@dataclass(frozen=True)
+class Told:
+    """An answer as a service tells of it.
+
+    Attributes
+    ----------
+    described : sequence of mapping
+        ``name``, ``type``, ``unit`` and ``description`` of each column.
+    """
+
+    described: Sequence[Mapping[str, str]]
+
+    @property
+    def columns(self) -> list[str]:
+        """Names."""
+        return [one["name"] for one in self.described]
+
+    @property
+    def types(self) -> list[str]:
+        """DuckDB's names of their types."""
+        return [one["type"] for one in self.described]
+
+    @property
+    def facts(self) -> list[Facts]:
+        """Unit and meaning of each."""
+        from starcat.query.columns import Facts
+
+        return [Facts(one["unit"], one["description"]) for one in self.described]
+
+
+def print_answer(answer: Described, found: Sequence[Sequence[Any]], rows: int) -> None:
+    """Print the first rows of an answer: as a table, or one below the other if that is too wide."""
+    cells = [[cell_text(value) for value in row] for row in found[:rows]]
+    units = [facts.unit for facts in answer.facts]
+    headings = [
+        f"{name}\n[{unit}]" if unit else name
+        for name, unit in zip(answer.columns, units, strict=True)
+    ]
+    if _width(headings, cells) <= MAX_WIDTH:
+        print_table("", headings, cells, _numbers(answer.types))
+    else:
+        for k, row in enumerate(cells):
+            facts = zip(answer.columns, row, units, strict=True)
+            print_table(f"row {k + 1}", ["column", "value", "unit"], list(facts))
+    if len(found) > rows:
+        say(f"the first {rows} rows; --rows N shows more, -o FILE writes all")
+
+
+def _width(headings: Sequence[str], cells: Sequence[Sequence[str]]) -> int:
+    """Return the width of a table whose long texts are folded."""
+    columns = zip(headings, *cells, strict=True)
+    widest = (max(len(line) for cell in column for line in cell.split("\n")) for column in columns)
+    heads = (max(map(len, heading.split("\n"))) for heading in headings)
+    wanted = [
+        max(head, min(most, FOLDED_CHARACTERS)) for head, most in zip(heads, widest, strict=True)
+    ]
+    return sum(wanted) + 2 * (len(wanted) - 1)
+
+
+def _numbers(types: Sequence[str]) -> list[int]:
+    """Return which columns are numbers, to be aligned at the right."""
+    numeric = re.compile(r"[UH]*(TINY|SMALL|BIG|HUGE)?INT|DOUBLE|FLOAT|DECIMAL")
+    return [k for k, kind in enumerate(types) if numeric.match(kind) and "[" not in kind]
+
+
+def print_views(session: Session, *, as_json: bool) -> None:
+    """Print the views that a query can use."""
+    views = [(target, view) for target in session.targets for view in target.views]
+    if as_json:
+        print_json([_view_facts(target, view) for target, view in views])
+        return
+    names = [f"{target.name}.{view.name}" for target, view in views]
+    rows = [
+        (name, _row_count(session, name), _first_sentence(_description(view)))
+        for name, (_, view) in zip(names, views, strict=True)
+    ]
+    print_table("", ["view", "rows", "a row"], rows, (1,))
+
+
+def _view_facts(target: Target, view: View) -> dict[str, Any]:
+    columns = view.schema.columns if view.schema else ()
+    return {
+        "schema": target.name,
+        "view": view.name,
+        "description": _description(view),
+        "columns": [
+            {"name": c.name, "dtype": c.dtype, "unit": c.unit, "description": c.description}
+            for c in columns
+        ],
+    }
+
+
+def _description(view: View) -> str:
+    return view.schema.description if view.schema else ""
+
+
+def _first_sentence(text: str) -> str:
+    return re.split(r"[.:;] ", text)[0].rstrip(".")
+
+
+def _row_count(session: Session, view: str) -> int:
+    with session.ask(f"SELECT count(*) FROM {view}") as answer:
+        return int(answer.rows(1)[0][0])
+
+
+def print_macros(*, as_json: bool) -> None:
+    """Print the macros, each with an example."""
+    from starcat.query.macros import macros
+
+    listed = sorted((m for m in macros()), key=lambda m: (m.is_table, m.name))
+    if as_json:
+        facts = ("name", "arguments", "is_table", "help", "example")
+        print_json([{fact: getattr(macro, fact) for fact in facts} for macro in listed])
+        return
+    for macro in listed:
+        after = "FROM " if macro.is_table else ""
+        _print_entry(f"{after}{macro.name}({macro.arguments})", [macro.help, macro.example])
+
+
+def _print_entry(title: str, paragraphs: Sequence[str]) -> None:
+    """Print a title, and paragraphs below it that are indented."""
+    indented = (textwrap.indent(textwrap.fill(text, MAX_WIDTH - 4), "    ") for text in paragraphs)
+    sys.stdout.write("\n".join([title, *indented, "\n"]))
+
+
+def print_gallery(*, as_json: bool) -> None:
+    """Print the named queries with their values."""
+    from starcat.query.gallery import gallery
+
+    queries = gallery().values()
+    if as_json:
+        print_json([asdict(query) for query in queries])
+        return
+    for query in queries:
+        needs = " Two targets." if query.targets == 2 else ""
+        values = [f"--set {v.name}={v.default}: {v.help}" for v in query.values]
+        _print_entry(query.name, [query.help + needs, *values])
+    say("starcat sql TARGET --named densest-fields --set count=5")

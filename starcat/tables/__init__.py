@@ -1,1 +1,0 @@
-"""Tables: released schemas, and Parquet files that follow them."""
