@@ -9,14 +9,14 @@ from typing import Annotated
 from fastapi import Depends, Request
 
 from starcat.service.catalogs import Catalogs
-from starcat.service.confined import Confined
 from starcat.service.jobs.job import JobStore
 from starcat.service.jobs.queue import JobQueue, open_queue
+from starcat.service.library import Library
 from starcat.service.places import Places
+from starcat.service.query_pool import QueryPool
 from starcat.service.records import Records
-from starcat.service.sessions import Sessions
+from starcat.service.sandbox.sandbox import Sandbox
 from starcat.service.settings import Settings
-from starcat.service.shelf import Shelf
 from starcat.service.vo.tap_service import Tap
 
 READ = "read"
@@ -37,15 +37,15 @@ class Service:
         What lies where.
     records : Records
         What is remembered.
-    shelf : Shelf
+    library : Library
         The databases there are.
     jobs : JobStore
         The jobs there are.
-    sessions : Sessions
+    query_pool : QueryPool
         Open query sessions.
     queue : JobQueue
         What waits for workers.
-    confined : Confined
+    sandbox : Sandbox
         Processes that read uploads and make files.
     tap : Tap
         What TAP needs.
@@ -58,10 +58,10 @@ class Service:
     settings: Settings
     places: Places
     records: Records
-    shelf: Shelf
+    library: Library
     jobs: JobStore
-    sessions: Sessions
-    confined: Confined
+    query_pool: QueryPool
+    sandbox: Sandbox
     tap: Tap
     queue: JobQueue
     catalogs: Catalogs
@@ -73,18 +73,18 @@ def open_service(settings: Settings) -> Service:
     places = Places(settings.root)
     places.make()
     records = Records(places.records)
-    shelf, sessions = Shelf(places), Sessions(settings)
+    library, query_pool = Library(places), QueryPool(settings)
     most = round(settings.job_memory_gib * GIB)
-    confined = Confined(settings, places.scratch)
+    sandbox = Sandbox(settings, places.scratch)
     return Service(
         settings=settings,
         places=places,
         records=records,
-        shelf=shelf,
+        library=library,
         jobs=JobStore(records),
-        sessions=sessions,
-        confined=confined,
-        tap=Tap(settings, places, records, shelf, sessions, confined),
+        query_pool=query_pool,
+        sandbox=sandbox,
+        tap=Tap(settings, places, records, library, query_pool, sandbox),
         queue=open_queue(settings, places),
         catalogs=Catalogs(places.catalogs / READ, most),
     )
