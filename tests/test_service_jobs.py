@@ -23,6 +23,7 @@ from starcat.artifact.verify import verify_artifact
 from starcat.errors import ConfigError, SourceMissing, TargetMissing
 from starcat.service.access import Principal, Role
 from starcat.service.app import make_app
+from starcat.service.jobs import job_states
 from starcat.service.jobs.job import Job
 from starcat.service.jobs.job_states import MAX_INTERRUPTED, Attempt, claim, interrupt
 from starcat.service.jobs.keys import build_key, file_digests
