@@ -11,7 +11,7 @@ from typing import Any
 from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
 from starcat.errors import ProductError, TargetMissing
 from starcat.releases.tree import Blob, files_of
-from starcat.service.places import DATABASE_ID, Places
+from starcat.service.paths import DATABASE_ID, ServicePaths
 from starcat.service.problems import Problem
 from starcat.specs.version import version_numbers
 from starcat.storage.digests import file_sha256
@@ -61,14 +61,14 @@ class Database:
 class Library:
     """The databases and catalogs of a service; a manifest is read once for each of its states."""
 
-    def __init__(self, places: Places) -> None:
-        self._places = places
+    def __init__(self, paths: ServicePaths) -> None:
+        self._paths = paths
         self._known: dict[Path, tuple[int, Database]] = {}
 
     def databases(self) -> list[Database]:
         """Return all databases that can be read, by name, version and id."""
         found = []
-        for path in self._places.databases.glob(f"*/*/{MANIFEST_NAME}"):
+        for path in self._paths.databases.glob(f"*/*/{MANIFEST_NAME}"):
             if not DATABASE_ID.fullmatch(path.parents[1].name):
                 continue
             try:
@@ -79,7 +79,7 @@ class Library:
 
     def database(self, database_id: str) -> Database:
         """Return the database of an id."""
-        for path in self._places.database(database_id).glob(f"*/{MANIFEST_NAME}"):
+        for path in self._paths.database(database_id).glob(f"*/{MANIFEST_NAME}"):
             return self._at(path)
         raise TargetMissing(
             f"no database has the id {database_id!r}; the list of them tells theirs"
@@ -97,7 +97,7 @@ class Library:
         if database is not None:
             return database.folder
         found = [
-            self._places.catalogs / one
+            self._paths.catalogs / one
             for one in self.catalogs()
             if name in (one, one.removesuffix(".parquet"), one.rpartition("-")[0])
         ]
@@ -110,7 +110,7 @@ class Library:
 
     def catalogs(self) -> list[str]:
         """Return the names of the catalogs that jobs have read."""
-        folder = self._places.catalogs
+        folder = self._paths.catalogs
         if not folder.is_dir():
             return []
         return sorted(path.name for path in folder.iterdir() if CATALOG.fullmatch(path.name))

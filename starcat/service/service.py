@@ -12,7 +12,7 @@ from starcat.service.catalogs import Catalogs
 from starcat.service.jobs.job import JobStore
 from starcat.service.jobs.queue import JobQueue, open_queue
 from starcat.service.library import Library
-from starcat.service.places import Places
+from starcat.service.paths import ServicePaths
 from starcat.service.query_pool import QueryPool
 from starcat.service.records import Records
 from starcat.service.sandbox.sandbox import Sandbox
@@ -33,7 +33,7 @@ class Service:
     ----------
     settings : Settings
         What the operator set.
-    places : Places
+    paths : ServicePaths
         What lies where.
     records : Records
         What is remembered.
@@ -56,7 +56,7 @@ class Service:
     """
 
     settings: Settings
-    places: Places
+    paths: ServicePaths
     records: Records
     library: Library
     jobs: JobStore
@@ -70,23 +70,23 @@ class Service:
 
 def open_service(settings: Settings) -> Service:
     """Open a service: its folders and its records."""
-    places = Places(settings.root)
-    places.make()
-    records = Records(places.records)
-    library, query_pool = Library(places), QueryPool(settings)
+    paths = ServicePaths(settings.root)
+    paths.make()
+    records = Records(paths.records)
+    library, query_pool = Library(paths), QueryPool(settings)
     most = round(settings.job_memory_gib * GIB)
-    sandbox = Sandbox(settings, places.scratch)
+    sandbox = Sandbox(settings, paths.scratch)
     return Service(
         settings=settings,
-        places=places,
+        paths=paths,
         records=records,
         library=library,
         jobs=JobStore(records),
         query_pool=query_pool,
         sandbox=sandbox,
-        tap=Tap(settings, places, records, library, query_pool, sandbox),
-        queue=open_queue(settings, places),
-        catalogs=Catalogs(places.catalogs / READ, most),
+        tap=Tap(settings, paths, records, library, query_pool, sandbox),
+        queue=open_queue(settings, paths),
+        catalogs=Catalogs(paths.catalogs / READ, most),
     )
 
 

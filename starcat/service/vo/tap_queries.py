@@ -11,7 +11,7 @@ from pathlib import Path
 from starcat.errors import ConfigError
 from starcat.exchange.label import Label
 from starcat.progress import Progress, no_progress
-from starcat.service.places import Places
+from starcat.service.paths import ServicePaths
 from starcat.service.query_pool import QueryPool
 from starcat.service.sandbox.sandbox import Sandbox
 from starcat.service.vo.tap_answers import Answers
@@ -31,7 +31,7 @@ class TapQueries:
 
     def __init__(
         self,
-        places: Places,
+        paths: ServicePaths,
         tables: TapTables,
         sessions: QueryPool,
         sandbox: Sandbox,
@@ -39,10 +39,10 @@ class TapQueries:
     ) -> None:
         self._sandbox = sandbox
         self.most_rows = most_rows
-        self._places = places
+        self._paths = paths
         self._tables = tables
         self._sessions = sessions
-        self._answers = Answers(places, sandbox)
+        self._answers = Answers(paths, sandbox)
 
     def answer(
         self,
@@ -78,7 +78,7 @@ class TapQueries:
                     "part of multipart/form-data with that name",
                     key="UPLOAD",
                 )
-        top = Path(tempfile.mkdtemp(prefix="upload-", dir=self._places.scratch))
+        top = Path(tempfile.mkdtemp(prefix="upload-", dir=self._paths.scratch))
         try:
             folder = top / UPLOADS
             folder.mkdir()
