@@ -19,9 +19,6 @@ from starcat.service.settings import Settings
 from starcat.service.shelf import Shelf
 from starcat.service.vo.tap_service import Tap
 
-READ = "read"
-"""Folder, among the catalogs, of what estimates start from."""
-
 GIB = 2**30
 
 
@@ -86,7 +83,7 @@ def open_service(settings: Settings) -> Service:
         confined=confined,
         tap=Tap(settings, places, records, shelf, sessions, confined),
         queue=open_queue(settings, places),
-        catalogs=Catalogs(places.catalogs / READ, most),
+        catalogs=Catalogs(most),
     )
 
 
