@@ -81,7 +81,7 @@ def test_a_database_is_brought_once(client, service, job, database):
     done = client.put(f"{path}/1/database", content=data, headers=TAR).json()
     assert done["result"] == {"database": job.key[:16]}
     assert service.shelf.database(job.key[:16]).title == "small-1.0.0"
-    assert list(service.places.scratch.iterdir()) == []
+    assert list(service.paths.scratch.iterdir()) == []
     for late in (
         client.put(f"{path}/1/database", content=data, headers=TAR),
         client.post(f"{path}/1/tell", json={"lines": []}),

@@ -115,7 +115,7 @@ def rows_of(service: Service, question: Question) -> Rows:
 def file_of(service: Service, question: Question, form: str) -> Answered:
     """Answer a question with a file."""
     paths = target_paths(service, question.targets)
-    with scratch_folder(service.places) as folder:
+    with scratch_folder(service.paths) as folder:
         source, target = folder / "rows.arrow", folder / "answer"
         with (
             service.sessions.session(paths, question.time_s) as session,

@@ -46,7 +46,7 @@ class Confined:
         self._time_s = settings.query_time_s
         self._scratch = scratch
         self._memory_bytes = int(settings.query_memory_gib * GIB)
-        self._places = threading.BoundedSemaphore(settings.queries)
+        self._slots = threading.BoundedSemaphore(settings.queries)
         self._lock = threading.Lock()
         self._idle: list[subprocess.Popen[bytes]] = []
         self._is_closed = False
@@ -54,7 +54,7 @@ class Confined:
 
     def call(self, task: str, arguments: Mapping[str, Any]) -> Any:
         """Have something done."""
-        if not self._places.acquire(timeout=turns.WAIT_S):
+        if not self._slots.acquire(timeout=turns.WAIT_S):
             raise busy()
         try:
             process = self._taken()
@@ -70,7 +70,7 @@ class Confined:
                 )
             self._give_back(process)
         finally:
-            self._places.release()
+            self._slots.release()
         if "kind" in answer:
             raise _error_of(answer)
         return answer["found"]

@@ -6,7 +6,7 @@ import secrets
 import shutil
 
 from starcat.service.jobs.job import State
-from starcat.service.places import DATABASE_ID, checked
+from starcat.service.paths import DATABASE_ID, checked
 from starcat.service.problems import Problem
 from starcat.service.service import Service
 
@@ -26,7 +26,7 @@ def remove_database(service: Service, database_id: str) -> None:
                     "cancel it, or wait until it has ended",
                 )
     # It is gone in one step; then its files are.
-    gone = service.places.scratch / f"removed-{secrets.token_hex(8)}"
-    service.places.database(database_id).rename(gone)
+    gone = service.paths.scratch / f"removed-{secrets.token_hex(8)}"
+    service.paths.database(database_id).rename(gone)
     service.sessions.forget(database.folder)
     shutil.rmtree(gone, ignore_errors=True)

@@ -12,7 +12,7 @@ from starcat.service.catalogs import Catalogs
 from starcat.service.confined import Confined
 from starcat.service.jobs.job import JobStore
 from starcat.service.jobs.queue import JobQueue, open_queue
-from starcat.service.places import Places
+from starcat.service.paths import ServicePaths
 from starcat.service.records import Records
 from starcat.service.sessions import Sessions
 from starcat.service.settings import Settings
@@ -30,7 +30,7 @@ class Service:
     ----------
     settings : Settings
         What the operator set.
-    places : Places
+    paths : ServicePaths
         What lies where.
     records : Records
         What is remembered.
@@ -53,7 +53,7 @@ class Service:
     """
 
     settings: Settings
-    places: Places
+    paths: ServicePaths
     records: Records
     shelf: Shelf
     jobs: JobStore
@@ -67,22 +67,22 @@ class Service:
 
 def open_service(settings: Settings) -> Service:
     """Open a service: its folders and its records."""
-    places = Places(settings.root)
-    places.make()
-    records = Records(places.records)
-    shelf, sessions = Shelf(places), Sessions(settings)
+    paths = ServicePaths(settings.root)
+    paths.make()
+    records = Records(paths.records)
+    shelf, sessions = Shelf(paths), Sessions(settings)
     most = round(settings.job_memory_gib * GIB)
-    confined = Confined(settings, places.scratch)
+    confined = Confined(settings, paths.scratch)
     return Service(
         settings=settings,
-        places=places,
+        paths=paths,
         records=records,
         shelf=shelf,
         jobs=JobStore(records),
         sessions=sessions,
         confined=confined,
-        tap=Tap(settings, places, records, shelf, sessions, confined),
-        queue=open_queue(settings, places),
+        tap=Tap(settings, paths, records, shelf, sessions, confined),
+        queue=open_queue(settings, paths),
         catalogs=Catalogs(most),
     )
 

@@ -52,7 +52,7 @@ class Sessions:
     def __init__(self, settings: Settings) -> None:
         memory_gb = settings.query_memory_gib * GIB_IN_GB
         self._limits = Limits(settings.query_time_s, memory_gb, DISK_GB)
-        self._places = threading.BoundedSemaphore(settings.queries)
+        self._slots = threading.BoundedSemaphore(settings.queries)
         self._lock = threading.Lock()
         self._idle: list[_Open] = []
         self.run = Turns(settings.queries).run
@@ -64,7 +64,7 @@ class Sessions:
         self, targets: Sequence[str | Path], time_s: float | None = None
     ) -> Iterator[Session]:
         """Give a session about some targets, which nobody else uses meanwhile."""
-        if not self._places.acquire(timeout=turns.WAIT_S):
+        if not self._slots.acquire(timeout=turns.WAIT_S):
             raise busy()
         try:
             key = tuple(map(_identity, targets))
@@ -80,7 +80,7 @@ class Sessions:
             finally:
                 self._give_back(one, is_kept and one.session.is_running)
         finally:
-            self._places.release()
+            self._slots.release()
 
     def forget(self, target: str | Path) -> None:
         """Close the sessions about a target that is to be removed and that nobody uses."""

@@ -10,7 +10,7 @@ from typing import Any
 from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
 from starcat.errors import ProductError, TargetMissing
 from starcat.releases.tree import Blob, files_of
-from starcat.service.places import DATABASE_ID, Places
+from starcat.service.paths import DATABASE_ID, ServicePaths
 from starcat.specs.version import version_numbers
 from starcat.storage.digests import file_sha256
 
@@ -66,14 +66,14 @@ class Database:
 class Shelf:
     """All databases there are."""
 
-    def __init__(self, places: Places) -> None:
-        self._places = places
+    def __init__(self, paths: ServicePaths) -> None:
+        self._paths = paths
         self._known: dict[Path, tuple[int, Database]] = {}
 
     def databases(self) -> list[Database]:
         """Return all databases."""
         found = []
-        for path in self._places.databases.glob(f"*/*/{MANIFEST_NAME}"):
+        for path in self._paths.databases.glob(f"*/*/{MANIFEST_NAME}"):
             if not DATABASE_ID.fullmatch(path.parents[1].name):
                 continue
             try:
@@ -84,7 +84,7 @@ class Shelf:
 
     def database(self, database_id: str) -> Database:
         """Return a database."""
-        for path in self._places.database(database_id).glob(f"*/{MANIFEST_NAME}"):
+        for path in self._paths.database(database_id).glob(f"*/{MANIFEST_NAME}"):
             return self._at(path)
         raise TargetMissing(
             f"no database has the id {database_id!r}; the list of them tells theirs"

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from starcat.errors import TargetMissing
-from starcat.service.places import DATABASE_ID
+from starcat.service.paths import DATABASE_ID
 from starcat.service.problems import Problem
 from starcat.service.service import Service
 from starcat.service.shelf import Database
@@ -18,10 +18,10 @@ CATALOG = re.compile(r"(?P<source>[a-z0-9_]{1,64})-[0-9a-f]{16}(\.parquet)?", re
 
 def catalog_names(service: Service) -> list[str]:
     """Return the names of the catalogs that can be asked about."""
-    if not service.places.catalogs.is_dir():
+    if not service.paths.catalogs.is_dir():
         return []
     return sorted(
-        path.name for path in service.places.catalogs.iterdir() if CATALOG.fullmatch(path.name)
+        path.name for path in service.paths.catalogs.iterdir() if CATALOG.fullmatch(path.name)
     )
 
 
@@ -48,7 +48,7 @@ def _target(service: Service, name: str) -> Path:
     if DATABASE_ID.fullmatch(name) or _titled(service, name):
         return database_of(service, name).folder
     found = [
-        service.places.catalogs / one
+        service.paths.catalogs / one
         for one in catalog_names(service)
         if name in (one, one.removesuffix(".parquet"), one.rpartition("-")[0])
     ]

@@ -228,7 +228,7 @@ def _identify(
     service: Service, database: str, asked: _Asked, kind: Kind | None
 ) -> tuple[dict[str, Any], bytes]:
     artifact = database_of(service, database).folder
-    with scratch_folder(service.places) as folder:
+    with scratch_folder(service.paths) as folder:
         _keep(asked, folder)
         found = service.confined.call(
             "identify",

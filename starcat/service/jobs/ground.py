@@ -7,7 +7,7 @@ from typing import Protocol
 
 from starcat.service.jobs.job import JobStore
 from starcat.service.jobs.queue import JobQueue, open_queue
-from starcat.service.places import Places
+from starcat.service.paths import ServicePaths
 from starcat.service.records import Records
 from starcat.service.settings import Settings
 from starcat.service.shelf import Shelf
@@ -21,7 +21,7 @@ class Ground(Protocol):
         """What the operator set."""
 
     @property
-    def places(self) -> Places:
+    def paths(self) -> ServicePaths:
         """What lies where."""
 
     @property
@@ -46,7 +46,7 @@ class WorkerGround:
     """The part of a service that a worker has; attributes as those of `Ground`."""
 
     settings: Settings
-    places: Places
+    paths: ServicePaths
     records: Records
     shelf: Shelf
     jobs: JobStore
@@ -55,8 +55,8 @@ class WorkerGround:
 
 def open_ground(settings: Settings) -> WorkerGround:
     """Open what a worker needs."""
-    places = Places(settings.root)
-    places.make()
-    records = Records(places.records)
-    queue = open_queue(settings, places)
-    return WorkerGround(settings, places, records, Shelf(places), JobStore(records), queue)
+    paths = ServicePaths(settings.root)
+    paths.make()
+    records = Records(paths.records)
+    queue = open_queue(settings, paths)
+    return WorkerGround(settings, paths, records, Shelf(paths), JobStore(records), queue)

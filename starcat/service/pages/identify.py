@@ -174,7 +174,7 @@ def identified(
 ) -> tuple[dict[str, Any], bytes]:
     """Identify a frame and draw it, in a confined process."""
     limited = options.model_copy(update={"time_limit_s": service.settings.query_time_s})
-    with scratch_folder(service.places) as folder:
+    with scratch_folder(service.paths) as folder:
         frame.keep(folder / frame.name)
         arguments = {
             "folder": str(folder),
@@ -189,7 +189,7 @@ def identified(
 
 
 def _simulated(service: Service, database: Database, name: str, seed: int) -> bytes:
-    with scratch_folder(service.places) as folder:
+    with scratch_folder(service.paths) as folder:
         write_frame(folder / name, database, seed)
         return (folder / name).read_bytes()
 

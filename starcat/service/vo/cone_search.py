@@ -99,7 +99,7 @@ def target_of(service: Service, name: str) -> tuple[Path, Label]:
         newest = named[-1]
         return newest.folder, Label("stars", newest.name, newest.version)
     if _NAME.fullmatch(name):
-        for path in _read_ones(service.places.catalogs, name):
+        for path in _read_ones(service.paths.catalogs, name):
             if path.is_file() or (path.is_dir() and is_store(path)):
                 return path, Label(name)
     raise TargetMissing(
@@ -124,7 +124,7 @@ def _answer(service: Service, name: str, asked: ConeRequest) -> SpooledTemporary
         view = star_view(session)
         with session.ask(cone_query(view, asked, maxrec)) as running:
             rows = with_ucds(running.batches(), view)
-            scratch = service.places.scratch
+            scratch = service.paths.scratch
             chunks = result_chunks(rows, asked.form, scratch, label=label, maxrec=maxrec)
             held: SpooledTemporaryFile[bytes]
             held = SpooledTemporaryFile(_HELD_BYTES, dir=str(scratch))  # noqa: SIM115

@@ -80,7 +80,7 @@ def _begun(service: Service, asked: Question, given: TapRequest, owner: str) -> 
         if gone.is_set():
             raise ClientGone
 
-    scratch = service.places.scratch
+    scratch = service.paths.scratch
     with tempfile.TemporaryDirectory(prefix="sync-", dir=scratch) as folder:
         files = given.keep(Path(folder)) | service.tap.jobs.answers(asked.uploads, owner)
         parts = service.tap.queries.answer(asked, files, progress=watch)

@@ -12,7 +12,7 @@ from starcat.errors import ConfigError
 from starcat.exchange.label import Label
 from starcat.progress import Progress, no_progress
 from starcat.service.confined import Confined
-from starcat.service.places import Places
+from starcat.service.paths import ServicePaths
 from starcat.service.sessions import Sessions
 from starcat.service.vo.tap_answers import Answers
 from starcat.service.vo.tap_tables import TapTables
@@ -31,7 +31,7 @@ class TapQueries:
 
     def __init__(
         self,
-        places: Places,
+        paths: ServicePaths,
         tables: TapTables,
         sessions: Sessions,
         confined: Confined,
@@ -39,10 +39,10 @@ class TapQueries:
     ) -> None:
         self._confined = confined
         self.most_rows = most_rows
-        self._places = places
+        self._paths = paths
         self._tables = tables
         self._sessions = sessions
-        self._answers = Answers(places, confined)
+        self._answers = Answers(paths, confined)
 
     def answer(
         self,
@@ -78,7 +78,7 @@ class TapQueries:
                     "part of multipart/form-data with that name",
                     key="UPLOAD",
                 )
-        top = Path(tempfile.mkdtemp(prefix="upload-", dir=self._places.scratch))
+        top = Path(tempfile.mkdtemp(prefix="upload-", dir=self._paths.scratch))
         try:
             folder = top / UPLOADS
             folder.mkdir()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from starcat.service.confined import Confined
-from starcat.service.places import Places
+from starcat.service.paths import ServicePaths
 from starcat.service.records import Records
 from starcat.service.sessions import Sessions
 from starcat.service.settings import Settings
@@ -37,7 +37,7 @@ class Tap:
     def __init__(
         self,
         settings: Settings,
-        places: Places,
+        paths: ServicePaths,
         records: Records,
         shelf: Shelf,
         sessions: Sessions,
@@ -49,9 +49,9 @@ class Tap:
             rows=settings.max_rows,
             upload_bytes=int(settings.upload_mib * 2**20),
         )
-        self.tables = TapTables(places, shelf, sessions)
-        self.queries = TapQueries(places, self.tables, sessions, confined, settings.max_rows)
-        self.jobs = TapJobs(records, places, self.limits)
+        self.tables = TapTables(paths, shelf, sessions)
+        self.queries = TapQueries(paths, self.tables, sessions, confined, settings.max_rows)
+        self.jobs = TapJobs(records, paths, self.limits)
         # One of the queries that run at the same time is left to those who wait for the answer.
         self.runner = TapRunner(self.jobs, self.queries, max(1, settings.queries - 1))
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from starcat.catalog.star_files import rejected_path
 from starcat.errors import StarcatError
-from starcat.service.places import Places
+from starcat.service.paths import ServicePaths
 from starcat.service.sessions import Sessions
 from starcat.service.shelf import Shelf
 from starcat.store.layout import is_store
@@ -43,8 +43,8 @@ class TapState:
 class TapTables:
     """The tables of a service, as they are now."""
 
-    def __init__(self, places: Places, shelf: Shelf, sessions: Sessions) -> None:
-        self._places = places
+    def __init__(self, paths: ServicePaths, shelf: Shelf, sessions: Sessions) -> None:
+        self._paths = paths
         self._shelf = shelf
         self._sessions = sessions
         self._looking = threading.Lock()
@@ -67,7 +67,7 @@ class TapTables:
             database.folder: f"Guide-star database {database.name}, version {database.version}"
             for database in self._shelf.databases()
         }
-        for path in sorted(self._places.catalogs.iterdir()):
+        for path in sorted(self._paths.catalogs.iterdir()):
             is_table = path.suffix == ".parquet" and path != rejected_path(path)
             if path.is_file() and is_table and not path.stem.endswith("rejected"):
                 found[path] = f"Stars of the catalog {path.stem}"
@@ -91,7 +91,7 @@ class TapTables:
 
     def _opened(self, about: dict[Path, str], key: str) -> TapState:
         own = own_schema()
-        folder = self._places.scratch / f"tap-{key}" / NAME
+        folder = self._paths.scratch / f"tap-{key}" / NAME
         schemas: tuple[Schema, ...] = ()
         if about:
             with self._sessions.session(list(about)) as session:
