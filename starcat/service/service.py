@@ -19,9 +19,6 @@ from starcat.service.sandbox.sandbox import Sandbox
 from starcat.service.settings import Settings
 from starcat.service.vo.tap_service import Tap
 
-READ = "read"
-"""Folder, among the catalogs, of what estimates start from."""
-
 GIB = 2**30
 
 
@@ -86,7 +83,7 @@ def open_service(settings: Settings) -> Service:
         sandbox=sandbox,
         tap=Tap(settings, paths, records, library, query_pool, sandbox),
         queue=open_queue(settings, paths),
-        catalogs=Catalogs(paths.catalogs / READ, most),
+        catalogs=Catalogs(most),
     )
 
 
