@@ -16,17 +16,9 @@ from starcat.storage.schema import ProductSchema, product_schema
 
 @dataclass(frozen=True)
 class Artifact:
-    """An artifact on disk.
+    """An artifact on disk."""
 
-    Attributes
-    ----------
-    folder : Path
-        The folder ``<name>-<version>``.
-    manifest : dict
-        Its manifest.
-    """
-
-    folder: Path
+    folder: Path  # the folder ``<name>-<version>``
     manifest: dict[str, Any]
 
     @property

@@ -66,39 +66,18 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Built:
-    """A finished build.
+    """A finished build."""
 
-    Attributes
-    ----------
-    folder : Path
-        The artifact.
-    outcome : {"written", "unchanged", "replaced"}
-        What happened to the folder.
-    manifest : dict
-        Manifest of the artifact.
-    filters : tuple of FilterCoverage
-        What each filter left.
-    coverage : CoverageReport
-        Coverage by the guide stars.
-    rates : tuple of Rates
-        Rates of the self-test: clean and hard frames, and the same without magnitudes.
-    problems : tuple of str
-        The first malformed records.
-    warnings : tuple of str
-        What is worth a second look, such as holes of the tiling.
-    times_s : dict of str to float
-        Seconds by stage.
-    """
-
-    folder: Path
-    outcome: Outcome
-    manifest: dict[str, Any]
-    filters: tuple[FilterCoverage, ...]
-    coverage: CoverageReport
+    folder: Path  # the artifact
+    outcome: Outcome  # "written", "unchanged", "replaced": What happened to the folder
+    manifest: dict[str, Any]  # manifest of the artifact
+    filters: tuple[FilterCoverage, ...]  # what each filter left
+    coverage: CoverageReport  # coverage by the guide stars
+    # rates of the self-test: clean and hard frames, and the same without magnitudes
     rates: tuple[Rates, ...]
-    problems: tuple[str, ...]
-    warnings: tuple[str, ...]
-    times_s: dict[str, float]
+    problems: tuple[str, ...]  # the first malformed records
+    warnings: tuple[str, ...]  # what is worth a second look, such as holes of the tiling
+    times_s: dict[str, float]  # seconds by stage
 
     def __repr__(self) -> str:
         """Return the artifact and how it identifies in one line."""

@@ -38,21 +38,11 @@ MB = 1e6
 
 @dataclass(frozen=True)
 class Row:
-    """What a row of a product costs.
+    """What a row of a product costs."""
 
-    Attributes
-    ----------
-    held_bytes : float
-        While the other products are made and written.
-    working_bytes : float
-        Beside that, while it is made itself.
-    micros : float
-        Microseconds to make, write and check it.
-    """
-
-    held_bytes: float
-    working_bytes: float
-    micros: float
+    held_bytes: float  # while the other products are made and written
+    working_bytes: float  # beside that, while it is made itself
+    micros: float  # microseconds to make, write and check it
 
 
 ROWS: Mapping[str, Row] = {
@@ -89,33 +79,16 @@ BASE_SECONDS = 3.0
 
 @dataclass(frozen=True)
 class Cost:
-    """What a build will cost.
+    """What a build will cost."""
 
-    Attributes
-    ----------
-    stars : int
-        Guide stars.
-    fields : int
-        Boresights.
-    rows : mapping of str to int
-        Rows of each product that will be made.
-    bytes : mapping of str to int
-        Memory that leaving out each product would save.
-    memory_bytes : int
-        Most memory that the build will hold.
-    seconds : float
-        Time from here on.
-    files : mapping of str to int
-        Bytes of each file as it will be written; those of the folder ``report`` and of the
-        manifest together as ``report``.
-    """
-
-    stars: int
-    fields: int
-    rows: Mapping[str, int]
-    bytes: Mapping[str, int]
-    memory_bytes: int
-    seconds: float
+    stars: int  # guide stars
+    fields: int  # boresights
+    rows: Mapping[str, int]  # rows of each product that will be made
+    bytes: Mapping[str, int]  # memory that leaving out each product would save
+    memory_bytes: int  # most memory that the build will hold
+    seconds: float  # time from here on
+    # bytes of each file as it will be written; those of the folder ``report`` and of the manifest
+    # together as ``report``
     files: Mapping[str, int] = field(default_factory=dict)
 
     @property
@@ -132,30 +105,14 @@ class Cost:
 
 @dataclass(frozen=True)
 class Made:
-    """What is there when a build is estimated: some products, and guide stars for the others.
+    """What is there when a build is estimated: some products, and guide stars for the others."""
 
-    Attributes
-    ----------
-    guide_stars : pyarrow.Table
-        As the schema ``stars`` has them.
-    fields : FieldStars
-        Their tiling.
-    spec : BuildSpec
-        Which products, and their parameters.
-    rejected_bytes : int
-        Size of the file of rejected records.
-    others : sequence of Product
-        Products that are there too, such as ``motions``.
-    base_bytes : float
-        Memory that is taken already.
-    """
-
-    guide_stars: pa.Table
-    fields: FieldStars
-    spec: BuildSpec
-    rejected_bytes: int
-    others: Sequence[Product] = ()
-    base_bytes: float = 0.0
+    guide_stars: pa.Table  # as the schema ``stars`` has them
+    fields: FieldStars  # their tiling
+    spec: BuildSpec  # which products, and their parameters
+    rejected_bytes: int  # size of the file of rejected records
+    others: Sequence[Product] = ()  # products that are there too, such as ``motions``
+    base_bytes: float = 0.0  # memory that is taken already
 
     @property
     def ingredients(self) -> Ingredients:

@@ -38,24 +38,13 @@ GOLDEN_RATIO = 0.5 * (1.0 + 5.0**0.5)
 
 @dataclass(frozen=True)
 class Extent:
-    """How large a product will be.
+    """How large a product will be."""
 
-    Attributes
-    ----------
-    rows : float
-        Rows of its table.
-    values : float
-        Entries of its lists, all rows together; 0 where it has none.
-    reached : float
-        Neighbours that are gone through to make it; its rows where these are what it lists.
-    records : float
-        Triangles over all fields, repeats included; 0 for other products.
-    """
-
-    rows: float
-    values: float = 0.0
+    rows: float  # rows of its table
+    values: float = 0.0  # entries of its lists, all rows together; 0 where it has none
+    # neighbours that are gone through to make it; its rows where these are what it lists
     reached: float = 0.0
-    records: float = 0.0
+    records: float = 0.0  # triangles over all fields, repeats included; 0 for other products
 
 
 def count_products(given: Ingredients) -> dict[str, Extent]:
@@ -90,24 +79,12 @@ def count_products(given: Ingredients) -> dict[str, Extent]:
 
 @dataclass(frozen=True)
 class LevelExtent:
-    """How large the product ``levels`` will be.
-
-    Attributes
-    ----------
-    levels : int
-        Its rows.
-    stars : int
-        Stars of all levels.
-    triangles : float
-        Triangles of all levels.
-    records : float
-        The same over all fields, repeats included.
-    """
+    """How large the product ``levels`` will be."""
 
     levels: int
-    stars: int
-    triangles: float
-    records: float
+    stars: int  # stars of all levels
+    triangles: float  # triangles of all levels
+    records: float  # the same over all fields, repeats included
 
 
 def count_levels(directions: Array, mag: Array, spec: BuildSpec) -> LevelExtent:

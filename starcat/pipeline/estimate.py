@@ -54,21 +54,12 @@ MOST_FOR_GAPS = 50_000
 
 @dataclass(frozen=True)
 class Choice:
-    """The guide stars of a spec and their fields.
+    """The guide stars of a spec and their fields."""
 
-    Attributes
-    ----------
-    selected : Selected
-        Guide stars, and of the others those that were bright enough to be looked at.
-    fields : FieldStars
-        The tiling of the guide stars.
-    rejected : dict of str to int
-        All records that are no guide stars, by reason.
-    """
-
+    # guide stars, and of the others those that were bright enough to be looked at
     selected: Selected
-    fields: FieldStars
-    rejected: Mapping[str, int]
+    fields: FieldStars  # the tiling of the guide stars
+    rejected: Mapping[str, int]  # all records that are no guide stars, by reason
 
     @property
     def nbytes(self) -> int:
@@ -134,44 +125,21 @@ def _check_levels(stars: int, spec: BuildSpec) -> None:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a spec will give.
-
-    Attributes
-    ----------
-    spec : BuildSpec
-        The spec.
-    cost : Cost
-        Rows, files, memory, and the time after reading.
-    read_seconds : float
-        Time to read the catalogs.
-    fields : FieldStars
-        The tiling of the guide stars.
-    coverage : CoverageSummary
-        How stars are spread over the fields.
-    enough_share, full_share : float
-        Shares of the fields with at least `MIN_GUIDE_STARS` stars, and with as many as the list
-        of a field is long.
-    filters : tuple of (str, int)
-        The stars that each filter leaves.
-    rejected : mapping of str to int
-        All other records, by reason.
-    refusals : tuple of str
-        Why the build will be refused; empty where it will not.
-    warnings : tuple of str
-        What is worth a second look.
-    """
+    """What a spec will give."""
 
     spec: BuildSpec
-    cost: Cost
-    read_seconds: float
-    fields: FieldStars
-    coverage: CoverageSummary
+    cost: Cost  # rows, files, memory, and the time after reading
+    read_seconds: float  # time to read the catalogs
+    fields: FieldStars  # the tiling of the guide stars
+    coverage: CoverageSummary  # how stars are spread over the fields
+    # shares of the fields with at least `MIN_GUIDE_STARS` stars, and with as many as the list of
+    # a field is long
     enough_share: float
     full_share: float
-    filters: tuple[tuple[str, int], ...]
-    rejected: Mapping[str, int]
-    refusals: tuple[str, ...]
-    warnings: tuple[str, ...]
+    filters: tuple[tuple[str, int], ...]  # the stars that each filter leaves
+    rejected: Mapping[str, int]  # all other records, by reason
+    refusals: tuple[str, ...]  # why the build will be refused; empty where it will not
+    warnings: tuple[str, ...]  # what is worth a second look
 
     @property
     def build_seconds(self) -> float:

@@ -34,27 +34,13 @@ from starcat.specs.build_spec import BuildSpec
 
 @dataclass(frozen=True)
 class FilterCoverage:
-    """What one filter leaves in the fields of the tiling.
+    """What one filter leaves in the fields of the tiling."""
 
-    Attributes
-    ----------
-    step : str
-        The filter.
-    stars : int
-        Stars left.
-    median_per_field : float
-        Stars in the field of a boresight.
-    min_per_field : int
-        The same.
-    share_below_4 : float
-        Share of the fields with fewer than 4 stars.
-    """
-
-    step: str
-    stars: int
-    median_per_field: float
+    step: str  # the filter
+    stars: int  # stars left
+    median_per_field: float  # stars in the field of a boresight
     min_per_field: int
-    share_below_4: float
+    share_below_4: float  # share of the fields with fewer than 4 stars
 
 
 def filter_coverage(step: Step, spec: BuildSpec) -> FilterCoverage:
@@ -140,33 +126,15 @@ def source_facts(
 
 @dataclass(frozen=True)
 class Results:
-    """The results of a build's stages.
-
-    Attributes
-    ----------
-    spec : BuildSpec
-        The build.
-    sources : sequence of SourceFacts
-        What went in.
-    products : sequence of Product
-        What came out.
-    facts : mapping of str to ProductFacts
-        The same as the manifest has it.
-    fields : FieldStars
-        The tiling of the guide stars.
-    filters : sequence of FilterCoverage
-        What each filter left.
-    rates : sequence of Rates
-        Rates of the self-test.
-    """
+    """The results of a build's stages."""
 
     spec: BuildSpec
-    sources: Sequence[SourceFacts]
-    products: Sequence[Product]
-    facts: Mapping[str, ProductFacts]
-    fields: FieldStars
-    filters: Sequence[FilterCoverage]
-    rates: Sequence[Rates]
+    sources: Sequence[SourceFacts]  # what went in
+    products: Sequence[Product]  # what came out
+    facts: Mapping[str, ProductFacts]  # the same as the manifest has it
+    fields: FieldStars  # the tiling of the guide stars
+    filters: Sequence[FilterCoverage]  # what each filter left
+    rates: Sequence[Rates]  # rates of the self-test
 
 
 def build_facts(folder: Path, results: Results) -> BuildFacts:

@@ -34,21 +34,11 @@ from starcat.storage.schema import ProductSchema, product_schema
 
 @dataclass(frozen=True)
 class Ingredients:
-    """What every recipe starts from.
+    """What every recipe starts from."""
 
-    Attributes
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        Guide stars, ICRS.
-    fields : FieldStars
-        The tiling of the sphere and the stars in each field.
-    spec : BuildSpec
-        Which products, and their parameters.
-    """
-
-    directions: Array
-    fields: FieldStars
-    spec: BuildSpec
+    directions: Array  # shape (N, 3): guide stars, ICRS
+    fields: FieldStars  # the tiling of the sphere and the stars in each field
+    spec: BuildSpec  # which products, and their parameters
 
     def radius_rad(self, radius_deg: float | None, factor: float = 1.0) -> float:
         """Return a product's radius."""

@@ -27,36 +27,16 @@ SAMPLE_ROWS = 8192
 
 @dataclass(frozen=True)
 class StarsRead:
-    """The catalogs of a spec, read: what every estimate with the same ones starts from.
+    """The catalogs of a spec, read: what every estimate with the same ones starts from."""
 
-    Attributes
-    ----------
-    stars : pyarrow.Table
-        Star table (schema ``stars``) with motions and amplitudes joined, by star_id.
-    motions : pyarrow.Table, optional
-        Where the motions are from (schema ``motions``), a row a star.
-    rejected : dict of str to int
-        Records that reading rejected, by reason.
-    rejected_rows : int
-        Those of them that the product ``rejected`` lists.
-    rejected_bytes : float
-        Bytes that one of them takes in its file.
-    held_bytes : int
-        Memory that the tables of the catalog take.
-    records : int
-        Records in all files of the star catalog.
-    notes : tuple of str
-        What a user should know of the inputs.
-    """
-
-    stars: pa.Table
-    motions: pa.Table | None
-    rejected: Mapping[str, int]
-    rejected_rows: int
-    rejected_bytes: float
-    held_bytes: int
-    records: int
-    notes: tuple[str, ...]
+    stars: pa.Table  # star table (schema ``stars``) with motions and amplitudes joined, by star_id
+    motions: pa.Table | None  # where the motions are from (schema ``motions``), a row a star
+    rejected: Mapping[str, int]  # records that reading rejected, by reason
+    rejected_rows: int  # those of them that the product ``rejected`` lists
+    rejected_bytes: float  # bytes that one of them takes in its file
+    held_bytes: int  # memory that the tables of the catalog take
+    records: int  # records in all files of the star catalog
+    notes: tuple[str, ...]  # what a user should know of the inputs
 
     @cached_property
     def by_brightness(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -78,46 +78,22 @@ _SPREAD_PX = 4.0
 
 @dataclass(frozen=True)
 class LimitRow:
-    """What a magnitude limit leaves in the fields of the tiling.
-
-    Attributes
-    ----------
-    faint_limit_mag : float
-        The limit.
-    guide_stars : int
-        Stars of the whole sky that pass the selection.
-    stars : Spread
-        How the stars are spread over the fields.
-    """
+    """What a magnitude limit leaves in the fields of the tiling."""
 
     faint_limit_mag: float
-    guide_stars: int
-    stars: Spread
+    guide_stars: int  # stars of the whole sky that pass the selection
+    stars: Spread  # how the stars are spread over the fields
 
 
 @dataclass(frozen=True)
 class Starter:
-    """A first spec, and what it and its neighbours give.
+    """A first spec, and what it and its neighbours give."""
 
-    Attributes
-    ----------
-    spec : BuildSpec
-        For the camera.
-    limits : tuple of LimitRow
-        The spec's own limit, and some that are brighter and fainter.
-    deepest_mag : float
-        Faintest star of the catalog; fainter limits add none.
-    thinned : LimitRow
-        What the spec's thinning leaves at its own limit.
-    cost : Cost
-        What the build will cost, by estimate.
-    """
-
-    spec: BuildSpec
-    limits: tuple[LimitRow, ...]
-    deepest_mag: float
-    thinned: LimitRow
-    cost: Cost
+    spec: BuildSpec  # for the camera
+    limits: tuple[LimitRow, ...]  # the spec's own limit, and some that are brighter and fainter
+    deepest_mag: float  # faintest star of the catalog; fainter limits add none
+    thinned: LimitRow  # what the spec's thinning leaves at its own limit
+    cost: Cost  # what the build will cost, by estimate
 
     @property
     def left_out(self) -> tuple[str, ...]:
