@@ -9,7 +9,7 @@ def convert(source: str, target: str, form: str) -> int:
     """Write a table to a file."""
     import pyarrow as pa
 
-    from starcat.exchange.formats import write_batches
+    from starcat.exchange.writers import write_batches
 
     with pa.OSFile(source) as file, pa.ipc.open_stream(file) as stream:
         return write_batches(stream, Path(target), form)

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from starcat.errors import ConfigError
-from starcat.exchange.label import Label
+from starcat.exchange.columns import Label
 from starcat.progress import Progress, no_progress
 from starcat.service.confined import Confined
 from starcat.service.places import Places
