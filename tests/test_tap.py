@@ -166,7 +166,7 @@ def test_who_reads_slowly_keeps_nobody_waiting(root):
         for _ in range(4):
             parts = service.tap.queries.answer(asked, {})
             next(parts)
-            spools.append(Spool(parts, service.places.scratch, threading.Event()))
+            spools.append(Spool(parts, service.paths.scratch, threading.Event()))
             next(iter(spools[-1]))
         assert len(table_of(client.get("/tap/sync", params={"QUERY": BRIGHT}))) > 0
         whole = [b"".join(spool) for spool in spools]
@@ -566,7 +566,7 @@ def test_jobs_outlive_the_server(tmp_path, small_artifact, bright):
     settings = Settings(root=root)
     with TestClient(make_app(settings), base_url=LOCAL) as client:
         records = Records(root / "records.sqlite")
-        jobs = TapJobs(records, client.app.state.service.places, ServiceLimits(60, 3600, 10, 10))
+        jobs = TapJobs(records, client.app.state.service.paths, ServiceLimits(60, 3600, 10, 10))
         made = [jobs.create("anonymous", [("QUERY", BRIGHT)]).job_id for _ in range(3)]
         for job_id in made[:2]:
             jobs.queue(job_id)

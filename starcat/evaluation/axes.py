@@ -15,28 +15,15 @@ from starcat.simulation.simulate import Noise
 
 @dataclass(frozen=True)
 class Axis:
-    """A quantity that a trial has one value of.
+    """A quantity that a trial has one value of."""
 
-    Attributes
-    ----------
-    label : str
-        The quantity in words, with its unit.
-    usual : tuple of float
-        Values that a sweep tries unless told otherwise; none for none.
-    low, high : float
-        Values outside of this range mean nothing.
-    read : callable
-        Function that returns its value in a trial; NaN where the trial has none.
-    write : callable
-        The same trial with another value.
-    """
-
-    label: str
-    usual: tuple[float, ...]
-    low: float
+    label: str  # the quantity in words, with its unit
+    usual: tuple[float, ...]  # values that a sweep tries unless told otherwise; none for none
+    low: float  # values outside of this range mean nothing
     high: float
+    # function that returns its value in a trial; NaN where the trial has none
     read: Callable[[Trial], float]
-    write: Callable[[Trial, float], Trial]
+    write: Callable[[Trial, float], Trial]  # the same trial with another value
 
     def with_value(self, trial: Trial, value: float) -> Trial:
         """Return a trial with another value of this quantity."""

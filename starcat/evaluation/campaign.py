@@ -29,20 +29,11 @@ from starcat.progress import Progress, no_progress
 
 @dataclass(frozen=True)
 class MeasuredRow:
-    """A row of a paper and what was measured.
+    """A row of a paper and what was measured."""
 
-    Attributes
-    ----------
-    row : Row
-        The paper's.
-    rates : TrialRates
-        Rates of the row's trial.
-    failures : dict of str to int
-        Frames without success by the row's rule, by cause.
-    """
-
-    row: Row
-    rates: TrialRates
+    row: Row  # the paper's
+    rates: TrialRates  # rates of the row's trial
+    # frames without success by the row's rule, by cause
     failures: dict[str, int] = field(default_factory=dict)
 
     @property
@@ -72,24 +63,12 @@ class MeasuredRow:
 
 @dataclass(frozen=True)
 class Outcome:
-    """All that was measured of a paper.
+    """All that was measured of a paper."""
 
-    Attributes
-    ----------
-    paper : Paper
-        What it prints.
-    is_quick : bool
-        Whether fewer frames were tried than the paper's.
-    rows : tuple of MeasuredRow
-        The measured rows, in the paper's order.
-    statistics : tuple of Statistic
-        Numbers that need no trial.
-    """
-
-    paper: Paper
-    is_quick: bool
-    rows: tuple[MeasuredRow, ...]
-    statistics: tuple[Statistic, ...]
+    paper: Paper  # what it prints
+    is_quick: bool  # whether fewer frames were tried than the paper's
+    rows: tuple[MeasuredRow, ...]  # the measured rows, in the paper's order
+    statistics: tuple[Statistic, ...]  # numbers that need no trial
 
     def as_dict(self) -> dict[str, Any]:
         """Return the outcome as plain values."""

@@ -22,44 +22,23 @@ from starcat.simulation.simulate import Frame
 
 @dataclass(frozen=True)
 class Verdict:
-    """One frame and its answer.
-
-    Attributes
-    ----------
-    frame : int
-        Number of the frame.
-    n_centroids, n_guide_stars, n_false : int
-        What the frame holds; guide stars are those that the camera saw.
-    status : str
-        Status of the answer: ``identified``, ``no_match`` or ``too_few_stars``.
-    n_named, n_right, n_wrong : int
-        Centroids with a star; those with their own; those with a star that is elsewhere.
-    is_reference_right : bool
-        The guide star nearest to the centre of the frame has its own name.
-    attitude_error_px : float
-        Largest displacement of a corner of the frame, pixels; NaN without an attitude.
-    boresight_error_arcsec, roll_error_arcsec : float
-        The same, across and about the true boresight.
-    false_match_probability : float
-        The probability that the matcher states.
-    time_ms : float
-        Processor time of the identification.
-    """
+    """One frame and its answer."""
 
     frame: int
-    n_centroids: int
+    n_centroids: int  # what the frame holds; guide stars are those that the camera saw
     n_guide_stars: int
     n_false: int
-    status: str
-    n_named: int
+    status: str  # status of the answer: ``identified``, ``no_match`` or ``too_few_stars``
+    n_named: int  # centroids with a star; those with their own; those with a star that is elsewhere
     n_right: int
     n_wrong: int
-    is_reference_right: bool
+    is_reference_right: bool  # the guide star nearest to the centre of the frame has its own name
+    # largest displacement of a corner of the frame, pixels; NaN without an attitude
     attitude_error_px: float
-    boresight_error_arcsec: float
+    boresight_error_arcsec: float  # the same, across and about the true boresight
     roll_error_arcsec: float
-    false_match_probability: float
-    time_ms: float
+    false_match_probability: float  # the probability that the matcher states
+    time_ms: float  # processor time of the identification
 
 
 FIELDS = tuple(field.name for field in fields(Verdict))

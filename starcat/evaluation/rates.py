@@ -62,15 +62,9 @@ GROUP BY cause
 
 @dataclass(frozen=True)
 class Share:
-    """So many of so many.
+    """So many of so many."""
 
-    Attributes
-    ----------
-    hits, count : int
-        Successes and frames.
-    """
-
-    hits: int
+    hits: int  # successes and frames
     count: int
 
     @property
@@ -98,29 +92,17 @@ class Share:
 
 @dataclass(frozen=True)
 class TrialRates:
-    """How a trial went.
+    """How a trial went."""
 
-    Attributes
-    ----------
-    ceiling : Share
-        Frames with at least four guide stars.
-    by_rule, by_rule_enough : Share
-        Successes by the paper's rule, of all frames and of those with four guide stars.
-    starcat, starcat_enough : Share
-        The same by starcat's own rule: accepted at 1e-9, attitude right, no star wrong.
-    wrong : int
-        Frames that starcat itself would have accepted with a wrong attitude.
-    mean_ms, median_ms, p95_ms : float
-        Time of an identification.
-    """
-
-    ceiling: Share
+    ceiling: Share  # frames with at least four guide stars
+    # successes by the paper's rule, of all frames and of those with four guide stars
     by_rule: Share
     by_rule_enough: Share
+    # the same by starcat's own rule: accepted at 1e-9, attitude right, no star wrong
     starcat: Share
     starcat_enough: Share
-    wrong: int
-    mean_ms: float
+    wrong: int  # frames that starcat itself would have accepted with a wrong attitude
+    mean_ms: float  # time of an identification
     median_ms: float
     p95_ms: float
 

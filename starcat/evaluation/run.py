@@ -27,18 +27,10 @@ from starcat.version import __version__
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What was measured, and where it is written down.
+    """What was measured, and where it is written down."""
 
-    Attributes
-    ----------
-    contents : tuple of dict
-        `Outcome.as_dict` of each paper or sweep.
-    page : Path
-        The report, ``index.html``; its tables and curves are beside it.
-    """
-
-    contents: tuple[dict[str, Any], ...]
-    page: Path
+    contents: tuple[dict[str, Any], ...]  # `Outcome.as_dict` of each paper or sweep
+    page: Path  # the report, ``index.html``; its tables and curves are beside it
 
 
 def prepare_artifacts(

@@ -28,41 +28,22 @@ NOISE_PX = 0.5
 
 @dataclass(frozen=True)
 class Sweep:
-    """What is to be tried.
+    """What is to be tried."""
 
-    Attributes
-    ----------
-    artifact : Path
-        The artifact's folder.
-    camera : Camera
-        What the matcher takes the camera to be; the true one differs where ``k1`` and
-        ``scale`` say so.
-    methods : tuple of str
-        Ways to identify.
-    limit_mag : float
-        Fainter stars are not seen.
-    values : mapping of str to tuple of float
-        Values of each quantity, by key of `AXES`. A single value holds for all trials; several
-        values are tried one after the other while the other quantities keep theirs.
-    frames : int
-        Frames of each trial.
-    tolerance_px : float, optional
-        Tolerance of the matcher; by default what the position noise asks for (`tolerance_for`).
-    seed : int
-        Seed of all that is random.
-    is_quick : bool
-        Whether few frames were asked for.
-    """
-
-    artifact: Path
+    artifact: Path  # the artifact's folder
+    # what the matcher takes the camera to be; the true one differs where ``k1`` and ``scale`` say
+    # so
     camera: Camera
-    methods: tuple[str, ...]
-    limit_mag: float
+    methods: tuple[str, ...]  # ways to identify
+    limit_mag: float  # fainter stars are not seen
+    # values of each quantity, by key of `AXES`. A single value holds for all trials; several
+    # values are tried one after the other while the other quantities keep theirs
     values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    frames: int = FRAMES
+    frames: int = FRAMES  # frames of each trial
+    # tolerance of the matcher; by default what the position noise asks for (`tolerance_for`)
     tolerance_px: float | None = None
-    seed: int = 1
-    is_quick: bool = False
+    seed: int = 1  # seed of all that is random
+    is_quick: bool = False  # whether few frames were asked for
 
 
 def sweep_values(**texts: str | None) -> dict[str, tuple[float, ...]]:

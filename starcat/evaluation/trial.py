@@ -47,80 +47,42 @@ MEASURED_ROOMS = ("geometry", "matcher", "simulation", "evaluation")
 
 @dataclass(frozen=True)
 class Attitudes:
-    """Where a trial looks.
+    """Where a trial looks."""
 
-    Attributes
-    ----------
-    kind : {"random", "grid", "stars"}
-        ``random``: uniform over all rotations. ``grid``: boresights in the middle of cells of
-        ``step_deg`` in right ascension and declination. ``stars``: boresights at guide stars
-        drawn at random.
-    count : int
-        Number of frames; 0 for the whole grid. Of a grid, so many are drawn, in order.
-    step_deg : float
-        Step of the grid.
-    roll_deg : float or None
-        Roll of ``grid`` and ``stars``; None draws it at random.
-    """
-
+    # "random", "grid", "stars": ``random``: uniform over all rotations. ``grid``: boresights in
+    # the middle of cells of ``step_deg`` in right ascension and declination. ``stars``:
+    # boresights at guide stars drawn at random
     kind: str = "random"
+    # number of frames; 0 for the whole grid. Of a grid, so many are drawn, in order
     count: int = 1000
-    step_deg: float = 2.0
-    roll_deg: float | None = None
+    step_deg: float = 2.0  # step of the grid
+    roll_deg: float | None = None  # roll of ``grid`` and ``stars``; None draws it at random
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Many frames of one kind, and how they are identified.
+    """Many frames of one kind, and how they are identified."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the file of results.
-    method : str
-        Name of the matcher's method.
-    attitudes : Attitudes
-        The attitudes of the camera.
-    noise : Noise
-        What the frames suffer.
-    camera : Camera, optional
-        The camera as it is; default: the database's.
-    assumed : Camera, optional
-        What the matcher is told; default: the same.
-    tolerance_px : float
-        Tolerance of the matcher.
-    max_false_match_probability : float
-        The least certain answer that is recorded; 1e-9 is what starcat itself accepts.
-    with_magnitudes : bool
-        Whether the matcher is given magnitudes.
-    answer : str
-        Key of `ANSWERS`: the matcher as it is, or a paper's method without verification.
-    selection : TriangleOrder
-        Order in which the matcher takes triangles.
-    guide_stars_only : bool
-        Whether nothing but guide stars shines.
-    min_share : float
-        Smallest share of the frame that an answer explains, as the matcher is told.
-    engine : {"numpy", "auto"}
-        ``numpy``, whose records are the same everywhere, or the C library where it is installed.
-    seed : int
-        Seed of all that is random. Each frame has its own, so that their number changes none.
-    """
-
-    name: str
-    method: str
-    attitudes: Attitudes = field(default_factory=Attitudes)
-    noise: Noise = field(default_factory=Noise)
-    camera: Camera | None = None
-    assumed: Camera | None = None
-    tolerance_px: float = 2.0
+    name: str  # name of the file of results
+    method: str  # name of the matcher's method
+    attitudes: Attitudes = field(default_factory=Attitudes)  # the attitudes of the camera
+    noise: Noise = field(default_factory=Noise)  # what the frames suffer
+    camera: Camera | None = None  # the camera as it is; default: the database's
+    assumed: Camera | None = None  # what the matcher is told; default: the same
+    tolerance_px: float = 2.0  # tolerance of the matcher
+    # the least certain answer that is recorded; 1e-9 is what starcat itself accepts
     max_false_match_probability: float = 1e-9
-    with_magnitudes: bool = True
+    with_magnitudes: bool = True  # whether the matcher is given magnitudes
+    # key of `ANSWERS`: the matcher as it is, or a paper's method without verification
     answer: str = "matcher"
+    # order in which the matcher takes triangles
     selection: TriangleOrder = field(default_factory=TriangleOrder)
-    guide_stars_only: bool = False
+    guide_stars_only: bool = False  # whether nothing but guide stars shines
+    # smallest share of the frame that an answer explains, as the matcher is told
     min_share: float = MIN_SHARE
+    # ``numpy``, whose records are the same everywhere, or the C library where it is installed
     engine: Literal["numpy", "auto"] = "numpy"
+    # seed of all that is random. Each frame has its own, so that their number changes none
     seed: int = 1
 
     @property

@@ -27,7 +27,7 @@ from starcat.errors import (
     StarcatError,
     TargetMissing,
 )
-from starcat.failures import DEFECT, failure_of, shown
+from starcat.failures import DEFECT, failure_of, shown, validation_message
 
 MEDIA_TYPE = "application/problem+json"
 
@@ -135,10 +135,9 @@ def add_problem_handlers(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     def refuse_parameters(request: Request, error: RequestValidationError) -> Response:
-        first: dict[str, Any] = dict(error.errors()[0])
-        key = ".".join(str(step) for step in first["loc"][1:])
-        where = f"{first['loc'][0]} {key}".strip()
-        detail = shown(f"{where}: {first['msg']}; /api/docs says what is expected", 500)
+        where, found = validation_message(error)
+        part, _, key = where.partition(".")
+        detail = shown(f"{part} {key}".strip() + f": {found}; /api/docs says what is expected", 500)
         problem = ProblemDetails(
             title="Unprocessable Content", status=422, detail=detail, code=2, key=key or None
         )

@@ -13,20 +13,11 @@ Line = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table of rates.
+    """A column of a table of rates."""
 
-    Attributes
-    ----------
-    head : str
-        Heading of the column.
-    cell : callable
-        Text of a row.
-    is_wanted : callable
-        Whether a group of rows has anything to say in it.
-    """
-
-    head: str
-    cell: Callable[[Line], str]
+    head: str  # heading of the column
+    cell: Callable[[Line], str]  # text of a row
+    # whether a group of rows has anything to say in it
     is_wanted: Callable[[Sequence[Line]], bool] = lambda lines: True
 
 

@@ -15,26 +15,12 @@ from starcat.evaluation.report.columns import LONG, Column, Line, marked_verdict
 
 @dataclass(frozen=True)
 class Table:
-    """A table of texts.
-
-    Attributes
-    ----------
-    title : str
-        Above it.
-    heads : tuple of str
-        Headings of the columns.
-    rows : tuple of tuple of str
-        Cells.
-    numbers : tuple of int
-        Columns that are aligned at the right.
-    notes : tuple of str
-        Below it.
-    """
+    """A table of texts."""
 
     title: str
-    heads: tuple[str, ...]
+    heads: tuple[str, ...]  # headings of the columns
     rows: tuple[tuple[str, ...], ...]
-    numbers: tuple[int, ...]
+    numbers: tuple[int, ...]  # columns that are aligned at the right
     notes: tuple[str, ...] = ()
 
 

@@ -16,7 +16,6 @@ from starcat.service.access import Reader
 from starcat.service.asking import Question, file_of, named_text, rows_of
 from starcat.service.problems import Problem
 from starcat.service.service import Service, TheService
-from starcat.service.targets import target_paths
 
 router = APIRouter(prefix="/sql", tags=["sql"])
 
@@ -146,8 +145,8 @@ async def ask(question: SqlQuestion, service: TheService, reader: Reader) -> Res
     """Ask a question about databases and catalogs in SQL; nothing is ever written."""
     asked = _checked(service, question)
     if question.format == "rows":
-        return await service.sessions.run(_rows, service, asked)
-    return await service.sessions.run(_file, service, asked, question.format)
+        return await service.query_pool.run(_rows, service, asked)
+    return await service.query_pool.run(_file, service, asked, question.format)
 
 
 @router.get("/queries", summary="Queries by name")
@@ -174,7 +173,7 @@ async def views(
     ],
 ) -> list[ViewFacts]:
     """Return the tables that a query about some targets sees."""
-    return await service.sessions.run(_views, service, target)
+    return await service.query_pool.run(_views, service, target)
 
 
 def _checked(service: Service, question: SqlQuestion) -> Question:
@@ -213,7 +212,7 @@ def _file(service: Service, asked: Question, form: str) -> Response:
 
 
 def _views(service: Service, targets: list[str]) -> list[ViewFacts]:
-    with service.sessions.session(target_paths(service, targets)) as session:
+    with service.query_pool.session([service.library.target(name) for name in targets]) as session:
         return [
             ViewFacts(
                 target=target.name,

@@ -131,7 +131,7 @@ async def console(
     problem: ProblemDetails | None = None
     if asked.query:
         try:
-            found = await service.sessions.run(_rows, service, database_id, asked)
+            found = await service.query_pool.run(_rows, service, database_id, asked)
             answer = cells_of(found)
         except TargetMissing:
             raise  # the page itself is not there
@@ -146,9 +146,9 @@ async def answer_file(
     service: TheService, _: Reader, database_id: str, asked: TheAsked, form: PageFormat = "csv"
 ) -> Response:
     """Give all rows of an answer as a file."""
-    database = service.shelf.database(database_id)
+    database = service.library.database(database_id)
     question = question_of(service, database.id, asked, service.settings.max_rows)
-    found = await service.sessions.run(file_of, service, question, form)
+    found = await service.query_pool.run(file_of, service, question, form)
     kind = FORMATS[form]
     headers = {
         "Content-Length": str(found.size),
@@ -180,7 +180,7 @@ def _rows(service: Service, database_id: str, asked: Asked) -> Rows:
 
 
 def _page(request: Request, service: Service, database_id: str, shown: _Shown) -> Response:
-    database = service.shelf.database(database_id)
+    database = service.library.database(database_id)
     asked, problem = shown.asked, shown.problem
     content = {
         "row": database_row(service, database),
@@ -203,7 +203,9 @@ def _page(request: Request, service: Service, database_id: str, shown: _Shown) -
         text=text,
         chosen=chosen,
         values=values_in(text, chosen, asked.values),
-        others=[(one.id, one.title) for one in service.shelf.databases() if one.id != database.id],
+        others=[
+            (one.id, one.title) for one in service.library.databases() if one.id != database.id
+        ],
         queries=list(gallery().values()),
         macros=sorted(macros(), key=lambda macro: (not macro.is_table, macro.name)),
         products=products_of(database.manifest),

@@ -15,7 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from starlette.exceptions import HTTPException
 
 from starcat.errors import StarcatError
-from starcat.failures import shown
+from starcat.failures import shown, validation_message
 from starcat.service.access import principal_of
 from starcat.service.pages.static_files import static_address
 from starcat.service.problems import Problem, ProblemDetails, problem_of, problem_response
@@ -137,9 +137,7 @@ class _PageRoute(APIRoute):
             except (StarcatError, Problem) as error:
                 return error_page(request, problem_of(error))
             except RequestValidationError as error:
-                first = error.errors()[0]
-                where = ".".join(str(step) for step in first["loc"])
-                problem = Problem(422, shown(f"{where}: {first['msg']}", 500))
+                problem = Problem(422, shown(": ".join(validation_message(error)), 500))
                 return error_page(request, problem_of(problem))
             except HTTPException as error:
                 problem = Problem(error.status_code, shown(str(error.detail), 500))

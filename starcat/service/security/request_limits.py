@@ -8,9 +8,9 @@ from urllib.parse import unquote_to_bytes
 
 from starlette.types import Receive, Scope, Send
 
-from starcat.service.guard.guard import Guard
-from starcat.service.guard.refusing import refuse
 from starcat.service.problems import Problem
+from starcat.service.security.guard import Guard
+from starcat.service.security.refusing import refuse
 
 MOST_HEADERS, MOST_HEADER_BYTES, MOST_TARGET_BYTES = 100, 32_768, 16_384
 

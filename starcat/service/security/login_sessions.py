@@ -10,8 +10,8 @@ import secrets
 import time
 from http.cookies import CookieError, SimpleCookie
 
-from starcat.service.guard.tokens import Token, digest_of, token_of
 from starcat.service.records import Records
+from starcat.service.security.tokens import Token, digest_of, token_of
 from starcat.service.settings import Settings
 
 

@@ -12,13 +12,13 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from starcat.service.access import Principal, Role
-from starcat.service.guard.buckets import Buckets
-from starcat.service.guard.guard import Guard
-from starcat.service.guard.identities import Identities
-from starcat.service.guard.refusing import address_of, later, refuse
-from starcat.service.guard.sessions import session_in
-from starcat.service.guard.tokens import Token
 from starcat.service.problems import Problem
+from starcat.service.security.buckets import Buckets
+from starcat.service.security.guard import Guard
+from starcat.service.security.identities import Identities
+from starcat.service.security.login_sessions import session_in
+from starcat.service.security.refusing import address_of, later, refuse
+from starcat.service.security.tokens import Token
 from starcat.service.settings import Settings
 
 VOSI = ("/tap/availability", "/tap/capabilities")

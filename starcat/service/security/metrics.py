@@ -10,9 +10,9 @@ from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from starcat.service.guard.bodies import GIB, free_gib
-from starcat.service.guard.guard import Guard
-from starcat.service.guard.sessions import SessionStore
+from starcat.service.security.bodies import GIB, free_gib
+from starcat.service.security.guard import Guard
+from starcat.service.security.login_sessions import SessionStore
 from starcat.service.service import Service
 from starcat.version import __version__
 
@@ -78,7 +78,7 @@ class _State(Collector):
             "starcat_sessions", "Sign-ins that have not expired.", self._sessions.count()
         )
         yield GaugeMetricFamily(
-            "starcat_databases", "Databases there are.", len(service.shelf.databases())
+            "starcat_databases", "Databases there are.", len(service.library.databases())
         )
         free = free_gib(service.settings.root) * GIB
         yield GaugeMetricFamily("starcat_disk_free_bytes", "Room that is left on the disk.", free)

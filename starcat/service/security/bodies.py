@@ -10,9 +10,9 @@ from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from starcat.service.guard.guard import Guard
-from starcat.service.guard.refusing import refuse
 from starcat.service.problems import Problem
+from starcat.service.security.guard import Guard
+from starcat.service.security.refusing import refuse
 from starcat.service.settings import Settings
 
 TEXT_MIB = 1.0

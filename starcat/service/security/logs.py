@@ -15,10 +15,10 @@ from typing import Any
 
 from starlette.types import Message, Receive, Scope, Send
 
-from starcat.service.guard.guard import Guard
-from starcat.service.guard.refusing import address_of
-from starcat.service.guard.request_id import request_id
 from starcat.service.problems import problem_of, problem_response
+from starcat.service.security.guard import Guard
+from starcat.service.security.refusing import address_of
+from starcat.service.security.request_id import request_id
 
 MOST = 500
 """Characters of a path that are written."""

@@ -10,7 +10,7 @@ HEAD_S = 15.0
 """Seconds in which the head of a request has to be there, and what is left of the one before."""
 
 
-class Patience(H11Protocol):
+class HeaderTimeout(H11Protocol):
     """The protocol of the server, with an end to its patience between requests.
 
     While a request is answered its handler decides how long that takes; `Bodies` sees to the time

@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 from collections import OrderedDict
 
-from starcat.service.guard.buckets import Buckets
-from starcat.service.guard.sessions import SessionStore
-from starcat.service.guard.tokens import Token, TokenStore, digest_of
+from starcat.service.security.buckets import Buckets
+from starcat.service.security.login_sessions import SessionStore
+from starcat.service.security.tokens import Token, TokenStore, digest_of
 from starcat.service.service import Service
 
 KNOWN_S = 5.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from starlette.datastructures import MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from starcat.service.guard.guard import Guard
+from starcat.service.security.guard import Guard
 from starcat.service.settings import Settings
 
 POLICY = (

@@ -11,7 +11,7 @@ from prometheus_client import CONTENT_TYPE_PLAIN_0_0_4
 from pydantic import BaseModel, Field
 
 from starcat.service.access import Reader
-from starcat.service.guard.bodies import free_gib
+from starcat.service.security.bodies import free_gib
 from starcat.service.service import Service, TheService
 
 router = APIRouter(tags=["operations"])

@@ -14,10 +14,10 @@ from urllib.parse import urlsplit
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from starcat.service.guard.guard import Guard
-from starcat.service.guard.refusing import refuse
-from starcat.service.guard.sessions import session_in
 from starcat.service.problems import Problem
+from starcat.service.security.guard import Guard
+from starcat.service.security.login_sessions import session_in
+from starcat.service.security.refusing import refuse
 from starcat.service.settings import Settings
 
 SAFE = ("GET", "HEAD", "OPTIONS")

@@ -14,7 +14,7 @@ JOB_ID = re.compile(r"[0-9a-f]{32}")
 
 
 @dataclass(frozen=True)
-class Places:
+class ServicePaths:
     """Files and folders of a service.
 
     Attributes

@@ -26,37 +26,17 @@ SAMPLE_ROWS = 8192
 
 
 @dataclass(frozen=True)
-class StarsRead:
-    """The catalogs of a spec, read: what every estimate with the same ones starts from.
+class CatalogSnapshot:
+    """The catalogs of a spec, read: what every estimate with the same ones starts from."""
 
-    Attributes
-    ----------
-    stars : pyarrow.Table
-        Star table (schema ``stars``) with motions and amplitudes joined, by star_id.
-    motions : pyarrow.Table, optional
-        Where the motions are from (schema ``motions``), a row a star.
-    rejected : dict of str to int
-        Records that reading rejected, by reason.
-    rejected_rows : int
-        Those of them that the product ``rejected`` lists.
-    rejected_bytes : float
-        Bytes that one of them takes in its file.
-    held_bytes : int
-        Memory that the tables of the catalog take.
-    records : int
-        Records in all files of the star catalog.
-    notes : tuple of str
-        What a user should know of the inputs.
-    """
-
-    stars: pa.Table
-    motions: pa.Table | None
-    rejected: Mapping[str, int]
-    rejected_rows: int
-    rejected_bytes: float
-    held_bytes: int
-    records: int
-    notes: tuple[str, ...]
+    stars: pa.Table  # star table (schema ``stars``) with motions and amplitudes joined, by star_id
+    motions: pa.Table | None  # where the motions are from (schema ``motions``), a row a star
+    rejected: Mapping[str, int]  # records that reading rejected, by reason
+    rejected_rows: int  # those of them that the product ``rejected`` lists
+    rejected_bytes: float  # bytes that one of them takes in its file
+    held_bytes: int  # memory that the tables of the catalog take
+    records: int  # records in all files of the star catalog
+    notes: tuple[str, ...]  # what a user should know of the inputs
 
     @cached_property
     def by_brightness(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -84,18 +64,18 @@ class StarsRead:
         return int(self.stars.nbytes + motions + 16 * len(self.stars))
 
 
-def read_stars(
+def read_snapshot(
     spec: BuildSpec,
     inputs: Inputs,
     workers: int = 2,
     progress: Progress = no_progress,
-) -> StarsRead:
+) -> CatalogSnapshot:
     """Read the catalogs of a spec, as its build does."""
     catalog, amplitudes = read_sources(spec, inputs, workers, progress)
     joined = join_motions(catalog, spec, inputs, workers, progress)
     stars, _ = join_all(joined.catalog.stars, amplitudes)
     catalog = joined.catalog
-    return StarsRead(
+    return CatalogSnapshot(
         stars.combine_chunks(),
         joined.table,
         catalog.rejected_by_reason,
@@ -107,7 +87,7 @@ def read_stars(
     )
 
 
-def what_is_read(spec: BuildSpec) -> dict[str, Any]:
+def reading_keys(spec: BuildSpec) -> dict[str, Any]:
     """Return all of a spec that reading its catalogs depends on."""
     content = spec.model_dump(mode="json")
     wanted = {

@@ -13,9 +13,9 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from starcat.service.guard.sessions import SessionStore
-from starcat.service.guard.tokens import DAY_S
 from starcat.service.jobs.job import ENDED
+from starcat.service.security.login_sessions import SessionStore
+from starcat.service.security.tokens import DAY_S
 from starcat.service.service import Service
 
 EVERY_S = 3600.0
@@ -42,11 +42,11 @@ class Removed:
 
 def remove_old(service: Service, now_s: float) -> Removed:
     """Remove what is older than the settings say."""
-    settings, places = service.settings, service.places
+    settings, paths = service.settings, service.paths
     removed = Removed(
         _remove_jobs(service, now_s - settings.keep_jobs_days * DAY_S),
-        _remove_entries(places.results, now_s - settings.keep_results_days * DAY_S),
-        _remove_entries(places.scratch, now_s - SCRATCH_DAYS * DAY_S),
+        _remove_entries(paths.results, now_s - settings.keep_results_days * DAY_S),
+        _remove_entries(paths.scratch, now_s - SCRATCH_DAYS * DAY_S),
         SessionStore(service.records, settings.session_hours).forget_expired(),
     )
     if removed != Removed(0, 0, 0, 0):
@@ -72,7 +72,7 @@ def _remove_jobs(service: Service, before_s: float) -> int:
             (*ENDED, before_s),
         ).fetchall()
     for row in rows:
-        shutil.rmtree(service.places.job(row["id"]), ignore_errors=True)
+        shutil.rmtree(service.paths.job(row["id"]), ignore_errors=True)
     return len(rows)
 
 
