@@ -17,10 +17,10 @@ from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import chord_from_separation, radec_from_directions, tangent_axes
 from starcat.geometry.zones import zones_of
+from starcat.pipeline.acceptance import advice_without_magnitudes, causes, check_rates
 from starcat.pipeline.build import Built, build
 from starcat.pipeline.cost import Cost, product_cost
-from starcat.pipeline.judgement import advice_without_magnitudes, causes, check_rates
-from starcat.pipeline.recipes import Ingredients, cook
+from starcat.pipeline.recipes import ProductInputs, make_product
 from starcat.pipeline.starter import STARS_A_FIELD, Starter, advice, starter_spec
 from starcat.products.boresights import stars_in_fields, tile_sphere
 from starcat.products.coverage import TilingGap
@@ -91,7 +91,7 @@ def test_init_thins_to_a_number_of_stars_a_field(fov_deg):
 @pytest.mark.parametrize("limit_mag", [5.0, 6.0])
 def test_rows_are_estimated(name: str, limit_mag: float, sky_of: Any) -> None:
     given = sky_of(limit_mag)
-    made = cook(name, given)
+    made = make_product(name, given)
     assert product_cost(given, 0.0).rows[name] == pytest.approx(len(made.table), rel=0.1)
 
 
@@ -103,13 +103,13 @@ def sky_of() -> Any:
 
     stars = ingest("gaia", locate("gaia", {})).stars
 
-    def make(limit_mag: float) -> Ingredients:
+    def make(limit_mag: float) -> ProductInputs:
         spec = preset(
             "gaia-12deg",
             {"selection.faint_limit_mag": str(limit_mag), "boresights.count": "2000"},
         )
         selected, fields = select_stars(stars, spec)
-        return Ingredients(directions_of(selected.guide_stars), fields, spec)
+        return ProductInputs(directions_of(selected.guide_stars), fields, spec)
 
     return make
 

@@ -20,7 +20,7 @@ from starcat.catalog.stars import directions_of, floats_of
 from starcat.errors import BuildError
 from starcat.pipeline.counts import Extent, LevelExtent, count_levels, count_products
 from starcat.pipeline.log import available_memory_bytes
-from starcat.pipeline.recipes import Ingredients, boresight_product
+from starcat.pipeline.recipes import ProductInputs, boresight_product
 from starcat.pipeline.sizes import (
     counterparts_bytes,
     database_bytes,
@@ -104,7 +104,7 @@ class Cost:
 
 
 @dataclass(frozen=True)
-class Made:
+class EstimateInputs:
     """What is there when a build is estimated: some products, and guide stars for the others."""
 
     guide_stars: pa.Table  # as the schema ``stars`` has them
@@ -115,9 +115,9 @@ class Made:
     base_bytes: float = 0.0  # memory that is taken already
 
     @property
-    def ingredients(self) -> Ingredients:
+    def inputs(self) -> ProductInputs:
         """What products are made from."""
-        return Ingredients(directions_of(self.guide_stars), self.fields, self.spec)
+        return ProductInputs(directions_of(self.guide_stars), self.fields, self.spec)
 
 
 def estimate_cost(
@@ -130,7 +130,7 @@ def estimate_cost(
     """Estimate what the products of a build will cost."""
     rejected = pa.concat_tables([catalog.rejected, selected.rejected])
     base = base_memory(catalog.stars.nbytes + catalog.rejected.nbytes)
-    made = Made(
+    made = EstimateInputs(
         selected.guide_stars, fields, spec, table_bytes(rejected), others=others, base_bytes=base
     )
     return whole_cost(made)
@@ -141,13 +141,13 @@ def base_memory(catalog_bytes: float) -> float:
     return BASE_BYTES + CATALOG_FACTOR * catalog_bytes
 
 
-def whole_cost(made: Made) -> Cost:
+def whole_cost(made: EstimateInputs) -> Cost:
     """Estimate what a build will cost, its files included."""
     spec, stars = made.spec, made.guide_stars
-    extents, levels = count_products(made.ingredients), None
+    extents, levels = count_products(made.inputs), None
     if spec.products.levels.enabled:
         levels = count_levels(directions_of(stars), floats_of(stars, "mag"), spec)
-    cost = _cost(made.ingredients, extents, levels, made.base_bytes)
+    cost = _cost(made.inputs, extents, levels, made.base_bytes)
     boresights = boresight_product(made.fields, spec.boresights.brightest).table
     longest = pc.max(pc.binary_length(stars["designation"])).as_py() or 1
     listed = pc.sum(pc.list_value_length(boresights["brightest"])).as_py() or 0
@@ -167,19 +167,19 @@ def whole_cost(made: Made) -> Cost:
     return replace(cost, rows=rows, files=files)
 
 
-def product_cost(given: Ingredients, base_bytes: float) -> Cost:
+def product_cost(inputs: ProductInputs, base_bytes: float) -> Cost:
     """Estimate what products that are made from guide stars alone will cost."""
-    return _cost(given, count_products(given), None, base_bytes)
+    return _cost(inputs, count_products(inputs), None, base_bytes)
 
 
 def _cost(
-    given: Ingredients,
+    inputs: ProductInputs,
     extents: Mapping[str, Extent],
     levels: LevelExtent | None,
     base_bytes: float,
 ) -> Cost:
     """Return what products of known size cost in memory and time."""
-    spec, fields = given.spec, given.fields
+    spec, fields = inputs.spec, inputs.fields
     rows = {name: extent.rows for name, extent in extents.items()}
     work = {name: extent.reached for name, extent in extents.items()}
     records = sum(extent.records for extent in extents.values())
@@ -199,7 +199,7 @@ def _cost(
     seconds += BASE_SECONDS + 3.0 * FRAME_SECONDS * spec.self_test.frames
     saved = {name: held[name] + work[name] * ROWS[name].working_bytes for name in work}
     return Cost(
-        len(given.directions),
+        len(inputs.directions),
         len(fields.count),
         {name: round(count) for name, count in rows.items()},
         {name: round(count) for name, count in saved.items()},
