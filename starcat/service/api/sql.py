@@ -9,23 +9,17 @@ from fastapi import APIRouter, Query
 from fastapi.responses import JSONResponse, Response, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
+from starcat.exchange.formats import FILE_FORMATS, FORMATS, FileFormat
 from starcat.query.gallery import gallery
 from starcat.query.macros import macros
 from starcat.service.access import Reader
 from starcat.service.asking import Question, file_of, named_text, rows_of
-from starcat.service.file_answers import type_of
 from starcat.service.problems import Problem
 from starcat.service.service import Service, TheService
 
 router = APIRouter(prefix="/sql", tags=["sql"])
 
-Form = Literal["rows", "csv", "json", "parquet", "votable", "fits", "ecsv", "npz"]
-
-SUFFIXES = {"votable": ".vot"}
-"""Suffixes of files that are not the name of the format."""
-
-OTHERS = (".csv", ".parquet", ".vot", ".fits", ".ecsv", ".npz")
-"""Suffixes of all but JSON."""
+Form = Literal["rows", FileFormat]
 
 MAX_SHOWN = 100_000
 """Rows of an answer that is no file."""
@@ -139,7 +133,11 @@ class ViewFacts(BaseModel):
         200: {
             "description": "Rows, or a file; ``X-Starcat-Rows`` says how many rows it has, and "
             "``X-Starcat-Cut`` whether there are more.",
-            "content": {type_of(f"answer{suffix}").partition(";")[0]: {} for suffix in OTHERS},
+            "content": {
+                FORMATS[name].media_type.partition(";")[0]: {}
+                for name in FILE_FORMATS
+                if name != "json"
+            },
         }
     },
 )
@@ -203,14 +201,14 @@ def _rows(service: Service, asked: Question) -> Response:
 
 def _file(service: Service, asked: Question, form: str) -> Response:
     found = file_of(service, asked, form)
-    name = "answer" + SUFFIXES.get(form, f".{form}")
+    kind = FORMATS[form]
     headers = {
         "Content-Length": str(found.size),
-        "Content-Disposition": f'attachment; filename="{name}"',
+        "Content-Disposition": f'attachment; filename="answer{kind.suffix}"',
         "X-Starcat-Rows": str(found.rows),
         "X-Starcat-Cut": str(found.is_cut).lower(),
     }
-    return StreamingResponse(found.chunks, media_type=type_of(name), headers=headers)
+    return StreamingResponse(found.chunks, media_type=kind.media_type, headers=headers)
 
 
 def _views(service: Service, targets: list[str]) -> list[ViewFacts]:

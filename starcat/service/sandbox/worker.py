@@ -24,7 +24,7 @@ def convert(source: str, target: str, form: str) -> int:
     """Write a table to a file of another format: some are held in memory as a whole."""
     import pyarrow as pa
 
-    from starcat.exchange.formats import write_batches
+    from starcat.exchange.writers import write_batches
 
     with pa.OSFile(source) as file, pa.ipc.open_stream(file) as stream:
         return write_batches(stream, Path(target), form)
