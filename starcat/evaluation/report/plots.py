@@ -9,8 +9,7 @@ from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
-from starcat.evaluation.report.columns import Line, method_of
-from starcat.evaluation.report.tables import groups_of
+from starcat.evaluation.report.tables import Line, groups_of, method_of
 from starcat.report.plots import headline, own_style
 
 if TYPE_CHECKING:
