@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from starcat.errors import QueryError
-from starcat.query.columns import Facts
 from starcat.query.engine import Engine
 from starcat.query.macros import macros
 from starcat.query.names import quoted, short_names
 from starcat.query.places import place_macros, place_statements, places_schema, reading
+from starcat.query.result import Facts
 from starcat.query.targets import Target, View, open_targets
 
 PREAMBLE_GB = 1.0

@@ -17,13 +17,12 @@ from typing import Any
 
 from starcat.errors import ProductError, QueryError
 from starcat.progress import Progress, no_progress
-from starcat.query.columns import column_facts, facts_by_name
 from starcat.query.engine import Allowance, Engine, WorkerEnded
 from starcat.query.macros import macros
 from starcat.query.messages import Statement, Views
 from starcat.query.names import quoted
 from starcat.query.preamble import preamble, schemas_of
-from starcat.query.running_query import RunningQuery
+from starcat.query.result import RunningQuery, column_facts, facts_by_name
 from starcat.query.targets import Target, View, open_targets
 
 MAX_COLUMNS = 100_000

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from starcat.query.columns import column_facts
+from starcat.query.result import column_facts
 
 
 @dataclass(frozen=True)
