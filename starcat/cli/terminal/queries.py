@@ -95,7 +95,7 @@ def _row_count(session: Session, view: str) -> int:
 
 def print_macros(*, as_json: bool) -> None:
     """Print the macros, each with an example."""
-    from starcat.query.macros import macros
+    from starcat.query.gallery import macros
 
     listed = sorted((m for m in macros()), key=lambda m: (m.is_table, m.name))
     if as_json:

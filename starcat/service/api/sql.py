@@ -10,8 +10,7 @@ from fastapi.responses import JSONResponse, Response, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from starcat.exchange.formats import FILE_FORMATS, FORMATS, FileFormat
-from starcat.query.gallery import gallery
-from starcat.query.macros import macros
+from starcat.query.gallery import gallery, macros
 from starcat.service.access import Reader
 from starcat.service.problems import Problem
 from starcat.service.service import Service, TheService

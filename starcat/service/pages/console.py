@@ -13,8 +13,7 @@ from starlette.concurrency import run_in_threadpool
 
 from starcat.errors import QueryError, StarcatError, TargetMissing
 from starcat.exchange.formats import FORMATS, PAGE_FORMATS, PageFormat
-from starcat.query.gallery import NamedQuery, gallery, guessed, named_query
-from starcat.query.macros import macros
+from starcat.query.gallery import NamedQuery, gallery, guessed, macros, named_query
 from starcat.query.result import ResultTable
 from starcat.service.access import Reader
 from starcat.service.pages.facts import database_row, products_of

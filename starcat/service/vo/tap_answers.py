@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 from starcat.exchange.columns import Label
 from starcat.exchange.formats import Format
 from starcat.exchange.writers import result_chunks
+from starcat.service.answer_files import file_of_rows, keep_rows
 from starcat.service.paths import ServicePaths
 from starcat.service.sandbox.sandbox import Sandbox
-from starcat.service.sql import file_of_rows, keep_rows
 from starcat.service.uploading import scratch_folder
 
 if TYPE_CHECKING:
