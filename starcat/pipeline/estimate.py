@@ -23,7 +23,7 @@ from starcat.errors import BuildError
 from starcat.geometry.sphere import saff_kuijlaars
 from starcat.pipeline.build import Inputs
 from starcat.pipeline.catalog_snapshot import SAMPLE_ROWS, CatalogSnapshot, read_snapshot
-from starcat.pipeline.cost import Cost, EstimateInputs, base_memory, check_memory, whole_cost
+from starcat.pipeline.cost import Cost, base_memory, check_memory, table_bytes, whole_cost
 from starcat.pipeline.guide_stars import (
     MIN_GUIDE_STARS,
     MOST_FIELD_STARS,
@@ -33,7 +33,6 @@ from starcat.pipeline.guide_stars import (
 )
 from starcat.pipeline.motions import motions_of
 from starcat.pipeline.recipes import field_size, tile_guide_stars
-from starcat.pipeline.sizes import table_bytes
 from starcat.products.boresights import FieldStars
 from starcat.products.coverage import (
     CoverageSummary,
@@ -157,15 +156,14 @@ def estimate(
 ) -> Estimate:
     """Estimate what a spec will give."""
     guide_stars, fields = choice.selected.guide_stars, choice.fields
-    made = EstimateInputs(
+    cost = whole_cost(
         guide_stars,
         fields,
         spec,
         _rejected_bytes(read, choice, spec),
-        _motion_product(read, guide_stars),
         base_memory(read.held_bytes),
+        _motion_product(read, guide_stars),
     )
-    cost = whole_cost(made)
     refusals = []
     for check in (
         partial(check_fields, fields, spec),
