@@ -120,6 +120,6 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         service.queue.close()
         service.tap.close()
         service.catalogs.close()
-        service.sessions.close()
-        service.confined.close()
+        service.query_pool.close()
+        service.sandbox.close()
         service.records.close()

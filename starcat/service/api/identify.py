@@ -23,7 +23,6 @@ from starcat.service.access import Reader
 from starcat.service.file_answers import type_of
 from starcat.service.problems import MEDIA_TYPE, Problem, ProblemDetails
 from starcat.service.service import Service, TheService
-from starcat.service.targets import database_of
 from starcat.service.uploading import safe_name, scratch_folder
 
 UNKNOWN_TYPE: dict[int | str, dict[str, Any]] = {
@@ -133,7 +132,7 @@ async def identify(
 ) -> Identified:
     """Identify the stars of frames and find the camera's attitude."""
     async with _sent(request, service.settings.upload_mib) as (frames, options):
-        found, _ = await service.confined.run(_identify, service, database, frames, options, None)
+        found, _ = await service.sandbox.run(_identify, service, database, frames, options, None)
     return Identified.model_validate(found)
 
 
@@ -158,7 +157,7 @@ async def picture(
 ) -> Response:
     """Return the first frame as a picture with its stars named, or as it is where none is."""
     async with _sent(request, service.settings.upload_mib) as (frames, options):
-        _, drawn = await service.confined.run(_identify, service, database, frames, options, kind)
+        _, drawn = await service.sandbox.run(_identify, service, database, frames, options, kind)
     return Response(drawn, media_type=type_of(f"picture.{kind}"))
 
 
@@ -231,7 +230,7 @@ def _identify(
     options: IdentifyOptions,
     kind: Kind | None,
 ) -> tuple[dict[str, Any], bytes]:
-    return identify_upload(service, database_of(service, database).folder, frames, options, kind)
+    return identify_upload(service, service.library.find(database).folder, frames, options, kind)
 
 
 def identify_upload(
@@ -241,7 +240,7 @@ def identify_upload(
     options: IdentifyOptions,
     kind: Kind | None,
 ) -> tuple[dict[str, Any], bytes]:
-    """Identify frames in a confined process; return the answers and the picture of the first."""
+    """Identify frames in the sandbox; return the answers and the picture of the first."""
     with scratch_folder(service.paths) as folder:
         with (folder / frames.name).open("wb") as file:
             shutil.copyfileobj(frames.content, file)
@@ -252,6 +251,6 @@ def identify_upload(
             "options": options.model_dump(),
             "picture": kind,
         }
-        found = service.confined.call("identify", arguments)
+        found = service.sandbox.call("identify", arguments)
         drawn = folder / f"picture.{kind}"
         return found, drawn.read_bytes() if drawn.is_file() else b""

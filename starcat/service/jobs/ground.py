@@ -7,10 +7,10 @@ from typing import Protocol
 
 from starcat.service.jobs.job import JobStore
 from starcat.service.jobs.queue import JobQueue, open_queue
+from starcat.service.library import Library
 from starcat.service.paths import ServicePaths
 from starcat.service.records import Records
 from starcat.service.settings import Settings
-from starcat.service.shelf import Shelf
 
 
 class Ground(Protocol):
@@ -29,7 +29,7 @@ class Ground(Protocol):
         """What is remembered."""
 
     @property
-    def shelf(self) -> Shelf:
+    def library(self) -> Library:
         """The databases there are."""
 
     @property
@@ -48,7 +48,7 @@ class WorkerGround:
     settings: Settings
     paths: ServicePaths
     records: Records
-    shelf: Shelf
+    library: Library
     jobs: JobStore
     queue: JobQueue
 
@@ -59,4 +59,4 @@ def open_ground(settings: Settings) -> WorkerGround:
     paths.make()
     records = Records(paths.records)
     queue = open_queue(settings, paths)
-    return WorkerGround(settings, paths, records, Shelf(paths), JobStore(records), queue)
+    return WorkerGround(settings, paths, records, Library(paths), JobStore(records), queue)

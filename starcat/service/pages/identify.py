@@ -19,12 +19,12 @@ from starcat.images.solve_files import IdentifyOptions
 from starcat.matcher.methods.table import METHODS
 from starcat.service.access import Reader
 from starcat.service.api.identify import MIB, SUFFIXES, FrameUpload, identify_upload
+from starcat.service.library import Database
 from starcat.service.pages.centroid_text import centroid_file
 from starcat.service.pages.rendering import page_router, render
 from starcat.service.pages.simulated import camera_of, frame_suffix, write_frame
 from starcat.service.problems import Problem, problem_of
 from starcat.service.service import Service, TheService
-from starcat.service.shelf import Database
 from starcat.service.uploading import scratch_folder
 
 router = page_router()
@@ -54,7 +54,7 @@ async def identify(request: Request, service: TheService, _: Reader) -> Response
     async with request.form(max_files=1, max_fields=20) as form:
         given = {name: str(form.get(name) or "")[:MIB] for name in FIELDS}
         try:
-            answer = await service.confined.run(_answer, service, form, given)
+            answer = await service.sandbox.run(_answer, service, form, given)
         except (StarcatError, Problem) as error:
             answer = {"problem": problem_of(error)}
     return await run_in_threadpool(_page, request, service, given, **answer)
@@ -62,7 +62,7 @@ async def identify(request: Request, service: TheService, _: Reader) -> Response
 
 def _answer(service: Service, form: FormData, given: dict[str, str]) -> dict[str, Any]:
     """Return what the page shows of an answer."""
-    database = service.shelf.database(given["database"])
+    database = service.library.database(given["database"])
     frame, options = frame_of(form, given, database, service), options_of(given, service)
     found, picture = identify_upload(service, database.folder, frame, options, "png")
     first = found["frames"][0]
@@ -82,16 +82,16 @@ async def simulated_frame(
     seed: Annotated[int, Query(ge=0, le=MAX_SEED)] = 0,
 ) -> Response:
     """Give a simulated frame of a database's camera, to try things with."""
-    database = service.shelf.database(database_id)
+    database = service.library.database(database_id)
     name = f"{database.title}-{seed}{frame_suffix(database)}"
-    content = await service.confined.run(_simulated, service, database, name, seed)
+    content = await service.sandbox.run(_simulated, service, database, name, seed)
     kind = "image/png" if name.endswith(".png") else "text/csv; charset=utf-8"
     headers = {"Content-Disposition": f'attachment; filename="{name}"'}
     return Response(content, media_type=kind, headers=headers)
 
 
 def _page(request: Request, service: Service, given: dict[str, str], **answer: Any) -> Response:
-    databases = service.shelf.databases()
+    databases = service.library.databases()
     problem = answer.get("problem")
     nothing = dict.fromkeys(("found", "picture", "problem", "errors", "field_deg"))
     return render(

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from starcat.exchange.label import Label
+from starcat.exchange.columns import Label
+from starcat.exchange.formats import Format
+from starcat.exchange.writers import result_chunks
 from starcat.service.answer_files import file_of_rows, keep_rows
-from starcat.service.confined import Confined
 from starcat.service.paths import ServicePaths
+from starcat.service.sandbox.sandbox import Sandbox
 from starcat.service.uploading import scratch_folder
-from starcat.vo.formats import Format
-from starcat.vo.results import result_chunks
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -22,9 +22,9 @@ _LABEL = Label("result")
 class Answers:
     """What makes bytes of answers."""
 
-    def __init__(self, paths: ServicePaths, confined: Confined) -> None:
+    def __init__(self, paths: ServicePaths, sandbox: Sandbox) -> None:
         self._paths = paths
-        self._confined = confined
+        self._sandbox = sandbox
 
     def chunks(self, batches: pa.RecordBatchReader, form: Format, max_rows: int) -> Iterator[bytes]:
         """Yield an answer in a format."""
@@ -39,5 +39,5 @@ class Answers:
         with scratch_folder(self._paths) as folder:
             rows = folder / "rows.arrow"
             keep_rows(batches, rows, max_rows)
-            chunks, _ = file_of_rows(self._confined, rows, folder / "answer.fits", "fits")
+            chunks, _ = file_of_rows(self._sandbox, rows, folder / "answer.fits", "fits")
         yield from chunks
