@@ -141,7 +141,6 @@ def starter_spec(
 
 
 def _is_quick(mag: NDArray[np.float64], limit: float, spec: BuildSpec, most: int) -> bool:
-    """Return whether what a limit leaves is counted in a moment."""
     if spec.boresights.count > MOST_BORESIGHTS:
         return False
     try:
