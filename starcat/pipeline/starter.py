@@ -30,8 +30,8 @@ from starcat.products.boresights import tile_sphere
 from starcat.products.coverage import Spread, field_coverage, summarise_coverage
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import BuildSpec, CameraSpec
+from starcat.specs.keys import spec_toml
 from starcat.specs.reading import spec_from_dict
-from starcat.specs.spec_toml import spec_toml
 from starcat.storage.atomic import whole_file
 
 SOURCE, BAND = "gaia", "G"

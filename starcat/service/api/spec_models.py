@@ -10,8 +10,8 @@ from starcat.pipeline.estimate import Estimate
 from starcat.pipeline.starter import Starter, advice
 from starcat.products.coverage import Spread
 from starcat.specs.build_spec import BuildSpec, CameraSpec
+from starcat.specs.keys import spec_toml
 from starcat.specs.reading import preset
-from starcat.specs.spec_toml import spec_toml
 
 
 class CheckedSpec(BaseModel):

@@ -15,9 +15,8 @@ from typing import Any
 from starcat.catalog.source import data_source, source_names
 from starcat.errors import ConfigError, StarcatError
 from starcat.specs.build_spec import BuildSpec
-from starcat.specs.keys import REQUIRED, SpecKey, spec_sections
+from starcat.specs.keys import REQUIRED, SpecKey, spec_sections, toml_value
 from starcat.specs.reading import content_of_toml, spec_from_dict
-from starcat.specs.spec_toml import toml_value
 
 ORIGIN = "spec"
 """What messages call the text."""
