@@ -13,12 +13,19 @@ from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.errors import TargetMissing
 from starcat.releases.tree import Blob
 from starcat.service.access import Publisher, Reader
-from starcat.service.archive import archive_bytes, archive_chunks
-from starcat.service.file_answers import FILE, REVALIDATED, file_answer, has_already, type_of
 from starcat.service.library import Database
 from starcat.service.problems import Problem
 from starcat.service.removal import remove_database
 from starcat.service.service import Service, TheService
+from starcat.service.transfers import (
+    FILE,
+    REVALIDATED,
+    archive_bytes,
+    archive_chunks,
+    file_answer,
+    has_already,
+    type_of,
+)
 
 router = APIRouter(prefix="/databases", tags=["databases"])
 

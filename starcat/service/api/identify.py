@@ -19,11 +19,10 @@ from starlette.datastructures import FormData, UploadFile
 
 from starcat.images.identification import IMAGE_SUFFIXES
 from starcat.service.access import Reader
-from starcat.service.file_answers import type_of
 from starcat.service.identifying import CAMERA_NAME, IdentifyOptions
 from starcat.service.problems import MEDIA_TYPE, Problem, ProblemDetails
 from starcat.service.service import Service, TheService
-from starcat.service.uploading import safe_name, scratch_folder
+from starcat.service.transfers import safe_name, scratch_folder, type_of
 
 UNKNOWN_TYPE: dict[int | str, dict[str, Any]] = {
     415: {
