@@ -9,13 +9,12 @@ from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from starcat.exchange.formats import FILE_FORMATS, FORMATS, FileFormat
-from starcat.query.gallery import gallery
-from starcat.query.macros import macros
+from starcat.query.gallery import gallery, macros
 from starcat.query.targets import View
 from starcat.service.access import Reader
 from starcat.service.problems import Problem
 from starcat.service.service import Service, TheService
-from starcat.service.sql import SqlQuery, named_text, query_file, query_rows
+from starcat.service.sql import SqlQuery, named_text, result_file, result_table
 
 router = APIRouter(prefix="/sql", tags=["sql"])
 
@@ -195,13 +194,12 @@ def _checked(service: Service, question: SqlQuestion) -> SqlQuery:
 
 
 def _rows(service: Service, query: SqlQuery) -> Response:
-    found = query_rows(service, query)
     # What JSON has was made sure of: a model would check every value once more.
-    return JSONResponse({"columns": found.columns, "rows": found.rows, "is_cut": found.is_cut})
+    return JSONResponse(result_table(service, query).as_json())
 
 
 def _file(service: Service, query: SqlQuery, form: str) -> Response:
-    found = query_file(service, query, form)
+    found = result_file(service, query, form)
     counts = {"X-Starcat-Rows": str(found.rows), "X-Starcat-Cut": str(found.is_cut).lower()}
     return found.response("answer", counts)
 

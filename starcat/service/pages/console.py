@@ -13,14 +13,14 @@ from starlette.concurrency import run_in_threadpool
 
 from starcat.errors import QueryError, StarcatError, TargetMissing
 from starcat.exchange.formats import FORMATS, PAGE_FORMATS, PageFormat
-from starcat.query.gallery import NamedQuery, gallery, guessed, named_query
-from starcat.query.macros import macros
+from starcat.query.gallery import NamedQuery, gallery, guessed, macros, named_query
+from starcat.query.result import ResultTable
 from starcat.service.access import Reader
 from starcat.service.pages.facts import database_row, products_of
 from starcat.service.pages.rendering import page_router, render
 from starcat.service.problems import Problem, ProblemDetails, problem_of
 from starcat.service.service import Service, TheService
-from starcat.service.sql import ResultRows, SqlQuery, query_file, query_rows
+from starcat.service.sql import SqlQuery, result_file, result_table
 
 router = page_router()
 
@@ -79,7 +79,7 @@ async def console(
     part: Annotated[Literal["", "answer"], Query()] = "",
 ) -> Response:
     """Show the console with the answer to its query; the script wants the answer alone."""
-    answer: ResultRows | None = None
+    answer: ResultTable | None = None
     problem: ProblemDetails | None = None
     if form.query:
         try:
@@ -101,13 +101,14 @@ async def answer_file(
     """Give all rows of an answer as a file."""
     database = service.library.database(database_id)
     query = _checked(service, database.id, asked, service.settings.max_rows)
-    found = await service.query_pool.run(query_file, service, query, form)
+    found = await service.query_pool.run(result_file, service, query, form)
     return found.response(database.title, {})
 
 
-def _rows(service: Service, database_id: str, form: ConsoleForm) -> ResultRows:
+def _rows(service: Service, database_id: str, form: ConsoleForm) -> ResultTable:
     most = min(form.rows, service.settings.max_rows)
-    return query_rows(service, _checked(service, database_id, form, most))
+    found = result_table(service, _checked(service, database_id, form, most))
+    return found.with_json_values()
 
 
 def _checked(service: Service, database_id: str, form: ConsoleForm, most: int) -> SqlQuery:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable
 from datetime import UTC, datetime
 from typing import Any
 from urllib.parse import quote
@@ -13,13 +11,10 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from starlette.exceptions import HTTPException
 
-from starcat.query.answer import cell_text
 from starcat.service.access import principal_of
 from starcat.service.pages.static_files import static_address
 from starcat.service.problems import Problem, RenderingRoute, as_json, problem_of
 from starcat.version import __version__
-
-_NUMERIC = re.compile(r"[UH]*(TINY|SMALL|BIG|HUGE)?INT|DOUBLE|FLOAT|DECIMAL")
 
 NAVIGATION = (
     ("/new", "New database"),
@@ -91,11 +86,6 @@ def moment_text(value: float) -> str:
     return f"{datetime.fromtimestamp(value, UTC):%Y-%m-%dT%H:%M:%SZ}"
 
 
-def is_numeric(kind: str) -> bool:
-    """Return whether a type of DuckDB is that of numbers."""
-    return bool(_NUMERIC.match(kind)) and "[" not in kind
-
-
 def _environment() -> Environment:
     environment = Environment(
         loader=PackageLoader("starcat.service.pages"),
@@ -104,16 +94,13 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    filters: dict[str, Callable[..., object]] = {
+    environment.filters |= {
         "count": count_text,
         "size": size_text,
         "duration": duration_text,
         "time": time_text,
         "moment": moment_text,
-        "cell": cell_text,
-        "is_numeric": is_numeric,
     }
-    environment.filters |= filters
     environment.globals |= {
         "static": static_address,
         "navigation": NAVIGATION,
