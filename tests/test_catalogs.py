@@ -18,7 +18,7 @@ from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.archives.sao import PRINTED_PM_DEC_ARCSEC_YR, icrs_from_fk5
 from starcat.catalog.ingest import Ingested, ingest
 from starcat.catalog.proper_motion import Motion, propagate
-from starcat.catalog.quality import Quality
+from starcat.catalog.verdict import Quality
 from starcat.catalog.source import data_source
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.errors import BuildError, ConfigError, ParseError, SourceMissing

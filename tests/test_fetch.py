@@ -24,8 +24,8 @@ from typing import Any
 import pytest
 
 import starcat
-from starcat.catalog.fetching.arrival import LOCK_NAME, read_lock
-from starcat.catalog.fetching.fetch import FetchReport, cache_folder, fetch_source
+from starcat.catalog.integrity import LOCK_NAME, read_lock
+from starcat.catalog.fetch import FetchReport, cache_folder, fetch_source
 from starcat.catalog.source import DataSource
 from starcat.errors import (
     ChecksumMismatch,
@@ -425,7 +425,7 @@ def test_killed_download_is_resumed(archive: Archive, tmp_path: Path) -> None:
     url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], stall=stall)
     program = (
         "import sys; from pathlib import Path\n"
-        "from starcat.catalog.fetching.fetch import fetch_source\n"
+        "from starcat.catalog.fetch import fetch_source\n"
         "from starcat.catalog.source import DataSource\n"
         "source = DataSource.model_validate_json(sys.argv[1])\n"
         "fetch_source(source, Path(sys.argv[2]), timeout_s=20)\n"

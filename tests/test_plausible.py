@@ -15,7 +15,7 @@ import pytest
 from starcat.catalog.ingest import Ingested, ingest
 from starcat.catalog.plausible import PLAUSIBLE, without_impossible
 from starcat.catalog.source import Column, data_source
-from starcat.catalog.star_files import write_star_tables
+from starcat.catalog.ingest import write_star_tables
 from starcat.catalog.stars import StarBlock
 from starcat.catalog.verdict import Verdicts
 
