@@ -1,0 +1,136 @@
+"""Tycho-2 (I/259): what the records of ``tyc2`` and ``suppl_1`` mean.
+
+``tyc2`` has mean positions at J2000; records marked X have only the observed position, at
+its own epoch near 1991.5. ``suppl_1`` has the brightest stars (Sirius, Vega, Arcturus …), at
+J1991.25; where its mflag is H, the VT column holds a Hipparcos Hp magnitude.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from starcat.arrays import Array, Mask
+from starcat.catalog.photometry import johnson_v
+from starcat.catalog.readers.records import Records
+from starcat.catalog.stars import Columns, join_flags
+from starcat.catalog.verdict import Quality, Verdicts, quality_flags
+
+COLUMNS = {
+    "tyc2": (
+        "tyc1", "tyc2", "tyc3", "pflag", "ra_mean_deg", "de_mean_deg", "pm_ra", "pm_de", "bt_mag",
+        "vt_mag", "prox", "hip", "ccdm", "ra_deg", "de_deg", "ep_ra_1990", "ep_de_1990", "posflg",
+    ),
+    "suppl_1": (
+        "tyc1", "tyc2", "tyc3", "flag", "ra_deg", "de_deg", "pm_ra", "pm_de", "mflag", "bt_mag",
+        "vt_mag", "prox", "hip", "ccdm",
+    ),
+}  # fmt: skip
+
+PROX_BEYOND = 999
+"""Value of ``prox`` for "no other star within 99.9 arcsec"; the unit is 0.1 arcsec."""
+
+_NUMBER_TEXTS = pa.array([str(number) for number in range(100_000)])
+"""Texts of all numbers that TYC2 and TYC3 can be, as looking up is faster than formatting."""
+
+_REGION_TEXTS = pc.binary_join_element_wise("TYC", _NUMBER_TEXTS[:10_000], " ")
+"""Texts of all numbers that TYC1 can be, with the name of the catalog before them."""
+
+
+def magnitudes(records: Records, band: str) -> Array:
+    """Return the magnitudes of Tycho-2 records."""
+    return _magnitudes(records, band)[0]
+
+
+def stars(records: Records, band: str, _: Verdicts) -> Columns:
+    """Return the star-table columns of Tycho-2 records."""
+    place = _place_tyc2(records) if records.layout == "tyc2" else _place_suppl(records)
+    number, designation = tycho_identity(records)
+    in_ccdm = ~records.is_blank("ccdm")
+    prox = records["prox"]
+    photocentre = place.pop("is_photocentre")
+    flag_parts = place.pop("double_flags")
+    mag, bits = _magnitudes(records, band)
+    bits[Quality.PHOTOCENTRE] = photocentre
+    return {
+        **place,
+        "star_id": number,
+        "designation": designation,
+        "pm_ra_cosdec_mas_yr": records["pm_ra"],
+        "pm_dec_mas_yr": records["pm_de"],
+        "mag": mag,
+        "band": band,
+        "second_mag": records["bt_mag" if band != "BT" else "vt_mag"],
+        "second_band": "BT" if band != "BT" else "VT",
+        "colour_mag": records["bt_mag"] - records["vt_mag"],
+        "colour_bands": "BT-VT",
+        "double_flag": join_flags({**flag_parts, "CCDM": (in_ccdm, records["ccdm"])}),
+        "is_flagged_double": place_is_double(flag_parts) | in_ccdm,
+        "companion_separation_arcsec": np.where(prox < PROX_BEYOND, 0.1 * prox, np.nan),
+        "hip_number": records["hip"],
+        "quality_flags": quality_flags(len(records), bits),
+    }
+
+
+def place_is_double(parts: dict[str, Any]) -> Mask:
+    """Return where any of a record's position flags means a double star."""
+    return np.asarray(np.logical_or.reduce([where for where, _ in parts.values()]))
+
+
+def _place_tyc2(records: Records) -> dict[str, Any]:
+    """Return the mean positions at J2000, or the observed ones where there is no mean."""
+    no_mean = np.isnan(records["ra_mean_deg"]) | np.isnan(records["de_mean_deg"])
+    observed_jyear = 1990.0 + 0.5 * (records["ep_ra_1990"] + records["ep_de_1990"])
+    photocentre = (records["pflag"] == b"P") | (records["posflg"] == b"P")
+    return {
+        "ra_deg": np.where(no_mean, records["ra_deg"], records["ra_mean_deg"]),
+        "dec_deg": np.where(no_mean, records["de_deg"], records["de_mean_deg"]),
+        "epoch_jyear": np.where(no_mean, observed_jyear, 2000.0),
+        "is_photocentre": photocentre,
+        "double_flags": {
+            "pflag": (records["pflag"] == b"P", records["pflag"]),
+            "posflg": (np.isin(records["posflg"], [b"D", b"P"]), records["posflg"]),
+        },
+    }
+
+
+def _place_suppl(records: Records) -> dict[str, Any]:
+    nowhere = np.zeros(len(records), dtype=bool)
+    return {
+        "ra_deg": records["ra_deg"],
+        "dec_deg": records["de_deg"],
+        "epoch_jyear": 1991.25,
+        "is_photocentre": nowhere,
+        "double_flags": {"pflag": (nowhere, None)},
+    }
+
+
+def _magnitudes(records: Records, band: str) -> tuple[Array, dict[Quality, Mask]]:
+    bt, vt = records["bt_mag"], records["vt_mag"]
+    if band == "BT":
+        return bt, {}
+    is_hp = np.zeros(len(records), dtype=bool)
+    if records.layout == "suppl_1":
+        is_hp = records["mflag"] == b"H"
+    if band == "VT":
+        return np.where(is_hp, np.nan, vt), {}
+    # Hp without a colour stands for V: they differ by less than 0.2 mag for most stars.
+    v = johnson_v(np.where(is_hp, np.nan, bt), vt)
+    bits = {
+        Quality.ESTIMATED_MAGNITUDE: v.is_estimated | is_hp,
+        Quality.COLOUR_OUT_OF_RANGE: v.is_out_of_range,
+    }
+    return v.mag, bits
+
+
+def tycho_identity(records: Records) -> tuple[NDArray[np.int64], pa.Array]:
+    """Return the packed number and the designation of Tycho records."""
+    parts = [records.integers(name) for name in ("tyc1", "tyc2", "tyc3")]
+    number = parts[0] * 1_000_000 + parts[1] * 10 + parts[2]
+    region = _REGION_TEXTS.take(pa.array(parts[0]))
+    texts = [_NUMBER_TEXTS.take(pa.array(part)) for part in parts[1:]]
+    return number, pc.binary_join_element_wise(region, *texts, "-")
