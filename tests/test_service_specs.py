@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
+from starcat.pipeline.catalog_snapshot import CatalogSnapshot, read_snapshot
 from starcat.pipeline.estimate import choose_stars
-from starcat.pipeline.stars_read import StarsRead, read_stars
 from starcat.pipeline.starter import starter_spec
 from starcat.service import catalogs as catalogs_module
 from starcat.service.app import make_app
@@ -156,7 +156,7 @@ def test_an_estimate_is_that_of_the_pipeline(client, small, small_spec):
     answer = client.post(f"{API}/specs/estimate", content=small_spec, headers=TOML)
     assert answer.status_code == 200
     found = answer.json()
-    read = read_stars(small, {})
+    read = read_snapshot(small, {})
     choice = choose_stars(read, small)
     assert found["guide_stars"] == len(choice.selected.guide_stars)
     assert found["fields"]["count"] == small.boresights.count
@@ -287,12 +287,12 @@ def test_every_operation_is_described(client):
 def test_a_catalog_is_read_once_however_many_ask(small, monkeypatch):
     calls = []
 
-    def counted(*arguments: Any, **options: Any) -> StarsRead:
+    def counted(*arguments: Any, **options: Any) -> CatalogSnapshot:
         calls.append(arguments)
         time.sleep(0.2)
-        return read_stars(*arguments, **options)
+        return read_snapshot(*arguments, **options)
 
-    monkeypatch.setattr(catalogs_module, "read_stars", counted)
+    monkeypatch.setattr(catalogs_module, "read_snapshot", counted)
     catalogs = Catalogs()
     found: list[int] = []
     threads = [
@@ -317,11 +317,11 @@ def test_a_catalog_is_read_once_however_many_ask(small, monkeypatch):
 def test_who_waits_too_long_is_told_when_to_ask_again(small, monkeypatch):
     go_on = threading.Event()
 
-    def slow(*arguments: Any, **options: Any) -> StarsRead:
+    def slow(*arguments: Any, **options: Any) -> CatalogSnapshot:
         go_on.wait(20)
-        return read_stars(*arguments, **options)
+        return read_snapshot(*arguments, **options)
 
-    monkeypatch.setattr(catalogs_module, "read_stars", slow)
+    monkeypatch.setattr(catalogs_module, "read_snapshot", slow)
     catalogs = Catalogs(wait_s=0.05)
     with pytest.raises(Problem) as told:
         catalogs.estimate(small)

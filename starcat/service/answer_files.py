@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcat.errors import QueryLimitError
-from starcat.exchange.first_rows import FirstRows
+from starcat.exchange.columns import FirstRows
 from starcat.service.sandbox.sandbox import Sandbox
 from starcat.service.uploading import sent_once
 

@@ -20,9 +20,9 @@ from starcat.catalog.parts import CATALOGS
 from starcat.catalog.source import DataSource, data_source
 from starcat.catalog.source_files import locate
 from starcat.errors import SourceMissing
+from starcat.pipeline.catalog_snapshot import CatalogSnapshot, read_snapshot, reading_keys
 from starcat.pipeline.estimate import Choice, Estimate, choose_stars, estimate
 from starcat.pipeline.guide_stars import MOST_FIELD_STARS
-from starcat.pipeline.stars_read import StarsRead, read_stars, what_is_read
 from starcat.pipeline.starter import Starter, starter_spec
 from starcat.service.jobs.keys import source_files
 from starcat.service.problems import Problem
@@ -89,8 +89,8 @@ class Catalogs:
     def __init__(self, max_memory_bytes: int | None = None, wait_s: float = WAIT_S) -> None:
         self._max_memory_bytes = max_memory_bytes
         self._wait_s = wait_s
-        # Pairs of StarsRead and CatalogRead; one that is larger than the limit is alone.
-        self._read: LRUCache[str, tuple[StarsRead, CatalogRead]] = LRUCache(
+        # Pairs of CatalogSnapshot and CatalogRead; one that is larger than the limit is alone.
+        self._read: LRUCache[str, tuple[CatalogSnapshot, CatalogRead]] = LRUCache(
             READ_BYTES, lambda pair: min(pair[0].nbytes, READ_BYTES)
         )
         self._choices: LRUCache[Any, Choice] = LRUCache(CHOICE_BYTES, lambda choice: choice.nbytes)
@@ -99,7 +99,7 @@ class Catalogs:
         )
         self._turns = threading.Semaphore(AT_ONCE)
         self._lock = threading.RLock()
-        self._underway: dict[str, Future[StarsRead]] = {}
+        self._underway: dict[str, Future[CatalogSnapshot]] = {}
         # One at a time: a catalog takes memory.
         self._reader = ThreadPoolExecutor(1, "catalog-reader")
 
@@ -146,7 +146,7 @@ class Catalogs:
                 most_field_stars=MOST_FIELD_STARS,
             )
 
-    def read(self, spec: BuildSpec, key: str | None = None) -> StarsRead:
+    def read(self, spec: BuildSpec, key: str | None = None) -> CatalogSnapshot:
         """Return the catalogs of a spec; read them where that was not done yet."""
         key = self._key(spec) if key is None else key
         found = self._cached(self._read, key)
@@ -179,8 +179,8 @@ class Catalogs:
         with self._lock:
             self._underway.pop(key, None)
 
-    def _read_files(self, key: str, spec: BuildSpec) -> StarsRead:
-        found = read_stars(spec, {})
+    def _read_files(self, key: str, spec: BuildSpec) -> CatalogSnapshot:
+        found = read_snapshot(spec, {})
         self._cache(self._read, key, (found, _facts(spec, found)))
         return found
 
@@ -192,7 +192,7 @@ class Catalogs:
         with self._lock, suppress(ValueError):  # larger than the cache
             cache[key] = value
 
-    def _choice(self, read: StarsRead, key: str, spec: BuildSpec) -> Choice:
+    def _choice(self, read: CatalogSnapshot, key: str, spec: BuildSpec) -> Choice:
         content = spec.model_dump(mode="json")
         own = {name: content[name] for name in ("selection", "camera", "boresights")}
         own["levels"] = content["products"]["levels"]
@@ -216,7 +216,7 @@ class Catalogs:
     def _key(spec: BuildSpec) -> str:
         """Return what the catalogs of a spec are kept under: what was asked for, of which files."""
         files = {name: _stamps(name) for name in _sources_read(spec)}
-        content = {"starcat": __version__, "asked": what_is_read(spec), "files": files}
+        content = {"starcat": __version__, "asked": reading_keys(spec), "files": files}
         return hashlib.sha256(json_bytes(content)).hexdigest()[:32]
 
 
@@ -266,7 +266,7 @@ def _stamps(name: str) -> list[tuple[str, int, int]]:
     return found
 
 
-def _facts(spec: BuildSpec, read: StarsRead) -> CatalogRead:
+def _facts(spec: BuildSpec, read: CatalogSnapshot) -> CatalogRead:
     mags = read.magnitudes
     band = spec.catalog.band or data_source(spec.catalog.source).bands[0]
     return CatalogRead(

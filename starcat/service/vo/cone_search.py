@@ -11,7 +11,8 @@ from fastapi import APIRouter, Request
 from fastapi.responses import Response, StreamingResponse
 
 from starcat.errors import QueryLimitError, StarcatError, TargetMissing
-from starcat.exchange.label import Label
+from starcat.exchange.columns import Label
+from starcat.exchange.writers import result_chunks
 from starcat.service.access import Reader
 from starcat.service.problems import Problem, problem_of
 from starcat.service.service import Service, TheService
@@ -25,7 +26,6 @@ from starcat.vo.cone import (
     star_view,
     with_ucds,
 )
-from starcat.vo.results import result_chunks
 
 router = APIRouter(prefix="/scs", tags=["cone search"])
 

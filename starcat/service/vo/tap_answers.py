@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from starcat.exchange.label import Label
+from starcat.exchange.columns import Label
+from starcat.exchange.formats import Format
+from starcat.exchange.writers import result_chunks
 from starcat.service.answer_files import file_of_rows, keep_rows
 from starcat.service.paths import ServicePaths
 from starcat.service.sandbox.sandbox import Sandbox
 from starcat.service.uploading import scratch_folder
-from starcat.vo.formats import Format
-from starcat.vo.results import result_chunks
 
 if TYPE_CHECKING:
     import pyarrow as pa

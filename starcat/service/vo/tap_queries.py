@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from starcat.errors import ConfigError
-from starcat.exchange.label import Label
+from starcat.exchange.columns import Label
 from starcat.progress import Progress, no_progress
 from starcat.service.paths import ServicePaths
 from starcat.service.query_pool import QueryPool
