@@ -17,7 +17,7 @@ from tomlkit.exceptions import TOMLKitError
 from starcat.catalog.source import data_source, source_names
 from starcat.errors import ConfigError, StarcatError
 from starcat.specs.build_spec import BuildSpec
-from starcat.specs.keys import REQUIRED, SpecKey, spec_sections, toml_value
+from starcat.specs.keys import REQUIRED, SpecKey, spec_sections
 from starcat.specs.reading import content_of_toml, spec_from_dict
 
 ORIGIN = "spec"
