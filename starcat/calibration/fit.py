@@ -51,24 +51,13 @@ PASSES = 4
 
 @dataclass(frozen=True)
 class Seen:
-    """The stars that were identified in some frames.
+    """The stars that were identified in some frames."""
 
-    Attributes
-    ----------
-    frame : ndarray of int64, shape (N,)
-        Number of the frame of each star, ascending; every number from 0 to F - 1 occurs.
-    centroids_px : ndarray of float64, shape (N, 2)
-        Where they were seen.
-    icrs : ndarray of float64, shape (N, 3)
-        Where they are.
-    matrices : ndarray of float64, shape (F, 3, 3)
-        About the attitudes, ``body = matrix @ icrs``.
-    """
-
+    # shape (N,): number of the frame of each star, ascending; every number from 0 to F - 1 occurs
     frame: NDArray[np.int64]
-    centroids_px: Array
-    icrs: Array
-    matrices: Array
+    centroids_px: Array  # shape (N, 2): where they were seen
+    icrs: Array  # shape (N, 3): where they are
+    matrices: Array  # shape (F, 3, 3): about the attitudes, ``body = matrix @ icrs``
 
     def __len__(self) -> int:
         """Return the number of stars."""

@@ -68,13 +68,6 @@ def checked_number(name: str, value: object, low: float = -np.inf, high: float =
 class Distortion:
     """Radial and tangential distortion of a lens (Brown-Conrady), as in OpenCV.
 
-    Attributes
-    ----------
-    k1, k2, k3 : float
-        Radial coefficients; ``k1 < 0`` is barrel distortion, ``k1 > 0`` pincushion.
-    p1, p2 : float
-        Tangential coefficients, of a lens whose elements are not centred.
-
     Raises
     ------
     ValueError
@@ -93,9 +86,11 @@ class Distortion:
     Conrady 1919, "Decentred lens-systems"; Brown 1966, "Decentering distortion of lenses".
     """
 
+    # k1, k2, k3: radial coefficients; ``k1 < 0`` is barrel distortion, ``k1 > 0`` pincushion
     k1: float = 0.0
     k2: float = 0.0
     k3: float = 0.0
+    # p1, p2: tangential coefficients, of a lens whose elements are not centred
     p1: float = 0.0
     p2: float = 0.0
 

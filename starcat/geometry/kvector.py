@@ -18,22 +18,15 @@ from numpy.typing import NDArray
 class KVector:
     """A K-vector over a sorted array of values.
 
-    Attributes
-    ----------
-    values : ndarray of float64, shape (n,)
-        Sorted, finite, ascending; duplicates are welcome.
-    counts : ndarray of int32, shape (n,)
-        ``counts[i]`` is the number of values on or below ``intercept + slope * i``.
-    intercept, slope : float
-        The line, in the unit of the values; ``slope`` is 0 where n < 2.
-
     References
     ----------
     Mortari and Neta 2000, "K-vector range searching techniques".
     """
 
-    values: NDArray[np.float64]
+    values: NDArray[np.float64]  # shape (n,): sorted, finite, ascending; duplicates are welcome
+    # shape (n,): ``counts[i]`` is the number of values on or below ``intercept + slope * i``
     counts: NDArray[np.int32]
+    # intercept, slope: the line, in the unit of the values; ``slope`` is 0 where n < 2
     intercept: float
     slope: float
 

@@ -21,21 +21,12 @@ _ROUNDING = 1e-12
 
 @dataclass(frozen=True)
 class Zones:
-    """Directions in order of declination.
+    """Directions in order of declination."""
 
-    Attributes
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        Unit vectors, southernmost first, so that a zone is read from one place.
-    order : ndarray of int64, shape (N,)
-        Rows that they had when they were given.
-    height : ndarray of float64, shape (N,)
-        Their third components.
-    """
-
+    # shape (N, 3): unit vectors, southernmost first, so that a zone is read from one place
     directions: Array
-    order: NDArray[np.int64]
-    height: Array
+    order: NDArray[np.int64]  # shape (N,): rows that they had when they were given
+    height: Array  # shape (N,): their third components
 
     def near(self, axis: Array, radius_rad: float) -> NDArray[np.int64]:
         """Return which directions lie within a cap.

@@ -43,34 +43,19 @@ _HOT_PART = 0.25
 
 @dataclass(frozen=True)
 class Levels:
-    """An image and its background.
+    """An image and its background."""
 
-    Attributes
-    ----------
-    raw : ndarray of float32, shape (height, width)
-        Grey values; 0 where they are left out.
-    above : ndarray of float32, shape (height, width)
-        The same above the background.
-    noise : ndarray of float32, shape (height, width)
-        Standard deviation of the background, grey values.
-    mask : ndarray of bool, shape (height, width)
-        Pixels left out, because their values are not finite.
-    is_rough : bool
-        Whether the noise of filtered pixels is larger than that of white noise: coarse digits,
-        a clipped background, JPEG, clouds.
-    is_flat : bool
-        Whether there is next to no noise: what compression left of it are steps.
-    box_px : int
-        Side of the boxes in which the background was found.
-    """
-
-    raw: Grey
-    above: Grey
-    noise: Grey
+    raw: Grey  # shape (height, width): grey values; 0 where they are left out
+    above: Grey  # shape (height, width): the same above the background
+    noise: Grey  # shape (height, width): standard deviation of the background, grey values
+    # shape (height, width): pixels left out, because their values are not finite
     mask: NDArray[np.bool_]
+    # whether the noise of filtered pixels is larger than that of white noise: coarse digits, a
+    # clipped background, JPEG, clouds
     is_rough: bool = False
+    # whether there is next to no noise: what compression left of it are steps
     is_flat: bool = False
-    box_px: int = _BOX_PX
+    box_px: int = _BOX_PX  # side of the boxes in which the background was found
 
 
 def load_sep() -> Any:

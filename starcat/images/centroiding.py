@@ -34,36 +34,20 @@ _PLATEAU_NOISE, _PLATEAU_DEPTH, _PLATEAU_PIXELS = 6.0, 0.005, 3
 
 @dataclass(frozen=True)
 class Spots:
-    """What was found in one image, brightest first.
+    """What was found in one image, brightest first."""
 
-    Attributes
-    ----------
-    centroids_px : ndarray of float64, shape (N, 2)
-        Pixels (x right, y down, origin at the outer corner of the top-left pixel).
-    flux : ndarray of float64, shape (N,)
-        Light above the background, in the units of the image.
-    mag : ndarray of float64, shape (N,)
-        Instrumental magnitude, -2.5 log10 flux: its zero point is unknown.
-    snr : ndarray of float64, shape (N,)
-        Flux over its standard deviation, in an aperture of two sigma.
-    saturated : ndarray of bool, shape (N,)
-        The brightest pixel is at the detector's limit: measured too faint.
-    blended : ndarray of bool, shape (N,)
-        Touches another spot: each pulls at the other's centroid.
-    at_edge : ndarray of bool, shape (N,)
-        Cut by the edge of the image: the centroid is pulled inwards.
-    psf_sigma_px : float
-        Standard deviation of a star's spot before the pixels sample it.
-    """
-
+    # shape (N, 2): pixels (x right, y down, origin at the outer corner of the top-left pixel)
     centroids_px: Array
-    flux: Array
-    mag: Array
-    snr: Array
+    flux: Array  # shape (N,): light above the background, in the units of the image
+    mag: Array  # shape (N,): instrumental magnitude, -2.5 log10 flux: its zero point is unknown
+    snr: Array  # shape (N,): flux over its standard deviation, in an aperture of two sigma
+    # shape (N,): the brightest pixel is at the detector's limit: measured too faint
     saturated: NDArray[np.bool_]
+    # shape (N,): touches another spot: each pulls at the other's centroid
     blended: NDArray[np.bool_]
+    # shape (N,): cut by the edge of the image: the centroid is pulled inwards
     at_edge: NDArray[np.bool_]
-    psf_sigma_px: float
+    psf_sigma_px: float  # standard deviation of a star's spot before the pixels sample it
 
     def __len__(self) -> int:
         """Return the number of spots."""

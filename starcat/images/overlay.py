@@ -31,21 +31,12 @@ _INTERVALS = 5
 
 @dataclass(frozen=True)
 class Overlay:
-    """Lines and planets in pixels.
+    """Lines and planets in pixels."""
 
-    Attributes
-    ----------
-    grid : tuple of (str, ndarray of float64, shape (P, 2))
-        What a line of the grid is called, and its points; NaN where there is no image.
-    figures : tuple of ndarray of float64, shape (P, 2)
-        Lines of constellations.
-    bodies : tuple of BodyInFrame
-        Planets, the Sun and the Moon.
-    """
-
+    # shape (P, 2): what a line of the grid is called, and its points; NaN where there is no image
     grid: tuple[tuple[str, Array], ...] = ()
-    figures: tuple[Array, ...] = ()
-    bodies: tuple[BodyInFrame, ...] = ()
+    figures: tuple[Array, ...] = ()  # shape (P, 2): lines of constellations
+    bodies: tuple[BodyInFrame, ...] = ()  # planets, the Sun and the Moon
 
 
 def overlay_from_attitude(

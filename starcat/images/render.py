@@ -38,40 +38,22 @@ _MOST_ELECTRONS = 1e15
 class Optics:
     """A lens and a detector, for one exposure.
 
-    Attributes
-    ----------
-    psf_sigma_px : float
-        Standard deviation of the Gaussian spot, pixels.
-    zero_point_e : float
-        Electrons of a star of magnitude 0. The default is 19,100 electrons per second and mm2
-        [1]_ through an aperture of 20 mm in 0.1 s.
-    background_e : float
-        Electrons of sky and dark current in a pixel.
-    read_noise_e : float
-        Standard deviation of the read-out, electrons.
-    gain_e_per_adu : float
-        Electrons of one step of the file.
-    bias_adu : float
-        Steps added to every pixel, so that noise does not fall below zero.
-    full_well_e : float
-        Electrons that a pixel can hold; what is above is lost.
-    hot_pixels : int
-        Pixels with a high dark current, at places that the seed gives.
-
     References
     ----------
     .. [1] Liebe 2002, "Accuracy performance of star trackers - a tutorial", IEEE Transactions
        on Aerospace and Electronic Systems 38 (2), 587-599.
     """
 
-    psf_sigma_px: float = 1.0
+    psf_sigma_px: float = 1.0  # standard deviation of the Gaussian spot, pixels
+    # electrons of a star of magnitude 0. The default is 19,100 electrons per second and mm2 [1]_
+    # through an aperture of 20 mm in 0.1 s.
     zero_point_e: float = 600_000.0
-    background_e: float = 20.0
-    read_noise_e: float = 8.0
-    gain_e_per_adu: float = 1.0
-    bias_adu: float = 100.0
-    full_well_e: float = 50_000.0
-    hot_pixels: int = 0
+    background_e: float = 20.0  # electrons of sky and dark current in a pixel
+    read_noise_e: float = 8.0  # standard deviation of the read-out, electrons
+    gain_e_per_adu: float = 1.0  # electrons of one step of the file
+    bias_adu: float = 100.0  # steps added to every pixel, so that noise does not fall below zero
+    full_well_e: float = 50_000.0  # electrons that a pixel can hold; what is above is lost
+    hot_pixels: int = 0  # pixels with a high dark current, at places that the seed gives
 
     def __post_init__(self) -> None:
         for name in ("psf_sigma_px", "gain_e_per_adu", "full_well_e"):
@@ -162,46 +144,21 @@ def render_image(
 
 @dataclass(frozen=True)
 class Scene:
-    """The sky behind the stars, and what is left of it in a file.
+    """The sky behind the stars, and what is left of it in a file."""
 
-    Attributes
-    ----------
-    town_light_e : float
-        Electrons of the gradient in the brightest corner or at the brightest edge; it is a tenth
-        of that on the opposite side.
-    town_light_deg : float
-        Direction in which it becomes brighter: 0 to the right, 90 down.
-    moon_px : pair of float, optional
-        Middle of the Moon; it may be outside of the frame.
-    moon_radius_px : float
-        Radius of its disk, which fills the well.
-    glow_e : float
-        Electrons of its glow at the edge of the disk.
-    glow_px : float
-        Distance from the Moon's middle at which the glow is half as bright.
-    nebula_e : float
-        Standard deviation of nebulous light, electrons.
-    nebula_px : float
-        Size of its structure.
-    black_adu : float
-        Step of the detector that is 0 in the file: what is darker is lost.
-    adu_per_step : float
-        Steps of the detector in a step of the file.
-    bits : int
-        8 or 16: what is brighter than the largest number is lost.
-    """
-
+    # electrons of the gradient in the brightest corner or at the brightest edge; it is a tenth of
+    # that on the opposite side
     town_light_e: float = 0.0
-    town_light_deg: float = 90.0
-    moon_px: tuple[float, float] | None = None
-    moon_radius_px: float = 22.0
-    glow_e: float = 0.0
-    glow_px: float = 60.0
-    nebula_e: float = 0.0
-    nebula_px: float = 20.0
-    black_adu: float = 0.0
-    adu_per_step: float = 1.0
-    bits: int = 16
+    town_light_deg: float = 90.0  # direction in which it becomes brighter: 0 to the right, 90 down
+    moon_px: tuple[float, float] | None = None  # middle of the Moon; it may be outside of the frame
+    moon_radius_px: float = 22.0  # radius of its disk, which fills the well
+    glow_e: float = 0.0  # electrons of its glow at the edge of the disk
+    glow_px: float = 60.0  # distance from the Moon's middle at which the glow is half as bright
+    nebula_e: float = 0.0  # standard deviation of nebulous light, electrons
+    nebula_px: float = 20.0  # size of its structure
+    black_adu: float = 0.0  # step of the detector that is 0 in the file: what is darker is lost
+    adu_per_step: float = 1.0  # steps of the detector in a step of the file
+    bits: int = 16  # 8 or 16: what is brighter than the largest number is lost
 
     def __post_init__(self) -> None:
         if self.bits not in (8, 16):

@@ -33,34 +33,21 @@ class FieldSize(Protocol):
 
 @dataclass(frozen=True)
 class NominalField:
-    """A field of view that is stated, not that of a detector.
+    """A field of view that is stated, not that of a detector."""
 
-    Attributes
-    ----------
-    fov_x_deg, fov_y_deg : float
-        Full angles across width and height, degrees.
-    """
-
+    # fov_x_deg, fov_y_deg: full angles across width and height, degrees
     fov_x_deg: float
     fov_y_deg: float
 
 
 @dataclass(frozen=True)
 class FieldStars:
-    """The stars in each of a number of fields.
+    """The stars in each of a number of fields."""
 
-    Attributes
-    ----------
-    boresights : ndarray of float64, shape (F, 3)
-        ICRS directions.
-    offsets : ndarray of int64, shape (F + 1,)
-        The stars of field f are ``star_index[offsets[f]:offsets[f + 1]]``.
-    star_index : ndarray of int32, shape (M,)
-        Rows of the star table, brightest first within a field.
-    """
-
-    boresights: Array
+    boresights: Array  # shape (F, 3): ICRS directions
+    # shape (F + 1,): the stars of field f are ``star_index[offsets[f]:offsets[f + 1]]``
     offsets: NDArray[np.int64]
+    # shape (M,): rows of the star table, brightest first within a field
     star_index: NDArray[np.int32]
 
     @property

@@ -47,18 +47,10 @@ class PositionsAndMagnitudes(Protocol):
 
 @dataclass(frozen=True)
 class MagnitudeCounts:
-    """How many stars have which magnitude.
+    """How many stars have which magnitude."""
 
-    Attributes
-    ----------
-    lowest : int
-        Number of the first bin; bin k begins at ``k * MAG_BIN``.
-    counts : ndarray of int64, shape (K,)
-        Stars of each bin; empty where no magnitude is known.
-    """
-
-    lowest: int
-    counts: Rows
+    lowest: int  # number of the first bin; bin k begins at ``k * MAG_BIN``
+    counts: Rows  # shape (K,): stars of each bin; empty where no magnitude is known
 
     @classmethod
     def of(cls, mag: Array) -> MagnitudeCounts:
@@ -117,18 +109,10 @@ class MagnitudeCounts:
 
 @dataclass(frozen=True)
 class Census:
-    """Counts of the stars of a catalog, or of a part of it.
+    """Counts of the stars of a catalog, or of a part of it."""
 
-    Attributes
-    ----------
-    tiles : ndarray of int64, shape (TILES,)
-        Stars in each tile of the sky.
-    magnitudes : MagnitudeCounts
-        Stars by magnitude.
-    """
-
-    tiles: Rows
-    magnitudes: MagnitudeCounts
+    tiles: Rows  # shape (TILES,): stars in each tile of the sky
+    magnitudes: MagnitudeCounts  # stars by magnitude
 
     @classmethod
     def of(cls, stars: PositionsAndMagnitudes) -> Census:

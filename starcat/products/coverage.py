@@ -21,93 +21,53 @@ Counts = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Coverage:
-    """What the field of each boresight holds.
+    """What the field of each boresight holds."""
 
-    Attributes
-    ----------
-    boresights : ndarray of float64, shape (F, 3)
-        ICRS directions.
-    stars : ndarray of int64, shape (F,)
-        Guide stars in the field.
-    pairs : ndarray of int64, shape (F,)
-        Pairs of them.
-    triangles : ndarray of int64, shape (F,)
-        Triangles of the brightest of them.
-    """
-
-    boresights: Array
-    stars: Counts
-    pairs: Counts
-    triangles: Counts
+    boresights: Array  # shape (F, 3): ICRS directions
+    stars: Counts  # shape (F,): guide stars in the field
+    pairs: Counts  # shape (F,): pairs of them
+    triangles: Counts  # shape (F,): triangles of the brightest of them
 
 
 @dataclass(frozen=True)
 class Spread:
-    """How one count is spread over the fields.
+    """How one count is spread over the fields."""
 
-    Attributes
-    ----------
-    minimum, one_percent, median, maximum : int
-        Values that occur; at least 1 % and 50 % of the fields have no more than
-        ``one_percent`` and ``median``.
-    mean : float
-        The numbers over all fields.
-    """
-
+    # minimum, one_percent, median, maximum: values that occur; at least 1 % and 50 % of the fields
+    # have no more than ``one_percent`` and ``median``
     minimum: int
     one_percent: int
     median: int
     maximum: int
-    mean: float
+    mean: float  # the numbers over all fields
 
 
 @dataclass(frozen=True)
 class CoverageSummary:
-    """The coverage of the sphere in a few numbers.
+    """The coverage of the sphere in a few numbers."""
 
-    Attributes
-    ----------
-    fields : int
-        Number of boresights.
-    stars, pairs, triangles : Spread
-        The numbers of a field.
-    worst_boresight : int
-        The field with the fewest stars; the first along the spiral where several have.
-    worst_ra_deg, worst_dec_deg : float
-        Its direction, degrees, ICRS.
-    histogram : ndarray of int64, shape (maximum + 1,)
-        ``histogram[n]`` fields hold n stars.
-    """
-
-    fields: int
+    fields: int  # number of boresights
+    # stars, pairs, triangles: the numbers of a field
     stars: Spread
     pairs: Spread
     triangles: Spread
+    # the field with the fewest stars; the first along the spiral where several have
     worst_boresight: int
+    # worst_ra_deg, worst_dec_deg: its direction, degrees, ICRS
     worst_ra_deg: float
     worst_dec_deg: float
-    histogram: Counts
+    histogram: Counts  # shape (maximum + 1,): ``histogram[n]`` fields hold n stars
 
 
 @dataclass(frozen=True)
 class TilingGap:
-    """The direction that is farthest from all boresights.
+    """The direction that is farthest from all boresights."""
 
-    Attributes
-    ----------
-    boresights : int
-        How many there are.
-    tile_radius_rad : float
-        Radius of the largest circle inside the field: seen whatever the roll.
-    covering_radius_rad : float
-        Every direction has a boresight within it, and this one none nearer.
-    ra_deg, dec_deg : float
-        The direction, degrees, ICRS.
-    """
-
-    boresights: int
-    tile_radius_rad: float
+    boresights: int  # how many there are
+    tile_radius_rad: float  # radius of the largest circle inside the field: seen whatever the roll
+    # every direction has a boresight within it, and this one none nearer
     covering_radius_rad: float
+    # ra_deg, dec_deg: the direction, degrees, ICRS
     ra_deg: float
     dec_deg: float
 

@@ -21,26 +21,15 @@ from starcat.products.neighbours import position_angles
 
 @dataclass(frozen=True)
 class GridPatterns:
-    """The pattern of every star that has an alignment star; a row is one star.
+    """The pattern of every star that has an alignment star; a row is one star."""
 
-    Attributes
-    ----------
-    star : ndarray of int32, shape (M,)
-        Rows of the star table, ascending.
-    alignment_star : ndarray of int32, shape (M,)
-        The nearest neighbour outside the buffer; of equally near ones the first.
-    cells : Ragged of int32, M lists
-        Occupied cells as `cell_of` numbers them, ascending, each once.
-    index : Index
-        Datasets ``cell_offsets``, int64, shape (cells + 1,) and ``cell_rows``, int32: the rows
-        whose pattern has cell c, ascending, are
-        ``cell_rows[cell_offsets[c]:cell_offsets[c + 1]]``. Attributes ``radius_rad``,
-        ``buffer_rad``, ``cells_per_side``.
-    """
-
-    star: NDArray[np.int32]
+    star: NDArray[np.int32]  # shape (M,): rows of the star table, ascending
+    # shape (M,): the nearest neighbour outside the buffer; of equally near ones the first
     alignment_star: NDArray[np.int32]
-    cells: Ragged
+    cells: Ragged  # occupied cells as `cell_of` numbers them, ascending, each once
+    # datasets ``cell_offsets``, int64, shape (cells + 1,) and ``cell_rows``, int32: the rows whose
+    # pattern has cell c, ascending, are ``cell_rows[cell_offsets[c]:cell_offsets[c + 1]]``.
+    # Attributes ``radius_rad``, ``buffer_rad``, ``cells_per_side``.
     index: Index
 
 

@@ -20,24 +20,14 @@ STARS_AT_ONCE = 4096
 
 @dataclass(frozen=True)
 class AngularReferenceSets:
-    """Every star's neighbours by separation; a row is one neighbour of one star.
+    """Every star's neighbours by separation; a row is one neighbour of one star."""
 
-    Attributes
-    ----------
-    star : ndarray of int32, shape (M,)
-        Rows of the star table, ascending.
-    neighbour : ndarray of int32, shape (M,)
-        Rows of the star table.
-    separation_rad : ndarray of float64, shape (M,)
-        Great-circle separations of the two, radians, ascending within a star.
-    index : Index
-        Dataset ``star_offsets``, int64, shape (N + 1,): the rows of star n are
-        ``star_offsets[n]:star_offsets[n + 1]``. Attribute ``radius_rad``.
-    """
-
-    star: NDArray[np.int32]
-    neighbour: NDArray[np.int32]
+    star: NDArray[np.int32]  # shape (M,): rows of the star table, ascending
+    neighbour: NDArray[np.int32]  # shape (M,): rows of the star table
+    # shape (M,): great-circle separations of the two, radians, ascending within a star
     separation_rad: NDArray[np.float64]
+    # dataset ``star_offsets``, int64, shape (N + 1,): the rows of star n are
+    # ``star_offsets[n]:star_offsets[n + 1]``. Attribute ``radius_rad``.
     index: Index
 
 

@@ -17,26 +17,16 @@ from starcat.products.index import Index, row_offsets
 
 @dataclass(frozen=True)
 class PlanarReferenceSets:
-    """Every star's neighbours by planar distance; a row is one neighbour of one star.
+    """Every star's neighbours by planar distance; a row is one neighbour of one star."""
 
-    Attributes
-    ----------
-    star : ndarray of int32, shape (M,)
-        Rows of the star table, ascending.
-    neighbour : ndarray of int32, shape (M,)
-        Rows of the star table.
-    ratio : ndarray of float64, shape (M,)
-        Gnomonic distance over the star's smallest one, 1 or more, ascending within a star.
-    index : Index
-        Datasets ``star_offsets``, int64, shape (N + 1,): the rows of star n are
-        ``star_offsets[n]:star_offsets[n + 1]``; and ``smallest_distance``, float64, shape
-        (N,): the distance that was divided by, in units of the focal length, NaN for a star
-        without rows. Attribute ``radius_rad``.
-    """
-
-    star: NDArray[np.int32]
-    neighbour: NDArray[np.int32]
+    star: NDArray[np.int32]  # shape (M,): rows of the star table, ascending
+    neighbour: NDArray[np.int32]  # shape (M,): rows of the star table
+    # shape (M,): gnomonic distance over the star's smallest one, 1 or more, ascending within a star
     ratio: NDArray[np.float64]
+    # datasets ``star_offsets``, int64, shape (N + 1,): the rows of star n are
+    # ``star_offsets[n]:star_offsets[n + 1]``; and ``smallest_distance``, float64, shape (N,): the
+    # distance that was divided by, in units of the focal length, NaN for a star without rows.
+    # Attribute ``radius_rad``.
     index: Index
 
 

@@ -27,30 +27,18 @@ FEWEST_BORESIGHTS = 1000
 
 @dataclass(frozen=True)
 class Levels:
-    """Stars and triangles of each level, the narrowest first.
+    """Stars and triangles of each level, the narrowest first."""
 
-    Attributes
-    ----------
-    level : ndarray of int32, shape (L,)
-        1 to L; level 0 is the camera's own field.
-    fov_x_deg, fov_y_deg : ndarray of float64, shape (L,)
-        Full angles of a level's fields.
-    stars : Ragged
-        Rows of the star table, ascending.
-    i, j, k : Ragged
-        Triangles: rows of the star table, i < j < k, in order.
-    index : Index
-        Nothing.
-    """
-
-    level: Rows
+    level: Rows  # shape (L,): 1 to L; level 0 is the camera's own field
+    # fov_x_deg, fov_y_deg: shape (L,): full angles of a level's fields
     fov_x_deg: Array
     fov_y_deg: Array
-    stars: Ragged
+    stars: Ragged  # rows of the star table, ascending
+    # i, j, k: triangles: rows of the star table, i < j < k, in order
     i: Ragged
     j: Ragged
     k: Ragged
-    index: Index
+    index: Index  # nothing
 
 
 def level_fields(
@@ -157,21 +145,11 @@ def find_levels(
 
 @dataclass(frozen=True)
 class Level:
-    """The stars of a level.
+    """The stars of a level."""
 
-    Attributes
-    ----------
-    before : ndarray of int32, shape (M,)
-        Rows of the star table that the level is chosen from.
-    tiled : FieldStars
-        These in the fields of the level; its star numbers are places in ``before``.
-    rows : ndarray of int32, shape (K,)
-        Rows of the star table that are left, ascending.
-    """
-
-    before: Rows
-    tiled: FieldStars
-    rows: Rows
+    before: Rows  # shape (M,): rows of the star table that the level is chosen from
+    tiled: FieldStars  # these in the fields of the level; its star numbers are places in ``before``
+    rows: Rows  # shape (K,): rows of the star table that are left, ascending
 
 
 def thin_levels(

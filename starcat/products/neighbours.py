@@ -23,36 +23,22 @@ _TURN = 2.0 * np.pi
 
 @dataclass(frozen=True)
 class Neighbours:
-    """Every star's neighbours by position angle; a row is one neighbour of one star.
+    """Every star's neighbours by position angle; a row is one neighbour of one star."""
 
-    Attributes
-    ----------
-    star : ndarray of int32, shape (M,)
-        Rows of the star table, ascending.
-    neighbour : ndarray of int32, shape (M,)
-        Rows of the star table.
-    position_angle_rad : ndarray of float64, shape (M,)
-        Position angle of the neighbour at the star, radians in [0, 2 pi), ascending within a
-        star.
-    successive_angle_rad : ndarray of float64, shape (M,)
-        Angle to the star's next neighbour, from the last one to the first; radians, their sum
-        over a star is 2 pi.
-    separation_rad : ndarray of float64, shape (M,)
-        Great-circle separations of the two, radians.
-    index : Index
-        Datasets ``star_offsets``, int64, shape (N + 1,): the rows of star n are
-        ``star_offsets[n]:star_offsets[n + 1]``; ``lookup_offsets``, int64, shape (bins + 1,)
-        and ``lookup_rows``, int32, shape (M,): the rows in bin b of
-        `starcat.geometry.patterns.bin_of`, ascending, are
-        ``lookup_rows[lookup_offsets[b]:lookup_offsets[b + 1]]``. Attributes
-        ``angle_bin_rad``, ``separation_bin_rad``, ``n_angle_bins``, ``n_separation_bins``.
-    """
-
-    star: NDArray[np.int32]
-    neighbour: NDArray[np.int32]
+    star: NDArray[np.int32]  # shape (M,): rows of the star table, ascending
+    neighbour: NDArray[np.int32]  # shape (M,): rows of the star table
+    # shape (M,): position angle of the neighbour at the star, radians in [0, 2 pi), ascending
+    # within a star
     position_angle_rad: Array
+    # shape (M,): angle to the star's next neighbour, from the last one to the first; radians, their
+    # sum over a star is 2 pi
     successive_angle_rad: Array
-    separation_rad: Array
+    separation_rad: Array  # shape (M,): great-circle separations of the two, radians
+    # datasets ``star_offsets``, int64, shape (N + 1,): the rows of star n are
+    # ``star_offsets[n]:star_offsets[n + 1]``; ``lookup_offsets``, int64, shape (bins + 1,) and
+    # ``lookup_rows``, int32, shape (M,): the rows in bin b of `starcat.geometry.patterns.bin_of`,
+    # ascending, are ``lookup_rows[lookup_offsets[b]:lookup_offsets[b + 1]]``. Attributes
+    # ``angle_bin_rad``, ``separation_bin_rad``, ``n_angle_bins``, ``n_separation_bins``.
     index: Index
 
 

@@ -14,19 +14,13 @@ from starcat.products.index import Index, kvector_index
 
 @dataclass(frozen=True)
 class StarPairs:
-    """All pairs of stars within a range of separations.
+    """All pairs of stars within a range of separations."""
 
-    Attributes
-    ----------
-    i, j : ndarray of int32, shape (M,)
-        Rows of the star table, i < j.
-    kvector : KVector
-        Over the separations, radians; ``kvector.values`` are the separations themselves,
-        ascending, equal ones in order of (i, j).
-    """
-
+    # i, j: shape (M,): rows of the star table, i < j
     i: NDArray[np.int32]
     j: NDArray[np.int32]
+    # over the separations, radians; ``kvector.values`` are the separations themselves, ascending,
+    # equal ones in order of (i, j)
     kvector: KVector
 
     @property

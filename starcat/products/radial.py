@@ -20,25 +20,15 @@ from starcat.products.neighbours import position_angles
 
 @dataclass(frozen=True)
 class RadialPatterns:
-    """The pattern of every star; a row is one star.
+    """The pattern of every star; a row is one star."""
 
-    Attributes
-    ----------
-    star : ndarray of int32, shape (N,)
-        Rows of the star table, ascending: all of them.
-    rings : Ragged of int32, N lists
-        Occupied rings as `ring_of` numbers them, ascending, each once.
-    sector_pattern : ndarray of int32, shape (N,)
-        A bit per occupied sector, the smallest of the cyclic shifts; 0 without neighbours.
-    index : Index
-        Datasets ``ring_offsets``, int64, shape (rings + 1,) and ``ring_rows``, int32: the rows
-        with ring r, ascending, are ``ring_rows[ring_offsets[r]:ring_offsets[r + 1]]``.
-        Attributes ``radius_rad``, ``rings``, ``sectors``.
-    """
-
-    star: NDArray[np.int32]
-    rings: Ragged
+    star: NDArray[np.int32]  # shape (N,): rows of the star table, ascending: all of them
+    rings: Ragged  # occupied rings as `ring_of` numbers them, ascending, each once
+    # shape (N,): a bit per occupied sector, the smallest of the cyclic shifts; 0 without neighbours
     sector_pattern: NDArray[np.int32]
+    # datasets ``ring_offsets``, int64, shape (rings + 1,) and ``ring_rows``, int32: the rows with
+    # ring r, ascending, are ``ring_rows[ring_offsets[r]:ring_offsets[r + 1]]``. Attributes
+    # ``radius_rad``, ``rings``, ``sectors``.
     index: Index
 
 

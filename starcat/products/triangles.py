@@ -29,28 +29,20 @@ AT_ONCE = 1 << 19
 
 @dataclass(frozen=True)
 class Triangles:
-    """Distinct triangles, by area.
+    """Distinct triangles, by area."""
 
-    Attributes
-    ----------
-    i, j, k : ndarray of int32, shape (M,)
-        Rows of the star table, i < j < k.
-    area_rad2, circumradius_rad, inradius_rad : ndarray of float32, shape (M,)
-        Features of the plane triangle, in square radians and radians.
-    times_seen : ndarray of int32, shape (M,)
-        Number of boresights whose brightest stars include the three.
-    index : Index
-        The K-vector over ``area_rad2``, and the attribute ``records``.
-    """
-
+    # i, j, k: shape (M,): rows of the star table, i < j < k
     i: NDArray[np.int32]
     j: NDArray[np.int32]
     k: NDArray[np.int32]
+    # area_rad2, circumradius_rad, inradius_rad: shape (M,): features of the plane triangle, in
+    # square radians and radians
     area_rad2: NDArray[np.float32]
     circumradius_rad: NDArray[np.float32]
     inradius_rad: NDArray[np.float32]
+    # shape (M,): number of boresights whose brightest stars include the three
     times_seen: NDArray[np.int32]
-    index: Index
+    index: Index  # the K-vector over ``area_rad2``, and the attribute ``records``
 
     @property
     def records(self) -> int:

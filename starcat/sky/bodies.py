@@ -55,30 +55,18 @@ _AU_DAY = LIGHT_KM_S * DAY_S / AU_KM
 
 @dataclass(frozen=True)
 class Bodies:
-    """The bodies of the solar system, as they are seen at a time.
+    """The bodies of the solar system, as they are seen at a time."""
 
-    Attributes
-    ----------
-    names : tuple of str, length B
-        ``Sun``, ``Moon``, the planets; ``Earth`` where the observer's position is known.
-    directions : ndarray of float64, shape (B, 3)
-        Apparent directions of their middles, ICRS axes: light time and aberration are in them.
-    distance_au : ndarray of float64, shape (B,)
-        From the observer.
-    radius_rad : ndarray of float64, shape (B,)
-        Half of what they subtend.
-    mag : ndarray of float64, shape (B,)
-        Magnitudes, V.
-    error_rad : ndarray of float64, shape (B,)
-        Largest error of the directions, that of an unknown position within 7,000 km of the
-        middle of the Earth included.
-    """
-
+    # ``Sun``, ``Moon``, the planets; ``Earth`` where the observer's position is known
     names: tuple[str, ...]
+    # shape (B, 3): apparent directions of their middles, ICRS axes: light time and aberration are
+    # in them
     directions: Array
-    distance_au: Array
-    radius_rad: Array
-    mag: Array
+    distance_au: Array  # shape (B,): from the observer
+    radius_rad: Array  # shape (B,): half of what they subtend
+    mag: Array  # shape (B,): magnitudes, V
+    # shape (B,): largest error of the directions, that of an unknown position within 7,000 km of
+    # the middle of the Earth included
     error_rad: Array
 
     def row(self, name: str) -> int:
