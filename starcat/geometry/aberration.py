@@ -27,19 +27,7 @@ _MAS = np.radians(1.0 / 3_600_000.0)
 def displaced_by_parallax(u: Array, parallax_mas: Array, observer_au: Array) -> Array:
     """Return directions as seen from a place that is not the barycentre.
 
-    Parameters
-    ----------
-    u : ndarray of float64, shape (N, 3)
-        Barycentric unit vectors.
-    parallax_mas : ndarray of float64, shape (N,)
-        Annual parallaxes, mas; NaN where unknown, which counts as 0.
-    observer_au : ndarray of float64, shape (3,)
-        Barycentric position of the observer, au.
-
-    Returns
-    -------
-    ndarray of float64, shape (N, 3)
-        Unit vectors.
+    The observer is at a barycentric position in au; a parallax that is NaN counts as 0.
     """
     parallax_rad = np.nan_to_num(parallax_mas) * _MAS
     return _unit(u - parallax_rad[:, None] * observer_au)
@@ -48,25 +36,12 @@ def displaced_by_parallax(u: Array, parallax_mas: Array, observer_au: Array) -> 
 def deflected(u: Array, from_sun_au: Array) -> Array:
     """Return directions of stars as the mass of the Sun bends their light.
 
-    Parameters
-    ----------
-    u : ndarray of float64, shape (N, 3)
-        Unit vectors from the observer.
-    from_sun_au : ndarray of float64, shape (3,)
-        Position of the observer relative to the Sun, au; not zero.
+    ``from_sun_au`` is where the observer is, relative to the Sun, not zero. Stars shift away
+    from the Sun.
 
-    Returns
-    -------
-    ndarray of float64, shape (N, 3)
-        Unit vectors, shifted away from the Sun.
-
-    Notes
-    -----
     Within 9 arcmin of the middle of the Sun, behind its disc, the deflection falls to zero
     instead of growing without limit.
 
-    References
-    ----------
     Urban and Seidelmann (eds.) 2013, Explanatory Supplement to the Astronomical Almanac, 3rd
     ed., eq. 7.63; the limit is that of SOFA's ``iauLdsun``.
     """
@@ -81,30 +56,14 @@ def deflected(u: Array, from_sun_au: Array) -> Array:
 def aberrated(u: Array, velocity_km_s: Array) -> Array:
     """Return directions as a moving observer sees them.
 
-    Parameters
-    ----------
-    u : ndarray of float64, shape (N, 3)
-        Unit vectors as an observer at rest sees them.
-    velocity_km_s : ndarray of float64, shape (3,)
-        Velocity of the observer, km/s, below that of light.
+    Stars shift towards the velocity; with the opposite velocity the same function takes them
+    back.
 
-    Returns
-    -------
-    ndarray of float64, shape (N, 3)
-        Unit vectors, shifted towards the velocity. With the opposite velocity the same function
-        takes them back.
-
-    Notes
-    -----
     Exact in special relativity. What SOFA's ``iauAb`` adds for the potential of the Sun is below
     a microarcsecond.
 
-    References
-    ----------
     Urban and Seidelmann (eds.) 2013, eq. 7.40.
 
-    Examples
-    --------
     >>> v = np.array([0.0, 29.8, 0.0])
     >>> shifted = aberrated(np.array([[1.0, 0.0, 0.0]]), v)
     >>> round(float(np.degrees(shifted[0, 1])) * 3600, 1)

@@ -16,18 +16,6 @@ from starcat.arrays import Array
 def directions_from_radec(ra_deg: ArrayLike, dec_deg: ArrayLike) -> Array:
     """Return unit vectors from right ascension and declination.
 
-    Parameters
-    ----------
-    ra_deg, dec_deg : array_like of float64, shape (N,)
-        Degrees, any common frame.
-
-    Returns
-    -------
-    ndarray of float64, shape (N, 3)
-        Unit vectors in the same frame.
-
-    Examples
-    --------
     >>> directions_from_radec([0.0], [90.0]).round(12)
     array([[0., 0., 1.]])
     """
@@ -42,20 +30,10 @@ def directions_from_radec(ra_deg: ArrayLike, dec_deg: ArrayLike) -> Array:
 
 
 def radec_from_directions(u: ArrayLike) -> tuple[Array, Array]:
-    """Return right ascension in [0, 360) and declination from directions.
+    """Return right ascension in [0, 360) and declination, degrees, of vectors of any length but 0.
 
-    Parameters
-    ----------
-    u : array_like of float64, shape (N, 3)
-        Directions; any length but zero.
+    The declination is exact at the poles (no arcsine).
 
-    Returns
-    -------
-    ra_deg, dec_deg : ndarray of float64, shape (N,)
-        Degrees. The declination is exact at the poles (no arcsine).
-
-    Examples
-    --------
     >>> radec_from_directions([[0.0, -1.0, 0.0]])
     (array([270.]), array([0.]))
     """
@@ -69,25 +47,11 @@ def radec_from_directions(u: ArrayLike) -> tuple[Array, Array]:
 
 
 def separation(u: ArrayLike, v: ArrayLike) -> Array:
-    """Return the great-circle separation of directions, exact at all angles.
+    """Return the great-circle separation of directions, radians, exact at all angles.
 
-    Parameters
-    ----------
-    u, v : array_like of float64, shape (N, 3) or (3,)
-        Unit vectors.
-
-    Returns
-    -------
-    ndarray of float64, shape (N,)
-        Radians, 0 to pi.
-
-    Notes
-    -----
     ``2 atan2(|u - v|, |u + v|)``: an arc cosine of the dot product returns NaN when rounding
     takes the product above 1, and loses half of the digits at small angles.
 
-    Examples
-    --------
     >>> float(separation([1.0, 0.0, 0.0], [0.0, 1.0, 0.0])) * 2 / np.pi
     1.0
     """
@@ -97,20 +61,8 @@ def separation(u: ArrayLike, v: ArrayLike) -> Array:
 
 
 def chord_from_separation(separation_rad: float) -> float:
-    """Return the chord of the unit sphere that spans a separation.
+    """Return the chord of the unit sphere that spans a separation: 0 to 2.
 
-    Parameters
-    ----------
-    separation_rad : float
-        Radians, 0 to pi.
-
-    Returns
-    -------
-    float
-        Chord length, 0 to 2: the radius that a k-d tree of directions is searched with.
-
-    Examples
-    --------
     >>> chord_from_separation(np.pi)
     2.0
     """
@@ -118,17 +70,9 @@ def chord_from_separation(separation_rad: float) -> float:
 
 
 def tangent_axes(ra_deg: ArrayLike, dec_deg: ArrayLike) -> tuple[Array, Array]:
-    """Return the east and north unit vectors at positions, also at the poles.
+    """Return the east and north unit vectors at positions.
 
-    Parameters
-    ----------
-    ra_deg, dec_deg : array_like of float64, shape (N,)
-        Degrees. At a pole the right ascension says which way east is.
-
-    Returns
-    -------
-    east, north : ndarray of float64, shape (N, 3)
-        Unit vectors along increasing right ascension and declination.
+    At a pole the right ascension says which way east is.
     """
     ra = np.radians(np.asarray(ra_deg, dtype=np.float64))
     dec = np.radians(np.asarray(dec_deg, dtype=np.float64))
@@ -140,31 +84,12 @@ def tangent_axes(ra_deg: ArrayLike, dec_deg: ArrayLike) -> tuple[Array, Array]:
 
 
 def saff_kuijlaars(count: int) -> Array:
-    """Return the generalised spiral points of Saff and Kuijlaars.
+    """Return the generalised spiral points of Saff and Kuijlaars, from south to north.
 
-    Parameters
-    ----------
-    count : int
-        Number of points, at least 1.
-
-    Returns
-    -------
-    ndarray of float64, shape (count, 3)
-        Directions in spiral order, from the south pole to the north pole.
-
-    Raises
-    ------
-    ValueError
-        If ``count`` is below 1.
-
-    References
-    ----------
     Saff and Kuijlaars, The Mathematical Intelligencer 19 (1997) 5:
     ``h_k = -1 + 2 (k - 1)/(N - 1)``, ``phi_k = phi_(k-1) + 3.6/sqrt(N (1 - h_k^2))``,
     ``phi_1 = phi_N = 0``.
 
-    Examples
-    --------
     >>> saff_kuijlaars(3)[[0, 2], 2]
     array([-1.,  1.])
     """

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Directions
 
 _ROUNDING = 1e-12
 """By so much a zone is wider than its cap: more than the sines are off by."""
@@ -24,27 +24,13 @@ class Zones:
     """Directions in order of declination."""
 
     # shape (N, 3): unit vectors, southernmost first, so that a zone is read from one place
-    directions: Array
+    directions: Directions
     order: NDArray[np.int64]  # shape (N,): rows that they had when they were given
     height: Array  # shape (N,): their third components
 
     def near(self, axis: Array, radius_rad: float) -> NDArray[np.int64]:
-        """Return which directions lie within a cap.
+        """Return which directions lie within a cap, its edge included: rows, ascending.
 
-        Parameters
-        ----------
-        axis : ndarray of float64, shape (3,)
-            Middle of the cap, a unit vector.
-        radius_rad : float
-            Its radius, itself included; 0 to pi.
-
-        Returns
-        -------
-        ndarray of int64
-            Rows, ascending.
-
-        Examples
-        --------
         >>> zones_of(np.eye(3)).near(np.array([0.0, 0.6, 0.8]), 1.0)
         array([1, 2])
         """
@@ -60,19 +46,8 @@ class Zones:
         return np.sort(self.order[first:last][inside])
 
 
-def zones_of(directions: Array) -> Zones:
-    """Return directions in order of declination.
-
-    Parameters
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        Unit vectors.
-
-    Returns
-    -------
-    Zones
-        Ready to be asked.
-    """
+def zones_of(directions: Directions) -> Zones:
+    """Return directions in order of declination."""
     order = np.argsort(directions[:, 2], kind="stable")
     ordered = directions[order]
     return Zones(ordered, order, np.ascontiguousarray(ordered[:, 2]))

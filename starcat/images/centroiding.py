@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Mask, Pixels
 from starcat.errors import ConfigError
 from starcat.images.background import (
     PIXEL_VARIANCE,
@@ -37,16 +37,16 @@ class Spots:
     """What was found in one image, brightest first."""
 
     # shape (N, 2): pixels (x right, y down, origin at the outer corner of the top-left pixel)
-    centroids_px: Array
+    centroids_px: Pixels
     flux: Array  # shape (N,): light above the background, in the units of the image
     mag: Array  # shape (N,): instrumental magnitude, -2.5 log10 flux: its zero point is unknown
     snr: Array  # shape (N,): flux over its standard deviation, in an aperture of two sigma
     # shape (N,): the brightest pixel is at the detector's limit: measured too faint
-    saturated: NDArray[np.bool_]
+    saturated: Mask
     # shape (N,): touches another spot: each pulls at the other's centroid
-    blended: NDArray[np.bool_]
+    blended: Mask
     # shape (N,): cut by the edge of the image: the centroid is pulled inwards
-    at_edge: NDArray[np.bool_]
+    at_edge: Mask
     psf_sigma_px: float  # standard deviation of a star's spot before the pixels sample it
 
     def __len__(self) -> int:
@@ -70,8 +70,6 @@ def find_spots(
 ) -> Spots:
     """Find the spots of an image and measure them.
 
-    References
-    ----------
     Bertin and Arnouts 1996, A&AS 117, 393. Barbary 2016, JOSS 1 (6), 58.
     """
     _check_positive(
@@ -152,14 +150,12 @@ def _measured(
     )
 
 
-def brightest_first(flux: Array, centroids_px: Array) -> NDArray[np.int64]:
+def brightest_first(flux: Array, centroids_px: Pixels) -> NDArray[np.int64]:
     """Return the order of spots."""
     return np.lexsort((centroids_px[:, 1], centroids_px[:, 0], -flux))
 
 
-def _is_saturated(
-    levels: Levels, found: NDArray[Any], saturation: float | None
-) -> NDArray[np.bool_]:
+def _is_saturated(levels: Levels, found: NDArray[Any], saturation: float | None) -> Mask:
     """Return which spots reach the limit, given or seen as a plateau at the image's maximum."""
     around = pixels_around(levels.raw, found["xpeak"], found["ypeak"])
     if saturation is not None:
@@ -180,5 +176,5 @@ def _windowed(levels: Levels, found: NDArray[Any], window: float) -> Array:
     return np.asarray(np.where(drifts[:, None], start, centroids) + 0.5, dtype=np.float64)
 
 
-def _is_blended(found: NDArray[Any]) -> NDArray[np.bool_]:
+def _is_blended(found: NDArray[Any]) -> Mask:
     return np.asarray((found["flag"] & load_sep().OBJ_MERGED) > 0)

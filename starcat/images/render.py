@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.special import erf
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Pixels
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.images.image_file import WRITTEN_KINDS, write_image
@@ -45,7 +45,7 @@ class Optics:
     """
 
     psf_sigma_px: float = 1.0  # standard deviation of the Gaussian spot, pixels
-    # electrons of a star of magnitude 0. The default is 19,100 electrons per second and mm2 [1]_
+    # electrons of a star of magnitude 0. The default is 19,100 electrons per second and mm2
     # through an aperture of 20 mm in 0.1 s.
     zero_point_e: float = 600_000.0
     background_e: float = 20.0  # electrons of sky and dark current in a pixel
@@ -65,7 +65,7 @@ class Optics:
 
 
 def star_electrons(
-    centroids_px: Array, mag: Array, camera_size: tuple[int, int], optics: Optics
+    centroids_px: Pixels, mag: Array, camera_size: tuple[int, int], optics: Optics
 ) -> Array:
     """Return the mean number of electrons that stars release, without background or noise."""
     width, height = camera_size
@@ -87,7 +87,7 @@ def star_electrons(
     return image
 
 
-def _check(centroids_px: Array, mag: Array, camera_size: tuple[int, int]) -> None:
+def _check(centroids_px: Pixels, mag: Array, camera_size: tuple[int, int]) -> None:
     if centroids_px.ndim != 2 or centroids_px.shape[1] != 2 or mag.shape != centroids_px.shape[:1]:
         raise ValueError(
             f"centroids_px of shape {centroids_px.shape} and mag of shape {mag.shape}; "
@@ -108,7 +108,7 @@ def _profiles(centre: Array, sigma: float) -> tuple[Array, NDArray[np.int64]]:
 
 
 def render_image(
-    centroids_px: Array,
+    centroids_px: Pixels,
     mag: Array,
     camera_size: tuple[int, int],
     optics: Optics,
@@ -117,13 +117,9 @@ def render_image(
 ) -> NDArray[np.uint16]:
     """Return the image of stars as a detector would record it.
 
-    Notes
-    -----
     Electrons of stars, background and hot pixels are Poisson variates; the full well cuts
     them; the read-out adds Gaussian noise and rounds to whole ADU.
 
-    Examples
-    --------
     >>> import numpy as np
     >>> image = render_image(np.array([[10.5, 20.5]]), np.array([3.0]), (64, 48), Optics(), 1)
     >>> image.shape, np.unravel_index(image.argmax(), image.shape) == (20, 10)

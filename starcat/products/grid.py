@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.geometry.patterns import cell_of
 from starcat.products.hausdorff_angular import angular_reference_sets
 from starcat.products.index import Index, Ragged, row_offsets, sorted_unique, stable_order
@@ -34,38 +35,16 @@ class GridPatterns:
 
 
 def grid_patterns(
-    directions: NDArray[np.float64], radius_rad: float, *, buffer_rad: float, cells_per_side: int
+    directions: Array, radius_rad: float, *, buffer_rad: float, cells_per_side: int
 ) -> GridPatterns:
     """Find the grid pattern of every star.
 
-    Parameters
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        ICRS directions of the stars.
-    radius_rad : float
-        Largest separation of a neighbour, radians, itself included; below pi / 2.
-    buffer_rad : float
-        Neighbours within it, itself included, are passed over; radians, 0 or more.
-    cells_per_side : int
-        The grid has this many rows and columns, 1 to 46,340.
+    Neighbours within the buffer, itself included, are passed over. A star without a neighbour
+    between buffer and radius (below pi / 2) has no row.
 
-    Returns
-    -------
-    GridPatterns
-        Sorted by star. A star without a neighbour between buffer and radius has no row.
-
-    Raises
-    ------
-    ValueError
-        If an argument is out of its range.
-
-    Notes
-    -----
     The alignment star lies exactly on the +x axis, which in a grid of an even number of cells
     is the lower edge of its row: an observed pattern has to put it at y = 0, not near it.
 
-    References
-    ----------
     Padgett and Kreutz-Delgado 1997, "A grid algorithm for autonomous star identification",
     IEEE Transactions on Aerospace and Electronic Systems 33, 202.
     """

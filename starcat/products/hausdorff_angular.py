@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.geometry.proximity import pairs_within
 from starcat.products.index import Index, row_offsets, stable_order
 
@@ -25,41 +26,22 @@ class AngularReferenceSets:
     star: NDArray[np.int32]  # shape (M,): rows of the star table, ascending
     neighbour: NDArray[np.int32]  # shape (M,): rows of the star table
     # shape (M,): great-circle separations of the two, radians, ascending within a star
-    separation_rad: NDArray[np.float64]
+    separation_rad: Array
     # dataset ``star_offsets``, int64, shape (N + 1,): the rows of star n are
     # ``star_offsets[n]:star_offsets[n + 1]``. Attribute ``radius_rad``.
     index: Index
 
 
-def angular_reference_sets(
-    directions: NDArray[np.float64], radius_rad: float
-) -> AngularReferenceSets:
+def angular_reference_sets(directions: Array, radius_rad: float) -> AngularReferenceSets:
     """Find the neighbours of every star within a radius, nearest first.
 
-    Parameters
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        ICRS directions of the stars.
-    radius_rad : float
-        Largest separation of a neighbour, radians, itself included. The method takes 4/3 of
-        the field's half-angle, which is up to the caller.
+    Sorted by (star, separation, neighbour); the radius is included.
 
-    Returns
-    -------
-    AngularReferenceSets
-        Sorted by (star, separation, neighbour).
-
-    Notes
-    -----
     Every pair of stars makes two rows, one from either end. Stars at the same place are
     neighbours at separation 0. The star itself is not in its set.
 
-    References
-    ----------
     Rotation-invariant feature with modified Hausdorff distance (S5), the feature of a star.
 
-    Examples
-    --------
     >>> found = angular_reference_sets(np.eye(3)[:2], 2.0)
     >>> found.star, found.neighbour, found.separation_rad
     (array([0, 1], dtype=int32), array([1, 0], dtype=int32), array([1.570..., 1.570...]))
@@ -81,7 +63,7 @@ def angular_reference_sets(
 
 
 def _nearest_first(
-    star: NDArray[np.int32], neighbour: NDArray[np.int32], separation_rad: NDArray[np.float64]
+    star: NDArray[np.int32], neighbour: NDArray[np.int32], separation_rad: Array
 ) -> NDArray[np.int64]:
     """Return the order of (star, separation, neighbour); the stars ascend already."""
     order = np.argsort(separation_rad)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.products.hausdorff_angular import angular_reference_sets
 from starcat.products.index import Index, row_offsets
 
@@ -22,7 +23,7 @@ class PlanarReferenceSets:
     star: NDArray[np.int32]  # shape (M,): rows of the star table, ascending
     neighbour: NDArray[np.int32]  # shape (M,): rows of the star table
     # shape (M,): gnomonic distance over the star's smallest one, 1 or more, ascending within a star
-    ratio: NDArray[np.float64]
+    ratio: Array
     # datasets ``star_offsets``, int64, shape (N + 1,): the rows of star n are
     # ``star_offsets[n]:star_offsets[n + 1]``; and ``smallest_distance``, float64, shape (N,): the
     # distance that was divided by, in units of the focal length, NaN for a star without rows.
@@ -30,36 +31,16 @@ class PlanarReferenceSets:
     index: Index
 
 
-def planar_reference_sets(
-    directions: NDArray[np.float64], radius_rad: float
-) -> PlanarReferenceSets:
+def planar_reference_sets(directions: Array, radius_rad: float) -> PlanarReferenceSets:
     """Find the ratios of the gnomonic distances around every star.
 
-    Parameters
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        ICRS directions of the stars.
-    radius_rad : float
-        Largest separation of a neighbour, radians, itself included; below pi / 2.
+    Sorted by (star, ratio, neighbour); the radius is below pi / 2, where the tangent plane
+    ends.
 
-    Returns
-    -------
-    PlanarReferenceSets
-        Sorted by (star, ratio, neighbour).
-
-    Raises
-    ------
-    ValueError
-        If the radius is not below pi / 2, where the tangent plane ends.
-
-    Notes
-    -----
     On the plane that touches the sphere at the star, a neighbour lies at the tangent of its
     separation. Stars at the same place have distance 0 and are left out: the method divides by
     the smallest distance that is not 0. The star itself, the method's leading 0, has no row.
 
-    References
-    ----------
     Wang et al. 2020 (S1), eqs. 6, 9 and 12.
     """
     if not radius_rad < 0.5 * np.pi:

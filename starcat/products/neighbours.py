@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Directions
 from starcat.geometry.patterns import bin_of
 from starcat.geometry.sphere import radec_from_directions, tangent_axes
 from starcat.products.hausdorff_angular import angular_reference_sets
@@ -43,36 +43,15 @@ class Neighbours:
 
 
 def find_neighbours(
-    directions: Array, radius_rad: float, *, angle_bin_rad: float, separation_bin_rad: float
+    directions: Directions, radius_rad: float, *, angle_bin_rad: float, separation_bin_rad: float
 ) -> Neighbours:
     """Find the neighbours of every star within a radius, counter-clockwise.
 
-    Parameters
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        ICRS directions of the stars.
-    radius_rad : float
-        Largest separation of a neighbour, radians, itself included.
-    angle_bin_rad, separation_bin_rad : float
-        Widths of the look-up table's bins, radians.
+    Sorted by (star, position angle, neighbour).
 
-    Returns
-    -------
-    Neighbours
-        Sorted by (star, position angle, neighbour).
-
-    Raises
-    ------
-    ValueError
-        If a bin is not wider than 0.
-
-    Notes
-    -----
     A star with one neighbour has one successive angle, 2 pi. A star at the same place is a
     neighbour with position angle 0.
 
-    References
-    ----------
     Sun et al. 2021 (S2), the feature of tables 1 and 2 and its look-up by angle and distance.
     """
     angle_bins = _bin_count(_TURN, angle_bin_rad, "angle_bin_rad")
@@ -105,26 +84,14 @@ def find_neighbours(
 
 
 def position_angles(
-    directions: Array, star: NDArray[np.integer[Any]], neighbour: NDArray[np.integer[Any]]
+    directions: Directions, star: NDArray[np.integer[Any]], neighbour: NDArray[np.integer[Any]]
 ) -> Array:
     """Return the position angles of neighbours at stars.
 
-    Parameters
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        ICRS directions.
-    star, neighbour : ndarray of int, shape (M,)
-        Rows of ``directions``.
+    Radians in [0, 2 pi), from north through east: counter-clockwise on the sky as seen from
+    inside. 0 where the two are at the same place; at a pole the star's own right ascension says
+    which way east is.
 
-    Returns
-    -------
-    ndarray of float64, shape (M,)
-        Radians in [0, 2 pi), from north through east: counter-clockwise on the sky as seen
-        from inside. 0 where the two are at the same place. At a pole the star's own right
-        ascension says which way east is.
-
-    Examples
-    --------
     >>> u = np.eye(3)
     >>> position_angles(u, np.array([0, 0]), np.array([2, 1])) * 2.0 / np.pi
     array([0., 1.])

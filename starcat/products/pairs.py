@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.geometry.kvector import KVector, build_kvector
 from starcat.geometry.proximity import pairs_within
 from starcat.products.index import Index, kvector_index
@@ -29,27 +30,17 @@ class StarPairs:
         return kvector_index(self.kvector)
 
     @property
-    def separation_rad(self) -> NDArray[np.float64]:
+    def separation_rad(self) -> Array:
         """Separations in radians, ascending, shape (M,)."""
         return self.kvector.values
 
 
 def find_pairs(
-    directions: NDArray[np.float64], min_separation_rad: float, max_separation_rad: float
+    directions: Array, min_separation_rad: float, max_separation_rad: float
 ) -> StarPairs:
     """Find all pairs of stars whose separation lies in a range.
 
-    Parameters
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        ICRS directions of the stars.
-    min_separation_rad, max_separation_rad : float
-        Closed interval, radians.
-
-    Returns
-    -------
-    StarPairs
-        Sorted by (separation, i, j).
+    The interval is closed; the rows are sorted by (separation, i, j).
     """
     found, angle = pairs_within(directions, max_separation_rad)
     far = angle >= min_separation_rad

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.geometry.patterns import cyclic_shifts, ring_of, sector_of
 from starcat.products.hausdorff_angular import AngularReferenceSets, angular_reference_sets
 from starcat.products.index import Index, Ragged, row_offsets, sorted_unique, stable_order
@@ -33,38 +34,15 @@ class RadialPatterns:
 
 
 def radial_patterns(
-    directions: NDArray[np.float64], radius_rad: float, *, rings: int, sectors: int
+    directions: Array, radius_rad: float, *, rings: int, sectors: int
 ) -> RadialPatterns:
     """Find the radial and the cyclic pattern of every star.
 
-    Parameters
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        ICRS directions of the stars.
-    radius_rad : float
-        Largest separation of a neighbour, radians, itself included; more than 0.
-    rings : int
-        Number of rings of equal width, 1 or more.
-    sectors : int
-        Number of sectors of equal angle, 1 to 31.
+    1 to 31 sectors; ValueError for what is out of range.
 
-    Returns
-    -------
-    RadialPatterns
-        Sorted by star.
-
-    Raises
-    ------
-    ValueError
-        If an argument is out of its range.
-
-    Notes
-    -----
     Sectors are counted counter-clockwise from the nearest neighbour, of equally near ones the
     first. A star at the same place is in ring 0 and, having no position angle, in no sector.
 
-    References
-    ----------
     Zhang, Wei and Jiang 2008, "Full-sky autonomous star identification based on radial and
     cyclic features of star pattern", Image and Vision Computing 26, 891.
     """
@@ -92,9 +70,7 @@ def radial_patterns(
     )
 
 
-def _sectors(
-    directions: NDArray[np.float64], sets: AngularReferenceSets, sectors: int
-) -> NDArray[np.int64]:
+def _sectors(directions: Array, sets: AngularReferenceSets, sectors: int) -> NDArray[np.int64]:
     """Return the occupied sectors of every star, bit 0 from its nearest neighbour on."""
     apart = sets.separation_rad > 0.0
     star = sets.star[apart]

@@ -13,7 +13,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Array
+from starcat.arrays import Directions
 from starcat.geometry.kvector import build_kvector
 from starcat.geometry.patterns import triangle_area
 from starcat.geometry.sphere import separation
@@ -50,26 +50,12 @@ class Triangles:
         return int(self.times_seen.sum())
 
 
-def find_triangles(fields: FieldStars, directions: Array, brightest: int) -> Triangles:
+def find_triangles(fields: FieldStars, directions: Directions, brightest: int) -> Triangles:
     """Find all triangles of the brightest stars of each field.
 
-    Parameters
-    ----------
-    fields : FieldStars
-        The tiling, stars brightest first.
-    directions : ndarray of float64, shape (N, 3)
-        ICRS directions of the stars.
-    brightest : int
-        How many stars of a field take part; n of them make n (n - 1) (n - 2) / 6 triangles.
+    Sorted by (area, i, j, k); n stars of a field make n (n - 1) (n - 2) / 6. Collinear
+    triangles have area 0, inradius 0 and an infinite circumradius.
 
-    Returns
-    -------
-    Triangles
-        Sorted by (area, i, j, k). Collinear triangles have area 0, inradius 0 and an infinite
-        circumradius.
-
-    References
-    ----------
     Liao and Zhang 2024 (S4), eqs. 4 and 7.
     """
     stars, seen = distinct_triangles(fields, len(directions), brightest)
@@ -91,7 +77,7 @@ def find_triangles(fields: FieldStars, directions: Array, brightest: int) -> Tri
 
 
 def _features(
-    stars: NDArray[np.int64], directions: Array
+    stars: NDArray[np.int64], directions: Directions
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Return area, circumradius and inradius of triangles, some at a time to save memory."""
     found = np.empty((3, len(stars)), dtype=np.float32)
@@ -114,21 +100,7 @@ def distinct_triangles(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the distinct triangles of all fields.
 
-    Parameters
-    ----------
-    fields : FieldStars
-        The tiling.
-    count : int
-        Number of stars in the table.
-    brightest : int
-        Stars of a field that take part.
-
-    Returns
-    -------
-    stars : ndarray of int64, shape (M, 3)
-        Rows i < j < k, in order.
-    times_seen : ndarray of int64, shape (M,)
-        Fields that have the triangle.
+    Rows i < j < k, shape (M, 3), in order, and the number of fields that have the triangle.
     """
     triples = _triples(fields, brightest)
     return _distinct_packed(triples) if count <= 1 << _PACKED_BITS else _distinct_rows(triples)

@@ -12,7 +12,7 @@ from functools import lru_cache
 import erfa
 import numpy as np
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Directions
 from starcat.geometry.aberration import AU_KM, LIGHT_KM_S, aberrated
 from starcat.sky.magnitudes import apparent_magnitude
 from starcat.sky.observer import DAY_S, Observer
@@ -61,7 +61,7 @@ class Bodies:
     names: tuple[str, ...]
     # shape (B, 3): apparent directions of their middles, ICRS axes: light time and aberration are
     # in them
-    directions: Array
+    directions: Directions
     distance_au: Array  # shape (B,): from the observer
     radius_rad: Array  # shape (B,): half of what they subtend
     mag: Array  # shape (B,): magnitudes, V

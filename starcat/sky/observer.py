@@ -17,7 +17,7 @@ from typing import Literal, get_args
 import erfa
 import numpy as np
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Directions
 from starcat.errors import ConfigError
 from starcat.geometry.aberration import (
     AU_KM,
@@ -131,21 +131,11 @@ class Observer:
         sun_au = earth_au - np.array(heliocentric["p"])
         return cls(moment, tt, position_au, velocity, sun_au, earth_au, place is not None)
 
-    def apparent(self, directions: Array, parallax_mas: Array | None = None) -> Array:
+    def apparent(self, directions: Directions, parallax_mas: Array | None = None) -> Array:
         """Return where stars of a catalog are seen.
 
-        Parameters
-        ----------
-        directions : ndarray of float64, shape (N, 3)
-            ICRS unit vectors, as catalogs have them.
-        parallax_mas : ndarray of float64, shape (N,), optional
-            Annual parallaxes, mas, NaN where unknown; all 0 by default.
-
-        Returns
-        -------
-        ndarray of float64, shape (N, 3)
-            Unit vectors in the same axes: with parallax, light deflection by the Sun and
-            aberration, astropy's GCRS to 1 mas.
+        With parallax (mas, NaN where unknown), light deflection by the Sun and aberration:
+        astropy's GCRS to 1 mas.
         """
         u = directions
         if parallax_mas is not None:
@@ -154,27 +144,7 @@ class Observer:
 
 
 def numbers_of(name: str, text: str, count: int) -> list[float]:
-    """Return the numbers of a text such as ``1.5,-7.2,0``.
-
-    Parameters
-    ----------
-    name : str
-        What they are, for the message.
-    text : str
-        Numbers with commas between them.
-    count : int
-        How many there have to be.
-
-    Returns
-    -------
-    list of float
-        Finite.
-
-    Raises
-    ------
-    ConfigError
-        If they are not that many finite numbers.
-    """
+    """Return so many numbers of a text such as ``1.5,-7.2,0``, or raise ConfigError."""
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:
