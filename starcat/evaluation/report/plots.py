@@ -9,8 +9,7 @@ from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
-from starcat.evaluation.report.columns import Line, method_of
-from starcat.evaluation.report.tables import groups_of
+from starcat.evaluation.report.tables import Line, groups_of, method_of
 from starcat.images.figure_file import own_style, write_figure
 from starcat.report.plots import STYLE, headline
 

@@ -10,12 +10,11 @@ from fastapi.responses import JSONResponse, Response, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from starcat.exchange.formats import FILE_FORMATS, FORMATS, FileFormat
-from starcat.query.gallery import gallery
-from starcat.query.macros import macros
+from starcat.query.gallery import gallery, macros
 from starcat.service.access import Reader
-from starcat.service.asking import Question, file_of, named_text, rows_of
 from starcat.service.problems import Problem
 from starcat.service.service import Service, TheService
+from starcat.service.sql import SqlQuery, named_text, result_file, result_table
 
 router = APIRouter(prefix="/sql", tags=["sql"])
 
@@ -176,7 +175,7 @@ async def views(
     return await service.query_pool.run(_views, service, target)
 
 
-def _checked(service: Service, question: SqlQuestion) -> Question:
+def _checked(service: Service, question: SqlQuestion) -> SqlQuery:
     """Return what is asked, within the limits that the operator set."""
     if (question.query is None) == (question.named is None):
         raise Problem(422, "give either a query or the name of one", key="query")
@@ -190,17 +189,17 @@ def _checked(service: Service, question: SqlQuestion) -> Question:
     else:
         text, values = question.query or "", dict(question.values)  # type: ignore[arg-type]
     time_s = min(question.time_limit_s or settings.query_time_s, settings.query_time_s)
-    return Question(question.targets, text, values, min(question.max_rows or default, most), time_s)
+    return SqlQuery(question.targets, text, values, min(question.max_rows or default, most), time_s)
 
 
-def _rows(service: Service, asked: Question) -> Response:
-    found = rows_of(service, asked)
+def _rows(service: Service, asked: SqlQuery) -> Response:
+    found = result_table(service, asked).as_json()
     # What JSON has was made sure of: a model would check every value once more.
-    return JSONResponse({"columns": found.columns, "rows": found.rows, "is_cut": found.is_cut})
+    return JSONResponse(found)
 
 
-def _file(service: Service, asked: Question, form: str) -> Response:
-    found = file_of(service, asked, form)
+def _file(service: Service, asked: SqlQuery, form: str) -> Response:
+    found = result_file(service, asked, form)
     kind = FORMATS[form]
     headers = {
         "Content-Length": str(found.size),

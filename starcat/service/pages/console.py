@@ -13,15 +13,14 @@ from starlette.concurrency import run_in_threadpool
 
 from starcat.errors import QueryError, StarcatError, TargetMissing
 from starcat.exchange.formats import FORMATS, PAGE_FORMATS, PageFormat
-from starcat.query.answer import cell_text
-from starcat.query.gallery import NamedQuery, gallery, guessed, named_query
-from starcat.query.macros import macros
+from starcat.query.gallery import NamedQuery, gallery, guessed, macros, named_query
+from starcat.query.result import ResultTable
 from starcat.service.access import Reader
-from starcat.service.asking import Question, Rows, file_of, rows_of
 from starcat.service.pages.facts import database_row, products_of
 from starcat.service.pages.rendering import page_router, render
 from starcat.service.problems import Problem, ProblemDetails, problem_of
 from starcat.service.service import Service, TheService
+from starcat.service.sql import SqlQuery, result_file, result_table
 
 router = page_router()
 
@@ -38,7 +37,6 @@ FIRST = "SELECT designation, mag, ra_deg, dec_deg\nFROM stars\nORDER BY mag\nLIM
 """What stands in the console before anything was asked."""
 
 _NAMES = re.compile(r"\$([A-Za-z_]\w{0,63})")
-_NUMERIC = re.compile(r"[UH]*(TINY|SMALL|BIG|HUGE)?INT|DOUBLE|FLOAT|DECIMAL")
 
 
 @dataclass(frozen=True)
@@ -67,33 +65,11 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Cells:
-    """An answer as the page shows it.
-
-    Attributes
-    ----------
-    columns : list of mapping
-        ``name``, ``unit`` and ``description`` of each.
-    numbers : list of bool
-        Which columns are numbers.
-    rows : list of list of str
-        Texts.
-    is_cut : bool
-        Whether there are more.
-    """
-
-    columns: list[dict[str, str]]
-    numbers: list[bool]
-    rows: list[list[str]]
-    is_cut: bool
-
-
-@dataclass(frozen=True)
 class _Shown:
     """What the console shows, or its answer alone."""
 
     asked: Asked
-    answer: Cells | None
+    answer: ResultTable | None
     problem: ProblemDetails | None
     is_part: bool
 
@@ -127,12 +103,11 @@ async def console(
     part: Annotated[Literal["", "answer"], Query()] = "",
 ) -> Response:
     """Show the console with the answer to what was asked; the script wants the answer alone."""
-    answer: Cells | None = None
+    answer: ResultTable | None = None
     problem: ProblemDetails | None = None
     if asked.query:
         try:
-            found = await service.query_pool.run(_rows, service, database_id, asked)
-            answer = cells_of(found)
+            answer = await service.query_pool.run(_rows, service, database_id, asked)
         except TargetMissing:
             raise  # the page itself is not there
         except (StarcatError, Problem) as error:
@@ -148,7 +123,7 @@ async def answer_file(
     """Give all rows of an answer as a file."""
     database = service.library.database(database_id)
     question = question_of(service, database.id, asked, service.settings.max_rows)
-    found = await service.query_pool.run(file_of, service, question, form)
+    found = await service.query_pool.run(result_file, service, question, form)
     kind = FORMATS[form]
     headers = {
         "Content-Length": str(found.size),
@@ -157,7 +132,7 @@ async def answer_file(
     return StreamingResponse(found.chunks, media_type=kind.media_type, headers=headers)
 
 
-def question_of(service: Service, database_id: str, asked: Asked, most: int) -> Question:
+def question_of(service: Service, database_id: str, asked: Asked, most: int) -> SqlQuery:
     """Return what is asked as the service answers it."""
     if not asked.query.strip():
         raise QueryError('the query is empty; try "SELECT count(*) FROM stars"')
@@ -171,12 +146,13 @@ def question_of(service: Service, database_id: str, asked: Asked, most: int) -> 
         values = chosen.with_values({n: t for n, t in asked.values.items() if n in known})
     else:
         values = {name: guessed(text) for name, text in asked.values.items()}
-    return Question(targets, asked.query, values, most, service.settings.query_time_s)
+    return SqlQuery(targets, asked.query, values, most, service.settings.query_time_s)
 
 
-def _rows(service: Service, database_id: str, asked: Asked) -> Rows:
+def _rows(service: Service, database_id: str, asked: Asked) -> ResultTable:
     most = min(asked.rows, service.settings.max_rows)
-    return rows_of(service, question_of(service, database_id, asked, most))
+    found = result_table(service, question_of(service, database_id, asked, most))
+    return found.with_json_values()
 
 
 def _page(request: Request, service: Service, database_id: str, shown: _Shown) -> Response:
@@ -231,13 +207,3 @@ def values_in(
         )
         for name in dict.fromkeys(_NAMES.findall(text))
     ]
-
-
-def cells_of(found: Rows) -> Cells:
-    """Return an answer as the page shows it."""
-    numbers = [
-        bool(_NUMERIC.match(column["type"])) and "[" not in column["type"]
-        for column in found.columns
-    ]
-    rows = [[cell_text(value) for value in row] for row in found.rows]
-    return Cells(found.columns, numbers, rows, found.is_cut)

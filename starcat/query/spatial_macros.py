@@ -15,7 +15,7 @@ from pathlib import Path
 from starcat.query.names import quoted, quoted_name
 from starcat.query.targets import POSITION, Target, View
 
-_MACROS = Path(__file__).parent / "sql" / "places.sql"
+_MACROS = Path(__file__).parent / "sql" / "spatial_macros.sql"
 
 _NUMBERS = ["x", "y", "z", "cosine", "sine", "reach", "ra_from", "ra_to", "dec_from", "dec_to"]
 """What is known of each file beside its name. Angles are in degrees."""
