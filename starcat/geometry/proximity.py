@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Directions
 from starcat.geometry.sphere import chord_from_separation, separation
 
 
-def nearest_neighbours(directions: Array, workers: int = 2) -> tuple[Array, NDArray[np.int64]]:
+def nearest_neighbours(directions: Directions, workers: int = 2) -> tuple[Array, NDArray[np.int64]]:
     """Return each star's nearest other star.
 
     Separations in radians and rows; of several at the same separation the first. N >= 2.
@@ -21,8 +21,8 @@ def nearest_neighbours(directions: Array, workers: int = 2) -> tuple[Array, NDAr
 
 
 def nearest_chords(
-    points: Array,
-    stars: Array,
+    points: Directions,
+    stars: Directions,
     itself: NDArray[np.int64],
     rank: NDArray[np.int64],
     workers: int = 1,
@@ -65,7 +65,9 @@ def separation_from_chord(chord: Array) -> Array:
     return 2.0 * np.arctan2(chord, other)
 
 
-def pairs_within(directions: Array, max_separation_rad: float) -> tuple[NDArray[np.int64], Array]:
+def pairs_within(
+    directions: Directions, max_separation_rad: float
+) -> tuple[NDArray[np.int64], Array]:
     """Return all pairs of stars within a separation.
 
     Rows i < j, shape (M, 2), in order of (i, j), and separations, radians; the largest is

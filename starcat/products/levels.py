@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Directions
 from starcat.products.boresights import FieldSize, FieldStars, NominalField, tile_sphere
 from starcat.products.index import Index, Ragged
-from starcat.products.triangles import distinct_triangles
+from starcat.products.pairs_and_triangles import distinct_triangles
 
 Rows = NDArray[np.int32]
 

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from starcat.arrays import Array, Matrix
-from starcat.geometry.aberration import AU_KM
 from starcat.geometry.attitude import (
     matrix_from_quaternion,
     quaternion_from_matrix,
@@ -29,7 +28,7 @@ from starcat.matcher.database import Database
 from starcat.matcher.observation import as_frame
 from starcat.matcher.result import MatchResult
 from starcat.sky.bodies import RADII_KM, Bodies, bodies_seen
-from starcat.sky.observer import Observer
+from starcat.sky.observer import AU_KM, Observer
 
 
 @dataclass(frozen=True)

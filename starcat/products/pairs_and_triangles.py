@@ -1,7 +1,8 @@
-"""Triangles of the brightest stars of each field: area, circumradius, inradius.
+"""Star pairs by separation, and triangles of the brightest stars of each field by area.
 
-The sides are great-circle separations and the triangle is the plane one with those sides, so
-the features do not depend on where in a frame it lies.
+Both have a K-vector over what they are sorted by. The sides of a triangle are great-circle
+separations and the triangle is the plane one with those sides, so that its features do not depend
+on where in a frame it lies.
 """
 
 from __future__ import annotations
@@ -13,12 +14,54 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Directions
-from starcat.geometry.kvector import build_kvector
+from starcat.arrays import Array, Directions
+from starcat.geometry.kvector import KVector, build_kvector
 from starcat.geometry.patterns import triangle_area
+from starcat.geometry.proximity import pairs_within
 from starcat.geometry.sphere import separation
 from starcat.products.boresights import FieldStars
 from starcat.products.index import Index, kvector_index
+
+
+@dataclass(frozen=True)
+class StarPairs:
+    """All pairs of stars within a range of separations."""
+
+    # i, j: shape (M,): rows of the star table, i < j
+    i: NDArray[np.int32]
+    j: NDArray[np.int32]
+    # over the separations, radians; ``kvector.values`` are the separations themselves, ascending,
+    # equal ones in order of (i, j)
+    kvector: KVector
+
+    @property
+    def index(self) -> Index:
+        """The K-vector as the database holds it."""
+        return kvector_index(self.kvector)
+
+    @property
+    def separation_rad(self) -> Array:
+        """Separations in radians, ascending, shape (M,)."""
+        return self.kvector.values
+
+
+def find_pairs(
+    directions: Directions, min_separation_rad: float, max_separation_rad: float
+) -> StarPairs:
+    """Find all pairs of stars whose separation lies in a range.
+
+    The interval is closed; the rows are sorted by (separation, i, j).
+    """
+    found, angle = pairs_within(directions, max_separation_rad)
+    far = angle >= min_separation_rad
+    found, angle = found[far].astype(np.int32), angle[far]
+    order = np.argsort(angle)
+    if bool(np.any(np.diff(angle[order]) == 0.0)):
+        # The pairs come in order of (i, j), which a stable sort keeps for equal separations.
+        order = np.argsort(angle, kind="stable")
+    i, j = found[order, 0], found[order, 1]
+    return StarPairs(i, j, build_kvector(angle[order]))
+
 
 _PACKED_BITS = 21
 """Three row numbers of so many bits fit into one int64."""
