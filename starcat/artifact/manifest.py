@@ -19,7 +19,7 @@ from starcat.errors import ArtifactMissing, ProductError, SchemaVersionError
 from starcat.version import __version__
 
 if TYPE_CHECKING:  # reading a manifest needs none of these
-    from starcat.catalog.file_parts import FileFacts
+    from starcat.catalog.source_files import FileFacts
     from starcat.storage.schema import ProductSchema
 
 MANIFEST_NAME = "manifest.json"

@@ -18,9 +18,9 @@ import pyarrow as pa
 
 from starcat.artifact.verify import check_artifact
 from starcat.artifact.writer import Product, write_manifest, write_products
-from starcat.catalog.fetching.locate import locate
 from starcat.catalog.ingest import Ingested
 from starcat.catalog.selection import Selected
+from starcat.catalog.source_files import locate
 from starcat.catalog.stars import directions_of, sort_rows
 from starcat.catalog.variability import AmplitudeTable, join_amplitudes, read_amplitudes
 from starcat.errors import BuildError, ConfigError

@@ -17,9 +17,9 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from starcat.catalog.fetching.locate import locate
 from starcat.catalog.ingest import ingest
 from starcat.catalog.selection import reject_dense, select_guide_stars
+from starcat.catalog.source_files import locate
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.errors import BuildError, OutputError
 from starcat.geometry.camera import Camera

@@ -43,6 +43,26 @@ class Database:
         """Name and version, as the folder has them."""
         return f"{self.name}-{self.version}"
 
+    @property
+    def spec(self) -> dict[str, Any]:
+        """The spec, with all defaults."""
+        return dict(self.manifest["spec"])
+
+    @property
+    def description(self) -> str:
+        """What the spec says of it."""
+        return str(self.spec.get("description") or "")
+
+    @property
+    def products(self) -> dict[str, int]:
+        """Rows of each product."""
+        return {name: int(facts["rows"]) for name, facts in self.manifest["products"].items()}
+
+    @property
+    def bytes(self) -> int:
+        """Size of all files together, without the manifest."""
+        return sum(int(facts["bytes"]) for facts in self.manifest["files"].values())
+
     @cached_property
     def manifest_blob(self) -> Blob:
         """Digest and size of the file of its manifest, by which releases name it."""
