@@ -15,7 +15,7 @@ from starcat.service.access import Reader
 from starcat.service.problems import REFUSALS
 from starcat.service.service import TheService
 from starcat.service.transfers import FILE, IMMUTABLE, REVALIDATED, file_answer, has_already
-from starcat.specs.version import NAME_PATTERN, VERSION_PATTERN
+from starcat.specs.section import NAME_PATTERN, VERSION_PATTERN
 
 router = APIRouter(prefix="/registry", tags=["releases"], responses=REFUSALS)
 

@@ -12,8 +12,8 @@ from starcat.geometry.sphere import radec_from_directions
 from starcat.pipeline.estimate import Estimate
 from starcat.pipeline.starter import Starter, advice
 from starcat.specs.build_spec import BuildSpec, CameraSpec
+from starcat.specs.keys import spec_toml
 from starcat.specs.reading import preset
-from starcat.specs.spec_toml import spec_toml
 
 MOST_FIELDS = 50_000
 """Fields that are listed one by one at the most."""
