@@ -9,8 +9,7 @@ from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
-from starcat.evaluation.report.columns import Line, method_of
-from starcat.evaluation.report.tables import groups_of
+from starcat.evaluation.report.tables import Line, groups_of, method_of
 from starcat.images.figure_file import own_style, write_figure
 from starcat.report.plots import STYLE, headline
 
@@ -81,7 +80,6 @@ def _places(x: Iterable[float]) -> dict[float, float]:
 def _draw_curves(
     axes: Axes, lines: Sequence[Line], series: Sequence[str], places: Mapping[float, float]
 ) -> list[Any]:
-    """Draw all curves; return what the legend shows."""
     shown = list(dict.fromkeys(series_of(line) for line in lines))
     width = max(places.values()) - min(places.values())
     handles = []

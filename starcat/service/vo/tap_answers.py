@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 from starcat.exchange.columns import Label
 from starcat.exchange.formats import Format
 from starcat.exchange.writers import result_chunks
-from starcat.service.answer_files import file_of_rows, keep_rows
 from starcat.service.paths import ServicePaths
 from starcat.service.sandbox.sandbox import Sandbox
-from starcat.service.uploading import scratch_folder
+from starcat.service.transfers import chunks_of, scratch_folder, write_rows
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -37,7 +36,8 @@ class Answers:
     def _fits(self, batches: pa.RecordBatchReader, max_rows: int) -> Iterator[bytes]:
         """Have a FITS file made, which is held in memory as a whole, by another process."""
         with scratch_folder(self._paths) as folder:
-            rows = folder / "rows.arrow"
-            keep_rows(batches, rows, max_rows)
-            chunks, _ = file_of_rows(self._sandbox, rows, folder / "answer.fits", "fits")
+            rows, result = folder / "rows.arrow", folder / "result.fits"
+            write_rows(batches, rows, max_rows)
+            self._sandbox.convert(rows, result, "fits")
+            chunks = chunks_of(result.open("rb"))
         yield from chunks

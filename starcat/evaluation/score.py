@@ -21,7 +21,7 @@ from starcat.simulation.simulate import Frame
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Score:
     """One frame and its answer."""
 
     frame: int
@@ -41,11 +41,11 @@ class Verdict:
     time_ms: float  # processor time of the identification
 
 
-FIELDS = tuple(field.name for field in fields(Verdict))
+FIELDS = tuple(field.name for field in fields(Score))
 """Columns of the records."""
 
 
-def judge(
+def score(
     number: int,
     frame: Frame,
     result: MatchResult,
@@ -53,7 +53,7 @@ def judge(
     camera: Camera,
     reach_px: float,
     time_ms: float,
-) -> Verdict:
+) -> Score:
     """Compare an answer with the truth."""
     named = result.star_index
     is_named = named >= 0
@@ -62,7 +62,7 @@ def judge(
     place = camera.pixels_from_directions(database.directions[named[other]] @ frame.matrix.T)
     away = np.hypot(*(place - frame.centroids_px[other]).T)
     error_px, across, about = _attitude_errors(frame.matrix, result.q_body_from_icrs, camera)
-    return Verdict(
+    return Score(
         frame=number,
         n_centroids=len(frame.star_index),
         n_guide_stars=frame.n_stars,

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 
+from starcat.evaluation.experiment import Attitudes, Experiment, description, run_experiment
 from starcat.evaluation.papers import s2, s4
-from starcat.evaluation.trial import Attitudes, Trial, description, run_trial
 from starcat.geometry.camera import Camera
 from starcat.matcher.fast import library_version
 from starcat.simulation.simulate import Frame, Noise, simulate_frame
@@ -39,24 +39,26 @@ def test_the_true_magnitude_decides_what_is_seen_where_it_is_asked_to(random_dir
     assert len(set(hidden.star_index.tolist()) - true) > 3
 
 
-def statuses(trial: Trial, artifact: Path, folder: Path) -> list[str]:
-    return pq.read_table(run_trial(trial, artifact, folder, workers=1))["status"].to_pylist()
+def statuses(experiment: Experiment, artifact: Path, folder: Path) -> list[str]:
+    return pq.read_table(run_experiment(experiment, artifact, folder, workers=1))[
+        "status"
+    ].to_pylist()
 
 
 def test_the_matcher_is_told_the_share_of_the_trial(small_artifact: Path, tmp_path: Path):
     noise = Noise(drop_probability=0.5, false_stars=4, limit_mag=6.0)
-    half = Trial("half", "triangle", Attitudes("random", 30), noise, min_share=0.05)
+    half = Experiment("half", "triangle", Attitudes("random", 30), noise, min_share=0.05)
     whole = replace(half, name="whole", min_share=1.0)
     assert statuses(half, small_artifact, tmp_path).count("identified") >= 10
     assert statuses(whole, small_artifact, tmp_path).count("identified") == 0
 
 
 def test_the_installed_engine_answers_as_numpy_does(small_artifact: Path, tmp_path: Path):
-    numpy = Trial("numpy", "triangle", Attitudes("random", 30), Noise(0.3, limit_mag=6.0))
+    numpy = Experiment("numpy", "triangle", Attitudes("random", 30), Noise(0.3, limit_mag=6.0))
     installed = replace(numpy, name="installed", engine="auto")
     found = [
-        pq.read_table(run_trial(trial, small_artifact, tmp_path, workers=1))
-        for trial in (numpy, installed)
+        pq.read_table(run_experiment(experiment, small_artifact, tmp_path, workers=1))
+        for experiment in (numpy, installed)
     ]
     for column in ("status", "n_named", "n_right", "n_wrong"):
         assert found[0][column].to_pylist() == found[1][column].to_pylist()
@@ -66,11 +68,11 @@ def test_the_installed_engine_answers_as_numpy_does(small_artifact: Path, tmp_pa
 
 
 def test_noise_of_a_magnitude_is_read_in_every_way():
-    rows = {row.trial.name: row for paper in (s2, s4) for row in paper.rows(quick=True)}
+    rows = {row.experiment.name: row for paper in (s2, s4) for row in paper.rows(quick=True)}
     one = rows["s2-magnitude-noise-1-dynamic_angle"]
     for name in ("guides", "share", "seen"):
         other = rows[f"s2-{name}-magnitude-1-dynamic_angle"]
         assert other.published_percent == one.published_percent == 98.84
-        assert other.trial != one.trial
-    assert rows["s4-seen-magnitude-1-triangle"].trial.noise.is_limit_true
-    assert rows["s4-mixed-installed-triangle"].trial.engine == "auto"
+        assert other.experiment != one.experiment
+    assert rows["s4-seen-magnitude-1-triangle"].experiment.noise.is_limit_true
+    assert rows["s4-mixed-installed-triangle"].experiment.engine == "auto"

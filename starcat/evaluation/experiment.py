@@ -1,7 +1,7 @@
 """Trials: many frames of one kind, identified in one way, written down frame by frame.
 
-A trial is fully described by its fields, and so is its result: a Parquet file that carries
-them. A trial whose file is there already is not run again.
+An experiment is fully described by its fields, and so is its result: a Parquet file that carries
+them. An experiment whose file is there already is not run again.
 """
 
 from __future__ import annotations
@@ -18,14 +18,20 @@ from typing import Any, Literal, get_type_hints
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
+from starcat.artifact.reader import open_artifact
+from starcat.catalog.stars import floats_of
 from starcat.evaluation.answers import ANSWERS
-from starcat.evaluation.catalog_sky import sky_of_artifact
-from starcat.evaluation.judge import Verdict, judge
+from starcat.evaluation.score import Score, score
 from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
 from starcat.geometry.camera import Camera
+from starcat.geometry.proximity import pairs_within
+from starcat.geometry.sphere import directions_from_radec
 from starcat.matcher.fast import library_version
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.triangle_order import TriangleOrder
@@ -42,12 +48,12 @@ AT_ONCE = 250
 """Frames of one task of a process."""
 
 MEASURED_ROOMS = ("geometry", "matcher", "simulation", "evaluation")
-"""The rooms whose code decides what a trial finds."""
+"""The rooms whose code decides what an experiment finds."""
 
 
 @dataclass(frozen=True)
 class Attitudes:
-    """Where a trial looks."""
+    """Where an experiment looks."""
 
     # "random", "grid", "stars": ``random``: uniform over all rotations. ``grid``: boresights in
     # the middle of cells of ``step_deg`` in right ascension and declination. ``stars``:
@@ -60,7 +66,7 @@ class Attitudes:
 
 
 @dataclass(frozen=True)
-class Trial:
+class Experiment:
     """Many frames of one kind, and how they are identified."""
 
     name: str  # name of the file of results
@@ -95,32 +101,32 @@ class Trial:
         return 2.0 * REACH * self.tolerance_px
 
 
-def run_trial(
-    trial: Trial,
+def run_experiment(
+    experiment: Experiment,
     artifact: Path,
     folder: Path,
     *,
     workers: int = 2,
     progress: Progress = no_progress,
 ) -> Path:
-    """Run a trial, unless its result is there."""
-    path = folder / f"{trial.name}.parquet"
-    facts = description(trial, artifact)
+    """Run an experiment, unless its result is there."""
+    path = folder / f"{experiment.name}.parquet"
+    facts = description(experiment, artifact)
     if path.is_file() and pq.read_schema(path).metadata.get(b"starcat_trial") == facts:
         return path
-    count = frame_count(trial)
+    count = frame_count(experiment)
     starts = range(0, count, AT_ONCE)
-    tasks = [(trial, artifact, first, min(first + AT_ONCE, count)) for first in starts]
-    verdicts: list[Verdict] = []
+    tasks = [(experiment, artifact, first, min(first + AT_ONCE, count)) for first in starts]
+    verdicts: list[Score] = []
     for part in _mapped(tasks, workers):
         verdicts.extend(part)
-        progress(trial.name, len(verdicts), count)
+        progress(experiment.name, len(verdicts), count)
     # Without an attitude its errors are NaN, which a query would take for a number.
     columns = {
         name: pa.array(
             [getattr(verdict, name) for verdict in verdicts], _TYPES[kind], from_pandas=True
         )
-        for name, kind in get_type_hints(Verdict).items()
+        for name, kind in get_type_hints(Score).items()
     }
     table = pa.table(columns).replace_schema_metadata({b"starcat_trial": facts})
     with whole_file(path) as partial:
@@ -128,12 +134,12 @@ def run_trial(
     return path
 
 
-def description(trial: Trial, artifact: Path) -> bytes:
-    """Return all that a trial's result depends on."""
+def description(experiment: Experiment, artifact: Path) -> bytes:
+    """Return all that an experiment's result depends on."""
     manifest = (artifact / "manifest.json").read_bytes()
-    facts = {**asdict(trial), "artifact": artifact.name, "code_sha256": code_sha256()}
+    facts = {**asdict(experiment), "artifact": artifact.name, "code_sha256": code_sha256()}
     facts["manifest_sha256"] = hashlib.sha256(manifest).hexdigest()
-    if trial.engine == "auto":
+    if experiment.engine == "auto":
         facts["c_library"] = library_version()
     return json.dumps(facts, sort_keys=True, default=str).encode()
 
@@ -149,16 +155,16 @@ def code_sha256() -> str:
     return digest.hexdigest()
 
 
-def frame_count(trial: Trial) -> int:
-    """Return how many frames a trial has."""
-    wanted = trial.attitudes
+def frame_count(experiment: Experiment) -> int:
+    """Return how many frames an experiment has."""
+    wanted = experiment.attitudes
     if wanted.kind != "grid":
         return wanted.count
     whole = round(360.0 / wanted.step_deg) * round(180.0 / wanted.step_deg)
     return min(whole, wanted.count) if wanted.count else whole
 
 
-def _mapped(tasks: list[tuple[Trial, Path, int, int]], workers: int) -> Iterator[list[Verdict]]:
+def _mapped(tasks: list[tuple[Experiment, Path, int, int]], workers: int) -> Iterator[list[Score]]:
     if workers == 1 or len(tasks) == 1:
         yield from map(_run_part, tasks)
         return
@@ -166,41 +172,43 @@ def _mapped(tasks: list[tuple[Trial, Path, int, int]], workers: int) -> Iterator
         yield from pool.map(_run_part, tasks)
 
 
-def _run_part(task: tuple[Trial, Path, int, int]) -> list[Verdict]:
-    """Identify some frames of a trial: the work of one process."""
-    trial, artifact, first, last = task
-    matcher, sky = _opened(artifact, trial)
-    camera = trial.camera or matcher.database.camera
-    assumed = trial.assumed or camera
-    answer: Callable[..., Any] = ANSWERS[trial.answer]
+def _run_part(task: tuple[Experiment, Path, int, int]) -> list[Score]:
+    """Identify some frames of an experiment: the work of one process."""
+    experiment, artifact, first, last = task
+    matcher, sky = _opened(artifact, experiment)
+    camera = experiment.camera or matcher.database.camera
+    assumed = experiment.assumed or camera
+    answer: Callable[..., Any] = ANSWERS[experiment.answer]
     verdicts = []
     for number in range(first, last):
-        generator = np.random.default_rng([trial.seed, number])
-        matrix = attitude_of(trial, number, matcher.database.directions, generator)
-        frame = simulate_frame(sky, camera, matrix, trial.noise, generator)
-        mag = frame.mag if trial.with_magnitudes else None
+        generator = np.random.default_rng([experiment.seed, number])
+        matrix = attitude_of(experiment, number, matcher.database.directions, generator)
+        frame = simulate_frame(sky, camera, matrix, experiment.noise, generator)
+        mag = frame.mag if experiment.with_magnitudes else None
         begun = time.process_time()
         result = answer(matcher, frame.centroids_px, assumed, mag)
         time_ms = 1000.0 * (time.process_time() - begun)
-        reach_px = REACH * trial.tolerance_px
-        verdicts.append(judge(number, frame, result, matcher.database, camera, reach_px, time_ms))
+        reach_px = REACH * experiment.tolerance_px
+        verdicts.append(score(number, frame, result, matcher.database, camera, reach_px, time_ms))
     return verdicts
 
 
 @lru_cache(maxsize=4)
-def _opened(artifact: Path, trial: Trial) -> tuple[Matcher, Sky]:
+def _opened(artifact: Path, experiment: Experiment) -> tuple[Matcher, Sky]:
     matcher = Matcher.open(
         artifact,
-        trial.method,
-        tolerance_px=trial.tolerance_px,
-        max_false_match_probability=trial.max_false_match_probability,
-        selection=trial.selection,
-        min_share=trial.min_share,
-        engine=trial.engine,
+        experiment.method,
+        tolerance_px=experiment.tolerance_px,
+        max_false_match_probability=experiment.max_false_match_probability,
+        selection=experiment.selection,
+        min_share=experiment.min_share,
+        engine=experiment.engine,
     )
     # Stars that noise may lift over the limit belong to the sky.
-    sky = _whole_sky(artifact).brighter(trial.noise.limit_mag + 6.0 * trial.noise.noise_mag)
-    if trial.guide_stars_only:
+    sky = _whole_sky(artifact).brighter(
+        experiment.noise.limit_mag + 6.0 * experiment.noise.noise_mag
+    )
+    if experiment.guide_stars_only:
         guides = sky.star_index >= 0
         sky = Sky(sky.directions[guides], sky.mag[guides], sky.star_index[guides])
     return matcher, sky
@@ -212,13 +220,13 @@ def _whole_sky(artifact: Path) -> Sky:
 
 
 def attitude_of(
-    trial: Trial,
+    experiment: Experiment,
     number: int,
     guide_stars: NDArray[np.float64],
     generator: np.random.Generator,
 ) -> NDArray[np.float64]:
-    """Return the attitude of one frame of a trial."""
-    wanted = trial.attitudes
+    """Return the attitude of one frame of an experiment."""
+    wanted = experiment.attitudes
     if wanted.kind == "random":
         return matrix_from_quaternion(generator.normal(size=4))
     roll_deg = generator.uniform(0.0, 360.0) if wanted.roll_deg is None else wanted.roll_deg
@@ -228,7 +236,54 @@ def attitude_of(
         return matrix_from_radec_roll(float(ra_deg), float(dec_deg), float(roll_deg))
     columns = round(360.0 / wanted.step_deg)
     whole = columns * round(180.0 / wanted.step_deg)
-    cell = number * whole // frame_count(trial)
+    cell = number * whole // frame_count(experiment)
     row, column = divmod(cell, columns)
     ra_deg, dec_deg = column * wanted.step_deg, -90.0 + (row + 0.5) * wanted.step_deg
     return matrix_from_radec_roll(ra_deg, dec_deg, float(roll_deg))
+
+
+def sky_of_artifact(folder: Path) -> Sky:
+    """Return the whole catalog of an artifact as a camera would see it."""
+    doubles = open_artifact(folder).manifest["spec"]["selection"]["doubles"]
+    return blend(catalog_of_artifact(folder), float(np.radians(doubles["min_separation_deg"])))
+
+
+def catalog_of_artifact(folder: Path) -> Sky:
+    """Return the whole catalog of an artifact."""
+    artifact = open_artifact(folder)
+    stars, rejected = artifact.table("stars"), artifact.table("rejected")
+    # A merged star's companion is in the guide star already.
+    there = pc.and_(pc.is_valid(rejected["ra_deg"]), pc.is_valid(rejected["mag"]))
+    tables = (stars, rejected.filter(pc.and_(there, pc.not_equal(rejected["reason"], "merged"))))
+    ra_deg, dec_deg, mag = (
+        np.concatenate([floats_of(table, name) for table in tables])
+        for name in ("ra_deg", "dec_deg", "mag")
+    )
+    index = np.full(len(mag), -1, dtype=np.int32)
+    index[: len(stars)] = np.arange(len(stars))
+    order = np.argsort(np.concatenate([table["star_id"].to_numpy() for table in tables]))
+    u = directions_from_radec(ra_deg, dec_deg)
+    return Sky(u[order], mag[order], index[order])
+
+
+def blend(sky: Sky, limit_rad: float) -> Sky:
+    """Join the points that a camera cannot tell apart."""
+    pairs, apart = pairs_within(sky.directions, limit_rad)
+    i, j = pairs[apart < limit_rad].T
+    count = len(sky)
+    graph = coo_array((np.ones(len(i)), (i, j)), shape=(count, count))
+    groups, label = connected_components(graph, directed=False)
+    brightest = np.lexsort((np.arange(count), sky.mag))
+    leader = np.empty(groups, dtype=np.int64)
+    leader[label[brightest[::-1]]] = brightest[::-1]
+    light = 10.0 ** (-0.4 * sky.mag)
+    total = np.bincount(label, light, groups)
+    centre = np.stack([np.bincount(label, light * u, groups) for u in sky.directions.T], axis=-1)
+    alone = np.bincount(label, minlength=groups)[label[leader]] == 1
+    order = np.argsort(leader)
+    leader, alone = leader[order], alone[order]
+    directions, mag = sky.directions[leader].copy(), sky.mag[leader].copy()
+    joined = order[~alone]
+    directions[~alone] = centre[joined] / np.linalg.norm(centre[joined], axis=1)[:, None]
+    mag[~alone] = -2.5 * np.log10(total[joined])
+    return Sky(directions, mag, sky.star_index[leader])
