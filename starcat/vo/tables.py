@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from starcat.query.result import column_facts
-from starcat.storage.votable import DUCKDB_DATATYPES
+from starcat.storage.parquet import DUCKDB_DATATYPES
 
 _CASTS = {
     "TINYINT": "SMALLINT",

@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 
 from starcat.errors import ConfigError, quoted
 from starcat.query.names import identifier
-from starcat.storage.votable import ARROW_DATATYPES
+from starcat.storage.parquet import ARROW_DATATYPES
 from starcat.vo.tables import Column, Table
 from starcat.vo.tap_schema import UPLOADS
 
