@@ -16,8 +16,7 @@ from starcat.service.query_pool import QueryPool
 from starcat.service.sandbox.sandbox import Sandbox
 from starcat.service.vo.tap_answers import Answers
 from starcat.service.vo.tap_tables import TapTables
-from starcat.vo.adql import translate
-from starcat.vo.answer import ask
+from starcat.vo.adql import ask, translate
 from starcat.vo.parameters import Question, Upload
 from starcat.vo.tables import Schema, Table
 from starcat.vo.tap_schema import UPLOADS
