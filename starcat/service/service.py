@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from typing import Annotated
 
 from fastapi import Depends, Request
@@ -11,13 +11,15 @@ from fastapi import Depends, Request
 from starcat.service.catalogs import Catalogs
 from starcat.service.confined import Confined
 from starcat.service.jobs.job import JobStore
-from starcat.service.jobs.queue import JobQueue, open_queue
 from starcat.service.paths import ServicePaths
 from starcat.service.records import Records
 from starcat.service.sessions import Sessions
 from starcat.service.settings import Settings
 from starcat.service.shelf import Shelf
-from starcat.service.vo.tap_service import Tap
+from starcat.service.vo.tap_jobs import QueryJobs
+from starcat.service.vo.tap_queries import TapQueries
+from starcat.service.vo.tap_tables import TapTables
+from starcat.vo.documents import ServiceLimits
 
 READ = "read"
 """Folder, among the catalogs, of what estimates start from."""
@@ -25,69 +27,70 @@ READ = "read"
 GIB = 2**30
 
 
-@dataclass(frozen=True)
+DAY_S = 86_400
+
+
+class Tap:
+    """The parts of TAP: what is granted, what there is to be asked, and what answers."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        paths: ServicePaths,
+        records: Records,
+        shelf: Shelf,
+        sessions: Sessions,
+        confined: Confined,
+        wake_slots: Callable[[], None],
+    ) -> None:
+        self.limits = ServiceLimits(
+            run_s=int(settings.job_time_s),
+            keep_s=int(settings.keep_results_days * DAY_S),
+            rows=settings.max_rows,
+            upload_bytes=int(settings.upload_mib * 2**20),
+        )
+        self.tables = TapTables(paths, shelf, sessions)
+        self.queries = TapQueries(paths, self.tables, sessions, confined, settings.max_rows)
+        self.jobs = QueryJobs(records, paths, self.limits, self.queries, wake_slots)
+
+
 class Service:
-    """What a running service is made of.
+    """A running service: its folders and records, and what works with them."""
 
-    Attributes
-    ----------
-    settings : Settings
-        What the operator set.
-    paths : ServicePaths
-        What lies where.
-    records : Records
-        What is remembered.
-    shelf : Shelf
-        The databases there are.
-    jobs : JobStore
-        The jobs there are.
-    sessions : Sessions
-        Open query sessions.
-    queue : JobQueue
-        What waits for workers.
-    confined : Confined
-        Processes that read uploads and make files.
-    tap : Tap
-        What TAP needs.
-    catalogs : Catalogs
-        The catalogs there are, and estimates from them.
-    stopping : threading.Event
-        Set when the service stops.
-    """
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.paths = ServicePaths(settings.root)
+        self.paths.make()
+        self.records = Records(self.paths.records)
+        self.shelf = Shelf(self.paths)
+        self.jobs = JobStore(self.records)
+        self.job_queued = threading.Condition()  # notified when a job waits
+        self.sessions = Sessions(settings)
+        self.confined = Confined(settings, self.paths.scratch)
+        self.tap = Tap(
+            settings,
+            self.paths,
+            self.records,
+            self.shelf,
+            self.sessions,
+            self.confined,
+            self.wake_slots,
+        )
+        most_bytes = round(settings.job_memory_gib * GIB)
+        self.catalogs = Catalogs(self.paths.catalogs / READ, most_bytes)
+        self.stopping = threading.Event()
 
-    settings: Settings
-    paths: ServicePaths
-    records: Records
-    shelf: Shelf
-    jobs: JobStore
-    sessions: Sessions
-    confined: Confined
-    tap: Tap
-    queue: JobQueue
-    catalogs: Catalogs
-    stopping: threading.Event = field(default_factory=threading.Event)
+    def wake_slots(self) -> None:
+        """Have an idle slot look for jobs now."""
+        with self.job_queued:
+            self.job_queued.notify_all()
 
-
-def open_service(settings: Settings) -> Service:
-    """Open a service: its folders and its records."""
-    paths = ServicePaths(settings.root)
-    paths.make()
-    records = Records(paths.records)
-    shelf, sessions = Shelf(paths), Sessions(settings)
-    most = round(settings.job_memory_gib * GIB)
-    confined = Confined(settings, paths.scratch)
-    return Service(
-        settings=settings,
-        paths=paths,
-        records=records,
-        shelf=shelf,
-        jobs=JobStore(records),
-        sessions=sessions,
-        confined=confined,
-        tap=Tap(settings, paths, records, shelf, sessions, confined),
-        queue=open_queue(settings, paths),
-        catalogs=Catalogs(paths.catalogs / READ, most),
-    )
+    def close(self) -> None:
+        """Close sessions, processes and records."""
+        self.catalogs.close()
+        self.sessions.close()
+        self.confined.close()
+        self.records.close()
 
 
 def service_of(request: Request) -> Service:

@@ -4,24 +4,31 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from starcat.errors import ConfigError
 from starcat.exchange.label import Label
 from starcat.progress import Progress, no_progress
+from starcat.service.answer_files import file_of_rows, keep_rows
 from starcat.service.confined import Confined
 from starcat.service.paths import ServicePaths
 from starcat.service.sessions import Sessions
-from starcat.service.vo.tap_answers import Answers
+from starcat.service.uploading import scratch_folder
 from starcat.service.vo.tap_tables import TapTables
 from starcat.vo.adql import translate
 from starcat.vo.answer import ask
+from starcat.vo.formats import Format
 from starcat.vo.parameters import Question, Upload
+from starcat.vo.results import result_chunks
 from starcat.vo.tables import Schema, Table
 from starcat.vo.tap_schema import UPLOADS
 from starcat.vo.uploads import table_of_facts
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 _LABEL = Label("result")
 
@@ -42,14 +49,13 @@ class TapQueries:
         self._paths = paths
         self._tables = tables
         self._sessions = sessions
-        self._answers = Answers(paths, confined)
 
     def answer(
         self,
         asked: Question,
         files: Mapping[str, Path],
         time_s: float | None = None,
-        progress: Progress = no_progress,
+        progress: Progress | Callable[..., None] = no_progress,
     ) -> Generator[bytes, None, None]:
         """Yield the answer to a question."""
         with self._uploaded(asked.uploads, files) as (folder, uploaded):
@@ -61,7 +67,21 @@ class TapQueries:
             translated = translate(asked.query, tables)
             with self._sessions.session(targets, time_s) as session:
                 batches = ask(session, translated, asked.max_rows, progress)
-                yield from self._answers.chunks(batches, asked.form, asked.max_rows)
+                yield from self._chunks(batches, asked.form, asked.max_rows)
+
+    def _chunks(
+        self, batches: pa.RecordBatchReader, form: Format, max_rows: int
+    ) -> Iterator[bytes]:
+        """Yield an answer in a format; FITS, held in memory as a whole, is another process's."""
+        if form.name != "fits":
+            scratch = self._paths.scratch
+            yield from result_chunks(batches, form, scratch, label=_LABEL, maxrec=max_rows)
+            return
+        with scratch_folder(self._paths) as folder:
+            rows = folder / "rows.arrow"
+            keep_rows(batches, rows, max_rows)
+            chunks, _ = file_of_rows(self._confined, rows, folder / "answer.fits", "fits")
+        yield from chunks
 
     @contextmanager
     def _uploaded(
