@@ -18,6 +18,9 @@ import pytest
 pytest.importorskip("fastapi")
 
 from fastapi.testclient import TestClient
+from starcat.service.jobs.pool import WorkerPool
+from starcat.service.jobs.queue import JsonMessages
+from starcat.service.jobs.recovery import recover
 
 from starcat.artifact.verify import verify_artifact
 from starcat.errors import ConfigError, SourceMissing, TargetMissing
@@ -27,9 +30,6 @@ from starcat.service.jobs import job_states
 from starcat.service.jobs.job import Job
 from starcat.service.jobs.job_states import MAX_INTERRUPTED, Attempt, claim, interrupt
 from starcat.service.jobs.keys import build_key, file_digests
-from starcat.service.jobs.pool import WorkerPool
-from starcat.service.jobs.queue import JsonMessages
-from starcat.service.jobs.recovery import recover
 from starcat.service.jobs.runner import Slots, lines_of
 from starcat.service.jobs.submission import (
     cancel_job,
@@ -436,7 +436,7 @@ def test_a_build_is_done_and_watched_over_http(archive, tmp_path, small_spec):
         listed = client.get(JOBS, params={"kind": "evaluate", "limit": 1}).json()
         assert (listed["total"], listed["jobs"][0]["id"]) == (1, measured)
         service = client.app.state.service
-        folder = service.shelf.database(database).folder
+        folder = service.library.database(database).folder
         assert verify_artifact(folder).findings == ()
         assert {path.stat().st_mode & 0o222 for path in folder.iterdir() if path.is_file()} == {0}
         assert not list(service.paths.jobs.glob("*/work"))
@@ -631,7 +631,7 @@ def test_a_catalog_is_read_either_way(service, archive):
 def test_a_database_that_is_there_is_not_built_again(service, spec):
     job = submit_build(service, spec, "anne").job
     Slots(service).run_job(job.id)
-    database = service.shelf.database(job.key[:16])
+    database = service.library.database(job.key[:16])
     with sqlite3.connect(service.paths.records) as records:  # killed before that was written
         records.execute("UPDATE jobs SET state = 'queued', result = NULL")
     records.close()

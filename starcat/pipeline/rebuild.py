@@ -16,7 +16,6 @@ from starcat.catalog.source import data_source
 from starcat.errors import ChecksumMismatch
 from starcat.pipeline.build import Inputs, build, check_inputs
 from starcat.progress import Progress, no_progress
-from starcat.specs.reading import spec_from_dict
 from starcat.storage.digests import file_sha256
 
 
@@ -55,7 +54,7 @@ def rebuild(
 ) -> Rebuilt:
     """Build an artifact again from its manifest, and compare every file."""
     old = open_artifact(artifact)
-    spec = spec_from_dict(old.manifest["spec"], f"{artifact.name}/{MANIFEST_NAME}")
+    spec = old.spec
     check_inputs(spec, inputs)
     found = _same_inputs(old, inputs, progress)
     if output is not None:

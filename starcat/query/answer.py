@@ -85,8 +85,8 @@ class Answer:
         """
         import pyarrow as pa
 
-        from starcat.exchange.column_types import plain_batch, plain_schema
-        from starcat.exchange.ecsv_file import astropy_table
+        from starcat.exchange.array_files import astropy_table
+        from starcat.exchange.columns import plain_batch, plain_schema
         from starcat.exchange.numpy_columns import numpy_columns
 
         schema = plain_schema(self._found.schema)

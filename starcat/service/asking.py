@@ -13,7 +13,6 @@ from starcat.errors import QueryError
 from starcat.query.gallery import named_query
 from starcat.service.answer_files import file_of_rows, keep_rows
 from starcat.service.service import Service
-from starcat.service.targets import target_paths
 from starcat.service.uploading import scratch_folder
 
 LARGEST_WHOLE = 2**53 - 1
@@ -98,9 +97,9 @@ def named_text(
 
 def rows_of(service: Service, question: Question) -> Rows:
     """Answer a question with rows."""
-    paths = target_paths(service, question.targets)
+    paths = [service.library.target(name) for name in question.targets]
     with (
-        service.sessions.session(paths, question.time_s) as session,
+        service.query_pool.session(paths, question.time_s) as session,
         session.ask(question.text, question.values) as running,
     ):
         found = running.rows(question.max_rows + 1)
@@ -114,15 +113,15 @@ def rows_of(service: Service, question: Question) -> Rows:
 
 def file_of(service: Service, question: Question, form: str) -> Answered:
     """Answer a question with a file."""
-    paths = target_paths(service, question.targets)
+    paths = [service.library.target(name) for name in question.targets]
     with scratch_folder(service.paths) as folder:
         source, target = folder / "rows.arrow", folder / "answer"
         with (
-            service.sessions.session(paths, question.time_s) as session,
+            service.query_pool.session(paths, question.time_s) as session,
             session.ask(question.text, question.values) as running,
         ):
             count, is_cut = keep_rows(running.batches(), source, question.max_rows)
-        chunks, size = file_of_rows(service.confined, source, target, form)
+        chunks, size = file_of_rows(service.sandbox, source, target, form)
     return Answered(chunks, size, count, is_cut)
 
 

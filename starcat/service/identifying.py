@@ -1,4 +1,4 @@
-"""Frames to answers, in a confined process that keeps the databases open."""
+"""Frames to answers, in a process of the sandbox that keeps the databases open."""
 
 from __future__ import annotations
 

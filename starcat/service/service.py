@@ -9,20 +9,17 @@ from typing import Annotated
 from fastapi import Depends, Request
 
 from starcat.service.catalogs import Catalogs
-from starcat.service.confined import Confined
 from starcat.service.jobs.job import JobStore
+from starcat.service.library import Library
 from starcat.service.paths import ServicePaths
+from starcat.service.query_pool import QueryPool
 from starcat.service.records import Records
-from starcat.service.sessions import Sessions
+from starcat.service.sandbox.sandbox import Sandbox
 from starcat.service.settings import Settings
-from starcat.service.shelf import Shelf
 from starcat.service.vo.tap_jobs import QueryJobs
 from starcat.service.vo.tap_queries import TapQueries
 from starcat.service.vo.tap_tables import TapTables
 from starcat.vo.documents import ServiceLimits
-
-READ = "read"
-"""Folder, among the catalogs, of what estimates start from."""
 
 GIB = 2**30
 
@@ -38,9 +35,9 @@ class Tap:
         settings: Settings,
         paths: ServicePaths,
         records: Records,
-        shelf: Shelf,
-        sessions: Sessions,
-        confined: Confined,
+        library: Library,
+        query_pool: QueryPool,
+        sandbox: Sandbox,
         wake_slots: Callable[[], None],
     ) -> None:
         self.limits = ServiceLimits(
@@ -49,8 +46,8 @@ class Tap:
             rows=settings.max_rows,
             upload_bytes=int(settings.upload_mib * 2**20),
         )
-        self.tables = TapTables(paths, shelf, sessions)
-        self.queries = TapQueries(paths, self.tables, sessions, confined, settings.max_rows)
+        self.tables = TapTables(paths, library, query_pool)
+        self.queries = TapQueries(paths, self.tables, query_pool, sandbox, settings.max_rows)
         self.jobs = QueryJobs(records, paths, self.limits, self.queries, wake_slots)
 
 
@@ -62,22 +59,21 @@ class Service:
         self.paths = ServicePaths(settings.root)
         self.paths.make()
         self.records = Records(self.paths.records)
-        self.shelf = Shelf(self.paths)
+        self.library = Library(self.paths)
         self.jobs = JobStore(self.records)
         self.job_queued = threading.Condition()  # notified when a job waits
-        self.sessions = Sessions(settings)
-        self.confined = Confined(settings, self.paths.scratch)
+        self.query_pool = QueryPool(settings)
+        self.sandbox = Sandbox(settings, self.paths.scratch)
         self.tap = Tap(
             settings,
             self.paths,
             self.records,
-            self.shelf,
-            self.sessions,
-            self.confined,
+            self.library,
+            self.query_pool,
+            self.sandbox,
             self.wake_slots,
         )
-        most_bytes = round(settings.job_memory_gib * GIB)
-        self.catalogs = Catalogs(self.paths.catalogs / READ, most_bytes)
+        self.catalogs = Catalogs(round(settings.job_memory_gib * GIB))
         self.stopping = threading.Event()
 
     def wake_slots(self) -> None:
@@ -88,8 +84,8 @@ class Service:
     def close(self) -> None:
         """Close sessions, processes and records."""
         self.catalogs.close()
-        self.sessions.close()
-        self.confined.close()
+        self.query_pool.close()
+        self.sandbox.close()
         self.records.close()
 
 

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from starcat.errors import ConfigError, TargetMissing, quoted
-from starcat.exchange.votable_header import error_document
+from starcat.exchange.formats import Format, response_format
+from starcat.exchange.votable_fields import error_document
 from starcat.query.names import quoted as sql_text
 from starcat.query.names import quoted_name
 from starcat.query.session import Session
 from starcat.query.targets import POSITION, View
-from starcat.vo.formats import Format, format_named
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -182,9 +182,9 @@ def _degrees(given: Mapping[str, str], key: str) -> float:
 def _form(text: str) -> tuple[Format, str]:
     """Return a format and its media type; by default what readers of all ages know."""
     if text.strip().lower() in ("", "text/xml"):
-        return format_named("votable/td"), MEDIA_TYPE
-    form = format_named(text)
-    return form, form.media_type
+        return response_format("votable/td"), MEDIA_TYPE
+    form = response_format(text)
+    return form, form.tap_type
 
 
 def _whole(

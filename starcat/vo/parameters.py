@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from starcat.errors import ConfigError, quoted
-from starcat.vo.formats import Format, format_named
+from starcat.exchange.formats import Format, response_format
 
 LANGUAGES = ("ADQL", "ADQL-2.0", "ADQL-2.1")
 
@@ -119,7 +119,7 @@ def question(given: Parameters, most_rows: int) -> Question:
         )
     return Question(
         query,
-        format_named(given.one("RESPONSEFORMAT") or given.one("FORMAT")),
+        response_format(given.one("RESPONSEFORMAT") or given.one("FORMAT")),
         max_rows(given.one("MAXREC"), most_rows),
         uploads(given.all("UPLOAD")),
         given.one("RUNID") or "",

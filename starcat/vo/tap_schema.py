@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcat.errors import SchemaError
-from starcat.exchange.units import unit_text
+from starcat.exchange.columns import unit_text
 from starcat.query.columns import Facts, column_facts
 from starcat.query.names import identifier
 from starcat.query.session import Session

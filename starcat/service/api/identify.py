@@ -23,7 +23,6 @@ from starcat.service.file_answers import type_of
 from starcat.service.identifying import CAMERA_NAME, IdentifyOptions
 from starcat.service.problems import MEDIA_TYPE, Problem, ProblemDetails
 from starcat.service.service import Service, TheService
-from starcat.service.targets import database_of
 from starcat.service.uploading import safe_name, scratch_folder
 
 UNKNOWN_TYPE: dict[int | str, dict[str, Any]] = {
@@ -133,7 +132,7 @@ async def identify(
 ) -> Identified:
     """Identify the stars of frames and find the camera's attitude."""
     async with _asked(request, service.settings.upload_mib) as asked:
-        found, _ = await service.confined.run(_identify, service, database, asked, None)
+        found, _ = await service.sandbox.run(_identify, service, database, asked, None)
     return Identified.model_validate(found)
 
 
@@ -158,7 +157,7 @@ async def picture(
 ) -> Response:
     """Return the first frame as a picture with its stars named, or as it is where none is."""
     async with _asked(request, service.settings.upload_mib) as asked:
-        _, drawn = await service.confined.run(_identify, service, database, asked, kind)
+        _, drawn = await service.sandbox.run(_identify, service, database, asked, kind)
     return Response(drawn, media_type=type_of(f"picture.{kind}"))
 
 
@@ -227,10 +226,10 @@ def _options(content: Any) -> IdentifyOptions:
 def _identify(
     service: Service, database: str, asked: _Asked, kind: Kind | None
 ) -> tuple[dict[str, Any], bytes]:
-    artifact = database_of(service, database).folder
+    artifact = service.library.find(database).folder
     with scratch_folder(service.paths) as folder:
         _keep(asked, folder)
-        found = service.confined.call(
+        found = service.sandbox.call(
             "identify",
             {
                 "folder": str(folder),

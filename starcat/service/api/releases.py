@@ -111,7 +111,7 @@ def publish(
 
 
 def _publish(service: Service, wanted: ToPublish, owner: str) -> PublishedRelease:
-    database = service.shelf.database(wanted.database)
+    database = service.library.database(wanted.database)
     published = publish_artifact(database.folder, str(service.paths.registry))
     publications = Publications(service.records)
     publications.add(published, database.id, wanted.note, owner)

@@ -58,7 +58,7 @@ def owned_bytes(service: Service, owner: str) -> int:
     taken = 0
     for [database_id] in rows:
         try:
-            files = service.shelf.database(str(database_id)).manifest["files"]
+            files = service.library.database(str(database_id)).manifest["files"]
         except (TargetMissing, ProductError, OSError):
             continue
         taken += sum(int(facts["bytes"]) for facts in files.values())

@@ -73,7 +73,7 @@ def submit_evaluation(
     seed: int | None = None,
 ) -> Submitted:
     """Have it measured how often frames are identified with a database."""
-    database = service.shelf.database(database_id)
+    database = service.library.database(database_id)
     test = spec_from_dict(database.manifest["spec"], database.title).self_test
     request = {
         "database": database_id,
@@ -113,7 +113,7 @@ def has_result(service: Service, job: Job) -> bool:
         name = str(result.get("catalog", ""))
         return bool(name) and (service.paths.catalogs / Path(name).name).exists()
     try:
-        service.shelf.database(str(result.get("database", "")))
+        service.library.database(str(result.get("database", "")))
     except TargetMissing:
         return False
     return True

@@ -17,9 +17,9 @@ from typing import Any
 from starcat.errors import TargetMissing
 from starcat.progress import Progress
 from starcat.service.jobs.job import Job, Kind
+from starcat.service.library import Library
 from starcat.service.paths import ServicePaths
 from starcat.service.settings import Settings
-from starcat.service.shelf import Shelf
 from starcat.storage.atomic import sync
 
 Log = Callable[[str, str], None]
@@ -65,10 +65,10 @@ def do_job(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
 
 def _build(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
     database_id = order.key[:16]
-    shelf = Shelf(order.paths)
+    library = Library(order.paths)
     result = {"database": database_id}
     try:
-        shelf.database(database_id)
+        library.database(database_id)
     except TargetMissing:
         pass
     else:
@@ -157,7 +157,7 @@ def _evaluate(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
     from starcat.simulation.selftest import self_test
 
     asked = order.request
-    database = Shelf(order.paths).database(str(asked["database"]))
+    database = Library(order.paths).database(str(asked["database"]))
     noise_px = float(asked["noise_px"])
     matcher = Matcher.open(database.folder, None, tolerance_px=max(0.5, 4.0 * noise_px))
     log("info", f"{asked['frames']} frames of each kind, of {database.title}")

@@ -12,28 +12,18 @@ from fastapi.responses import Response, StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
 from starcat.errors import QueryError, StarcatError, TargetMissing
+from starcat.exchange.formats import FORMATS, PAGE_FORMATS, PageFormat
 from starcat.query.answer import cell_text
 from starcat.query.gallery import NamedQuery, gallery, guessed, named_query
 from starcat.query.macros import macros
 from starcat.service.access import Reader
 from starcat.service.asking import Question, Rows, file_of, rows_of
-from starcat.service.file_answers import type_of
 from starcat.service.pages.facts import database_row, products_of
 from starcat.service.pages.rendering import page_router, render
 from starcat.service.problems import Problem, ProblemDetails, problem_of
 from starcat.service.service import Service, TheService
 
 router = page_router()
-
-FORMATS = {
-    "csv": "CSV",
-    "json": "JSON",
-    "parquet": "Parquet",
-    "votable": "VOTable",
-    "fits": "FITS",
-    "ecsv": "ECSV",
-}
-"""What an answer can be downloaded as."""
 
 ROWS = (20, 100, 500, 2000)
 """Rows that can be shown."""
@@ -49,8 +39,6 @@ FIRST = "SELECT designation, mag, ra_deg, dec_deg\nFROM stars\nORDER BY mag\nLIM
 
 _NAMES = re.compile(r"\$([A-Za-z_]\w{0,63})")
 _NUMERIC = re.compile(r"[UH]*(TINY|SMALL|BIG|HUGE)?INT|DOUBLE|FLOAT|DECIMAL")
-
-Form = Literal["csv", "json", "parquet", "votable", "fits", "ecsv"]
 
 
 @dataclass(frozen=True)
@@ -143,7 +131,7 @@ async def console(
     problem: ProblemDetails | None = None
     if asked.query:
         try:
-            found = await service.sessions.run(_rows, service, database_id, asked)
+            found = await service.query_pool.run(_rows, service, database_id, asked)
             answer = cells_of(found)
         except TargetMissing:
             raise  # the page itself is not there
@@ -155,18 +143,18 @@ async def console(
 
 @router.get("/databases/{database_id}/sql/file")
 async def answer_file(
-    service: TheService, _: Reader, database_id: str, asked: TheAsked, form: Form = "csv"
+    service: TheService, _: Reader, database_id: str, asked: TheAsked, form: PageFormat = "csv"
 ) -> Response:
     """Give all rows of an answer as a file."""
-    database = service.shelf.database(database_id)
+    database = service.library.database(database_id)
     question = question_of(service, database.id, asked, service.settings.max_rows)
-    found = await service.sessions.run(file_of, service, question, form)
-    name = f"{database.title}{'.vot' if form == 'votable' else f'.{form}'}"
+    found = await service.query_pool.run(file_of, service, question, form)
+    kind = FORMATS[form]
     headers = {
         "Content-Length": str(found.size),
-        "Content-Disposition": f'attachment; filename="{name}"',
+        "Content-Disposition": f'attachment; filename="{database.title}{kind.suffix}"',
     }
-    return StreamingResponse(found.chunks, media_type=type_of(name), headers=headers)
+    return StreamingResponse(found.chunks, media_type=kind.media_type, headers=headers)
 
 
 def question_of(service: Service, database_id: str, asked: Asked, most: int) -> Question:
@@ -192,14 +180,14 @@ def _rows(service: Service, database_id: str, asked: Asked) -> Rows:
 
 
 def _page(request: Request, service: Service, database_id: str, shown: _Shown) -> Response:
-    database = service.shelf.database(database_id)
+    database = service.library.database(database_id)
     asked, problem = shown.asked, shown.problem
     content = {
         "row": database_row(service, database),
         "asked": asked,
         "answer": shown.answer,
         "problem": problem,
-        "formats": FORMATS,
+        "formats": {name: FORMATS[name].title for name in PAGE_FORMATS},
     }
     status = 200 if problem is None else problem.status
     if shown.is_part:
@@ -215,7 +203,9 @@ def _page(request: Request, service: Service, database_id: str, shown: _Shown) -
         text=text,
         chosen=chosen,
         values=values_in(text, chosen, asked.values),
-        others=[(one.id, one.title) for one in service.shelf.databases() if one.id != database.id],
+        others=[
+            (one.id, one.title) for one in service.library.databases() if one.id != database.id
+        ],
         queries=list(gallery().values()),
         macros=sorted(macros(), key=lambda macro: (not macro.is_table, macro.name)),
         products=products_of(database.manifest),

@@ -22,12 +22,12 @@ from starcat.images.identification import IMAGE_SUFFIXES
 from starcat.matcher.methods.table import METHODS
 from starcat.service.access import Reader
 from starcat.service.identifying import IdentifyOptions
+from starcat.service.library import Database
 from starcat.service.pages.centroid_text import centroid_file
 from starcat.service.pages.rendering import page_router, render
 from starcat.service.pages.simulated import camera_of, frame_suffix, write_frame
 from starcat.service.problems import Problem, problem_of
 from starcat.service.service import Service, TheService
-from starcat.service.shelf import Database
 from starcat.service.uploading import safe_name, scratch_folder
 
 router = page_router()
@@ -75,7 +75,7 @@ async def identify(request: Request, service: TheService, _: Reader) -> Response
     async with request.form(max_files=1, max_fields=20) as form:
         given = {name: str(form.get(name) or "")[:MIB] for name in FIELDS}
         try:
-            answer = await service.confined.run(_answer, service, form, given)
+            answer = await service.sandbox.run(_answer, service, form, given)
         except (StarcatError, Problem) as error:
             answer = {"problem": problem_of(error)}
     return await run_in_threadpool(_page, request, service, given, **answer)
@@ -83,7 +83,7 @@ async def identify(request: Request, service: TheService, _: Reader) -> Response
 
 def _answer(service: Service, form: FormData, given: dict[str, str]) -> dict[str, Any]:
     """Return what the page shows of an answer."""
-    database = service.shelf.database(given["database"])
+    database = service.library.database(given["database"])
     frame, options = frame_of(form, given, database, service), options_of(given)
     found, picture = identified(service, database, frame, options)
     first = found["frames"][0]
@@ -103,16 +103,16 @@ async def simulated_frame(
     seed: Annotated[int, Query(ge=0, le=MAX_SEED)] = 0,
 ) -> Response:
     """Give a simulated frame of a database's camera, to try things with."""
-    database = service.shelf.database(database_id)
+    database = service.library.database(database_id)
     name = f"{database.title}-{seed}{frame_suffix(database)}"
-    content = await service.confined.run(_simulated, service, database, name, seed)
+    content = await service.sandbox.run(_simulated, service, database, name, seed)
     kind = "image/png" if name.endswith(".png") else "text/csv; charset=utf-8"
     headers = {"Content-Disposition": f'attachment; filename="{name}"'}
     return Response(content, media_type=kind, headers=headers)
 
 
 def _page(request: Request, service: Service, given: dict[str, str], **answer: Any) -> Response:
-    databases = service.shelf.databases()
+    databases = service.library.databases()
     problem = answer.get("problem")
     nothing = dict.fromkeys(("found", "picture", "problem", "errors", "field_deg"))
     return render(
@@ -172,7 +172,7 @@ def options_of(given: dict[str, str]) -> IdentifyOptions:
 def identified(
     service: Service, database: Database, frame: Frame, options: IdentifyOptions
 ) -> tuple[dict[str, Any], bytes]:
-    """Identify a frame and draw it, in a confined process."""
+    """Identify a frame and draw it, in a process of the sandbox."""
     limited = options.model_copy(update={"time_limit_s": service.settings.query_time_s})
     with scratch_folder(service.paths) as folder:
         frame.keep(folder / frame.name)
@@ -183,7 +183,7 @@ def identified(
             "options": limited.model_dump(),
             "picture": "png",
         }
-        found = service.confined.call("identify", arguments)
+        found = service.sandbox.call("identify", arguments)
         drawn = folder / "picture.png"
         return found, drawn.read_bytes() if drawn.is_file() else b""
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from starlette.types import Message, Receive, Scope, Send
 
-from starcat.service.problems import problem_of, problem_response
+from starcat.service.problems import as_json
 from starcat.service.security.guard import Guard
 from starcat.service.security.refusing import address_of
 from starcat.service.security.request_id import request_id
@@ -119,4 +119,4 @@ class Defects(Guard):
             _logger.exception("a defect of starcat: %s %s", scope["method"], scope["path"][:MOST])
             if is_begun:
                 raise  # the server ends the connection, so that the client sees it is not whole
-            await problem_response(problem_of(error))(scope, receive, send)
+            await as_json(error)(scope, receive, send)

@@ -78,7 +78,7 @@ class _State(Collector):
             "starcat_sessions", "Sign-ins that have not expired.", self._sessions.count()
         )
         yield GaugeMetricFamily(
-            "starcat_databases", "Databases there are.", len(service.shelf.databases())
+            "starcat_databases", "Databases there are.", len(service.library.databases())
         )
         free = free_gib(service.settings.root) * GIB
         yield GaugeMetricFamily("starcat_disk_free_bytes", "Room that is left on the disk.", free)

@@ -8,12 +8,12 @@ from collections.abc import Mapping
 from starlette.requests import HTTPConnection
 from starlette.types import Receive, Scope, Send
 
-from starcat.service.problems import Problem, problem_of, problem_response
+from starcat.service.problems import Problem, as_json
 
 
 async def refuse(scope: Scope, receive: Receive, send: Send, problem: Problem) -> None:
     """Answer a request with what is wrong with it."""
-    await problem_response(problem_of(problem), problem.headers)(scope, receive, send)
+    await as_json(problem)(scope, receive, send)
 
 
 def later(wait_s: float) -> Mapping[str, str]:

@@ -208,7 +208,7 @@ class QueryJobs:
             for part in self._queries.answer(asked, files, job.limit_s, check):
                 check()
                 stream.write(part)
-        return Outcome("done", {"media_type": asked.form.media_type})
+        return Outcome("done", {"media_type": asked.form.tap_type})
 
     def _exists(self, job_id: str) -> bool:
         with self._records.reading() as connection:

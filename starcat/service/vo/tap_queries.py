@@ -10,19 +10,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcat.errors import ConfigError
-from starcat.exchange.label import Label
+from starcat.exchange.columns import Label
+from starcat.exchange.formats import Format
+from starcat.exchange.writers import result_chunks
 from starcat.progress import Progress, no_progress
 from starcat.service.answer_files import file_of_rows, keep_rows
-from starcat.service.confined import Confined
 from starcat.service.paths import ServicePaths
-from starcat.service.sessions import Sessions
+from starcat.service.query_pool import QueryPool
+from starcat.service.sandbox.sandbox import Sandbox
 from starcat.service.uploading import scratch_folder
 from starcat.service.vo.tap_tables import TapTables
 from starcat.vo.adql import translate
 from starcat.vo.answer import ask
-from starcat.vo.formats import Format
 from starcat.vo.parameters import Question, Upload
-from starcat.vo.results import result_chunks
 from starcat.vo.tables import Schema, Table
 from starcat.vo.tap_schema import UPLOADS
 from starcat.vo.uploads import table_of_facts
@@ -40,15 +40,15 @@ class TapQueries:
         self,
         paths: ServicePaths,
         tables: TapTables,
-        sessions: Sessions,
-        confined: Confined,
+        query_pool: QueryPool,
+        sandbox: Sandbox,
         most_rows: int,
     ) -> None:
-        self._confined = confined
+        self._sandbox = sandbox
         self.most_rows = most_rows
         self._paths = paths
         self._tables = tables
-        self._sessions = sessions
+        self._query_pool = query_pool
 
     def answer(
         self,
@@ -65,7 +65,7 @@ class TapQueries:
                 tables = tables.with_schema(uploaded)
                 targets.append(folder)
             translated = translate(asked.query, tables)
-            with self._sessions.session(targets, time_s) as session:
+            with self._query_pool.session(targets, time_s) as session:
                 batches = ask(session, translated, asked.max_rows, progress)
                 yield from self._chunks(batches, asked.form, asked.max_rows)
 
@@ -80,7 +80,7 @@ class TapQueries:
         with scratch_folder(self._paths) as folder:
             rows = folder / "rows.arrow"
             keep_rows(batches, rows, max_rows)
-            chunks, _ = file_of_rows(self._confined, rows, folder / "answer.fits", "fits")
+            chunks, _ = file_of_rows(self._sandbox, rows, folder / "answer.fits", "fits")
         yield from chunks
 
     @contextmanager
@@ -111,4 +111,4 @@ class TapQueries:
 
     def _read(self, file: Path, upload: Upload, folder: Path) -> Table:
         given = {"path": str(file), "name": upload.table, "folder": str(folder)}
-        return table_of_facts(self._confined.call("upload", given))
+        return table_of_facts(self._sandbox.call("upload", given))

@@ -1,6 +1,6 @@
 """The tables that TAP shows: those of all databases, and of the catalogs that were read.
 
-What is known of them is found out once for each state of the shelf, and written as TAP_SCHEMA's
+What is known of them is found out once for each state of the library, and written as TAP_SCHEMA's
 tables, which queries read like any others.
 """
 
@@ -14,9 +14,9 @@ from pathlib import Path
 
 from starcat.catalog.star_files import rejected_path
 from starcat.errors import StarcatError
+from starcat.service.library import Library
 from starcat.service.paths import ServicePaths
-from starcat.service.sessions import Sessions
-from starcat.service.shelf import Shelf
+from starcat.service.query_pool import QueryPool
 from starcat.store.layout import is_store
 from starcat.vo.tables import Schema, Tables
 from starcat.vo.tap_schema import NAME, own_schema, session_schemas, write_tap_schema
@@ -43,10 +43,10 @@ class TapState:
 class TapTables:
     """The tables of a service, as they are now."""
 
-    def __init__(self, paths: ServicePaths, shelf: Shelf, sessions: Sessions) -> None:
+    def __init__(self, paths: ServicePaths, library: Library, query_pool: QueryPool) -> None:
         self._paths = paths
-        self._shelf = shelf
-        self._sessions = sessions
+        self._library = library
+        self._query_pool = query_pool
         self._looking = threading.Lock()
         self._state: tuple[str, TapState] | None = None
 
@@ -65,7 +65,7 @@ class TapTables:
         """Return what there is on disk, and what each is."""
         found = {
             database.folder: f"Guide-star database {database.name}, version {database.version}"
-            for database in self._shelf.databases()
+            for database in self._library.databases()
         }
         for path in sorted(self._paths.catalogs.iterdir()):
             is_table = path.suffix == ".parquet" and path != rejected_path(path)
@@ -84,7 +84,7 @@ class TapTables:
 
     def _opens(self, path: Path) -> bool:
         try:
-            with self._sessions.session([path]):
+            with self._query_pool.session([path]):
                 return True
         except StarcatError:
             return False
@@ -94,7 +94,7 @@ class TapTables:
         folder = self._paths.scratch / f"tap-{key}" / NAME
         schemas: tuple[Schema, ...] = ()
         if about:
-            with self._sessions.session(list(about)) as session:
+            with self._query_pool.session(list(about)) as session:
                 names = [target.name for target in session.targets]
                 told = dict(zip(names, about.values(), strict=True))
                 schemas = session_schemas(session, told)

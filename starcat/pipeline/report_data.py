@@ -25,7 +25,7 @@ from starcat.catalog.verdict import Reason
 from starcat.pipeline.guide_stars import MIN_GUIDE_STARS
 from starcat.pipeline.recipes import field_size
 from starcat.products.boresights import FieldStars, tile_sphere
-from starcat.products.coverage import Coverage, field_coverage
+from starcat.products.coverage import Coverage, coverage_from_counts, field_coverage
 from starcat.report.coverage_report import CoverageReport, report_coverage
 from starcat.report.report import BuildFacts
 from starcat.simulation.selftest import Rates
@@ -41,11 +41,6 @@ class FilterCoverage:
     median_per_field: float  # stars in the field of a boresight
     min_per_field: int
     share_below_4: float  # share of the fields with fewer than 4 stars
-
-
-def filter_coverage(step: Step, spec: BuildSpec) -> FilterCoverage:
-    """Count what a filter leaves in the fields of the tiling."""
-    return _filter_coverage(step, _counts(step, spec))
 
 
 def _counts(step: Step, spec: BuildSpec) -> NDArray[np.int64]:
@@ -125,7 +120,7 @@ def source_facts(
 
 
 @dataclass(frozen=True)
-class Results:
+class BuildResults:
     """The results of a build's stages."""
 
     spec: BuildSpec
@@ -137,7 +132,7 @@ class Results:
     rates: Sequence[Rates]  # rates of the self-test
 
 
-def build_facts(folder: Path, results: Results) -> BuildFacts:
+def build_facts(folder: Path, results: BuildResults) -> BuildFacts:
     """Return what the report of a build is made of."""
     spec, tables = results.spec, {product.name: product.table for product in results.products}
     products = {name: facts.as_dict() for name, facts in results.facts.items()}
@@ -163,13 +158,8 @@ def build_facts(folder: Path, results: Results) -> BuildFacts:
 
 def artifact_coverage(artifact: Artifact) -> CoverageReport:
     """Return the coverage of an artifact, from its own boresights."""
-    from starcat.pipeline.facts import coverage_report
-    from starcat.products.coverage import coverage_from_counts
-    from starcat.specs.reading import spec_from_dict
-
     table = artifact.table("boresights")
     boresights = np.stack([table[name].to_numpy() for name in ("x", "y", "z")], axis=-1)
-    spec = spec_from_dict(artifact.manifest["spec"], "manifest.json")
     counts = table["star_count"].to_numpy()
-    coverage = coverage_from_counts(boresights, counts, spec.boresights.brightest)
-    return coverage_report(coverage, spec)
+    coverage = coverage_from_counts(boresights, counts, artifact.spec.boresights.brightest)
+    return coverage_report(coverage, artifact.spec)

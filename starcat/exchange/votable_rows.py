@@ -1,7 +1,9 @@
-"""Rows of a VOTable as BINARY2: a bit a column for null, then the values, big end first.
+"""Rows of a VOTable as BINARY2 and as TABLEDATA.
 
-Runs of columns of fixed width are filled as one numpy record; lists and texts stand between them
-as bytes, each with its length at the end of the record before. One call joins the rows.
+BINARY2 has a bit a column for null, then the values, big end first. Runs of columns of fixed width
+are filled as one numpy record; lists and texts stand between them as bytes, each with its length at
+the end of the record before. One call joins the rows. TABLEDATA is text in ``TR`` and ``TD``, with
+all digits of every number.
 """
 
 from __future__ import annotations
@@ -14,11 +16,16 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from starcat.exchange.votable_columns import Cells, VotableColumn, is_ascii, is_constant, text_bytes
+from starcat.exchange.votable_fields import Cells, VotableColumn, is_ascii, is_constant, text_bytes
 
 _TRUE, _FALSE, _UNKNOWN = ord("T"), ord("F"), ord("?")
 _FOUR_BYTES = 0xF0
 """The least first byte of a letter that UTF-8 says in four bytes, and UTF-16 in two units."""
+
+_BETWEEN = "</TD><TD>"
+_ROW_BEGINS, _ROW_ENDS = "<TR><TD>", "</TD></TR>\n"
+_ESCAPES = (("&", "&amp;"), ("<", "&lt;"), (">", "&gt;"))
+_NULL_IS_EMPTY = {"null_handling": "replace", "null_replacement": ""}
 
 
 class Binary2:
@@ -141,3 +148,69 @@ def _binary(offsets: NDArray[np.int64], content: NDArray[np.uint8]) -> pa.Array:
     places = pa.py_buffer(offsets.astype(np.int32))
     held = pa.py_buffer(np.ascontiguousarray(content))
     return pa.BinaryArray.from_buffers(pa.binary(), len(offsets) - 1, [None, places, held])
+
+
+class Tabledata:
+    """What writes batches of a table as TABLEDATA."""
+
+    def __init__(self, columns: Sequence[VotableColumn]) -> None:
+        self._columns = tuple(columns)
+
+    def rows(self, cells: Sequence[Cells], count: int) -> bytes:
+        """Return rows."""
+        if not count:
+            return b""
+        parts: list[pa.Array | str] = []
+        for column, found in zip(self._columns, cells, strict=True):
+            text = _texts(column, found)
+            # What is the same in all rows is put between the columns that differ, as one text.
+            if isinstance(text, str) and parts and isinstance(parts[-1], str):
+                parts[-1] += _BETWEEN + text
+            else:
+                parts.append(text)
+        last = parts.pop()
+        if isinstance(last, str):
+            last = pa.repeat(last, count)
+        # The end of a row and the beginning of the next go with the last cell.
+        last = pc.binary_join_element_wise(last, _ROW_ENDS + _ROW_BEGINS, "", **_NULL_IS_EMPTY)
+        joined = pc.binary_join_element_wise(*parts, last, _BETWEEN, **_NULL_IS_EMPTY)
+        _, content = text_bytes(joined)
+        return b"".join([_ROW_BEGINS.encode(), content.data[: -len(_ROW_BEGINS)]])
+
+
+def _texts(column: VotableColumn, cells: Cells) -> pa.Array | str:
+    """Return the texts of cells, of which null may be any; one text where all are the same."""
+    if cells.offsets is not None:
+        return _lists(cells.offsets, _numbers(cells.values))
+    values = cells.values
+    if values.null_count == len(values):
+        return ""
+    if values.null_count == 0 and is_constant(values):
+        values = values.slice(0, 1)
+    texts = _escaped(values) if column.is_text else _numbers(values)
+    return texts[0].as_py() if len(texts) < len(cells.values) else texts
+
+
+def _numbers(values: pa.Array) -> pa.Array:
+    """Return numbers and truth values as text, null as null."""
+    if pa.types.is_boolean(values.type):
+        return pc.if_else(values, "T", "F")
+    texts = values.cast(pa.string())
+    if pa.types.is_floating(values.type) and not pc.all(pc.is_finite(values)).as_py():
+        texts = pc.if_else(pc.is_nan(values), "NaN", texts)
+        endless = pc.if_else(pc.greater(values, 0), "+Inf", "-Inf")
+        texts = pc.if_else(pc.is_inf(values), endless, texts)
+    return texts
+
+
+def _lists(offsets: NDArray[np.int64], items: pa.Array) -> pa.Array:
+    texts = pc.fill_null(items, "NaN")
+    return pc.binary_join(pa.ListArray.from_arrays(offsets.astype(np.int32), texts), " ")
+
+
+def _escaped(texts: pa.Array) -> pa.Array:
+    _, letters = text_bytes(texts)
+    for letter, escape in _ESCAPES:
+        if (letters == ord(letter)).any():
+            texts = pc.replace_substring(texts, letter, escape)
+    return texts

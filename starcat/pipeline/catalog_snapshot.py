@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from starcat.catalog.stars import floats_of
 from starcat.pipeline.build import Inputs, join_all, read_sources
+from starcat.pipeline.cost import table_bytes
 from starcat.pipeline.motions import join_motions
-from starcat.pipeline.sizes import table_bytes
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import BuildSpec
 
@@ -26,7 +26,7 @@ SAMPLE_ROWS = 8192
 
 
 @dataclass(frozen=True)
-class StarsRead:
+class CatalogSnapshot:
     """The catalogs of a spec, read: what every estimate with the same ones starts from."""
 
     stars: pa.Table  # star table (schema ``stars``) with motions and amplitudes joined, by star_id
@@ -64,18 +64,18 @@ class StarsRead:
         return int(self.stars.nbytes + motions + 16 * len(self.stars))
 
 
-def read_stars(
+def read_snapshot(
     spec: BuildSpec,
     inputs: Inputs,
     workers: int = 2,
     progress: Progress = no_progress,
-) -> StarsRead:
+) -> CatalogSnapshot:
     """Read the catalogs of a spec, as its build does."""
     catalog, amplitudes = read_sources(spec, inputs, workers, progress)
     joined = join_motions(catalog, spec, inputs, workers, progress)
     stars, _ = join_all(joined.catalog.stars, amplitudes)
     catalog = joined.catalog
-    return StarsRead(
+    return CatalogSnapshot(
         stars.combine_chunks(),
         joined.table,
         catalog.rejected_by_reason,
@@ -87,7 +87,7 @@ def read_stars(
     )
 
 
-def what_is_read(spec: BuildSpec) -> dict[str, Any]:
+def reading_keys(spec: BuildSpec) -> dict[str, Any]:
     """Return all of a spec that reading its catalogs depends on."""
     content = spec.model_dump(mode="json")
     wanted = {

@@ -13,17 +13,17 @@ import pytest
 
 from starcat.errors import QueryError, QueryLimitError
 from starcat.query.session import MAX_CHECKED, Session
-from starcat.service import turns
 from starcat.service.problems import Problem
-from starcat.service.sessions import IDLE, Sessions
+from starcat.service.query_pool import IDLE, QueryPool
+from starcat.service.sandbox import pool
 from starcat.service.settings import Settings
 
 COUNT = "SELECT count(*) FROM stars"
 
 
 @pytest.fixture
-def sessions(tmp_path: Path) -> Iterator[Sessions]:
-    opened = Sessions(Settings(root=tmp_path, queries=1))
+def sessions(tmp_path: Path) -> Iterator[QueryPool]:
+    opened = QueryPool(Settings(root=tmp_path, queries=1))
     yield opened
     opened.close()
 
@@ -45,7 +45,7 @@ def is_there(process: int) -> bool:
     return True
 
 
-def test_the_next_question_has_the_same_process(sessions: Sessions, small_artifact: Path) -> None:
+def test_the_next_question_has_the_same_process(sessions: QueryPool, small_artifact: Path) -> None:
     with sessions.session([small_artifact]) as session:
         first = process_of(session)
         assert count(session) > 100
@@ -62,7 +62,7 @@ def count_nowhere(session: Session) -> None:
         running.rows(1)
 
 
-def test_one_that_took_too_long_is_thrown_away(sessions: Sessions, small_artifact: Path) -> None:
+def test_one_that_took_too_long_is_thrown_away(sessions: QueryPool, small_artifact: Path) -> None:
     processes: list[int] = []
 
     def ask() -> None:
@@ -81,7 +81,9 @@ def test_one_that_took_too_long_is_thrown_away(sessions: Sessions, small_artifac
         assert count(session) > 100
 
 
-def test_one_that_was_left_halfway_is_thrown_away(sessions: Sessions, small_artifact: Path) -> None:
+def test_one_that_was_left_halfway_is_thrown_away(
+    sessions: QueryPool, small_artifact: Path
+) -> None:
     processes: list[int] = []
 
     def leave() -> None:
@@ -98,7 +100,7 @@ def test_one_that_was_left_halfway_is_thrown_away(sessions: Sessions, small_arti
     assert not is_there(processes[0])
 
 
-def test_only_some_are_kept(sessions: Sessions, artifact_version: Callable[[str], Path]) -> None:
+def test_only_some_are_kept(sessions: QueryPool, artifact_version: Callable[[str], Path]) -> None:
     processes = []
     for number in range(IDLE + 1):
         with sessions.session([artifact_version(f"1.0.{number}")]) as session:
@@ -107,7 +109,7 @@ def test_only_some_are_kept(sessions: Sessions, artifact_version: Callable[[str]
 
 
 def test_a_target_that_was_replaced_is_opened_anew(
-    sessions: Sessions, small_artifact: Path, tmp_path: Path
+    sessions: QueryPool, small_artifact: Path, tmp_path: Path
 ) -> None:
     folder = tmp_path / small_artifact.name
     shutil.copytree(small_artifact, folder)
@@ -123,9 +125,9 @@ def test_a_target_that_was_replaced_is_opened_anew(
 
 
 def test_who_waits_too_long_is_told_to_come_again(
-    sessions: Sessions, small_artifact: Path, monkeypatch: pytest.MonkeyPatch
+    sessions: QueryPool, small_artifact: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(turns, "WAIT_S", 0.05)
+    monkeypatch.setattr(pool, "WAIT_S", 0.05)
     with (
         sessions.session([small_artifact]),
         pytest.raises(Problem, match="ask again later") as caught,
@@ -149,7 +151,7 @@ def test_who_waits_too_long_is_told_to_come_again(
     assert answer is True
 
 
-def test_checked_queries_do_not_grow_without_end(sessions: Sessions, small_artifact: Path) -> None:
+def test_checked_queries_do_not_grow_without_end(sessions: QueryPool, small_artifact: Path) -> None:
     with sessions.session([small_artifact]) as session:
         for number in range(MAX_CHECKED + 20):
             session.check(f"SELECT {number}")

@@ -1,4 +1,4 @@
-"""The process that reads uploads and makes files, for `starcat.service.confined`.
+"""The process that reads uploads and makes files, for `starcat.service.sandbox.sandbox`.
 
 A request is a line of JSON, and so is the answer: nothing that was uploaded can make the server
 run anything.
@@ -15,9 +15,20 @@ from pathlib import Path
 from typing import Any
 
 from starcat.query.confinement import forbid_writing, limit_memory, limit_time
-from starcat.service.converting import convert
 from starcat.service.identifying import identify
+from starcat.service.sandbox.child import own_output
 from starcat.vo.uploads import upload_facts
+
+
+def convert(source: str, target: str, form: str) -> int:
+    """Write a table to a file of another format: some are held in memory as a whole."""
+    import pyarrow as pa
+
+    from starcat.exchange.writers import write_batches
+
+    with pa.OSFile(source) as file, pa.ipc.open_stream(file) as stream:
+        return write_batches(stream, Path(target), form)
+
 
 TASKS: dict[str, Callable[..., Any]] = {
     "identify": identify,
@@ -29,9 +40,7 @@ TASKS: dict[str, Callable[..., Any]] = {
 def serve() -> None:
     """Answer requests until there are no more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    # Whatever a library prints goes where nobody reads it.
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    answers = own_output()
     opening = json.loads(sys.stdin.buffer.readline() or b"{}")
     if not opening:
         return
@@ -56,4 +65,8 @@ def _answer(task: Callable[..., Any], arguments: dict[str, Any]) -> dict[str, An
     except Exception as error:
         kind = "MemoryError" if isinstance(error, MemoryError) else type(error).__name__
         key = getattr(error, "key", None)
-        return {"kind": kind, "words": str(error)[:4000], "key": key if key is None else str(key)}
+        return {
+            "kind": kind,
+            "message": str(error)[:4000],
+            "key": None if key is None else str(key),
+        }
