@@ -32,9 +32,8 @@ from starcat.service.jobs.runner import (
     CANCELLED,
     STOPPED,
     TICK_S,
-    ProcessGroups,
+    Processes,
     limit_exceeded,
-    run_process,
     time_exceeded,
 )
 from starcat.service.jobs.work import Order, order_of, place_database, threads_of
@@ -311,4 +310,4 @@ def _followed(worker: Worker, order: Order, job_time_s: float) -> Outcome:
         return time_exceeded(began_s, job_time_s)
 
     report({"log": f"runs on {worker.address}", "level": "info"})
-    return run_process(ProcessGroups(), order, report, reason_to_end)
+    return Processes().run(order, report, reason_to_end)

@@ -158,7 +158,7 @@ def retry(
 
 
 def interrupt(records: Records, job: Job) -> None:
-    """Record that whoever ran an attempt is gone: the job waits again, unless that was too often."""
+    """Have a job wait again whose attempt is lost, unless that was too often."""
     with records.writing() as connection:
         row = connection.execute(
             "UPDATE jobs SET interrupted = interrupted + 1 WHERE id = ? AND attempt = ? "

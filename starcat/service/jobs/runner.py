@@ -7,24 +7,23 @@ stops; nothing is left of an attempt but what it has finished.
 from __future__ import annotations
 
 import json
-import os
-import selectors
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from starcat.service.jobs.job import job_problem
 from starcat.service.jobs.job_states import Outcome
-from starcat.service.jobs.task import PROGRAM, memory_problem
+from starcat.service.jobs.task import memory_problem
 from starcat.service.jobs.work import Order
+from starcat.service.sandbox.child import Child
 from starcat.storage.atomic import make_folder
+
+TASK = "starcat.service.jobs.task:main"
 
 TICK_S = 0.2
 """How often it is looked whether a process has to end."""
@@ -58,71 +57,52 @@ def time_exceeded(began_s: float, job_time_s: float) -> Outcome | None:
     )
 
 
-@dataclass
-class ProcessGroups:
-    """The processes of jobs that run, each with those that it has started."""
+class Processes:
+    """The processes of jobs that run."""
 
-    groups: set[int] = field(default_factory=set)
-    _lock: threading.Lock = field(default_factory=threading.Lock)
+    def __init__(self) -> None:
+        self.children: set[Child] = set()
+        self._lock = threading.Lock()
 
-    @contextmanager
-    def started(self, order: Order) -> Iterator[subprocess.Popen[bytes]]:
-        """Start the process of a job, in a group of its own, and see that it has ended."""
-        make_folder(order.paths.job(order.job_id))
-        with order.paths.job_stderr(order.job_id).open("wb") as stderr:
-            process = subprocess.Popen(
-                [sys.executable, "-c", PROGRAM, *sys.path],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=stderr,
-                start_new_session=True,
-                # Arrow's own allocators reserve gigabytes, which count as memory that is used.
-                env={**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system", "MPLBACKEND": "agg"},
-            )
-        with self._lock:
-            self.groups.add(process.pid)
-        try:
-            _send(process.stdin, asdict(order))
-            yield process
-        finally:
-            end_group(process.pid)
-            process.wait()
-            with self._lock:
-                self.groups.discard(process.pid)
-            for pipe in (process.stdin, process.stdout):
-                with suppress(OSError):
-                    pipe.close()  # type: ignore[union-attr]
+    def run(self, order: Order, report: Report, reason_to_end: ReasonToEnd) -> Outcome:
+        """Run the process of a job until it ends, or has to."""
+        ended: Outcome | None = None
+        told: Outcome | None = None
+        with self._started(order) as child:
+            for line in child.lines(TICK_S):
+                if line is not None:
+                    told = _outcome_in(line, report) or told
+                elif ended is None and told is None:
+                    ended = reason_to_end()
+                    if ended is not None:
+                        child.kill()
+        if told is not None and (told.state == "done" or ended is None):
+            return told  # it was faster than whoever wanted its end
+        return ended or _death(child.wait(), order)
 
     def end_all(self) -> None:
         """End all processes at once."""
         with self._lock:
-            for group in self.groups:
-                end_group(group)
+            for child in self.children:
+                child.kill()
 
-
-def end_group(group: int) -> None:
-    """End a process and those that it has started."""
-    with suppress(ProcessLookupError, PermissionError):
-        os.killpg(group, signal.SIGKILL)
-
-
-def run_process(
-    groups: ProcessGroups, order: Order, report: Report, reason_to_end: ReasonToEnd
-) -> Outcome:
-    """Run the process of a job until it ends, or has to."""
-    ended: Outcome | None = None
-    told: Outcome | None = None
-    with groups.started(order) as process:
-        for line in lines_of(process.stdout, TICK_S) if process.stdout else ():
-            if line is not None:
-                told = _outcome_in(line, report) or told
-            elif ended is None and told is None:
-                ended = reason_to_end()
-                if ended is not None:
-                    end_group(process.pid)
-    if told is not None and (told.state == "done" or ended is None):
-        return told  # it was faster than whoever wanted its end
-    return ended or _death(process.returncode, order)
+    @contextmanager
+    def _started(self, order: Order) -> Iterator[Child]:
+        """Start the process of a job, in a group of its own, and see that it has ended."""
+        make_folder(order.paths.job(order.job_id))
+        with order.paths.job_stderr(order.job_id).open("wb") as stderr:
+            # Arrow's own allocators reserve gigabytes, which count as memory that is used.
+            environment = {"ARROW_DEFAULT_MEMORY_POOL": "system", "MPLBACKEND": "agg"}
+            child = Child(TASK, environment=environment, stderr=stderr, has_group=True)
+        with self._lock:
+            self.children.add(child)
+        try:
+            child.send(asdict(order))
+            yield child
+        finally:
+            child.close()
+            with self._lock:
+                self.children.discard(child)
 
 
 def _outcome_in(line: bytes, report: Report) -> Outcome | None:
@@ -159,27 +139,3 @@ def _tail(path: Path) -> str:
     with path.open("rb") as file:
         file.seek(max(0, path.stat().st_size - TAIL_BYTES))
         return file.read().decode(errors="replace")
-
-
-def lines_of(pipe: IO[bytes], tick_s: float) -> Iterator[bytes | None]:
-    """Yield the whole lines that arrive in a pipe until its other end is closed; None each tick."""
-    with selectors.DefaultSelector() as selector:
-        selector.register(pipe, selectors.EVENT_READ)
-        held, tick_at_s = b"", time.monotonic() + tick_s
-        while True:
-            if selector.select(max(0.0, tick_at_s - time.monotonic())):
-                data = os.read(pipe.fileno(), 1 << 16)
-                if not data:
-                    return
-                *lines, held = (held + data).split(b"\n")
-                yield from lines
-            if time.monotonic() >= tick_at_s:
-                yield None
-                tick_at_s = time.monotonic() + tick_s
-
-
-def _send(pipe: IO[bytes] | None, content: dict[str, Any]) -> None:
-    if pipe is not None:
-        with suppress(BrokenPipeError):  # what it died of is told by how it ended
-            pipe.write(json.dumps(content).encode() + b"\n")
-            pipe.flush()

@@ -28,9 +28,8 @@ from starcat.service.jobs.limits import disk_shortage, folder_bytes, owner_exces
 from starcat.service.jobs.runner import (
     CANCELLED,
     STOPPED,
-    ProcessGroups,
+    Processes,
     limit_exceeded,
-    run_process,
     time_exceeded,
 )
 from starcat.service.jobs.work import order_of
@@ -80,7 +79,7 @@ class JobSlots:
 
     def __init__(self, service: Service) -> None:
         self.service = service
-        self.processes = ProcessGroups()
+        self.processes = Processes()
         self.stop_at_s: float | None = None  # when what still runs is ended, `time.monotonic`
         self.cluster = ClusterJobs(self) if service.settings.scheduler else None
         self._threads: list[threading.Thread] = []
@@ -175,7 +174,7 @@ class JobSlots:
             return Outcome("failed", job_problem("Insufficient storage", 507, short))
         order = order_of(job, service.settings, str(service.paths.root))
         try:
-            return run_process(self.processes, order, attempt.report, self._watch(attempt))
+            return self.processes.run(order, attempt.report, self._watch(attempt))
         finally:
             shutil.rmtree(service.paths.job_work(job.id), ignore_errors=True)
 

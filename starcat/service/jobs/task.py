@@ -23,6 +23,7 @@ from starcat.errors import StarcatError
 from starcat.query.confinement import limit_memory
 from starcat.service.jobs.job import job_problem
 from starcat.service.jobs.work import Order, do_job, prepare
+from starcat.service.sandbox.child import own_output
 from starcat.storage.locks import locked
 
 NICENESS = 10
@@ -38,15 +39,11 @@ NO_THREAD = "can't start new thread"
 
 _SET_PARENT_DEATH_SIGNAL = 1
 
-PROGRAM = (
-    "import sys; sys.path[:] = sys.argv[1:]; from starcat.service.jobs.task import main; main()"
-)
-
 
 class Messages:
     """What happens, written as lines of JSON."""
 
-    def __init__(self, output: IO[str]) -> None:
+    def __init__(self, output: IO[bytes]) -> None:
         self._output = output
         self._lock = threading.Lock()
         self._stage, self._at_s = "", 0.0
@@ -73,7 +70,7 @@ class Messages:
     def write(self, content: dict[str, Any]) -> None:
         """Write any message."""
         with self._lock:
-            self._output.write(json.dumps(content) + "\n")
+            self._output.write(json.dumps(content).encode() + b"\n")
             self._output.flush()
 
 
@@ -92,15 +89,13 @@ class _Lines(logging.Handler):
 def main() -> None:
     """Read the order, and do it."""
     end_with_parent()
-    output = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # what a library prints is no message
+    messages = Messages(own_output())
     order = Order(**json.loads(sys.stdin.buffer.readline()))
     threading.Thread(target=_end_with_input, daemon=True).start()
     with suppress(OSError, AttributeError):
         os.nice(NICENESS)
         # What answers somebody who waits gets a processor at once, where Linux can do that.
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-    messages = Messages(output)
     logger = logging.getLogger("starcat")
     logger.setLevel(logging.INFO)
     logger.addHandler(_Lines(messages))
