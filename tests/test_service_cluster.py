@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import shutil
 import subprocess
@@ -19,6 +20,7 @@ import pytest
 pytest.importorskip("fastapi")
 pytest.importorskip("distributed")
 
+from distributed import Client
 from fastapi.testclient import TestClient
 
 from starcat.artifact.verify import verify_artifact
@@ -150,8 +152,6 @@ class Cluster:
         options = ["--host", "127.0.0.1", "--port", str(port), "--no-dashboard"]
         self.scheduler = self._start("scheduler", *options, "--scheduler-file", str(file))
         until(lambda: file.exists() and '"address"' in file.read_text())
-        import json
-
         self.address = str(json.loads(file.read_text())["address"])
 
     def worker(self, name: str, **env: str) -> subprocess.Popen[bytes]:
@@ -299,6 +299,8 @@ class TestCluster:
         failed = ended(far, submit(far, small_spec))
         assert "no worker of the cluster can do it: the catalogs of this" in failed.error["detail"]
         cluster.worker("one")
+        with Client(cluster.address, set_as_default=False) as client:
+            client.wait_for_workers(2, timeout=60)
         version = small_spec.replace("1.0.0", "1.0.1")
         assert ended(far, submit(far, version)).state == "done"
 

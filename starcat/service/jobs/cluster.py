@@ -12,6 +12,7 @@ import logging
 import shutil
 import threading
 import time
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from io import BytesIO
@@ -46,7 +47,7 @@ from starcat.store.cluster import cluster
 if TYPE_CHECKING:
     from distributed import Client, Future, Worker
 
-    from starcat.service.jobs.slots import JobSlots
+    from starcat.service.service import Service
 
 TOPIC = "starcat-jobs"
 """Where workers tell of all jobs; messages are told apart by the key of their task."""
@@ -71,8 +72,14 @@ class ClusterResult:
 class ClusterJobs:
     """The cluster as the slots of a service use it: connected when the first job waits."""
 
-    def __init__(self, slots: JobSlots) -> None:
-        self._slots, self._service = slots, slots.service
+    def __init__(
+        self,
+        service: Service,
+        run_here: Callable[[Attempt], Outcome],
+        reason_to_end: Callable[[Attempt], Outcome | None],
+    ) -> None:
+        self._service = service
+        self._run_here, self._reason_to_end = run_here, reason_to_end
         self.problem: str | None = None
         self._client: Client | None = None
         self._closing = ExitStack()
@@ -104,7 +111,7 @@ class ClusterJobs:
         """Have a job done by the cluster."""
         job = attempt.job
         if job.request.get("to") == "hats":
-            return self._slots.run_process(attempt)
+            return self._run_here(attempt)
         short = disk_shortage(self._service)
         if short is not None:
             return Outcome("failed", job_problem("Insufficient storage", 507, short))
@@ -181,7 +188,7 @@ class ClusterJobs:
             with suppress(Empty):
                 attempt.report(inbox.get(timeout=TICK_S))
                 heard_s = time.monotonic()
-            ended = self._slots.reason_to_end(attempt)
+            ended = self._reason_to_end(attempt)
             if ended is not None:
                 return ended
             if heard_s is not None and time.monotonic() - heard_s > silence_s:

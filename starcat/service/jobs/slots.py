@@ -81,7 +81,9 @@ class JobSlots:
         self.service = service
         self.processes = Processes()
         self.stop_at_s: float | None = None  # when what still runs is ended, `time.monotonic`
-        self.cluster = ClusterJobs(self) if service.settings.scheduler else None
+        self.cluster: ClusterJobs | None = None
+        if service.settings.scheduler is not None:
+            self.cluster = ClusterJobs(service, self.run_process, self.reason_to_end)
         self._threads: list[threading.Thread] = []
 
     @property
