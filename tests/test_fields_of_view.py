@@ -98,8 +98,8 @@ def test_rows_are_estimated(name: str, limit_mag: float, sky_of: Any) -> None:
 
 @pytest.fixture(scope="module")
 def sky_of() -> Any:
-    from starcat.catalog.fetching.locate import locate
     from starcat.catalog.ingest import ingest
+    from starcat.catalog.source_files import locate
     from starcat.pipeline.guide_stars import select_stars
 
     stars = ingest("gaia", locate("gaia", {})).stars

@@ -47,8 +47,8 @@ from starcat.service.server import run_server
 from starcat.service.service import Service
 from starcat.service.settings import Settings, read_settings
 from starcat.specs.build_spec import BuildSpec
+from starcat.specs.keys import spec_toml
 from starcat.specs.reading import spec_from_dict
-from starcat.specs.spec_toml import spec_toml
 from starcat.storage.locks import locked
 
 LOCAL = "http://127.0.0.1:8000"

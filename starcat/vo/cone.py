@@ -40,31 +40,16 @@ _RANGES = {"RA": (0.0, 360.0), "DEC": (-90.0, 90.0), "SR": (0.0, 180.0)}
 
 @dataclass(frozen=True)
 class ConeRequest:
-    """A circle on the sky, and what is wanted of the stars in it.
+    """A circle on the sky, and what is wanted of the stars in it."""
 
-    Attributes
-    ----------
-    ra_deg, dec_deg : float
-        Its centre, ICRS.
-    radius_deg : float
-        Its radius; 0 asks for the columns only.
-    verbosity : int
-        1 for identity and place, 2 for all columns with a UCD, 3 for all.
-    maxrec : int, optional
-        Rows at most; None where that is not said.
-    form : Format
-        How the answer is written.
-    media_type : str
-        What it is sent as.
-    """
-
+    # Its centre, ICRS.
     ra_deg: float
     dec_deg: float
-    radius_deg: float
-    verbosity: int
-    maxrec: int | None
-    form: Format
-    media_type: str
+    radius_deg: float  # its radius; 0 asks for the columns only
+    verbosity: int  # 1 for identity and place, 2 for all columns with a UCD, 3 for all
+    maxrec: int | None  # rows at most; None where that is not said
+    form: Format  # how the answer is written
+    media_type: str  # what it is sent as
 
 
 def cone_request(parameters: Iterable[tuple[str, str]]) -> ConeRequest:

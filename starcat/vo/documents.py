@@ -66,18 +66,12 @@ they read know no name for it yet."""
 
 @dataclass(frozen=True)
 class ServiceLimits:
-    """What the service grants.
+    """What the service grants."""
 
-    Attributes
-    ----------
-    run_s, keep_s : int
-        Seconds that a query may take, and that its answer is kept.
-    rows, upload_bytes : int
-        Rows of an answer, and bytes of an upload at most.
-    """
-
+    # Seconds that a query may take, and that its answer is kept.
     run_s: int
     keep_s: int
+    # Rows of an answer, and bytes of an upload at most.
     rows: int
     upload_bytes: int
 

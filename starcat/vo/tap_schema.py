@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 from starcat.errors import SchemaError
 from starcat.exchange.columns import unit_text
-from starcat.query.columns import Facts, column_facts
 from starcat.query.names import identifier
+from starcat.query.result import Facts, column_facts
 from starcat.query.session import Session
 from starcat.query.targets import View
 from starcat.storage.parquet import write_parquet

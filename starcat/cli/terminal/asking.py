@@ -13,8 +13,7 @@ from starcat.cli.terminal.console import progress_bars, say
 from starcat.cli.terminal.queries import print_first_rows, print_views
 from starcat.errors import QueryError
 from starcat.query.gallery import guessed, named_query
-from starcat.query.preamble import preamble_of
-from starcat.query.session import Limits, Session, open_session
+from starcat.query.session import Limits, Session, open_session, preamble_of
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from starcat.catalog.fetching.locate import locate
-from starcat.catalog.readers.files import find_files
 from starcat.catalog.source import data_source
+from starcat.catalog.source_files import SourceFiles, locate
 from starcat.errors import SourceMissing, reason
 from starcat.service.jobs.job import Kind
 from starcat.service.records import Records
@@ -66,7 +65,7 @@ def source_files(name: str, paths: Iterable[Path]) -> list[Path]:
             # The partitions of a store are named in its metadata, with their digests.
             found += sorted(one for one in path.iterdir() if one.is_file())
         else:
-            found += [file.path for file in find_files(data_source(name), [path])]
+            found += [file.path for file in SourceFiles.find(data_source(name), [path]).files]
     return found
 
 

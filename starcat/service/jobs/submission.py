@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from starcat.catalog.ingest import check_band, star_catalog
+from starcat.catalog.ingest import ingest_options
 from starcat.errors import TargetMissing
 from starcat.service.access import Principal, Role
 from starcat.service.jobs.job import Job, Kind
@@ -53,7 +53,7 @@ def submit_ingest(
     """Have a catalog read."""
     request = {
         "source": source,
-        "band": check_band(star_catalog(source), band),
+        "band": ingest_options(source, band).band,
         "epoch_jyear": epoch_jyear,
         "read_limit_mag": read_limit_mag,
         "to": to,

@@ -114,7 +114,7 @@ def place_database(made: Path, final: Path) -> None:
 
 
 def _ingest(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
-    from starcat.catalog.fetching.locate import locate
+    from starcat.catalog.source_files import locate
 
     asked = order.request
     source, to = str(asked["source"]), asked["to"]
@@ -134,7 +134,8 @@ def _ingest(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
         stored = ingest_to_store(source, paths, made, **how, options=options, progress=progress)
         problems, notes, rows = stored.problems, stored.notes, int(stored.manifest["kept"])
     else:
-        from starcat.catalog.star_files import rejected_path, write_star_tables
+        from starcat.catalog.ingest import write_star_tables
+        from starcat.catalog.verdict import rejected_path
         from starcat.store.reading import read_catalog
 
         read = read_catalog(source, paths, **how, workers=order.threads, progress=progress)
@@ -181,7 +182,7 @@ _DOES: Mapping[Kind, Callable[[Order, Progress, Log], dict[str, Any]]] = {
 
 _NEEDS: Mapping[Kind, tuple[str, ...]] = {
     "build": ("starcat.pipeline.build", "matplotlib.backends.backend_agg"),
-    "ingest": ("starcat.catalog.star_files", "starcat.store.ingest"),
+    "ingest": ("starcat.catalog.ingest", "starcat.store.ingest"),
     "evaluate": ("starcat.simulation.selftest",),
 }
 

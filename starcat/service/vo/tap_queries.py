@@ -14,11 +14,10 @@ from starcat.exchange.columns import Label
 from starcat.exchange.formats import Format
 from starcat.exchange.writers import result_chunks
 from starcat.progress import Progress, no_progress
-from starcat.service.answer_files import file_of_rows, keep_rows
 from starcat.service.paths import ServicePaths
 from starcat.service.query_pool import QueryPool
 from starcat.service.sandbox.sandbox import Sandbox
-from starcat.service.uploading import scratch_folder
+from starcat.service.transfers import chunks_of, scratch_folder, write_rows
 from starcat.service.vo.tap_tables import TapTables
 from starcat.vo.adql import translate
 from starcat.vo.answer import ask
@@ -78,9 +77,10 @@ class TapQueries:
             yield from result_chunks(batches, form, scratch, label=_LABEL, maxrec=max_rows)
             return
         with scratch_folder(self._paths) as folder:
-            rows = folder / "rows.arrow"
-            keep_rows(batches, rows, max_rows)
-            chunks, _ = file_of_rows(self._sandbox, rows, folder / "answer.fits", "fits")
+            rows, result = folder / "rows.arrow", folder / "result.fits"
+            write_rows(batches, rows, max_rows)
+            self._sandbox.convert(rows, result, "fits")
+            chunks = chunks_of(result.open("rb"))
         yield from chunks
 
     @contextmanager

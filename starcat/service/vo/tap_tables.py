@@ -12,7 +12,7 @@ import threading
 from dataclasses import dataclass
 from pathlib import Path
 
-from starcat.catalog.star_files import rejected_path
+from starcat.catalog.verdict import rejected_path
 from starcat.errors import StarcatError
 from starcat.service.library import Library
 from starcat.service.paths import ServicePaths
