@@ -19,8 +19,7 @@ from starcat.service.query_pool import QueryPool
 from starcat.service.sandbox.sandbox import Sandbox
 from starcat.service.transfers import chunks_of, scratch_folder, write_rows
 from starcat.service.vo.tap_tables import TapTables
-from starcat.vo.adql import translate
-from starcat.vo.answer import ask
+from starcat.vo.adql import ask, translate
 from starcat.vo.parameters import Question, Upload
 from starcat.vo.tables import Schema, Table
 from starcat.vo.tap_schema import UPLOADS
