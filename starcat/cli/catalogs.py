@@ -13,7 +13,7 @@ from starcat.cli.options import Json, Scheduler, Workers, inputs_by_source
 from starcat.errors import SourceError
 
 if TYPE_CHECKING:
-    from starcat.catalog.fetching.fetch import FetchReport
+    from starcat.catalog.fetch import FetchReport
     from starcat.catalog.ingest import Ingested
     from starcat.pipeline.match_summary import Summary
     from starcat.store.ingest import Stored
@@ -47,8 +47,9 @@ def fetch(
 
     Example: starcat fetch tycho2
     """
-    from starcat.catalog.fetching.fetch import cache_folder, fetch_source
+    from starcat.catalog.fetch import fetch_source
     from starcat.catalog.source import data_source
+    from starcat.catalog.source_files import cache_folder
 
     with progress_bars() as progress:
         report = fetch_source(
@@ -109,7 +110,7 @@ def ingest(
 
     Example: starcat ingest sao --input sao.dat.gz -o sao.parquet --epoch-jyear 2026.0
     """
-    from starcat.catalog.fetching.locate import locate
+    from starcat.catalog.source_files import locate
     from starcat.errors import ConfigError
     from starcat.store.options import StoreOptions
 
@@ -156,7 +157,7 @@ def _ingest_to_file(
     *,
     as_json: bool,
 ) -> None:
-    from starcat.catalog.star_files import write_star_tables
+    from starcat.catalog.ingest import write_star_tables
     from starcat.store.reading import read_catalog
 
     with progress_bars() as progress:
@@ -204,8 +205,8 @@ def crossmatch(
 
 def print_sources(*, as_json: bool) -> None:
     """Print the data sources and where each would be read from."""
-    from starcat.catalog.fetching.locate import locate
     from starcat.catalog.source import data_source, source_names
+    from starcat.catalog.source_files import locate
 
     found: list[dict[str, Any]] = []
     for name in source_names():
@@ -269,7 +270,7 @@ def print_fetched(report: FetchReport, *, as_json: bool) -> None:
 
 def print_ingested(read: Ingested, output: Path, *, as_json: bool) -> None:
     """Print what became of the records of a catalog."""
-    from starcat.catalog.star_files import rejected_path
+    from starcat.catalog.verdict import rejected_path
 
     facts = {
         "source": read.source,

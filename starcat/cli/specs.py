@@ -42,8 +42,8 @@ def presets(
 
     Example: starcat presets gaia-12deg --toml
     """
+    from starcat.specs.keys import spec_toml
     from starcat.specs.reading import preset
-    from starcat.specs.spec_toml import spec_toml
 
     if toml:
         if name is None:

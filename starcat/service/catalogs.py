@@ -16,9 +16,9 @@ from typing import Any, TypeVar
 
 from cachetools import LRUCache
 
-from starcat.catalog.blocks import CATALOGS
-from starcat.catalog.fetching.locate import locate
+from starcat.catalog.parts import CATALOGS
 from starcat.catalog.source import DataSource, data_source
+from starcat.catalog.source_files import locate
 from starcat.errors import SourceMissing
 from starcat.pipeline.catalog_snapshot import CatalogSnapshot, read_snapshot, reading_keys
 from starcat.pipeline.estimate import Choice, Estimate, choose_stars, estimate

@@ -1,6 +1,6 @@
 """Which files a source should have, and whether one that has arrived is what was expected.
 
-`expected_files` lists names and addresses. `examine` takes a file on disk and checks its
+`expected_files` lists names and addresses. `check_download` takes a file on disk and checks its
 digest, gzip stream, record lengths and number of records; an error says what was found, what
 was expected and what to do. Where an archive publishes no digest, the first one seen is kept
 in a lock file beside the data and holds from then on. This module opens no connection and
@@ -22,8 +22,9 @@ import pooch
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from starcat.catalog.readers.files import Block, InputFile, read_blocks
+from starcat.catalog.readers.blocks import GZIP_MAGIC, Block, read_blocks
 from starcat.catalog.source import DataSource, RecordFile
+from starcat.catalog.source_files import InputFile
 from starcat.errors import (
     ChecksumMismatch,
     ConfigError,
@@ -45,21 +46,11 @@ _LINE_FEED, _CARRIAGE_RETURN = 10, 13
 
 @dataclass(frozen=True)
 class ExpectedFile:
-    """One file that is to be in a data folder: a record file, or one part of it.
-
-    Attributes
-    ----------
-    source : DataSource
-        The source.
-    file : RecordFile
-        One of its files.
-    part : str
-        One of the parts of ``file``; empty where it has none.
-    """
+    """One file that is to be in a data folder: a record file, or one part of it."""
 
     source: DataSource
     file: RecordFile
-    part: str
+    part: str  # one of the parts of the file; empty where it has none
 
     @property
     def addresses(self) -> tuple[tuple[str, str], ...]:
@@ -146,26 +137,14 @@ def _no_address(source: DataSource) -> SourceMissing:
 
 
 class LockEntry(BaseModel):
-    """What a file was when it first arrived.
-
-    Attributes
-    ----------
-    sha256 : str
-        Digest, lower-case hexadecimal.
-    bytes : int
-        Size as published, that is before unpacking.
-    rows : int
-        Records.
-    url : str
-        Where it came from; empty for a file that somebody put there by hand.
-    """
+    """What a file was when it first arrived."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
-    bytes: int
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")  # lower case
+    bytes: int  # as published, that is before unpacking
     rows: int
-    url: str
+    url: str  # where it came from; empty for a file that somebody put there by hand
 
 
 _ENTRIES = TypeAdapter(dict[str, LockEntry])
@@ -187,7 +166,7 @@ def read_lock(folder: Path) -> dict[str, LockEntry]:
         ) from error
 
 
-def examine(expected: ExpectedFile, path: Path, final: Path, url: str) -> LockEntry:
+def check_download(expected: ExpectedFile, path: Path, final: Path, url: str) -> LockEntry:
     """Check digest, records and their number; record a first arrival in the lock file."""
     lock = read_lock(final.parent)
     entry = lock.get(final.name)
@@ -281,7 +260,9 @@ def _check_total(
 def _count_records(expected: ExpectedFile, path: Path, name: str) -> int:
     """Count the records and check the length of each, one block of the file after the other."""
     file = expected.file
-    if name.endswith(".gz") and not _is_gzip(path):
+    with path.open("rb") as stream:
+        is_gzip = stream.read(len(GZIP_MAGIC)) == GZIP_MAGIC
+    if name.endswith(".gz") and not is_gzip:
         raise SourceError(f"{name} is not a gzip file: the address answers with something else.")
     rows = 0
     for block in read_blocks(InputFile(path, file), expected.source.name, lambda _: None):
@@ -292,11 +273,6 @@ def _count_records(expected: ExpectedFile, path: Path, name: str) -> int:
     if rows == 0:
         raise ParseError(f"{name} holds no record.")
     return rows
-
-
-def _is_gzip(path: Path) -> bool:
-    with path.open("rb") as stream:
-        return stream.read(2) == b"\x1f\x8b"
 
 
 def _count_packed(block: Block, name: str) -> int:

@@ -12,11 +12,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from starcat.catalog.ingest import Ingested, ingest
-from starcat.catalog.plausible import PLAUSIBLE, without_impossible
+from starcat.catalog.ingest import Ingested, ingest, write_star_tables
+from starcat.catalog.parts import RANGES, check_ranges
 from starcat.catalog.source import Column, data_source
-from starcat.catalog.star_files import write_star_tables
-from starcat.catalog.stars import StarBlock
 from starcat.catalog.verdict import Verdicts
 
 sys.path.insert(0, str(Path(__file__).parent / "builders"))
@@ -157,14 +155,15 @@ def test_one_message_does_not_quote_a_whole_field(read: Read) -> None:
     assert "the first 60 of 20,001 characters" in problem
 
 
-@pytest.mark.parametrize("name", sorted(PLAUSIBLE))
-def test_the_ends_of_what_is_plausible(name: str) -> None:
-    least, greatest = PLAUSIBLE[name]
+@pytest.mark.parametrize("name", sorted(RANGES))
+def test_the_ends_of_ranges(name: str) -> None:
+    least, greatest = RANGES[name]
     values = np.array([least, greatest, np.nextafter(least, -np.inf), np.nextafter(greatest, 1e99)])
     columns = {"ra_deg": np.ones(4), "dec_deg": np.ones(4), "epoch_jyear": 2000.0, name: values}
-    block = without_impossible(StarBlock(columns, Verdicts(4)))
-    assert block.verdicts.is_kept.tolist() == [True, True, False, False]
-    assert block.verdicts.count_by_reason() == {"impossible_value": 2}
+    verdicts = Verdicts(4)
+    check_ranges(columns, verdicts)
+    assert verdicts.is_kept.tolist() == [True, True, False, False]
+    assert verdicts.reasons.to_pylist() == ["impossible_value"] * 2
 
 
 def test_ranges_follow_limits_then_digits_then_units() -> None:

@@ -13,7 +13,6 @@ module does not unpack, and reads no star.
 from __future__ import annotations
 
 import logging
-import os
 import secrets
 import tempfile
 from collections.abc import Sequence
@@ -21,12 +20,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import pooch
-
-from starcat.catalog.fetching.arrival import (
+from starcat.catalog.integrity import (
     ExpectedFile,
     LockEntry,
-    examine,
+    check_download,
     expected_files,
     read_lock,
 )
@@ -51,55 +48,23 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class FetchedFile:
-    """One file that is in the folder and is what it should be.
-
-    Attributes
-    ----------
-    name : str
-        File name.
-    path : Path
-        Where it is.
-    bytes : int
-        Size as published, that is before unpacking.
-    sha256 : str
-        Digest.
-    rows : int
-        Records.
-    url : str
-        Where it came from; empty for a file that somebody put there by hand.
-    status : {"downloaded", "resumed", "present"}
-        What was done.
-    """
+    """One file that is in the folder and is what it should be."""
 
     name: str
     path: Path
-    bytes: int
+    bytes: int  # as published, that is before unpacking
     sha256: str
     rows: int
-    url: str
+    url: str  # where it came from; empty for a file that somebody put there by hand
     status: Status
 
 
 @dataclass(frozen=True)
 class FetchReport:
-    """What `fetch_source` did.
-
-    Attributes
-    ----------
-    source : str
-        Name of the data source.
-    files : tuple of FetchedFile
-        In the order of the data source.
-    """
+    """What `fetch_source` did."""
 
     source: str
-    files: tuple[FetchedFile, ...]
-
-
-def cache_folder() -> Path:
-    """Return the folder that downloads go to by default."""
-    chosen = os.environ.get("STARCAT_CACHE")
-    return Path(chosen).expanduser() if chosen else Path(pooch.os_cache("starcat"))
+    files: tuple[FetchedFile, ...]  # in the order of the data source
 
 
 def fetch_source(
@@ -204,7 +169,7 @@ def _take_present(expected: ExpectedFile, path: Path) -> FetchedFile:
     if not path.is_file():
         raise OutputError(f"{path} is in the way: it is not a file. Move it.", path=path)
     try:
-        entry = examine(expected, path, path, url="")
+        entry = check_download(expected, path, path, url="")
     except SourceError as error:
         error.args = (f"{error} The file is {path}: move it away to fetch it again.",)
         raise
@@ -217,7 +182,7 @@ def _take_arrived(
     """Check a file that has come, then give it its name or set it aside."""
     part = part_of(own)
     try:
-        entry = examine(expected, part, path, url=url)
+        entry = check_download(expected, part, path, url=url)
     except SourceError as error:
         error.path = beside(path, ".rejected")
         rename(part, error.path)
