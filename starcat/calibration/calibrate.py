@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starcat.arrays import Array
-from starcat.calibration.fit import Fit, fit_camera
-from starcat.calibration.lens import AXES, PARAMETERS, camera_of, values_of
+from starcat.calibration.fit import AXES, PARAMETERS, Fit, camera_of, fit_camera, values_of
 from starcat.calibration.models import COMPLETE, Trial, choose_model, chosen, is_enough, start_of
 from starcat.calibration.rounds import Identified, first_answer, identify_part, settled
 from starcat.errors import CalibrationError

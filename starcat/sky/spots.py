@@ -50,31 +50,23 @@ def identify_in_time(
     Parameters
     ----------
     identify : callable
-        `Matcher.identify`, its camera and options filled in: it is given the centroids and the
-        keyword ``magnitudes``.
-    database : Database
-        The stars that it names.
-    centroids_px : array_like of float64, shape (N, 2)
-        Pixels.
+        `Matcher.identify`, its camera and options filled in.
+    database, observer : Database, Observer
+        The stars that it names; when and from where the frame was taken.
+    centroids_px, magnitudes : array_like of float64, shape (N, 2) and (N,)
+        Pixels, and magnitudes of any zero point.
     camera : Camera
-        The camera that took the frame; where the answer has found another focal length, that one
-        counts.
-    observer : Observer
-        When and from where.
-    magnitudes : array_like of float64, shape (N,), optional
-        Magnitudes of the centroids, of any zero point.
-    tolerance_px : float, default 2
-        Largest distance of a spot from its planet, beside the error of the ephemeris.
-    max_false_match_probability : float, default 1e-9
-        Less certain answers are withheld.
+        The camera that took the frame; a focal length that the answer has found counts instead.
+    tolerance_px, max_false_match_probability : float
+        As of `Matcher`; a spot may be off its planet by the error of the ephemeris too.
 
     Returns
     -------
     MatchResult
         Spots of planets are in ``dropped``, with the planet's name in small letters as the
-        reason, and no star. A frame that is not identified, and whose spots have a brightness,
-        is asked again without one or two of its three brightest spots; such an answer is taken
-        only if a planet is at each of them, and its probability is that of all these questions.
+        reason, and no star. A frame that is not identified is asked again without one or two of
+        its three brightest spots; such an answer is taken only if a planet is at each of them,
+        and its probability is that of all these questions.
     """
     frame, mag = as_frame(centroids_px, magnitudes)
     seen = bodies_seen(observer)
