@@ -156,7 +156,6 @@ def calibrate_frames(
 def _finished(
     matcher: Matcher, frames: Sequence[MeasuredFrame], identified: Identified, fit: Fit
 ) -> Calibration:
-    """Return the calibration that compares all models, once the stars are known."""
     size_px = identified.camera.width_px, identified.camera.height_px
     seen = identified.seen(frames, matcher)
     trials, terms = [], fit.free

@@ -208,7 +208,6 @@ def _polar(calibration: Calibration) -> tuple[Array, Array]:
 
 
 def _draw_profile(axes: Axes, calibration: Calibration, residual_px: Array, name: str) -> None:
-    """Draw residuals against the radius, and their means in bins of as many stars."""
     fit = calibration.fit
     radius = np.hypot(*(fit.seen.centroids_px - calibration.camera.principal_point_px).T)
     limit = 4.5 * fit.noise_px

@@ -118,7 +118,6 @@ def _plane(body: Directions) -> Points:
 
 
 def _image(values: Array, z: Points) -> Points:
-    """Return the images of directions, as `Distortion.distorted` does inside its fold."""
     k1, k2, k3, p1, p2 = values[3:8]
     s = z.real**2 + z.imag**2
     factor = 1.0 + s * (k1 + s * (k2 + s * k3)) + 2.0 * (p2 * z.real + p1 * z.imag)
@@ -259,7 +258,6 @@ def turned_to(seen: Seen, values: Array, bend_px: float) -> tuple[Array, Array]:
 
 
 def _one_fit(seen: Seen, values: Array, rows: list[int], bend_px: float, accuracy: float) -> Array:
-    """Return all numbers, those of some rows fitted."""
     last: tuple[bytes, Array, Array] = b"", np.empty(0), seen.matrices
 
     def at(x: Array) -> tuple[Array, Array, Array]:
