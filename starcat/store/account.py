@@ -25,20 +25,11 @@ Facts = dict[str, Any]
 
 @dataclass(frozen=True)
 class Written:
-    """What the tasks of a run wrote.
+    """What the tasks of a run wrote."""
 
-    Attributes
-    ----------
-    parts : sequence of dict
-        Results of splitting, one a file.
-    repeated : int
-        Records of stars that were read before.
-    partitions, margins : sequence of (Pixel, dict)
-        Results of finishing, and of writing margins.
-    """
-
-    parts: Sequence[Facts]
-    repeated: int
+    parts: Sequence[Facts]  # results of splitting, one a file
+    repeated: int  # records of stars that were read before
+    # partitions, margins: results of finishing, and of writing margins
     partitions: Sequence[tuple[Pixel, Facts]]
     margins: Sequence[tuple[Pixel, Facts]]
 

@@ -39,35 +39,21 @@ STAR_KEYS = ("star_id", "source_file", "source_line")
 
 @dataclass(frozen=True)
 class Finish:
-    """What is asked of a worker that finishes a partition.
+    """What is asked of a worker that finishes a partition."""
 
-    Attributes
-    ----------
-    pixel : Pixel
-        The partition.
-    beside : tuple of Pixel
-        Partitions whose margin has stars of this one.
-    margin_rad : float
-        How far margins reach.
-    index, repeated : Path
-        Files that say what the runs hold, and which records are of a star read before.
-    catalog, borders : Path
-        Folder of the HATS catalog, and for the stars that border on other partitions.
-    collection : Path
-        Folder of the whole store.
-    is_alone : bool
-        Whether the catalog has but one star.
-    """
-
-    pixel: Pixel
-    beside: tuple[Pixel, ...]
-    margin_rad: float
+    pixel: Pixel  # the partition
+    beside: tuple[Pixel, ...]  # partitions whose margin has stars of this one
+    margin_rad: float  # how far margins reach
+    # index, repeated: files that say what the runs hold, and which records are of a star read
+    # before
     index: Path
     repeated: Path
+    # catalog, borders: folder of the HATS catalog, and for the stars that border on other
+    # partitions
     catalog: Path
     borders: Path
-    collection: Path
-    is_alone: bool
+    collection: Path  # folder of the whole store
+    is_alone: bool  # whether the catalog has but one star
 
 
 def finish(asked: Finish) -> tuple[dict[str, Any], Digests]:
@@ -193,21 +179,11 @@ def border_path(folder: Path, pixel: Pixel) -> Path:
 
 @dataclass(frozen=True)
 class Margin:
-    """What is asked of a worker that writes the margin of a partition.
+    """What is asked of a worker that writes the margin of a partition."""
 
-    Attributes
-    ----------
-    pixel : Pixel
-        The partition.
-    batches : tuple of (Path, int)
-        Where its neighbours' stars are.
-    catalog : Path
-        Folder of the HATS margin catalog.
-    """
-
-    pixel: Pixel
-    batches: tuple[tuple[Path, int], ...]
-    catalog: Path
+    pixel: Pixel  # the partition
+    batches: tuple[tuple[Path, int], ...]  # where its neighbours' stars are
+    catalog: Path  # folder of the HATS margin catalog
 
 
 def write_margin(asked: Margin) -> tuple[dict[str, Any], Digests]:

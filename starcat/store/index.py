@@ -16,27 +16,15 @@ from starcat.store.runs import BUCKETS, Run, Share, repeated_places
 
 @dataclass(frozen=True)
 class RunIndex:
-    """Batches by coarse pixel.
+    """Batches by coarse pixel."""
 
-    Attributes
-    ----------
-    order : int
-        Order of the coarse pixels.
-    paths : tuple of Path
-        Arrow files of the runs.
-    pixels : ndarray of int64, shape (B,)
-        Coarse pixel of each batch, ascending.
-    runs, batches : ndarray of int64, shape (B,)
-        Number of its run, and its number in the run.
-    buckets : ndarray of int64, shape (R, BUCKETS + 1)
-        Where each bucket of numbers begins in the places of each run.
-    """
-
-    order: int
-    paths: tuple[Path, ...]
-    pixels: Pixels
+    order: int  # order of the coarse pixels
+    paths: tuple[Path, ...]  # arrow files of the runs
+    pixels: Pixels  # shape (B,): coarse pixel of each batch, ascending
+    # runs, batches: shape (B,): number of its run, and its number in the run
     runs: NDArray[np.int64]
     batches: NDArray[np.int64]
+    # shape (R, BUCKETS + 1): where each bucket of numbers begins in the places of each run
     buckets: NDArray[np.int64]
 
     def shares(self, pixel: Pixel) -> list[Share]:

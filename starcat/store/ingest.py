@@ -56,23 +56,12 @@ _BYTES_A_RECORD = 40
 
 @dataclass(frozen=True)
 class Stored:
-    """A catalog store that was made.
+    """A catalog store that was made."""
 
-    Attributes
-    ----------
-    folder : Path
-        Where it is.
-    outcome : {"written", "unchanged", "replaced"}
-        What happened to the folder.
-    manifest : dict
-        The content of its ``store.json``.
-    problems, notes : tuple of str
-        The first malformed records, and what a user should know of the inputs.
-    """
-
-    folder: Path
-    outcome: Outcome
-    manifest: dict[str, Any]
+    folder: Path  # where it is
+    outcome: Outcome  # what happened to the folder
+    manifest: dict[str, Any]  # the content of its ``store.json``
+    # problems, notes: the first malformed records, and what a user should know of the inputs
     problems: tuple[str, ...]
     notes: tuple[str, ...]
 

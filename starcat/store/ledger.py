@@ -37,15 +37,9 @@ def digests_of(files: Iterable[Path]) -> Digests:
 
 @dataclass(frozen=True)
 class Work:
-    """The hidden folder of a run.
+    """The hidden folder of a run."""
 
-    Attributes
-    ----------
-    folder : Path
-        ``.<name>.work`` beside the final name.
-    """
-
-    folder: Path
+    folder: Path  # ``.<name>.work`` beside the final name
 
     @classmethod
     def of(cls, final: Path) -> Work:
@@ -118,26 +112,13 @@ def _always(_: Any, __: dict[str, Any]) -> bool:
 
 @dataclass(frozen=True)
 class Job:
-    """A task with a name, which does not do what the ledger says is done.
+    """A task with a name, which does not do what the ledger says is done."""
 
-    Attributes
-    ----------
-    work : Work
-        The run that it is a part of.
-    name : str
-        Unique in the run.
-    task : callable
-        What to do.
-    asked : object
-        What to call it with.
-    is_valid : callable, optional
-        Whether the result of an earlier run still holds, of what is asked and that result.
-    """
-
-    work: Work
-    name: str
-    task: Task
-    asked: Any
+    work: Work  # the run that it is a part of
+    name: str  # unique in the run
+    task: Task  # what to do
+    asked: Any  # what to call it with
+    # whether the result of an earlier run still holds, of what is asked and that result
     is_valid: Callable[[Any, dict[str, Any]], bool] = _always
 
     def run(self) -> dict[str, Any]:

@@ -22,33 +22,15 @@ HATS_VERSION = "v1.0"
 
 @dataclass(frozen=True)
 class Described:
-    """A HATS catalog whose partitions are written.
+    """A HATS catalog whose partitions are written."""
 
-    Attributes
-    ----------
-    name : str
-        The name that it gets.
-    kind : str
-        ``object`` or ``margin``.
-    rows : int
-        Its stars.
-    bytes : int
-        Size of its partitions.
-    max_rows : int
-        Stars that a partition may hold.
-    pixels : tuple of Pixel
-        The partitions, by their place on the sky.
-    more : dict of str to object
-        Further properties.
-    """
-
-    name: str
-    kind: str
-    rows: int
-    bytes: int
-    max_rows: int
-    pixels: tuple[Pixel, ...]
-    more: Mapping[str, Any]
+    name: str  # the name that it gets
+    kind: str  # ``object`` or ``margin``
+    rows: int  # its stars
+    bytes: int  # size of its partitions
+    max_rows: int  # stars that a partition may hold
+    pixels: tuple[Pixel, ...]  # the partitions, by their place on the sky
+    more: Mapping[str, Any]  # further properties
 
 
 def write_slices(

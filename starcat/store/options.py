@@ -19,29 +19,15 @@ _RUN_ROWS = (20_000, 250_000)
 
 @dataclass(frozen=True)
 class StoreOptions:
-    """How a store is made.
+    """How a store is made."""
 
-    Attributes
-    ----------
-    max_partition_rows : int
-        Stars that a partition may hold.
-    margin_arcsec : float
-        How far the margin of a partition reaches.
-    memory_bytes : int
-        Memory of all processes together; the bytes of the store do not depend on it.
-    workers : int
-        Processes on this machine.
-    scheduler : str, optional
-        Address of a Dask cluster to use instead.
-    resume, replace : bool
-        Whether to go on with an unfinished run, and to replace a store that differs.
-    """
-
-    max_partition_rows: int = MAX_ROWS
-    margin_arcsec: float = MARGIN_ARCSEC
+    max_partition_rows: int = MAX_ROWS  # stars that a partition may hold
+    margin_arcsec: float = MARGIN_ARCSEC  # how far the margin of a partition reaches
+    # memory of all processes together; the bytes of the store do not depend on it
     memory_bytes: int = MEMORY_BYTES
-    workers: int = 2
-    scheduler: str | None = None
+    workers: int = 2  # processes on this machine
+    scheduler: str | None = None  # address of a Dask cluster to use instead
+    # resume, replace: whether to go on with an unfinished run, and to replace a store that differs
     resume: bool = False
     replace: bool = False
 

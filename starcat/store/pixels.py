@@ -37,11 +37,6 @@ Pixels = NDArray[np.int64]
 class Pixel:
     """A pixel of the sky, as a partition covers it.
 
-    Attributes
-    ----------
-    order, number : int
-        Nested HEALPix.
-
     Examples
     --------
     >>> Pixel(6, 41234).path.as_posix()
@@ -50,6 +45,7 @@ class Pixel:
     (360287970189639680, True)
     """
 
+    # order, number: nested HEALPix
     order: int
     number: int
 

@@ -31,24 +31,12 @@ Levels = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Region:
-    """A pixel and the rings around it.
+    """A pixel and the rings around it."""
 
-    Attributes
-    ----------
-    core : Pixel, optional
-        The pixel in the middle; None for the whole sky.
-    order : int
-        Order of the rings' pixels.
-    pixels : ndarray of int64, shape (N,)
-        Pixels of the rings, ascending.
-    levels : ndarray of int64, shape (N,)
-        Number of the ring that each is in, from 1.
-    """
-
-    core: Pixel | None
-    order: int
-    pixels: Pixels
-    levels: Levels
+    core: Pixel | None  # the pixel in the middle; None for the whole sky
+    order: int  # order of the rings' pixels
+    pixels: Pixels  # shape (N,): pixels of the rings, ascending
+    levels: Levels  # shape (N,): number of the ring that each is in, from 1
 
     @property
     def ranges(self) -> tuple[tuple[int, int], ...]:

@@ -44,39 +44,23 @@ PLACES = np.dtype([("star_id", np.int64), ("place", np.int64)])
 
 @dataclass(frozen=True)
 class Run:
-    """A run on disk.
+    """A run on disk."""
 
-    Attributes
-    ----------
-    stars, places : Path
-        Arrow file of the stars; file of `PLACES`, by bucket.
-    pixels, rows : ndarray of int64, shape (B,)
-        Coarse pixel and number of stars of each batch.
-    buckets : ndarray of int64, shape (BUCKETS + 1,)
-        Where each bucket begins in ``places``.
-    """
-
+    # stars, places: arrow file of the stars; file of `PLACES`, by bucket
     stars: Path
     places: Path
+    # pixels, rows: shape (B,): coarse pixel and number of stars of each batch
     pixels: Pixels
     rows: NDArray[np.int64]
-    buckets: NDArray[np.int64]
+    buckets: NDArray[np.int64]  # shape (BUCKETS + 1,): where each bucket begins in ``places``
 
 
 @dataclass(frozen=True)
 class Share:
-    """The batches of a run that a partition reads.
+    """The batches of a run that a partition reads."""
 
-    Attributes
-    ----------
-    stars : Path
-        Arrow file of the run.
-    batches : tuple of int
-        Their numbers, ascending.
-    """
-
-    stars: Path
-    batches: tuple[int, ...]
+    stars: Path  # arrow file of the run
+    batches: tuple[int, ...]  # their numbers, ascending
 
 
 def places_of(stars: pa.Table) -> NDArray[np.int64]:

@@ -28,29 +28,14 @@ from starcat.store.runs import HISTOGRAM_ORDER, Run, write_run
 
 @dataclass(frozen=True)
 class Split:
-    """What is asked of a worker that splits a file.
+    """What is asked of a worker that splits a file."""
 
-    Attributes
-    ----------
-    number : int
-        Number of the file among the inputs.
-    file : InputFile
-        The file.
-    how : Reading
-        Which catalog, band, epoch and limit.
-    order : int
-        Order of the coarse pixels of the runs.
-    run_rows : int
-        Stars of a run: what is held in memory.
-    runs, rejected : Path
-        Folders for the runs, and for the rejected records.
-    """
-
-    number: int
-    file: InputFile
-    how: IngestOptions
-    order: int
-    run_rows: int
+    number: int  # number of the file among the inputs
+    file: InputFile  # the file
+    how: IngestOptions  # which catalog, band, epoch and limit
+    order: int  # order of the coarse pixels of the runs
+    run_rows: int  # stars of a run: what is held in memory
+    # runs, rejected: folders for the runs, and for the rejected records
     runs: Path
     rejected: Path
 
