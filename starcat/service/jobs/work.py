@@ -134,7 +134,7 @@ def _ingest(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
     made = order.work / name
     if to == "hats":
         from starcat.store.ingest import ingest_to_store
-        from starcat.store.options import StoreOptions
+        from starcat.store.plan import StoreOptions
 
         options = StoreOptions(
             memory_bytes=order.memory_bytes, workers=order.threads, scheduler=order.scheduler
