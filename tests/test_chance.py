@@ -22,7 +22,7 @@ from starcat.matcher.observation import observe
 from starcat.matcher.pose import pose_at
 from starcat.matcher.verification import agree
 from starcat.matcher.ways import compatible_pairs, log_compatible_ways, log_ways
-from starcat.products.pairs import find_pairs
+from starcat.products.pairs_and_triangles import find_pairs
 from starcat.simulation.simulate import Frame, Noise, simulate_frame
 from starcat.simulation.sky import Sky
 

@@ -16,8 +16,12 @@ from starcat.catalog.stars import directions_of
 from starcat.errors import BuildError
 from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
-from starcat.geometry.sphere import chord_from_separation, radec_from_directions, tangent_axes
-from starcat.geometry.zones import zones_of
+from starcat.geometry.sphere import (
+    chord_from_separation,
+    radec_from_directions,
+    tangent_axes,
+    zones_of,
+)
 from starcat.pipeline.acceptance import advice_without_magnitudes, causes, check_rates
 from starcat.pipeline.build import Built, build
 from starcat.pipeline.cost import Cost, product_cost
@@ -25,7 +29,7 @@ from starcat.pipeline.recipes import ProductInputs, make_product
 from starcat.pipeline.starter import STARS_A_FIELD, Starter, advice, starter_spec
 from starcat.products.boresights import stars_in_fields, tile_sphere
 from starcat.products.coverage import TilingGap
-from starcat.products.triangles import find_triangles
+from starcat.products.pairs_and_triangles import find_triangles
 from starcat.simulation.interval import wilson_interval
 from starcat.simulation.selftest import Rates
 from starcat.specs.build_spec import BuildSpec, CameraSpec

@@ -32,7 +32,7 @@ SINGLE_MODULES = {
     "cli": ["", "__main__"],  # "" is starcat itself
 }
 
-GEOMETRY = ("attitude", "camera", "distortion", "kvector", "patterns", "sphere", "zones")
+GEOMETRY = ("attitude", "camera", "distortion", "kvector", "patterns", "sphere")
 ONBOARD = ("blocks", "grid", "image", "layout", "reading", "structure")
 LIGHT = {
     "starcat.arrays",

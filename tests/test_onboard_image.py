@@ -26,8 +26,7 @@ from starcat.onboard.image import Contents, longest_pair_rad, make_image
 from starcat.onboard.layout import BYTE_ORDERS, HEADER, Sizes, check_bytes, in_order
 from starcat.onboard.reading import read_image
 from starcat.products.boresights import tile_sphere
-from starcat.products.pairs import find_pairs
-from starcat.products.triangles import find_triangles
+from starcat.products.pairs_and_triangles import find_pairs, find_triangles
 
 CAMERA = Camera(1024, 768, fov_x_deg=20.0)
 

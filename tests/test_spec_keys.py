@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from starcat.errors import ConfigError
 from starcat.pipeline.starter import ENOUGH_STARS, boresight_count
 from starcat.specs.build_spec import BuildSpec, CameraSpec
-from starcat.specs.keys import REQUIRED, spec_sections
+from starcat.specs.keys import REQUIRED, spec_sections, spec_toml, toml_value
 from starcat.specs.reading import preset, preset_names, read_spec, spec_from_dict
-from starcat.specs.spec_toml import spec_toml, toml_value
 
 
 def all_keys():

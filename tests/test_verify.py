@@ -16,11 +16,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from starcat.artifact.content import content_sha256
 from starcat.artifact.database import INDICES
 from starcat.artifact.manifest import DATABASE_NAME, MANIFEST_NAME, manifest_digest
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import Finding, check_artifact, verify_artifact
+from starcat.artifact.writer import content_sha256
 from starcat.errors import ProductError
 from starcat.resources import resource_folder
 from starcat.storage.digests import file_sha256, json_bytes

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Directions, Mask, Pixels
 from starcat.calibration.lens import (
     FOCAL,
     PARAMETERS,
@@ -51,30 +51,19 @@ PASSES = 4
 
 @dataclass(frozen=True)
 class Seen:
-    """The stars that were identified in some frames.
+    """The stars that were identified in some frames."""
 
-    Attributes
-    ----------
-    frame : ndarray of int64, shape (N,)
-        Number of the frame of each star, ascending; every number from 0 to F - 1 occurs.
-    centroids_px : ndarray of float64, shape (N, 2)
-        Where they were seen.
-    icrs : ndarray of float64, shape (N, 3)
-        Where they are.
-    matrices : ndarray of float64, shape (F, 3, 3)
-        About the attitudes, ``body = matrix @ icrs``.
-    """
-
+    # shape (N,): number of the frame of each star, ascending; every number from 0 to F - 1 occurs
     frame: NDArray[np.int64]
-    centroids_px: Array
-    icrs: Array
-    matrices: Array
+    centroids_px: Pixels  # shape (N, 2): where they were seen
+    icrs: Directions  # shape (N, 3): where they are
+    matrices: Array  # shape (F, 3, 3): about the attitudes, ``body = matrix @ icrs``
 
     def __len__(self) -> int:
         """Return the number of stars."""
         return len(self.frame)
 
-    def of(self, wanted: NDArray[np.bool_]) -> Seen:
+    def of(self, wanted: Mask) -> Seen:
         """Return the stars of some of the frames."""
         stars, number = wanted[self.frame], np.cumsum(wanted) - 1
         return Seen(
@@ -197,9 +186,7 @@ def _one_fit(seen: Seen, values: Array, rows: list[int], bend_px: float, accurac
     return out
 
 
-def reduced_derivatives(
-    seen: Seen, values: Array, rows: list[int], inside: NDArray[np.bool_]
-) -> Array:
+def reduced_derivatives(seen: Seen, values: Array, rows: list[int], inside: Mask) -> Array:
     """Return how pixels change with numbers of the camera when the attitudes follow."""
     body = _body(seen, seen.matrices)
     by_value, by_turn = value_derivatives(values, body)[:, :, rows], turn_derivatives(values, body)

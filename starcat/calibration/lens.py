@@ -12,7 +12,7 @@ from dataclasses import asdict
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Directions
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 
@@ -63,7 +63,7 @@ def cropped(camera: Camera, share: float) -> tuple[Camera, Array]:
     return middle, np.array([left, top], dtype=np.float64)
 
 
-def project(values: Array, body: Array) -> Array:
+def project(values: Array, body: Directions) -> Array:
     """Project directions with any numbers, those of a lens that folds the image included."""
     w, focal_px = _image(values, _plane(body)), values[0]
     aspect, skew = values[-2:]
@@ -71,7 +71,7 @@ def project(values: Array, body: Array) -> Array:
     return np.column_stack([x, values[2] + focal_px * (1.0 + aspect) * w.imag])
 
 
-def value_derivatives(values: Array, body: Array) -> Array:
+def value_derivatives(values: Array, body: Directions) -> Array:
     """Return how pixels change with the numbers of the camera."""
     focal_px, (aspect, skew) = values[0], values[-2:]
     z = _plane(body)
@@ -87,7 +87,7 @@ def value_derivatives(values: Array, body: Array) -> Array:
     return by_value
 
 
-def turn_derivatives(values: Array, body: Array) -> Array:
+def turn_derivatives(values: Array, body: Directions) -> Array:
     """Return how pixels change with the attitude of the camera."""
     focal_px, (aspect, skew) = values[0], values[-2:]
     k1, k2, k3, p1, p2 = values[3:8]
@@ -106,7 +106,7 @@ def turn_derivatives(values: Array, body: Array) -> Array:
     return by_turn
 
 
-def _plane(body: Array) -> Points:
+def _plane(body: Directions) -> Points:
     return np.asarray((body[:, 0] + 1j * body[:, 1]) / body[:, 2])
 
 

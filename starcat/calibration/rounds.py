@@ -73,22 +73,13 @@ ROUND_MODELS = (
 
 @dataclass(frozen=True)
 class Identified:
-    """What the matcher says about the frames.
+    """What the matcher says about the frames."""
 
-    Attributes
-    ----------
-    results : tuple of MatchResult
-        One a frame, about the centroids as they were given; those outside of the part of the
-        frame that was asked about have no star.
-    camera : Camera
-        That they were identified with.
-    tolerance_px : float
-        Within which.
-    """
-
+    # one a frame, about the centroids as they were given; those outside of the part of the frame
+    # that was asked about have no star
     results: tuple[MatchResult, ...]
-    camera: Camera
-    tolerance_px: float
+    camera: Camera  # that they were identified with
+    tolerance_px: float  # within which
 
     @property
     def found(self) -> list[int]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.special import erf
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Pixels
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.images.image_file import WRITTEN_KINDS, write_image
@@ -38,40 +38,22 @@ _MOST_ELECTRONS = 1e15
 class Optics:
     """A lens and a detector, for one exposure.
 
-    Attributes
-    ----------
-    psf_sigma_px : float
-        Standard deviation of the Gaussian spot, pixels.
-    zero_point_e : float
-        Electrons of a star of magnitude 0. The default is 19,100 electrons per second and mm2
-        [1]_ through an aperture of 20 mm in 0.1 s.
-    background_e : float
-        Electrons of sky and dark current in a pixel.
-    read_noise_e : float
-        Standard deviation of the read-out, electrons.
-    gain_e_per_adu : float
-        Electrons of one step of the file.
-    bias_adu : float
-        Steps added to every pixel, so that noise does not fall below zero.
-    full_well_e : float
-        Electrons that a pixel can hold; what is above is lost.
-    hot_pixels : int
-        Pixels with a high dark current, at places that the seed gives.
-
     References
     ----------
     .. [1] Liebe 2002, "Accuracy performance of star trackers - a tutorial", IEEE Transactions
        on Aerospace and Electronic Systems 38 (2), 587-599.
     """
 
-    psf_sigma_px: float = 1.0
+    psf_sigma_px: float = 1.0  # standard deviation of the Gaussian spot, pixels
+    # electrons of a star of magnitude 0. The default is 19,100 electrons per second and mm2
+    # through an aperture of 20 mm in 0.1 s.
     zero_point_e: float = 600_000.0
-    background_e: float = 20.0
-    read_noise_e: float = 8.0
-    gain_e_per_adu: float = 1.0
-    bias_adu: float = 100.0
-    full_well_e: float = 50_000.0
-    hot_pixels: int = 0
+    background_e: float = 20.0  # electrons of sky and dark current in a pixel
+    read_noise_e: float = 8.0  # standard deviation of the read-out, electrons
+    gain_e_per_adu: float = 1.0  # electrons of one step of the file
+    bias_adu: float = 100.0  # steps added to every pixel, so that noise does not fall below zero
+    full_well_e: float = 50_000.0  # electrons that a pixel can hold; what is above is lost
+    hot_pixels: int = 0  # pixels with a high dark current, at places that the seed gives
 
     def __post_init__(self) -> None:
         for name in ("psf_sigma_px", "gain_e_per_adu", "full_well_e"):
@@ -83,7 +65,7 @@ class Optics:
 
 
 def star_electrons(
-    centroids_px: Array, mag: Array, camera_size: tuple[int, int], optics: Optics
+    centroids_px: Pixels, mag: Array, camera_size: tuple[int, int], optics: Optics
 ) -> Array:
     """Return the mean number of electrons that stars release, without background or noise."""
     width, height = camera_size
@@ -105,7 +87,7 @@ def star_electrons(
     return image
 
 
-def _check(centroids_px: Array, mag: Array, camera_size: tuple[int, int]) -> None:
+def _check(centroids_px: Pixels, mag: Array, camera_size: tuple[int, int]) -> None:
     if centroids_px.ndim != 2 or centroids_px.shape[1] != 2 or mag.shape != centroids_px.shape[:1]:
         raise ValueError(
             f"centroids_px of shape {centroids_px.shape} and mag of shape {mag.shape}; "
@@ -126,7 +108,7 @@ def _profiles(centre: Array, sigma: float) -> tuple[Array, NDArray[np.int64]]:
 
 
 def render_image(
-    centroids_px: Array,
+    centroids_px: Pixels,
     mag: Array,
     camera_size: tuple[int, int],
     optics: Optics,
@@ -135,13 +117,9 @@ def render_image(
 ) -> NDArray[np.uint16]:
     """Return the image of stars as a detector would record it.
 
-    Notes
-    -----
     Electrons of stars, background and hot pixels are Poisson variates; the full well cuts
     them; the read-out adds Gaussian noise and rounds to whole ADU.
 
-    Examples
-    --------
     >>> import numpy as np
     >>> image = render_image(np.array([[10.5, 20.5]]), np.array([3.0]), (64, 48), Optics(), 1)
     >>> image.shape, np.unravel_index(image.argmax(), image.shape) == (20, 10)
@@ -162,46 +140,21 @@ def render_image(
 
 @dataclass(frozen=True)
 class Scene:
-    """The sky behind the stars, and what is left of it in a file.
+    """The sky behind the stars, and what is left of it in a file."""
 
-    Attributes
-    ----------
-    town_light_e : float
-        Electrons of the gradient in the brightest corner or at the brightest edge; it is a tenth
-        of that on the opposite side.
-    town_light_deg : float
-        Direction in which it becomes brighter: 0 to the right, 90 down.
-    moon_px : pair of float, optional
-        Middle of the Moon; it may be outside of the frame.
-    moon_radius_px : float
-        Radius of its disk, which fills the well.
-    glow_e : float
-        Electrons of its glow at the edge of the disk.
-    glow_px : float
-        Distance from the Moon's middle at which the glow is half as bright.
-    nebula_e : float
-        Standard deviation of nebulous light, electrons.
-    nebula_px : float
-        Size of its structure.
-    black_adu : float
-        Step of the detector that is 0 in the file: what is darker is lost.
-    adu_per_step : float
-        Steps of the detector in a step of the file.
-    bits : int
-        8 or 16: what is brighter than the largest number is lost.
-    """
-
+    # electrons of the gradient in the brightest corner or at the brightest edge; it is a tenth of
+    # that on the opposite side
     town_light_e: float = 0.0
-    town_light_deg: float = 90.0
-    moon_px: tuple[float, float] | None = None
-    moon_radius_px: float = 22.0
-    glow_e: float = 0.0
-    glow_px: float = 60.0
-    nebula_e: float = 0.0
-    nebula_px: float = 20.0
-    black_adu: float = 0.0
-    adu_per_step: float = 1.0
-    bits: int = 16
+    town_light_deg: float = 90.0  # direction in which it becomes brighter: 0 to the right, 90 down
+    moon_px: tuple[float, float] | None = None  # middle of the Moon; it may be outside of the frame
+    moon_radius_px: float = 22.0  # radius of its disk, which fills the well
+    glow_e: float = 0.0  # electrons of its glow at the edge of the disk
+    glow_px: float = 60.0  # distance from the Moon's middle at which the glow is half as bright
+    nebula_e: float = 0.0  # standard deviation of nebulous light, electrons
+    nebula_px: float = 20.0  # size of its structure
+    black_adu: float = 0.0  # step of the detector that is 0 in the file: what is darker is lost
+    adu_per_step: float = 1.0  # steps of the detector in a step of the file
+    bits: int = 16  # 8 or 16: what is brighter than the largest number is lost
 
     def __post_init__(self) -> None:
         if self.bits not in (8, 16):

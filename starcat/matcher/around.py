@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.geometry.zones import zones_of
+from starcat.geometry.sphere import zones_of
 from starcat.matcher.database import Database
 
 Rows = NDArray[np.int64]

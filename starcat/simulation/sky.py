@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.geometry.zones import Zones, zones_of
+from starcat.geometry.sphere import Zones, zones_of
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Matrix, Pixels
 from starcat.geometry.attitude import matrix_from_quaternion, solve_wahba_svd
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
@@ -107,8 +107,8 @@ def identify_in_time(
 
 
 def planets_among(
-    centroids_px: Array,
-    matrix: Array,
+    centroids_px: Pixels,
+    matrix: Matrix,
     camera: Camera,
     seen: Bodies,
     *,
@@ -119,33 +119,11 @@ def planets_among(
 ) -> dict[int, str]:
     """Return which centroids are planets, the Moon or the Sun.
 
-    Parameters
-    ----------
-    centroids_px : ndarray of float64, shape (N, 2)
-        Pixels; NaN for a centroid that is not to be used.
-    matrix : ndarray of float64, shape (3, 3)
-        Attitude, of apparent directions.
-    camera : Camera
-        The camera.
-    seen : Bodies
-        The bodies, as the observer sees them.
-    magnitudes : ndarray of float64, shape (N,), optional
-        Magnitudes of the centroids, of any zero point.
-    star_mag : ndarray of float64, shape (N,), optional
-        Magnitudes of the stars that were found for them, NaN where none.
-    tolerance_px : float, default 2
-        Largest distance of a spot from its planet, beside the error of the ephemeris and the
-        disc.
-    faint_limit_mag : float, optional
-        Bodies more than 1 mag fainter are not looked for.
-
-    Returns
-    -------
-    dict of int to str
-        Name of the body in small letters by row of the centroid. Of several centroids within
-        reach of one body the brightest is its spot, or the nearest without magnitudes. A spot
-        stays its star's if the star is brighter than the planet, or where the body is the Sun or
-        the Moon and shows a disc.
+    The matrix is of apparent directions; ``star_mag`` are magnitudes of the stars that were
+    found for the centroids, NaN where none. Returned is the name of the body in small letters
+    by row of the centroid. Of several centroids within reach of one body the brightest is its
+    spot, or the nearest without magnitudes. A spot stays its star's if the star is brighter
+    than the planet, or where the body is the Sun or the Moon and shows a disc.
     """
     rows: dict[int, str] = {}
     places = camera.pixels_from_directions(seen.directions @ matrix.T)

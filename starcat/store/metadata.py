@@ -20,7 +20,7 @@ from starcat.catalog.parts import IngestOptions
 from starcat.catalog.verdict import Reason
 from starcat.errors import BuildError
 from starcat.storage.digests import json_bytes
-from starcat.storage.votable import votable_metadata
+from starcat.storage.parquet import votable_metadata
 from starcat.store.cluster import versions
 from starcat.store.finish import SKYMAP_ORDER, store_schema
 from starcat.store.layout import (

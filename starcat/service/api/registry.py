@@ -12,10 +12,10 @@ from fastapi.responses import Response
 from starcat.errors import TargetMissing
 from starcat.releases.tree import INDEX_NAME
 from starcat.service.access import Reader
-from starcat.service.file_answers import FILE, IMMUTABLE, REVALIDATED, file_answer, has_already
 from starcat.service.problems import REFUSALS
 from starcat.service.service import TheService
-from starcat.specs.version import NAME_PATTERN, VERSION_PATTERN
+from starcat.service.transfers import FILE, IMMUTABLE, REVALIDATED, file_answer, has_already
+from starcat.specs.section import NAME_PATTERN, VERSION_PATTERN
 
 router = APIRouter(prefix="/registry", tags=["releases"], responses=REFUSALS)
 

@@ -25,7 +25,7 @@ from starcat.service.pages.rendering import page_router, render
 from starcat.service.pages.simulated import camera_of, frame_suffix, write_frame
 from starcat.service.problems import Problem, problem_of
 from starcat.service.service import Service, TheService
-from starcat.service.uploading import scratch_folder
+from starcat.service.transfers import scratch_folder
 
 router = page_router()
 

@@ -46,6 +46,10 @@ class Sandbox:
         error = error_of_kind(answer["kind"], answer["message"], key=answer["key"])
         raise error or RuntimeError(f"{answer['kind']}: {answer['message']}")
 
+    def convert(self, source: Path, target: Path, form: str) -> None:
+        """Have an Arrow stream made a file of some format: some need the table in memory."""
+        self.call("convert", {"source": str(source), "target": str(target), "form": form})
+
     def _begin(self, _: None) -> Child:
         child = Child(
             "starcat.service.sandbox.worker:serve",

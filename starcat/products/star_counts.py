@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Directions
 from starcat.geometry.sphere import saff_kuijlaars
 
 Rows = NDArray[np.int64]
@@ -47,33 +47,14 @@ class PositionsAndMagnitudes(Protocol):
 
 @dataclass(frozen=True)
 class MagnitudeCounts:
-    """How many stars have which magnitude.
+    """How many stars have which magnitude."""
 
-    Attributes
-    ----------
-    lowest : int
-        Number of the first bin; bin k begins at ``k * MAG_BIN``.
-    counts : ndarray of int64, shape (K,)
-        Stars of each bin; empty where no magnitude is known.
-    """
-
-    lowest: int
-    counts: Rows
+    lowest: int  # number of the first bin; bin k begins at ``k * MAG_BIN``
+    counts: Rows  # shape (K,): stars of each bin; empty where no magnitude is known
 
     @classmethod
     def of(cls, mag: Array) -> MagnitudeCounts:
-        """Count magnitudes.
-
-        Parameters
-        ----------
-        mag : ndarray of float64, shape (N,)
-            Magnitudes; NaN where unknown.
-
-        Returns
-        -------
-        MagnitudeCounts
-            Their counts.
-        """
+        """Count magnitudes; NaN where unknown."""
         known = mag[~np.isnan(mag)]
         if not len(known):
             return cls(0, np.empty(0, dtype=np.int64))
@@ -94,18 +75,7 @@ class MagnitudeCounts:
         return MagnitudeCounts(lowest, counts)
 
     def density(self, wanted: Array) -> Array:
-        """Return the share of the stars per magnitude.
-
-        Parameters
-        ----------
-        wanted : ndarray of float64, shape (M,)
-            Magnitudes of stars that were counted.
-
-        Returns
-        -------
-        ndarray of float64, shape (M,)
-            Per magnitude, smoothed by a normal distribution; integrates to 1.
-        """
+        """Return the share of the stars per magnitude, smoothed; it integrates to 1."""
         reach = int(np.ceil(4.0 * MAG_SMOOTHING / MAG_BIN))
         counts = np.pad(self.counts, reach).astype(np.float64)
         kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) * MAG_BIN / MAG_SMOOTHING) ** 2)
@@ -117,33 +87,14 @@ class MagnitudeCounts:
 
 @dataclass(frozen=True)
 class Census:
-    """Counts of the stars of a catalog, or of a part of it.
+    """Counts of the stars of a catalog, or of a part of it."""
 
-    Attributes
-    ----------
-    tiles : ndarray of int64, shape (TILES,)
-        Stars in each tile of the sky.
-    magnitudes : MagnitudeCounts
-        Stars by magnitude.
-    """
-
-    tiles: Rows
-    magnitudes: MagnitudeCounts
+    tiles: Rows  # shape (TILES,): stars in each tile of the sky
+    magnitudes: MagnitudeCounts  # stars by magnitude
 
     @classmethod
     def of(cls, stars: PositionsAndMagnitudes) -> Census:
-        """Count stars.
-
-        Parameters
-        ----------
-        stars : MovingStars
-            The catalog, or a part of it.
-
-        Returns
-        -------
-        Census
-            Their counts.
-        """
+        """Count the stars of a catalog, or of a part of it."""
         tiles = np.bincount(tiles_of(stars.directions), minlength=TILES)
         return cls(tiles, MagnitudeCounts.of(stars.mag))
 
@@ -157,30 +108,16 @@ class Census:
         return int(self.tiles.sum())
 
     def density(self) -> Array:
-        """Return the number of stars per steradian around each tile.
+        """Return the number of stars per steradian around each tile, never 0.
 
-        Returns
-        -------
-        ndarray of float64, shape (TILES,)
-            At least one star is counted, so that no density is 0.
+        At least one star is counted.
         """
         total = np.maximum(self.tiles[_tiles()[1]].sum(axis=1).astype(np.float64), 1.0)
         return np.asarray(total / (TILES_AVERAGED * 4.0 * np.pi / TILES))
 
 
-def tiles_of(directions: Array) -> Rows:
-    """Return the tiles of the sky that directions are in.
-
-    Parameters
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        ICRS unit vectors.
-
-    Returns
-    -------
-    ndarray of int64, shape (N,)
-        0 to ``TILES - 1``.
-    """
+def tiles_of(directions: Directions) -> Rows:
+    """Return the tiles of the sky that directions are in, 0 to ``TILES - 1``."""
     return np.asarray(_tiles()[0].query(directions)[1], dtype=np.int64)
 
 

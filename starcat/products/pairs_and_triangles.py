@@ -1,7 +1,8 @@
-"""Triangles of the brightest stars of each field: area, circumradius, inradius.
+"""Star pairs by separation, and triangles of the brightest stars of each field by area.
 
-The sides are great-circle separations and the triangle is the plane one with those sides, so
-the features do not depend on where in a frame it lies.
+Both have a K-vector over what they are sorted by. The sides of a triangle are great-circle
+separations and the triangle is the plane one with those sides, so that its features do not depend
+on where in a frame it lies.
 """
 
 from __future__ import annotations
@@ -13,12 +14,54 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Array
-from starcat.geometry.kvector import build_kvector
+from starcat.arrays import Array, Directions
+from starcat.geometry.kvector import KVector, build_kvector
 from starcat.geometry.patterns import triangle_area
+from starcat.geometry.proximity import pairs_within
 from starcat.geometry.sphere import separation
 from starcat.products.boresights import FieldStars
 from starcat.products.index import Index, kvector_index
+
+
+@dataclass(frozen=True)
+class StarPairs:
+    """All pairs of stars within a range of separations."""
+
+    # i, j: shape (M,): rows of the star table, i < j
+    i: NDArray[np.int32]
+    j: NDArray[np.int32]
+    # over the separations, radians; ``kvector.values`` are the separations themselves, ascending,
+    # equal ones in order of (i, j)
+    kvector: KVector
+
+    @property
+    def index(self) -> Index:
+        """The K-vector as the database holds it."""
+        return kvector_index(self.kvector)
+
+    @property
+    def separation_rad(self) -> Array:
+        """Separations in radians, ascending, shape (M,)."""
+        return self.kvector.values
+
+
+def find_pairs(
+    directions: Directions, min_separation_rad: float, max_separation_rad: float
+) -> StarPairs:
+    """Find all pairs of stars whose separation lies in a range.
+
+    The interval is closed; the rows are sorted by (separation, i, j).
+    """
+    found, angle = pairs_within(directions, max_separation_rad)
+    far = angle >= min_separation_rad
+    found, angle = found[far].astype(np.int32), angle[far]
+    order = np.argsort(angle)
+    if bool(np.any(np.diff(angle[order]) == 0.0)):
+        # The pairs come in order of (i, j), which a stable sort keeps for equal separations.
+        order = np.argsort(angle, kind="stable")
+    i, j = found[order, 0], found[order, 1]
+    return StarPairs(i, j, build_kvector(angle[order]))
+
 
 _PACKED_BITS = 21
 """Three row numbers of so many bits fit into one int64."""
@@ -29,28 +72,20 @@ AT_ONCE = 1 << 19
 
 @dataclass(frozen=True)
 class Triangles:
-    """Distinct triangles, by area.
+    """Distinct triangles, by area."""
 
-    Attributes
-    ----------
-    i, j, k : ndarray of int32, shape (M,)
-        Rows of the star table, i < j < k.
-    area_rad2, circumradius_rad, inradius_rad : ndarray of float32, shape (M,)
-        Features of the plane triangle, in square radians and radians.
-    times_seen : ndarray of int32, shape (M,)
-        Number of boresights whose brightest stars include the three.
-    index : Index
-        The K-vector over ``area_rad2``, and the attribute ``records``.
-    """
-
+    # i, j, k: shape (M,): rows of the star table, i < j < k
     i: NDArray[np.int32]
     j: NDArray[np.int32]
     k: NDArray[np.int32]
+    # area_rad2, circumradius_rad, inradius_rad: shape (M,): features of the plane triangle, in
+    # square radians and radians
     area_rad2: NDArray[np.float32]
     circumradius_rad: NDArray[np.float32]
     inradius_rad: NDArray[np.float32]
+    # shape (M,): number of boresights whose brightest stars include the three
     times_seen: NDArray[np.int32]
-    index: Index
+    index: Index  # the K-vector over ``area_rad2``, and the attribute ``records``
 
     @property
     def records(self) -> int:
@@ -58,26 +93,12 @@ class Triangles:
         return int(self.times_seen.sum())
 
 
-def find_triangles(fields: FieldStars, directions: Array, brightest: int) -> Triangles:
+def find_triangles(fields: FieldStars, directions: Directions, brightest: int) -> Triangles:
     """Find all triangles of the brightest stars of each field.
 
-    Parameters
-    ----------
-    fields : FieldStars
-        The tiling, stars brightest first.
-    directions : ndarray of float64, shape (N, 3)
-        ICRS directions of the stars.
-    brightest : int
-        How many stars of a field take part; n of them make n (n - 1) (n - 2) / 6 triangles.
+    Sorted by (area, i, j, k); n stars of a field make n (n - 1) (n - 2) / 6. Collinear
+    triangles have area 0, inradius 0 and an infinite circumradius.
 
-    Returns
-    -------
-    Triangles
-        Sorted by (area, i, j, k). Collinear triangles have area 0, inradius 0 and an infinite
-        circumradius.
-
-    References
-    ----------
     Liao and Zhang 2024 (S4), eqs. 4 and 7.
     """
     stars, seen = distinct_triangles(fields, len(directions), brightest)
@@ -99,7 +120,7 @@ def find_triangles(fields: FieldStars, directions: Array, brightest: int) -> Tri
 
 
 def _features(
-    stars: NDArray[np.int64], directions: Array
+    stars: NDArray[np.int64], directions: Directions
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Return area, circumradius and inradius of triangles, some at a time to save memory."""
     found = np.empty((3, len(stars)), dtype=np.float32)
@@ -122,21 +143,7 @@ def distinct_triangles(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the distinct triangles of all fields.
 
-    Parameters
-    ----------
-    fields : FieldStars
-        The tiling.
-    count : int
-        Number of stars in the table.
-    brightest : int
-        Stars of a field that take part.
-
-    Returns
-    -------
-    stars : ndarray of int64, shape (M, 3)
-        Rows i < j < k, in order.
-    times_seen : ndarray of int64, shape (M,)
-        Fields that have the triangle.
+    Rows i < j < k, shape (M, 3), in order, and the number of fields that have the triangle.
     """
     triples = _triples(fields, brightest)
     return _distinct_packed(triples) if count <= 1 << _PACKED_BITS else _distinct_rows(triples)

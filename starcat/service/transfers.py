@@ -1,4 +1,4 @@
-"""Files as answers: with their digest as ETag, and a range of them where one is asked for.
+"""Files that come and go: uploads in scratch folders, files and ranges of them, tar archives.
 
 Starlette sends the bytes. What a request asks for is decided here: a range that cannot be
 understood, or several at once, is the whole file, as RFC 9110 has it.
@@ -7,17 +7,27 @@ understood, or several at once, is the whole file, as RFC 9110 has it.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+import secrets
+import shutil
+import tarfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import IO, TYPE_CHECKING, Any
 
 from fastapi import Request
 from fastapi.responses import FileResponse, Response
 from starlette.types import Receive, Scope, Send
 
-from starcat.errors import TargetMissing
+from starcat.errors import QueryLimitError, TargetMissing
+from starcat.exchange.columns import FirstRows
 from starcat.exchange.formats import FILE_FORMATS, FORMATS
+from starcat.releases.tree import Blob
+from starcat.service.paths import ServicePaths
 from starcat.service.problems import MEDIA_TYPE, Problem, ProblemDetails
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 IMMUTABLE = "private, max-age=31536000, immutable"
 """What lies under its digest never changes."""
@@ -39,6 +49,11 @@ TYPES = {
 """Content types by suffix; all else are bytes."""
 
 BYTES = "application/octet-stream"
+
+CHUNK_BYTES = 1 << 18
+
+MAX_BYTES = 4 << 30
+"""Size of a result that is held on disk until it is sent."""
 
 CONTENTS: dict[str, dict[str, object]] = {
     kind: {} for kind in sorted({BYTES, *(kind.partition(";")[0] for kind in TYPES.values())})
@@ -147,3 +162,91 @@ def _part(request: Request, size: int, headers: Mapping[str, str]) -> tuple[int,
             headers={"Content-Range": f"bytes */{size}"},
         )
     return start, end
+
+
+def archive_bytes(folder: str, files: Mapping[str, Blob]) -> int:
+    """Return the size of an archive."""
+    parts = (len(_head(folder, name, blob)) + _whole(blob.bytes) for name, blob in files.items())
+    return sum(parts) + 2 * tarfile.BLOCKSIZE
+
+
+def archive_chunks(folder: Path, files: Mapping[str, Blob]) -> Iterator[bytes]:
+    """Give the bytes of an archive, the same for the same files."""
+    for name, blob in files.items():
+        yield _head(folder.name, name, blob)
+        left = blob.bytes
+        with (folder / name).open("rb") as file:
+            while left:
+                chunk = file.read(min(left, CHUNK_BYTES))
+                if not chunk:
+                    raise OSError(f"{name}: {left} bytes are missing")
+                left -= len(chunk)
+                yield chunk
+        yield bytes(_whole(blob.bytes) - blob.bytes)
+    yield bytes(2 * tarfile.BLOCKSIZE)
+
+
+def _head(folder: str, name: str, blob: Blob) -> bytes:
+    facts = tarfile.TarInfo(f"{folder}/{name}")
+    facts.size = blob.bytes
+    return facts.tobuf(tarfile.PAX_FORMAT)
+
+
+def _whole(size: int) -> int:
+    """Return a size in whole blocks."""
+    return -(-size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
+
+
+_UNUSUAL = re.compile(r"[^A-Za-z0-9_-]+", re.ASCII)
+
+
+@contextmanager
+def scratch_folder(paths: ServicePaths) -> Iterator[Path]:
+    """Give a new folder, which is removed afterwards."""
+    folder = paths.scratch / secrets.token_hex(16)
+    folder.mkdir(mode=0o700)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def safe_name(given: str | None, suffixes: tuple[str, ...], default: str) -> str:
+    """Return a file name that an upload may be kept under.
+
+    Examples
+    --------
+    >>> safe_name("../../a b.PNG", (".png",), "frame"), safe_name("x.exe", (".png",), "frame")
+    ('a_b.png', 'x_exe')
+    >>> safe_name("....", (".png",), "frame")
+    'frame'
+    """
+    name = (given or "").replace("\\", "/").rpartition("/")[2]
+    suffix = PurePosixPath(name).suffix.lower()
+    known = suffix if suffix in suffixes else ""
+    stem = name[: -len(known)] if known else name
+    return (_UNUSUAL.sub("_", stem).strip("_")[:80] or default) + known
+
+
+def write_rows(batches: pa.RecordBatchReader, path: Path, most: int) -> tuple[int, bool]:
+    """Write the first rows as an Arrow stream; return their number, and whether there are more."""
+    import pyarrow as pa
+
+    count = size = 0
+    first = FirstRows(batches, most)
+    with pa.OSFile(str(path), "wb") as file, pa.ipc.new_stream(file, batches.schema) as stream:
+        for part in first:
+            stream.write_batch(part)
+            count, size = count + part.num_rows, size + part.nbytes
+            if size > MAX_BYTES and not first.were_more:
+                raise QueryLimitError(
+                    f"the answer is larger than {MAX_BYTES >> 30} GiB; ask for fewer rows"
+                )
+    return count, first.were_more
+
+
+def chunks_of(file: IO[bytes]) -> Iterator[bytes]:
+    """Give the rest of an open file, and close it."""
+    with file:
+        while chunk := file.read(CHUNK_BYTES):
+            yield chunk
