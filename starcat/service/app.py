@@ -16,7 +16,6 @@ from starcat.service.api import (
     databases,
     identify,
     jobs,
-    registry,
     releases,
     specs,
     sql,
@@ -54,7 +53,7 @@ RESOURCES: tuple[APIRouter, ...] = (
 """Routers of the REST interface, under `API`."""
 
 OTHERS: tuple[APIRouter, ...] = (
-    registry.router,
+    releases.registry_router,
     health.router,
     signing.router,
     cone_search.router,
