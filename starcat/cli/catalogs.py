@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from starcat.catalog.ingest import Ingested
     from starcat.pipeline.match_summary import Summary
     from starcat.store.ingest import Stored
-    from starcat.store.options import StoreOptions
+    from starcat.store.plan import StoreOptions
 
 app = typer.Typer()
 
@@ -112,7 +112,7 @@ def ingest(
     """
     from starcat.catalog.source_files import locate
     from starcat.errors import ConfigError
-    from starcat.store.options import StoreOptions
+    from starcat.store.plan import StoreOptions
 
     if to not in ("parquet", "hats"):
         raise ConfigError(f"--to {to}: choose parquet or hats", key="to", value=to)
