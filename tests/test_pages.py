@@ -13,7 +13,7 @@ from fastapi.testclient import TestClient
 from starcat.service.app import make_app
 from starcat.service.jobs.job_states import Attempt, claim
 from starcat.service.pages.draft import draft_of_form, draft_of_text
-from starcat.service.pages.static_files import DIGEST, FILES
+from starcat.service.pages.rendering import DIGEST, FILES
 from starcat.service.settings import Settings
 from starcat.specs.reading import preset, preset_names, read_spec
 

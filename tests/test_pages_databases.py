@@ -17,7 +17,7 @@ from fastapi.testclient import TestClient
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-from shelved import DATABASE, shelve
+from shelved import DATABASE, shelve, waiting_build
 
 from starcat.errors import QueryError
 from starcat.query.gallery import gallery, named_query
@@ -385,7 +385,7 @@ def test_the_time_of_a_build_is_that_of_its_job(tmp_path, small_artifact):
     ended_s = time.time() - 86_400.0
     with TestClient(app, base_url=LOCAL) as client:
         service = app.state.service
-        job = service.jobs.add("build", {}, key=DATABASE + 48 * "0", title="t", owner="o")
+        job = waiting_build(service, DATABASE)
         with service.records.writing() as connection:
             connection.execute(
                 "UPDATE jobs SET state = 'done', ended_s = ?, result = ? WHERE id = ?",

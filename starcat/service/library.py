@@ -10,9 +10,11 @@ from typing import Any
 
 from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
 from starcat.errors import ProductError, TargetMissing
+from starcat.geometry.camera import Camera
 from starcat.releases.tree import Blob, files_of
 from starcat.service.paths import DATABASE_ID, ServicePaths
 from starcat.service.problems import Problem
+from starcat.specs.build_spec import CameraSpec
 from starcat.specs.section import version_numbers
 from starcat.storage.digests import file_sha256
 
@@ -52,6 +54,18 @@ class Database:
     def description(self) -> str:
         """What the spec says of it."""
         return str(self.spec.get("description") or "")
+
+    @property
+    def catalog(self) -> str:
+        """Name of the star catalog, with the band."""
+        catalog = self.spec["catalog"]
+        band = catalog.get("band")
+        return f"{catalog['source']}{f' ({band})' if band else ''}"
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The camera that it is for."""
+        return CameraSpec.model_validate(self.spec["camera"]).camera()
 
     @property
     def products(self) -> dict[str, int]:

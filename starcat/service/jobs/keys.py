@@ -31,6 +31,13 @@ def build_key(records: Records, spec: BuildSpec) -> str:
     return key_of("build", {"spec": spec.recorded(), "inputs": inputs})
 
 
+def ingest_key(records: Records, request: Mapping[str, Any]) -> str:
+    """Return the key of an ingest."""
+    source = str(request["source"])
+    inputs = {source: source_digests(records, source)}
+    return key_of("ingest", {**request, "inputs": inputs})
+
+
 def key_of(kind: Kind, content: Mapping[str, Any]) -> str:
     """Return the key of a job of any kind."""
     whole = {"kind": kind, "starcat": __version__, **content}

@@ -29,7 +29,6 @@ from starcat.service.pages.facts import (
     report_of,
 )
 from starcat.service.pages.rendering import page_router, render
-from starcat.service.pages.simulated import camera_of
 from starcat.service.service import Service, TheService
 
 router = page_router()
@@ -105,7 +104,7 @@ def coverage_page(
         report=report_of(database),
         sky_map=sky_map(fields),
         fields=[field_at(fields, number) for number in numbers],
-        fov=_field_of_view(database),
+        fov=(database.camera.fov_x_deg, database.camera.fov_y_deg),
         order=order,
         page=page,
         pages=pages,
@@ -233,9 +232,3 @@ def evaluate(service: TheService, builder: Builder, database_id: str) -> Respons
 def _head(service: Service, database: Database, tab: str) -> dict[str, Any]:
     """Return what the head of every page of a database needs."""
     return {"row": database_row(service, database), "database": database, "tab": tab}
-
-
-def _field_of_view(database: Database) -> tuple[float, float]:
-    """Return the full angles of the field across width and height, degrees."""
-    camera = camera_of(database)
-    return camera.fov_x_deg, camera.fov_y_deg

@@ -74,6 +74,5 @@ class Sandbox:
                 raise late from None
             raise Problem(
                 422,
-                "the process that read it ended by itself, as it does upon damaged files; send "
-                "another",
+                "the process that read the file crashed, as it does on damaged files; send another",
             ) from None
