@@ -11,7 +11,7 @@ import typer
 from starcat.cli.commands.shared import Json, Scheduler, Workers, inputs_by_source
 
 if TYPE_CHECKING:
-    from starcat.store.options import StoreOptions
+    from starcat.store.plan import StoreOptions
 
 app = typer.Typer()
 
@@ -110,7 +110,7 @@ def ingest(
     """
     from starcat.catalog.source_files import locate
     from starcat.errors import ConfigError
-    from starcat.store.options import StoreOptions
+    from starcat.store.plan import StoreOptions
 
     if to not in ("parquet", "hats"):
         raise ConfigError(f"--to {to}: choose parquet or hats", key="to", value=to)
