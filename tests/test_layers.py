@@ -38,6 +38,7 @@ LIGHT = {
     "starcat.arrays",
     "starcat.errors",
     "starcat.storage.hdf5",
+    "starcat.storage.product_table",
     *(f"starcat.geometry.{name}" for name in GEOMETRY),
     *(f"starcat.onboard.{name}" for name in ONBOARD),
 }

@@ -9,7 +9,7 @@ from typing import Any
 
 import duckdb
 
-from starcat.matcher.searching import CERTAIN
+from starcat.matcher.settings import CERTAIN
 from starcat.simulation.interval import wilson_interval
 
 _ACCEPTED = f"status = 'identified' AND false_match_probability <= {CERTAIN!r}"

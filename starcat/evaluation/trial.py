@@ -26,11 +26,9 @@ from starcat.evaluation.catalog_sky import sky_of_artifact
 from starcat.evaluation.judge import Verdict, judge
 from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
 from starcat.geometry.camera import Camera
-from starcat.matcher.fast import library_version
+from starcat.matcher.c_engine import library_version
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.methods.triangle_order import TriangleOrder
-from starcat.matcher.observation import MIN_SHARE
-from starcat.matcher.verification import REACH
+from starcat.matcher.settings import MIN_SHARE, REACH, TriangleOrder
 from starcat.progress import Progress, no_progress
 from starcat.simulation.simulate import Noise, simulate_frame
 from starcat.simulation.sky import Sky

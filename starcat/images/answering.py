@@ -95,11 +95,11 @@ def sky_of_answer(
     frame: MeasuredFrame, result: MatchResult, observer: Observer | None
 ) -> SkyInTime | None:
     """Return what a time adds to the answer to a frame."""
-    if observer is None or result.asked is None or result.camera is None:
+    if observer is None or result.database is None or result.camera is None:
         return None
     from starcat.sky.in_time import sky_in_time
 
-    database = result.asked.database
+    database = result.database
     return sky_in_time(result, database, frame.centroids_px, result.camera, observer)
 
 
@@ -116,8 +116,8 @@ def write_extras(
     observer: Observer | None = None,
 ) -> None:
     """Write what is asked for beside the answer to a frame."""
-    if picture is not None and result.asked is not None:
-        database = result.asked.database
+    if picture is not None and result.database is not None:
+        database = result.database
         eye = result.camera or camera
         sky = sky_of_answer(frame, result, observer)
         draw(picture, replace(measured, frames=[frame]), result, database, eye, sky)

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import matrix_from_quaternion
 from starcat.geometry.camera import Camera
-from starcat.matcher.asking import SCALE_FREE
 from starcat.matcher.centroids import (
     MeasuredFrame,
     read_frames,
@@ -23,6 +22,7 @@ from starcat.matcher.centroids import (
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
+from starcat.matcher.settings import SCALE_FREE
 from starcat.matcher.tracking import Tracker
 from starcat.simulation.simulate import Frame
 

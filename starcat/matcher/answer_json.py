@@ -39,8 +39,8 @@ def facts(result: MatchResult) -> Content:
         why = result.refusal
         found["refusal"] = {
             "reason": why.reason,
-            "words": why.words,
-            "advice": why.advice,
+            "words": why.message,
+            "advice": why.hint,
             "n_matched": why.n_matched,
             "false_match_probability": why.false_match_probability,
             "share": why.share,

@@ -13,10 +13,11 @@ from functools import cache
 import numpy as np
 import pyarrow as pa
 
-from starcat.artifact.database import INDICES, stored_dtype
+from starcat.artifact.database import stored_dtype
 from starcat.pipeline.counts import Extent, LevelExtent
 from starcat.specs.build_spec import BuildSpec
 from starcat.storage.parquet import ROW_GROUP_ROWS, parquet_bytes
+from starcat.storage.product_table import indices_of
 from starcat.storage.schema import product_schema
 
 Curve = tuple[tuple[float, ...], tuple[float, ...]]
@@ -201,7 +202,7 @@ def database_bytes(
             total += values * width if column.is_list else 0.0
             datasets += 2 if column.is_list else 1
         total += _index_bytes(name, extent, stars, spec)
-        datasets += len(INDICES.get(name, ()))
+        datasets += len(indices_of(name))
     return round(total + DATASET_BYTES * datasets)
 
 

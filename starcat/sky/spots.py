@@ -17,10 +17,9 @@ from starcat.arrays import Array
 from starcat.geometry.attitude import matrix_from_quaternion, solve_wahba_svd
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
-from starcat.matcher.matcher import TOLERANCE_PX
 from starcat.matcher.observation import as_frame
 from starcat.matcher.result import MatchResult
-from starcat.matcher.searching import CERTAIN
+from starcat.matcher.settings import CERTAIN, TOLERANCE_PX
 from starcat.sky.bodies import Bodies, bodies_seen
 from starcat.sky.observer import Observer
 
@@ -76,7 +75,8 @@ def identify_in_time(
         is asked again without one or two of its three brightest spots; such an answer is taken
         only if a planet is at each of them, and its probability is that of all these questions.
     """
-    frame, mag = as_frame(centroids_px, magnitudes)
+    given = as_frame(centroids_px, camera, magnitudes)
+    frame, mag = given.centroids_px, given.magnitudes
     seen = bodies_seen(observer)
     found = identify(frame, magnitudes=mag)
 
