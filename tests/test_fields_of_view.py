@@ -248,7 +248,7 @@ def test_triangles_of_90_deg_have_great_circle_sides():
 
 
 def test_the_sides_of_an_observed_triangle_are_those_of_its_stars_at_90_deg():
-    from starcat.matcher.observation import observe
+    from frames import observe
 
     camera = Camera(1280, 960, fov_x_deg=90.0)
     places = np.array([[0.5, 0.5], [1279.5, 0.5], [1279.5, 959.5], [640.0, 480.0]])

@@ -9,15 +9,23 @@ from math import inf, isnan, tan
 
 import numpy as np
 import pytest
+from frames import observe
 from hypothesis import given
 from hypothesis import strategies as st
 
+from starcat.evaluation import bare_methods
+from starcat.evaluation.bare_methods import (
+    name_by_points,
+    name_by_separations,
+    rank_by_full_differences,
+    rank_by_ratios,
+)
 from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import radec_from_directions, separation
 from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.methods import hausdorff_angular, hausdorff_l1, hausdorff_l2, reference_sets
+from starcat.matcher.methods import hausdorff, reference_sets
 from starcat.matcher.methods.consensus import (
     _all_agreeing,
     consistent,
@@ -25,23 +33,22 @@ from starcat.matcher.methods.consensus import (
     neighbour_candidates,
     support,
 )
-from starcat.matcher.methods.pairs import side_tolerance_rad
+from starcat.matcher.methods.hausdorff import rank_by_points, rank_by_separations
 from starcat.matcher.methods.reference import references
 from starcat.matcher.methods.reference_sets import (
     lowest,
     means_of_minima,
-    smallest_differences,
     within_reach,
 )
-from starcat.matcher.methods.triangle_order import TriangleOrder
-from starcat.matcher.observation import Observation, observe
+from starcat.matcher.methods.table import METHODS
+from starcat.matcher.observation import Observation
 from starcat.products.hausdorff_angular import angular_reference_sets
 from starcat.products.hausdorff_l2 import planar_reference_sets
 from starcat.simulation.simulate import Noise, simulate_frames
 
 CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
 FOCAL_PX = CAMERA.focal_length_px
-METHODS = ("hausdorff_angular", "hausdorff_l2", "hausdorff_l1")
+NAMES = ("hausdorff_angular", "hausdorff_l2", "hausdorff_l1")
 TURNING = ("hausdorff_angular", "hausdorff_l2")
 """The methods that do not mind a roll."""
 
@@ -120,13 +127,6 @@ ARRANGED = reference_sets.reference_sets(
 NUMBERS = st.lists(st.floats(-1.0, 6.0) | st.sampled_from([1.0, 1.5, 2.0, 3.5]), max_size=8)
 
 
-@given(NUMBERS)
-def test_smallest_differences_are_those_of_loops(numbers):
-    found = smallest_differences(ARRANGED, np.array(numbers))
-    expected = [[min((abs(n - v) for v in s), default=inf) for s in SETS] for n in numbers]
-    assert found == pytest.approx(np.array(expected).reshape(-1, len(SETS)))
-
-
 @given(NUMBERS, st.floats(0.01, 3.0))
 def test_gains_within_reach_are_those_of_loops(numbers, step):
     reach = step * (1.0 + np.arange(len(numbers)))
@@ -165,12 +165,12 @@ def things_made(database: Database) -> list[str]:
     return [database.name]
 
 
-def test_what_is_derived_is_made_once_and_let_go_with_its_database(random_directions):
+def test_what_is_cached_is_made_once_and_let_go_with_its_database(random_directions):
     database = make_database(random_directions(20, 5))
-    one = database.derived(things_made)
-    assert database.derived(things_made) is one
+    one = database.cached(things_made)
+    assert database.cached(things_made) is one
     other = replace(database, name="other")
-    assert other.derived(things_made) == ["other"]
+    assert other.cached(things_made) == ["other"]
     gone = weakref.ref(database)
     del database
     gc.collect()
@@ -204,7 +204,10 @@ def test_angular_scores_are_those_of_loops(small_sky, cap_px):
     for count in (2, 6, 9):
         seen = observed(generator.uniform(0.0, 1024.0, (count, 2)))
         every = len(small_sky.directions)
-        stars, scores = hausdorff_angular.rank_stars(seen, small_sky, cap_rad=cap_rad, count=every)
+        if cap_rad is None:
+            stars, scores = rank_by_full_differences(seen, small_sky, count=every)
+        else:
+            stars, scores = rank_by_separations(seen, small_sky, cap_rad=cap_rad, count=every)
         expected = angular_scores(small_sky, seen, cap_rad)
         ordered = np.take_along_axis(expected, np.where(stars < 0, 0, stars), axis=1)
         ordered[stars < 0] = inf
@@ -214,24 +217,22 @@ def test_angular_scores_are_those_of_loops(small_sky, cap_px):
 
 def test_many_pairs_are_scored_in_parts(small_sky, monkeypatch):
     seen = observed(np.random.default_rng(8).uniform(0.0, 1024.0, (9, 2)))
-    for cap_rad in (None, 0.02):
-        whole = hausdorff_angular.rank_stars(seen, small_sky, cap_rad=cap_rad, count=5)
-        with monkeypatch.context() as patch:
-            patch.setattr(hausdorff_angular, "_AT_ONCE", 2 * len(small_sky.directions))
-            parts = hausdorff_angular.rank_stars(seen, small_sky, cap_rad=cap_rad, count=5)
-        assert parts[0].tolist() == whole[0].tolist()
-        assert parts[1] == pytest.approx(whole[1], abs=1e-15)
+    whole = rank_by_separations(seen, small_sky, cap_rad=0.02, count=5)
+    monkeypatch.setattr(hausdorff, "_AT_ONCE", 2 * len(small_sky.directions))
+    parts = rank_by_separations(seen, small_sky, cap_rad=0.02, count=5)
+    assert parts[0].tolist() == whole[0].tolist()
+    assert parts[1] == pytest.approx(whole[1], abs=1e-15)
 
 
 def test_separations_beyond_the_radius_are_not_used(random_directions):
     near = make_database(random_directions(300, 4), (5.0, 5.0))
     seen = observed([[100.0, 100.0], [150.0, 100.0], [900.0, 900.0]])
-    stars, scores = hausdorff_angular.rank_stars(seen, near, cap_rad=0.01, count=2)
+    stars, scores = rank_by_separations(seen, near, cap_rad=0.01, count=2)
     alone = int(np.argmax(seen.centroids_px[:, 0]))
     assert stars[alone].tolist() == [-1, -1]
     assert np.isinf(scores[alone]).all()
     pair = observed([[100.0, 100.0], [150.0, 100.0]])
-    only = hausdorff_angular.rank_stars(pair, near, cap_rad=0.01, count=2)[1]
+    only = rank_by_separations(pair, near, cap_rad=0.01, count=2)[1]
     assert np.delete(scores, alone, axis=0).tolist() == only.tolist()
 
 
@@ -239,8 +240,8 @@ def test_only_the_first_centroids_take_part_on_request(sky):
     frame = frames(sky, 1)[0]
     seen = observed(frame.centroids_px)
     first = observed(seen.centroids_px[:6])
-    whole = hausdorff_angular.rank_stars(first, sky, cap_rad=0.001, count=4)
-    part = hausdorff_angular.rank_stars(seen, sky, cap_rad=0.001, count=4, first=6)
+    whole = rank_by_separations(first, sky, cap_rad=0.001, count=4)
+    part = rank_by_separations(seen, sky, cap_rad=0.001, count=4, first=6)
     assert part[0].tolist() == whole[0].tolist()
     assert part[1] == pytest.approx(whole[1], abs=1e-15)
 
@@ -249,7 +250,7 @@ def test_the_bare_angular_method_names_the_stars_of_noiseless_frames(sky):
     right = total = 0
     for frame in frames(sky, 20):
         seen = observed(frame.centroids_px)
-        named = hausdorff_angular.identify_bare(seen, sky)
+        named = name_by_separations(seen, sky)
         true = frame.star_index[seen.rows]
         right += int((named == true).sum())
         total += len(true)
@@ -262,32 +263,32 @@ def test_names_outside_the_field_and_names_given_twice_are_outliers(sky, monkeyp
     far = np.argsort(u @ u[0])[:2]
     names = np.array([near[0], far[0], near[1], far[1], near[2], near[2], -1])[:, None]
     scores = np.where(names < 0, inf, 0.001)
-    monkeypatch.setattr(hausdorff_angular, "rank_stars", lambda *_, **__: (names, scores))
+    monkeypatch.setattr(bare_methods, "rank_by_full_differences", lambda *_, **__: (names, scores))
     seen = observed(np.random.default_rng(1).uniform(0.0, 1024.0, (7, 2)))
-    named = hausdorff_angular.identify_bare(seen, sky)
+    named = name_by_separations(seen, sky)
     assert named.tolist() == [near[0], -1, near[1], -1, -1, -1, -1]
     # Two names on either side of the sky, the last star's among them, and one without: a tie.
     here, there = np.argsort(u @ u[-1])[:2], np.argsort(-(u @ u[-1]))[1:3]
     names = np.array([*here, *there, -1])[:, None]
     scores = np.where(names < 0, inf, 0.001)
-    named = hausdorff_angular.identify_bare(observed(seen.centroids_px[:5]), sky)
+    named = name_by_separations(observed(seen.centroids_px[:5]), sky)
     assert named.tolist() == [*here, -1, -1, -1]
 
 
 def test_the_angular_method_begins_with_consensus_and_goes_on_without(sky, monkeypatch):
     frame = frames(sky, 1)[0]
     seen = observed(frame.centroids_px)
-    first = next(hausdorff_angular.candidates(seen, sky, TriangleOrder()))
+    first = next(hausdorff.angular_candidates(seen, sky))
     assert first.stars.shape[1] > 6
-    monkeypatch.setattr(hausdorff_angular, "consistent_candidates", lambda *_: iter(()))
-    first = next(hausdorff_angular.candidates(seen, sky, TriangleOrder()))
+    monkeypatch.setattr(hausdorff, "consistent_candidates", lambda *_: iter(()))
+    first = next(hausdorff.angular_candidates(seen, sky))
     assert first.stars.shape == (1, 3)
     assert Matcher(sky, "hausdorff_angular").identify(frame.centroids_px).status == "identified"
 
 
 def test_crowded_frames_are_thinned_out(sky):
     px = np.random.default_rng(17).uniform(0.0, 1024.0, (70, 2))
-    assert list(hausdorff_angular.candidates(observed(px), sky, TriangleOrder()))
+    assert list(hausdorff.angular_candidates(observed(px), sky))
 
 
 # Planar reference sets
@@ -340,14 +341,14 @@ def test_l2_scores_are_those_of_loops(small_sky, weights, known):
         mag[1:2] = np.nan
         seen = observed(generator.uniform(0.0, 1024.0, (count, 2)), mag if known else None)
         for reference in range(count):
-            found = hausdorff_l2.rank_stars(seen, small_sky, reference, count=200, **weights)
+            found = rank_by_ratios(seen, small_sky, reference, count=200, **weights)
             assert same_ranking(found, l2_scores(small_sky, seen, reference, **weights))
 
 
 def test_the_reference_star_is_the_nearest_to_the_centre(small_sky):
     seen = observed([[100.0, 900.0], [700.0, 700.0], [530.0, 500.0]], [1.0, 2.0, 3.0])
     central = int(np.flatnonzero(seen.centroids_px[:, 0] == 530.0)[0])
-    for rank_stars in (hausdorff_l2.rank_stars, hausdorff_l1.rank_stars):
+    for rank_stars in (rank_by_ratios, rank_by_points):
         default = rank_stars(seen, small_sky, count=9)
         asked = rank_stars(seen, small_sky, central, count=9)
         assert default[0].tolist() == asked[0].tolist()
@@ -360,11 +361,11 @@ def test_the_smallest_distance_is_one_that_is_not_zero(small_sky):
     body[5] = body[0]
     twin = replace(seen, body=body)
     alone = observed(seen.centroids_px[:5])
-    found = hausdorff_l2.rank_stars(twin, small_sky, 0, count=200)
-    expected = hausdorff_l2.rank_stars(alone, small_sky, 0, count=200)
+    found = rank_by_ratios(twin, small_sky, 0, count=200)
+    expected = rank_by_ratios(alone, small_sky, 0, count=200)
     assert found[0].tolist() == expected[0].tolist()
     assert found[1].tolist() == expected[1].tolist()
-    same = (hausdorff_l2.likely_stars(one, small_sky, 0, 3, 9).tolist() for one in (twin, alone))
+    same = (hausdorff.likely_stars(one, small_sky, 0, 3, 9).tolist() for one in (twin, alone))
     assert len({tuple(stars) for stars in same}) == 1
 
 
@@ -378,8 +379,8 @@ def test_l2_does_not_mind_a_roll(sky, star, roll_deg):
     turned = 512.0 + (upright[kept] - 512.0) @ matrix.T
     if kept.sum() < 3:
         return
-    one = hausdorff_l2.rank_stars(observed(upright[kept]), sky, count=9)
-    other = hausdorff_l2.rank_stars(observed(turned), sky, count=9)
+    one = rank_by_ratios(observed(upright[kept]), sky, count=9)
+    other = rank_by_ratios(observed(turned), sky, count=9)
     assert other[1] == pytest.approx(one[1], abs=1e-9)
     assert one[1][0] < 1e-12
     assert star in star_of[kept]
@@ -392,8 +393,8 @@ def test_l2_does_not_mind_the_scale_of_a_centred_frame(sky, star, scale):
     if inside.sum() < 3:
         return
     shrunk = 512.0 + scale * (nominal[inside] - 512.0)
-    one = hausdorff_l2.rank_stars(observed(nominal[inside]), sky, count=9)
-    other = hausdorff_l2.rank_stars(observed(shrunk), sky, count=9)
+    one = rank_by_ratios(observed(nominal[inside]), sky, count=9)
+    other = rank_by_ratios(observed(shrunk), sky, count=9)
     assert other[1] == pytest.approx(one[1], abs=1e-8)
 
 
@@ -402,7 +403,7 @@ def test_l2_names_the_star_at_the_centre_of_noiseless_frames(sky):
     for star in range(40):
         for roll_deg, scale in ((0.0, 1.0), (77.0, 1.0), (180.0, 1.4)):
             px, _ = frame_centred_on(sky, star, roll_deg, scale)
-            right += int(hausdorff_l2.rank_stars(observed(px), sky, count=1)[0][0]) == star
+            right += int(rank_by_ratios(observed(px), sky, count=1)[0][0]) == star
     assert right >= 0.95 * 120
 
 
@@ -412,7 +413,7 @@ def test_another_radius_serves_frames_of_another_scale(sky):
     for star in range(40):
         seen = observed(frame_centred_on(sky, star, 180.0, 0.7)[0])
         for radius_rad in right:
-            found = hausdorff_l2.rank_stars(seen, sky, count=1, radius_rad=radius_rad)
+            found = rank_by_ratios(seen, sky, count=1, radius_rad=radius_rad)
             right[radius_rad] += int(found[0][0]) == star
     assert right[shrunk] >= 38
     assert right[None] < 20
@@ -433,9 +434,9 @@ def test_another_divisor_finds_what_the_smallest_distance_misses(sky, spoilt):
             px = np.concatenate([px, [[512.0 + 0.7 * away[nearest], 512.0]]])
         seen = observed(px)
         centre = int(references(seen)[0])
-        bare += int(hausdorff_l2.rank_stars(seen, sky, centre, count=1)[0][0]) == star
-        first_round += star in hausdorff_l2.likely_stars(seen, sky, centre, 1, 10)
-        likely += star in hausdorff_l2.likely_stars(seen, sky, centre, 2, 10)
+        bare += int(rank_by_ratios(seen, sky, centre, count=1)[0][0]) == star
+        first_round += star in hausdorff.likely_stars(seen, sky, centre, 1, 10)
+        likely += star in hausdorff.likely_stars(seen, sky, centre, 2, 10)
         tried += 1
     assert tried > 30
     assert bare < 0.5 * tried
@@ -457,13 +458,13 @@ def test_a_difference_of_ratios_counts_in_units_of_its_error(small_sky):
                 for k in range(divisors):
                     scores = [
                         loop_agreement(members(small_sky, "hausdorff_l2", "ratio", star), k)(
-                            distance, j, side_tolerance_rad(seen)
+                            distance, j, seen.side_tolerance_rad
                         )
                         for star in range(len(small_sky.directions))
                     ]
                     order = sorted(range(len(scores)), key=lambda s: (-round(scores[s], 12), s))
                     expected |= {star for star in order[:count] if scores[star] > 0.0}
-            found = hausdorff_l2.likely_stars(seen, small_sky, 0, divisors, count)
+            found = hausdorff.likely_stars(seen, small_sky, 0, divisors, count)
             assert set(found.tolist()) == expected
 
 
@@ -517,7 +518,7 @@ def test_l1_scores_are_those_of_loops(small_sky):
                 ]
                 expected.append(sum(minima) / len(minima) if minima else inf)
             # A star at the pole has its own north, which the loops do not know.
-            found = hausdorff_l1.rank_stars(seen, small_sky, reference, count=200)
+            found = rank_by_points(seen, small_sky, reference, count=200)
             kept = found[0] != 0
             expected[0] = inf
             assert same_ranking((found[0][kept], found[1][kept]), np.array(expected))
@@ -534,7 +535,7 @@ def test_l1_needs_an_upright_camera_of_the_nominal_scale(sky):
     def right(**how) -> float:
         frames = (frame_centred_on(sky, star, **how)[0] for star in range(40))
         seen = [observed(px) for px in frames]
-        return np.mean([hausdorff_l1.identify_bare(one, sky) == k for k, one in enumerate(seen)])
+        return np.mean([name_by_points(one, sky) == k for k, one in enumerate(seen)])
 
     assert right(roll_deg=0.0) == 1.0
     assert right(roll_deg=0.5) == 1.0
@@ -546,8 +547,8 @@ def test_l1_has_no_right_star_upside_down_where_l2_has(sky):
     l1 = l2 = 0
     for star in range(30):
         seen = observed(frame_centred_on(sky, star, 180.0)[0])
-        l1 += int(hausdorff_l1.rank_stars(seen, sky, count=1)[0][0]) == star
-        l2 += int(hausdorff_l2.rank_stars(seen, sky, count=1)[0][0]) == star
+        l1 += int(rank_by_points(seen, sky, count=1)[0][0]) == star
+        l2 += int(rank_by_ratios(seen, sky, count=1)[0][0]) == star
     assert l1 <= 2
     assert l2 >= 28
 
@@ -570,7 +571,7 @@ def loop_fits(sky: Database, seen: Observation, one, other) -> bool:
         return False
     apart = separation(sky.directions[s], sky.directions[t])
     wanted = separation(seen.body[a], seen.body[b])
-    return bool(abs(apart - wanted) <= side_tolerance_rad(seen))
+    return bool(abs(apart - wanted) <= seen.side_tolerance_rad)
 
 
 def test_names_agree_as_loops_say(sky):
@@ -726,7 +727,7 @@ def test_neighbours_that_agree_are_those_of_loops(sky, double, tolerance_px):
 # The matcher
 
 
-@pytest.fixture(scope="module", params=METHODS)
+@pytest.fixture(scope="module", params=NAMES)
 def matcher(request, sky) -> Matcher:
     return Matcher(sky, request.param)
 
@@ -788,9 +789,7 @@ def test_without_magnitudes_nothing_depends_on_brightness(matcher):
         seen = observed(px)
         proposed = []
         for database in (matcher.database, fainter):
-            module = {"hausdorff_angular": hausdorff_angular, "hausdorff_l2": hausdorff_l2}
-            method = module.get(matcher.method, hausdorff_l1)
-            batches = list(method.candidates(seen, database, TriangleOrder()))[:20]
+            batches = list(METHODS[matcher.method].propose(seen, database))[:20]
             proposed.append([(b.centroids.tolist(), b.stars.tolist()) for b in batches])
         assert proposed[0]
         assert proposed[0] == proposed[1]
@@ -822,9 +821,7 @@ def test_few_centroids_and_empty_sets_are_no_match(matcher, random_directions):
             assert found.status == ("too_few_stars" if count < 4 else "no_match")
     for count in (0, 1, 2, 3):
         px = generator.uniform(0.0, 1024.0, (count, 2))
-        module = {"hausdorff_angular": hausdorff_angular, "hausdorff_l2": hausdorff_l2}
-        method = module.get(matcher.method, hausdorff_l1)
-        for batch in method.candidates(observed(px), matcher.database, TriangleOrder()):
+        for batch in METHODS[matcher.method].propose(observed(px), matcher.database):
             assert batch.stars.shape == batch.centroids.shape
 
 

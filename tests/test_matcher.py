@@ -12,6 +12,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from frames import observe
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -23,16 +24,15 @@ from starcat.geometry.attitude import (
 )
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
+from starcat.matcher.c_engine import FEATURES, is_compiled
 from starcat.matcher.database import Database, open_database, products_in
-from starcat.matcher.fast import FEATURES, is_compiled
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.methods import pairs, pyramid, triangle
-from starcat.matcher.methods.candidates import Candidates
+from starcat.matcher.methods import pairs, triangle
 from starcat.matcher.methods.table import METHODS, best_method
-from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder
-from starcat.matcher.observation import Observation, observe
+from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.pose import pose_at
-from starcat.matcher.verification import REACH, BestOf, agree, agreeing_centroids, verify
+from starcat.matcher.settings import REACH, TriangleOrder
+from starcat.matcher.verification import BestOf, agree, agreeing_centroids, verify
 from starcat.simulation.selftest import answers_rightly, self_test
 from starcat.simulation.simulate import Frame, Noise, simulate_frame, simulate_frames
 from starcat.simulation.sky import Sky
@@ -352,9 +352,8 @@ def test_verification_of_nothing(sky):
 # --- Methods
 
 
-def proposals(matcher: Matcher, seen: Observation, selection: TriangleOrder = DEFAULT) -> Iterator:
-    propose = METHODS[matcher.method].propose
-    for batch in propose(seen, matcher.database, selection):
+def proposals(matcher: Matcher, seen: Observation) -> Iterator:
+    for batch in METHODS[matcher.method].propose(seen, matcher.database):
         yield from zip(batch.centroids.tolist(), batch.stars.tolist(), strict=True)
 
 
@@ -425,7 +424,7 @@ def test_directed_pairs_go_both_ways(sky, low):
 def test_a_pyramid_has_the_fourth_star_of_its_apex(sky):
     for frame in frames(sky, 5, Noise(0.3, 0.1, 3)):
         seen = observed(frame)
-        for batch in pyramid.candidates(seen, sky, DEFAULT):
+        for batch in pairs.pyramid_candidates(seen, sky):
             assert batch.centroids.shape == batch.stars.shape == (len(batch), 4)
             assert (batch.centroids == batch.centroids[0]).all()
             assert len(set(batch.centroids[0].tolist())) == 4

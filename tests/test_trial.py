@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 from starcat.evaluation.papers import s2, s4
 from starcat.evaluation.trial import Attitudes, Trial, description, run_trial
 from starcat.geometry.camera import Camera
-from starcat.matcher.fast import library_version
+from starcat.matcher.c_engine import library_version
 from starcat.simulation.simulate import Frame, Noise, simulate_frame
 from starcat.simulation.sky import Sky
 

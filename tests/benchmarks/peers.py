@@ -99,7 +99,7 @@ def drive_starcat(
     Where the focal length is told wrong by up to ``off``, as much is allowed.
     """
     from starcat.geometry.attitude import matrix_from_quaternion
-    from starcat.matcher.fast import Limits, fast_matcher
+    from starcat.matcher.c_engine import Limits, fast_matcher
     from starcat.matcher.matcher import Matcher
 
     of_kind = {
