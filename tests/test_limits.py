@@ -85,7 +85,7 @@ def test_no_more_steps_are_taken_than_there_are(sky):
     seen = observe(
         np.random.default_rng(0).uniform(0.0, 1024.0, (40, 2)), sky.camera, 2.0, budget=budget
     )
-    proposals = METHODS["triangle"].propose(seen, sky, Matcher(sky).selection)
+    proposals = METHODS["triangle"].propose(seen, sky)
     with pytest.raises(BudgetSpentError, match="steps"):
         list(proposals)
     assert budget.steps <= 700

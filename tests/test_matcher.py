@@ -20,7 +20,6 @@ from starcat.errors import ConfigError, ProductError, SchemaVersionError
 from starcat.geometry.attitude import (
     matrix_from_quaternion,
     matrix_from_radec_roll,
-    quaternion_from_matrix,
 )
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
@@ -720,7 +719,7 @@ def test_an_answer_is_right_within_the_tolerance(triangles, shift_px, is_right):
     tilt = np.array([[1.0, 0.0, angle], [0.0, 1.0, 0.0], [-angle, 0.0, 1.0]])
     moved = replace(
         triangles.identify(frame.centroids_px),
-        q_body_from_icrs=quaternion_from_matrix(tilt @ frame.matrix),
+        matrix=tilt @ frame.matrix,
     )
     assert answers_rightly(moved, frame, triangles) == is_right
 
