@@ -3,6 +3,34 @@
 It is bounded by an expected number: that of the attitudes, over the whole sky, which put as many
 stars as near to centroids that lie anywhere on the detector. This number does not depend on how
 many candidates a method has tried.
+
+There are ``C(N, n) M! / (M - n)!`` ways to assign n of N centroids to n of M stars. In each
+of them, the frames whose squared residuals sum to less than Q in some attitude fill the
+volume ``8 pi^2 f^3 sqrt(det H)`` times that of a ball of radius sqrt(Q) in the 2n - 3
+dimensions that the fit leaves free, out of A^n for all frames. The first factor is that of
+all attitudes, in pixels; H is the sum, over the n places, of the squared derivatives by the
+three angles. The product is the expected number. Its sum over the N - 3 possible values of
+n bounds the probability. M is counted around the field, so the bound is higher in a crowded
+field, and where most of the field is left unexplained.
+
+Focal length. Where it is fitted, the frames that agree are those of a manifold with a fourth
+dimension: the volume is ``8 pi^2 f^3 L sqrt(det H)`` times that of a ball in 2n - 4
+dimensions, L being the logarithm of the range and H having a fourth row for the derivatives
+by the logarithm of f. The two ends of the range add that of the known focal length once.
+
+Magnitudes. Assignments of centroids to stars that they are not compatible with are never
+agreements, so they are not counted (`log_compatible_assignments`). The hypothesis is that the
+places of the centroids are random; it says nothing of their magnitudes. So the expected
+number is that of random places with the magnitudes that the frame has, whatever they are:
+it holds also where the magnitudes of false spots are those of the stars, and where the
+stated error is wrong (then true frames may be missed).
+
+Noise. Where nothing is stated, each of the N - 3 values of n is allotted the same share of
+the probability: the expected number is divided by 1 / (N - 3). Any other shares do as well,
+if they add up to 1 at every attitude and do not depend on where the centroids are. A stated
+noise tells, before any residual is seen, which n will matter: with one star fewer than n*
+an agreement of true stars is typically not certain, with one more it is so many times over.
+So n* has the largest share and every further n a tenth of the one before (`_log_share`).
 """
 
 from __future__ import annotations
@@ -41,36 +69,6 @@ def false_match_probability(
     log_scales: float = 0.0,
 ) -> float:
     """Bound the probability that random centroids agree as well with any attitude.
-
-    Notes
-    -----
-    There are ``C(N, n) M! / (M - n)!`` ways to assign n of N centroids to n of M stars. In each
-    of them, the frames whose squared residuals sum to less than Q in some attitude fill the
-    volume ``8 pi^2 f^3 sqrt(det H)`` times that of a ball of radius sqrt(Q) in the 2n - 3
-    dimensions that the fit leaves free, out of A^n for all frames. The first factor is that of
-    all attitudes, in pixels; H is the sum, over the n places, of the squared derivatives by the
-    three angles. The product is the expected number. Its sum over the N - 3 possible values of
-    n bounds the probability. M is counted around the field, so the bound is higher in a crowded
-    field, and where most of the field is left unexplained.
-
-    Focal length. Where it is fitted, the frames that agree are those of a manifold with a fourth
-    dimension: the volume is ``8 pi^2 f^3 L sqrt(det H)`` times that of a ball in 2n - 4
-    dimensions, L being the logarithm of the range and H having a fourth row for the derivatives
-    by the logarithm of f. The two ends of the range add that of the known focal length once.
-
-    Magnitudes. Assignments of centroids to stars that they are not compatible with are never
-    agreements, so they are not counted (`log_compatible_assignments`). The hypothesis is that the
-    places of the centroids are random; it says nothing of their magnitudes. So the expected
-    number is that of random places with the magnitudes that the frame has, whatever they are:
-    it holds also where the magnitudes of false spots are those of the stars, and where the
-    stated error is wrong (then true frames may be missed).
-
-    Noise. Where nothing is stated, each of the N - 3 values of n is allotted the same share of
-    the probability: the expected number is divided by 1 / (N - 3). Any other shares do as well,
-    if they add up to 1 at every attitude and do not depend on where the centroids are. A stated
-    noise tells, before any residual is seen, which n will matter: with one star fewer than n*
-    an agreement of true stars is typically not certain, with one more it is so many times over.
-    So n* has the largest share and every further n a tenth of the one before (`_log_share`).
 
     Examples
     --------

@@ -50,38 +50,7 @@ class Matcher(Settings, _WithDatabase):
     Attributes
     ----------
     database : Database
-        The stars and the products that the method needs.
-    method : str
-        A key of `METHODS`.
-    tolerance_px : float
-        Largest error of a centroid, as a radius: 2 px, or three times ``noise_px`` where that is
-        stated.
-    max_false_match_probability : float
-        Answers that chance would give more often than this are withheld.
-    selection : TriangleOrder
-        Order and limits of the triangles of centroids, for the methods that use triangles.
-    max_batches : int
-        Batches of candidates tried before giving up.
-    noise_px : float, optional
-        Standard deviation of a centroid on each axis. Stating it, instead of a tolerance, makes
-        frames of few stars certain that would be withheld.
-    noise_mag : float, optional
-        Standard deviation of the magnitudes of centroids in the band of the database, its zero
-        point included. Where it is stated, a centroid is no star whose magnitude differs by
-        more than 3.5 of it, and agreements of magnitudes count as evidence.
-    engine : {"auto", "c", "numpy"}
-        ``numpy`` is the reference. ``c`` is the library that flies, for the methods ``triangle``
-        and ``pyramid`` with the default selection: with triangles twenty times as fast from
-        Python, and a hundred times in itself. Both name the same stars. ``auto`` is ``c`` where
-        it can serve.
-    min_share : float
-        Smallest share of the frame, by weight, that the attitude of an answer explains; a third.
-    max_steps : float
-        Steps that a frame may take (`Budget`), then the best answer so far is given, or none. The
-        same steps give the same answer. Infinite by default.
-    time_limit_s : float
-        Seconds that a frame may take. Infinite by default. Where this, ``min_share``,
-        ``max_steps`` or a tolerance above 4 px is given, ``auto`` is ``numpy``.
+        The stars and the products that the method needs; then come the fields of `Settings`.
     """
 
     def __post_init__(self) -> None:

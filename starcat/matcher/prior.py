@@ -148,7 +148,12 @@ def anchored_pairs(
             place = stars[first] + (predicted[other] - predicted[anchor])
             along = np.where((square >= low) & (square <= high), place @ stars.T, -math.inf)
             second = along.argmax(axis=1)
-            fits = np.flatnonzero(along[np.arange(len(first)), second] > -math.inf)
+            # A wrong attitude turns the two against each other by no more than their distance.
+            slack_rad = 2.0 * (
+                reach_rad * float(apart_rad[other]) + REACH * observation.tolerance_rad
+            )
+            least_along = 0.5 * (np.einsum("ij,ij->i", place, place) + 1.0 - slack_rad**2)
+            fits = np.flatnonzero(along[np.arange(len(first)), second] >= least_along)
             if len(fits):
                 pairs = near[np.column_stack([first[fits], second[fits]])]
                 yield Candidates(np.broadcast_to([anchor, other], pairs.shape), pairs)

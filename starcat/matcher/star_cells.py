@@ -23,10 +23,15 @@ MIN_SIDE = 0.02
 SMALLEST_REACH = 0.25 * MIN_SIDE
 """Cells of the smallest side serve all reaches up to this."""
 
+MANY_STARS = 15_000
+"""So many stars are searched by zones; a product of all is faster for fewer."""
+
 
 def stars_in_cap(database: Database, axis: Array, radius_rad: float) -> Rows:
     """Return the rows of the stars up to an angle from a direction, ascending."""
-    return database.cached(_zones).near(axis, radius_rad)
+    if len(database.mag) >= MANY_STARS:
+        return database.cached(_zones).near(axis, radius_rad)
+    return (database.directions @ axis >= math.cos(radius_rad)).nonzero()[0]
 
 
 def _zones(database: Database) -> Zones:
