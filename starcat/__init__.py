@@ -17,8 +17,8 @@ TYPE_CHECKING = False  # as a type checker knows it, without importing typing fo
 if TYPE_CHECKING:
     from typing import Any
 
+    from starcat.api.artifact import connect
     from starcat.api.artifact import open_artifact as open  # noqa: A004 - as numpy, gzip and PIL have it
-    from starcat.api.connection import connect
     from starcat.api.functions import build, calibrate, ingest, verify
     from starcat.errors import StarcatError
     from starcat.geometry.camera import Camera
@@ -56,7 +56,7 @@ _HOMES = {
     "Tracker": ("starcat.matcher.tracking", "Tracker"),
     "build": ("starcat.api.functions", "build"),
     "calibrate": ("starcat.api.functions", "calibrate"),
-    "connect": ("starcat.api.connection", "connect"),
+    "connect": ("starcat.api.artifact", "connect"),
     "identify_in_time": ("starcat.sky.spots", "identify_in_time"),
     "ingest": ("starcat.api.functions", "ingest"),
     "open": ("starcat.api.artifact", "open_artifact"),

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
 
 from typer import Abort, TyperException
 
@@ -86,6 +88,30 @@ def failure_of(error: Exception, doing: str) -> Failure:
     text = shown(str(error), MAX_FOREIGN) or "no message"
     what = f"this is a defect of starcat: '{doing}'{_stage_of(error)} ended with {kind}: {text}"
     return Failure(DEFECT, kind, f"{what}; {hint}", hint)
+
+
+class ValidationFailure(Protocol):
+    """An exception of pydantic or FastAPI."""
+
+    def errors(self) -> Sequence[Mapping[str, Any]]:
+        """Return what is wrong, each with ``loc``, ``msg``, ``type`` and ``input``."""
+
+
+class Invalid(NamedTuple):
+    """What pydantic found first."""
+
+    key: str
+    """With dots; empty for the value as a whole."""
+    message: str
+
+
+def validation_message(error: ValidationFailure, *, show_input: bool = False) -> Invalid:
+    """Return the first error of pydantic in words, with the value that it found if asked to."""
+    first = error.errors()[0]
+    key = ".".join(str(step)[:100] for step in first["loc"][:10])
+    found = show_input and first["type"] not in ("missing", "json_invalid")
+    value = f" (found {str(first['input'])[:80]!r})" if found else ""
+    return Invalid(key, first["msg"].removeprefix("Value error, ") + value)
 
 
 def shown(text: str, most: int) -> str:

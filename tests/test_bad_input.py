@@ -44,9 +44,9 @@ from starcat.onboard.image import Contents, make_image
 from starcat.onboard.reading import read_image
 from starcat.releases.publishing import publish_artifact
 from starcat.service.access import Role
-from starcat.service.guard.tokens import TokenStore
-from starcat.service.places import Places
+from starcat.service.paths import ServicePaths
 from starcat.service.records import Records
+from starcat.service.security.tokens import TokenStore
 from starcat.sky.observer import Observer
 from starcat.store.pixels import Pixel
 
@@ -1957,12 +1957,12 @@ def _(place: Place) -> Call:
 def service_with_a_token(place: Place) -> Path:
     """A root with the token of anna."""
     root = place.folder / "service"
-    records = Records(Places(root).records) if root.exists() else None
+    records = Records(ServicePaths(root).records) if root.exists() else None
     if records is None:
         root.mkdir()
-        records = Records(Places(root).records)
+        records = Records(ServicePaths(root).records)
         TokenStore(records).create("anna", Role.READER)
-        Places(root).make()
+        ServicePaths(root).make()
     records.close()
     return root
 

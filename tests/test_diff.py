@@ -44,7 +44,7 @@ def test_an_artifact_does_not_differ_from_itself(small_artifact: Path) -> None:
     assert found.is_same
     assert (found.spec, found.sources, found.software) == ((), (), ())
     assert (found.came, found.went, found.moved) == ((), (), ())
-    assert [product.product for product in found.products] == artifact.products
+    assert [product.product for product in found.products] == list(artifact.products)
     assert all(product.is_same for product in found.products)
 
 

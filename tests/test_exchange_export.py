@@ -18,9 +18,8 @@ from astropy.table import Table
 
 from starcat.artifact.reader import open_artifact
 from starcat.errors import OutputError
-from starcat.exchange.export import EXPORT_FORMATS, export_tables
-from starcat.exchange.formats import SUFFIXES
-from starcat.exchange.tables import in_memory, tables_of
+from starcat.exchange.export import export_tables, in_memory, tables_of
+from starcat.exchange.formats import EXPORT_FORMATS, FILE_FORMATS, FORMATS
 from starcat.storage.schema import product_schema
 
 Run = Callable[[list[Any]], Any]
@@ -232,7 +231,7 @@ def test_pandas_reads_the_csv(starcat: Run, small_artifact: Path, tmp_path: Path
 
 
 def test_every_format_has_a_name_of_its_own() -> None:
-    names = [suffix for suffixes in SUFFIXES.values() for suffix in suffixes]
+    names = [suffix for one in FILE_FORMATS for suffix in FORMATS[one].suffixes]
     assert len(names) == len(set(names))
 
 

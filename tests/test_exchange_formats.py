@@ -26,16 +26,10 @@ from hypothesis import strategies as st
 
 from starcat.artifact.reader import open_artifact
 from starcat.errors import ConfigError, OutputError, SchemaError
-from starcat.exchange.export import export_tables
-from starcat.exchange.formats import (
-    FORMATS,
-    SUFFIXES,
-    format_of,
-    write_batches,
-    write_text_batches,
-)
-from starcat.exchange.label import Label
-from starcat.exchange.tables import tables_of
+from starcat.exchange.columns import Label
+from starcat.exchange.export import export_tables, tables_of
+from starcat.exchange.formats import FILE_FORMATS, FORMATS, format_of
+from starcat.exchange.writers import write_batches, write_text_batches
 from starcat.resources import resource_folder
 from starcat.storage.schema import product_schema
 
@@ -47,7 +41,7 @@ PRODUCTS = sorted(
 
 
 def written(table: pa.Table, folder: Path, file_format: str, rows_a_batch: int = 1000) -> Path:
-    path = folder / f"table{SUFFIXES[file_format][0]}"
+    path = folder / f"table{FORMATS[file_format].suffix}"
     reader = pa.RecordBatchReader.from_batches(table.schema, table.to_batches(rows_a_batch))
     assert write_batches(reader, path, file_format) == len(table)
     assert [entry.name for entry in folder.iterdir() if "partial" in entry.name] == []
@@ -233,7 +227,7 @@ def test_a_column_without_a_name_is_refused(file_format: str, tmp_path: Path) ->
     [("fits", "x" * 68), ("fits", "'" * 34), ("npz", "x" * 65_531), ("npz", "é" * 32_765)],
 )
 def test_names_as_long_as_can_be(file_format: str, longest: str, tmp_path: Path) -> None:
-    path = tmp_path / f"a{SUFFIXES[file_format][0]}"
+    path = tmp_path / f"a{FORMATS[file_format].suffix}"
     write_batches(pa.table({longest: [7]}).to_reader(), path, file_format)
     if file_format == "fits":
         assert Table.read(path)[longest][0] == 7
@@ -314,7 +308,7 @@ def test_parquet_is_the_product(products: dict[str, pa.Table], tmp_path: Path) -
         assert b"IVOA.VOTable-Parquet.content" in pq.read_metadata(path).metadata
 
 
-@pytest.mark.parametrize("file_format", FORMATS)
+@pytest.mark.parametrize("file_format", FILE_FORMATS)
 def test_the_same_table_gives_the_same_bytes(
     products: dict[str, pa.Table], tmp_path: Path, file_format: str
 ) -> None:
@@ -572,11 +566,11 @@ def test_parquet_keeps_the_types_of_sql(result: pa.Table, tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("query", "names", "words"),
     [
-        ("select interval 1 day a", FORMATS, r"column 'a' .* epoch\(a\)"),
-        ("select 'x'::blob b", FORMATS, r"column 'b' .* hex\(b\)"),
-        ("select map {'k': 1} c", FORMATS, r"column 'c' .* map_entries\(c\)"),
-        ("select {'p': interval 1 day} d", FORMATS, r"column 'd.p' .* epoch"),
-        ("select 1 e, 2 e", FORMATS, r"column 'e' is there twice.* AS"),
+        ("select interval 1 day a", FILE_FORMATS, r"column 'a' .* epoch\(a\)"),
+        ("select 'x'::blob b", FILE_FORMATS, r"column 'b' .* hex\(b\)"),
+        ("select map {'k': 1} c", FILE_FORMATS, r"column 'c' .* map_entries\(c\)"),
+        ("select {'p': interval 1 day} d", FILE_FORMATS, r"column 'd.p' .* epoch"),
+        ("select 1 e, 2 e", FILE_FORMATS, r"column 'e' is there twice.* AS"),
         ("select 1e30::hugeint f", ["votable", "fits", "ecsv", "npz"], r"column 'f'.*VARCHAR"),
         ("select 18446744073709551615::ubigint g", ["votable", "fits"], r"column 'g'.*VARCHAR"),
         ("select [1, null] h", ["votable", "fits", "ecsv", "npz"], r"column 'h'.*DOUBLE"),
@@ -665,7 +659,7 @@ def test_a_null_alone_in_its_row_is_no_empty_line(tmp_path: Path) -> None:
     assert duckdb.sql(f"select a::int from '{path}'").fetchall() == [(1,), (None,), (3,)]
 
 
-@pytest.mark.parametrize("file_format", FORMATS)
+@pytest.mark.parametrize("file_format", FILE_FORMATS)
 def test_a_table_without_rows(tmp_path: Path, file_format: str) -> None:
     schema = pa.schema({"a": pa.int64(), "b": pa.list_(pa.float64()), "c": pa.string()})
     path = written(schema.empty_table(), tmp_path, file_format)
@@ -714,7 +708,7 @@ def test_streamed_formats_never_hold_the_table(tmp_path: Path) -> None:
 )
 def test_the_suffix_says_the_format(name: str, file_format: str) -> None:
     assert format_of(name) == format_of(Path(name)) == file_format
-    assert file_format in FORMATS
+    assert file_format in FILE_FORMATS
 
 
 @pytest.mark.parametrize("name", ["a", "a.csv.gz", "stars.hdf5", ".csv"])
@@ -733,14 +727,14 @@ def test_formats_that_are_not_there(tmp_path: Path) -> None:
 
 def test_a_place_that_cannot_be_written_to(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    for file_format in FORMATS:
+    for file_format in FILE_FORMATS:
         with pytest.raises(OutputError, match="cannot be written"):
             write_batches(pa.table({"a": [1]}).to_reader(), tmp_path / "file" / "a", file_format)
 
 
 def test_a_query_that_fails_halfway_is_no_error_of_the_file(tmp_path: Path) -> None:
     query = "select if(i = 150000, error('boom'), i::varchar) a from range(200000) t(i)"
-    for file_format in FORMATS:
+    for file_format in FILE_FORMATS:
         with pytest.raises(OSError, match="boom") as raised:
             write_batches(duckdb.sql(query).to_arrow_reader(1000), tmp_path / "a", file_format)
         assert not isinstance(raised.value, OutputError)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,10 +18,10 @@ from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import chord_from_separation, radec_from_directions, tangent_axes
 from starcat.geometry.zones import zones_of
+from starcat.pipeline.acceptance import advice_without_magnitudes, causes, check_rates
 from starcat.pipeline.build import Built, build
 from starcat.pipeline.cost import Cost, product_cost
-from starcat.pipeline.judgement import advice_without_magnitudes, causes, check_rates
-from starcat.pipeline.recipes import Ingredients, cook
+from starcat.pipeline.recipes import ProductInputs, make_product
 from starcat.pipeline.starter import STARS_A_FIELD, Starter, advice, starter_spec
 from starcat.products.boresights import stars_in_fields, tile_sphere
 from starcat.products.coverage import TilingGap
@@ -91,7 +92,7 @@ def test_init_thins_to_a_number_of_stars_a_field(fov_deg):
 @pytest.mark.parametrize("limit_mag", [5.0, 6.0])
 def test_rows_are_estimated(name: str, limit_mag: float, sky_of: Any) -> None:
     given = sky_of(limit_mag)
-    made = cook(name, given)
+    made = make_product(name, given)
     assert product_cost(given, 0.0).rows[name] == pytest.approx(len(made.table), rel=0.1)
 
 
@@ -103,13 +104,13 @@ def sky_of() -> Any:
 
     stars = ingest("gaia", locate("gaia", {})).stars
 
-    def make(limit_mag: float) -> Ingredients:
+    def make(limit_mag: float) -> ProductInputs:
         spec = preset(
             "gaia-12deg",
             {"selection.faint_limit_mag": str(limit_mag), "boresights.count": "2000"},
         )
         selected, fields = select_stars(stars, spec)
-        return Ingredients(directions_of(selected.guide_stars), fields, spec)
+        return ProductInputs(directions_of(selected.guide_stars), fields, spec)
 
     return make
 
@@ -126,7 +127,7 @@ def test_the_memory_of_a_build_is_estimated(starcat, tmp_path):
     )
     estimate = next(line for line in done.stderr.splitlines() if line.startswith("estimate: "))
     assert "6,682 guide stars in 10,000 fields" in estimate
-    said_gib = float(estimate.rpartition("; ")[2].split()[0])
+    said_gib = float(re.findall(r"([0-9.]+) GiB", estimate)[0])
     log = json.loads((tmp_path / "gaia-12deg-1.0.0.build.json").read_bytes())
     assert 1.0 / 1.5 < said_gib * GIB / log["peak_memory_bytes"] < 1.5
 

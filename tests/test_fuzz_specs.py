@@ -27,8 +27,8 @@ from starcat.artifact.writer import write_products
 from starcat.catalog.ingest import Ingested, ingest
 from starcat.errors import ConfigError, StarcatError
 from starcat.pipeline.build import database_facts, make_products, run_self_test
-from starcat.pipeline.facts import filter_coverage
 from starcat.pipeline.guide_stars import select_stars
+from starcat.pipeline.report_data import filter_coverages
 from starcat.products.coverage import tiling_gap
 from starcat.progress import no_progress
 from starcat.resources import resource_folder
@@ -204,8 +204,7 @@ def build_from(spec: BuildSpec, catalog: Ingested) -> None:
 
 def build_a_little(spec: BuildSpec, catalog: Ingested) -> None:
     selected, fields = select_stars(catalog.stars, spec)
-    for step in selected.steps:
-        filter_coverage(step, spec)
+    filter_coverages(selected.steps, fields, spec)
     tiling_gap(fields.boresights, spec.camera.camera().radius_rad)
     products = make_products(spec, catalog, selected, fields)
     with tempfile.TemporaryDirectory() as folder:

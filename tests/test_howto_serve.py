@@ -18,7 +18,7 @@ from urllib.error import URLError
 
 import pytest
 
-from starcat.service.guard.metrics import Metrics
+from starcat.service.security.metrics import Metrics
 from starcat.service.service import open_service
 from starcat.service.settings import Settings, read_settings
 

@@ -27,12 +27,10 @@ from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.images.background import SMALLEST_PX, Levels, repair_hot_pixels, subtract_background
 from starcat.images.centroiding import Spots, brightest_first, find_spots
 from starcat.images.detection import detect
+from starcat.images.frame_axes import FrameAxes, draw_compass, mark_radii, place_labels, stretch
 from starcat.images.image_file import read_image, write_image
-from starcat.images.labels import place_labels
 from starcat.images.picture import compass_from_matrix, draw_identified
-from starcat.images.plate import Plate, draw_compass, mark_radii
 from starcat.images.render import Optics, render_image, star_electrons
-from starcat.images.stretch import stretch
 
 Array = NDArray[np.float64]
 
@@ -881,7 +879,7 @@ def test_the_compass_stands_in_the_emptiest_corner(free):
     corners = {(0, 1), (0, 0), (1, 1), (1, 0)} - {free}
     spots = 100.0 * np.array(sorted(corners)) + np.where(np.array(sorted(corners)) > 0, -9, 9)
     axes = Figure().add_axes((0.0, 0.0, 1.0, 1.0))
-    plate = Plate(axes, 2.0, (100, 100), spots, ["a", "b", "c"], np.full(3, 6.0))
+    plate = FrameAxes(axes, 2.0, (100, 100), spots, ["a", "b", "c"], np.full(3, 6.0))
     box = draw_compass(plate, (np.array([0.0, -1.0]), np.array([-1.0, 0.0])))
     assert tuple((box[0, :2] > 50.0).astype(int)) == free
     assert draw_compass(plate, None).shape == (0, 4)

@@ -11,7 +11,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from starcat.service.app import make_app
-from starcat.service.jobs.transitions import Attempt, claim
+from starcat.service.jobs.job_states import Attempt, claim
 from starcat.service.pages.draft import draft_of_form, draft_of_text, plain_toml
 from starcat.service.pages.static_files import DIGEST, FILES
 from starcat.service.settings import Settings

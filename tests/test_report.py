@@ -25,7 +25,7 @@ from starcat.artifact.reader import Artifact, open_artifact
 from starcat.cli.terminal.coverage_tables import histogram_rows
 from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars
 from starcat.pipeline.build import build
-from starcat.pipeline.facts import artifact_coverage
+from starcat.pipeline.report_data import artifact_coverage
 from starcat.products.coverage import coverage_from_counts
 from starcat.report.coverage_report import report_coverage
 from starcat.report.page import table

@@ -16,11 +16,11 @@ from astropy.io.votable import parse
 from astropy.table import Table
 
 from starcat.errors import ConfigError, QueryLimitError, SchemaError
-from starcat.exchange.label import Label
-from starcat.vo.formats import FORMATS, Format, format_named
-from starcat.vo.results import result_chunks
+from starcat.exchange.columns import Label
+from starcat.exchange.formats import TAP_FORMATS, Format, response_format
+from starcat.exchange.writers import result_chunks
 
-EVERY = pytest.mark.parametrize("asked", FORMATS, ids=lambda one: one.name)
+EVERY = pytest.mark.parametrize("asked", TAP_FORMATS, ids=lambda one: one.name)
 ROWS = [
     {"star_id": 4472832130942575872, "mag": 9.5, "name": "Barnard's star"},
     {"star_id": 2, "mag": None, "name": "a\tb"},
@@ -45,14 +45,14 @@ def table() -> pa.Table:
 
 def rows_of(content: bytes, asked: Format, folder: Path) -> list[tuple[int, float | None]]:
     """Return the numbers of a star and its magnitude, as a reader of the format finds them."""
-    path = folder / f"read.{asked.suffix}"
+    path = folder / f"read{asked.suffix}"
     path.write_bytes(content)
-    if asked.suffix == "parquet":
+    if asked.suffix == ".parquet":
         read = pq.read_table(path).to_pylist()
-    elif asked.suffix == "json":
+    elif asked.suffix == ".json":
         read = json.loads(content)
-    elif asked.suffix in ("csv", "tsv"):
-        delimiter = "," if asked.suffix == "csv" else "\t"
+    elif asked.suffix in (".csv", ".tsv"):
+        delimiter = "," if asked.suffix == ".csv" else "\t"
         lines = csv.DictReader(io.StringIO(content.decode()), delimiter=delimiter)
         read = [
             {
@@ -63,7 +63,7 @@ def rows_of(content: bytes, asked: Format, folder: Path) -> list[tuple[int, floa
             for row in lines
         ]
     else:
-        found = Table.read(path, format="fits" if asked.suffix == "fits" else "votable")
+        found = Table.read(path, format="fits" if asked.suffix == ".fits" else "votable")
         mags = np.ma.filled(found["mag"], np.nan)
         pairs = zip(found["star_id"], mags, strict=True)
         read = [{"star_id": int(star_id), "mag": float(mag)} for star_id, mag in pairs]
@@ -113,11 +113,11 @@ def test_every_format_has_the_rows(
     ],
 )
 def test_a_format_is_asked_for_by_name_or_media_type(text: str | None, name: str) -> None:
-    assert format_named(text).name == name
+    assert response_format(text).name == name
 
 
 def test_no_two_formats_are_asked_for_alike() -> None:
-    aliases = [alias for one in FORMATS for alias in (one.name, one.media_type, *one.aliases)]
+    aliases = [alias for one in TAP_FORMATS for alias in (one.name, one.tap_type, *one.aliases)]
     assert len(set(aliases)) == len(aliases)
 
 
@@ -126,7 +126,7 @@ def test_no_two_formats_are_asked_for_alike() -> None:
 )
 def test_an_unknown_format_is_refused_with_those_that_there_are(text: str) -> None:
     with pytest.raises(ConfigError, match=r"is not known; choose one of votable.*csv") as caught:
-        format_named(text)
+        response_format(text)
     assert len(str(caught.value)) < 300
 
 
@@ -162,19 +162,19 @@ def test_what_fails_midway_is_never_taken_for_the_whole(tmp_path: Path, asked: F
 def test_a_table_that_a_format_cannot_hold_is_refused(tmp_path: Path) -> None:
     table = pa.table({"a": ["é"]})
     with pytest.raises(SchemaError, match="ASCII in FITS"):
-        result_chunks(table.to_reader(), format_named("fits"), tmp_path)
+        result_chunks(table.to_reader(), response_format("fits"), tmp_path)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", ["fits", "parquet"])
 def test_a_file_is_gone_when_nobody_reads_on(tmp_path: Path, name: str) -> None:
     large = pa.table({"a": np.random.default_rng(1).normal(size=100_000)})
-    given = result_chunks(large.to_reader(), format_named(name), tmp_path)
+    given = result_chunks(large.to_reader(), response_format(name), tmp_path)
     next(given)
     assert list(tmp_path.iterdir())
     given.close()  # type: ignore[attr-defined]
     assert not list(tmp_path.iterdir())
-    unread = result_chunks(large.to_reader(), format_named(name), tmp_path)
+    unread = result_chunks(large.to_reader(), response_format(name), tmp_path)
     del unread
     assert not list(tmp_path.iterdir())
 
@@ -187,9 +187,9 @@ def test_tsv_has_one_line_a_row_and_no_quotation_marks(tmp_path: Path) -> None:
             "d": [True, None, False, True],
         }
     )
-    content = b"".join(result_chunks(table.to_reader(), format_named("tsv"), tmp_path))
+    content = b"".join(result_chunks(table.to_reader(), response_format("tsv"), tmp_path))
     assert content.decode() == (
         'a b\tc\td\nsay "no"\t[1,2]\ttrue\nx  y\t\t\n\t[]\tfalse\n\t[3]\ttrue\n'
     )
-    empty = b"".join(result_chunks(table[:0].to_reader(), format_named("tsv"), tmp_path))
+    empty = b"".join(result_chunks(table[:0].to_reader(), response_format("tsv"), tmp_path))
     assert empty.decode() == "a b\tc\td\n"

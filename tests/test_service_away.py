@@ -80,8 +80,8 @@ def test_a_database_is_brought_once(client, service, job, database):
     assert client.put(f"{path}/2/database", content=data, headers=TAR).status_code == 409
     done = client.put(f"{path}/1/database", content=data, headers=TAR).json()
     assert done["result"] == {"database": job.key[:16]}
-    assert service.shelf.database(job.key[:16]).title == "small-1.0.0"
-    assert list(service.places.scratch.iterdir()) == []
+    assert service.library.database(job.key[:16]).title == "small-1.0.0"
+    assert list(service.paths.scratch.iterdir()) == []
     for late in (
         client.put(f"{path}/1/database", content=data, headers=TAR),
         client.post(f"{path}/1/tell", json={"lines": []}),
@@ -169,12 +169,12 @@ def test_a_damaged_or_another_database_is_refused(client, service, job, database
     data[len(data) // 2] ^= 1
     stars.write_bytes(data)
     answer = client.put(f"{path}/1/database", content=packed(database), headers=TAR)
-    assert (answer.status_code, service.shelf.databases()) == (422, [])
+    assert (answer.status_code, service.library.databases()) == (422, [])
     other = database.with_name("other")
     shutil.copytree(artifact_version("2.0.0"), other / "small-1.0.0", copy_function=shutil.copyfile)
     answer = client.put(f"{path}/1/database", content=packed(other), headers=TAR)
     assert answer.status_code == 422
-    assert service.shelf.databases() == []
+    assert service.library.databases() == []
 
 
 def test_only_publishers_bring_databases(tmp_path):

@@ -22,10 +22,10 @@ from starlette.testclient import TestClient
 from starcat.errors import ConfigError, TargetMissing
 from starcat.service.access import Reader, Role, principal_of
 from starcat.service.app import make_app
-from starcat.service.guard import bodies, identities, retention, who
-from starcat.service.guard.buckets import Buckets
-from starcat.service.guard.logs import JsonFormatter
-from starcat.service.guard.tokens import TokenStore
+from starcat.service.security import auth, bodies, identities, retention
+from starcat.service.security.buckets import Buckets
+from starcat.service.security.logs import JsonFormatter
+from starcat.service.security.tokens import TokenStore
 from starcat.service.server import run_server
 from starcat.service.settings import Settings, read_settings
 
@@ -83,7 +83,7 @@ def test_a_token_is_kept_as_a_digest_only(client: Make) -> None:
     at = client()
     token, text = tokens_of(at).create("anna", Role.BUILDER)
     app: Any = at.app
-    path = app.state.service.places.records
+    path = app.state.service.paths.records
     app.state.service.records.close()
     written = b"".join(one.read_bytes() for one in path.parent.glob("records.sqlite*"))
     assert token.name.encode() in written
@@ -280,15 +280,15 @@ def test_a_bucket_fills_again_and_the_quietest_is_forgotten(
     now[0] = 1.0
     assert buckets.take("a") == 0.0
     assert buckets.take("a") == 1.0
-    monkeypatch.setattr("starcat.service.guard.buckets.MOST", 2)
+    monkeypatch.setattr("starcat.service.security.buckets.MOST", 2)
     buckets.take("b")
     buckets.take("c")
     assert buckets.take("a") == 0.0  # full again, for it was forgotten
 
 
 def test_addresses_of_one_network_are_counted_together() -> None:
-    assert who.network_of("2001:db8:0:1::1") == who.network_of("2001:db8:0:1:ffff::2")
-    assert who.network_of("2001:db8:0:2::1") != who.network_of("2001:db8:0:1::1")
+    assert auth.network_of("2001:db8:0:1::1") == auth.network_of("2001:db8:0:1:ffff::2")
+    assert auth.network_of("2001:db8:0:2::1") != auth.network_of("2001:db8:0:1::1")
 
 
 @pytest.mark.parametrize(
@@ -469,12 +469,12 @@ def test_ready_says_what_is_wrong(client: Make, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(type(app.state.workers), "is_alive", True)
     found = at.get("/readyz")
     assert (found.status_code, found.json()) == (200, {"ready": True, "reasons": []})
-    monkeypatch.setattr("starcat.service.guard.health.free_gib", lambda folder: 0.2)
+    monkeypatch.setattr("starcat.service.security.health.free_gib", lambda folder: 0.2)
     found = at.get("/readyz")
     assert found.status_code == 503
     assert "0.2 GiB of disk are left, less than 1" in found.json()["reasons"]
     monkeypatch.setattr("starcat.service.records.WAIT_S", 0.05)
-    other = sqlite3.connect(app.state.service.places.records)
+    other = sqlite3.connect(app.state.service.paths.records)
     other.execute("BEGIN IMMEDIATE")
     app.state.service.records.close()
     assert any("records cannot be written" in one for one in at.get("/readyz").json()["reasons"])
@@ -485,7 +485,7 @@ def test_what_is_old_is_removed_and_databases_and_releases_stay(client: Make) ->
     at = client(keep_jobs_days=2.0, keep_results_days=1.0)
     app: Any = at.app
     service = app.state.service
-    places = service.places
+    places = service.paths
     jobs = [service.jobs.add("build", {}, key="0" * 64, title="t", owner="o") for _ in range(3)]
     now_s = time.time()
     with service.records.writing() as connection:

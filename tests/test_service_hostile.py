@@ -26,8 +26,8 @@ from shelved import DATABASE, shelve
 
 from starcat.pipeline.build import build
 from starcat.service.access import Role
-from starcat.service.guard.tokens import TokenStore
 from starcat.service.records import Records
+from starcat.service.security.tokens import TokenStore
 from starcat.specs.reading import spec_from_dict
 
 EVIL = "https://evil.example"

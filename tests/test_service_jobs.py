@@ -23,8 +23,9 @@ from starcat.artifact.verify import verify_artifact
 from starcat.errors import ConfigError, SourceMissing, TargetMissing
 from starcat.service.access import Principal, Role
 from starcat.service.app import make_app
-from starcat.service.jobs import transitions
+from starcat.service.jobs import job_states
 from starcat.service.jobs.job import Job
+from starcat.service.jobs.job_states import MAX_INTERRUPTED, Attempt, claim, interrupt
 from starcat.service.jobs.keys import build_key, file_digests
 from starcat.service.jobs.pool import WorkerPool
 from starcat.service.jobs.queue import JsonMessages
@@ -37,7 +38,6 @@ from starcat.service.jobs.submission import (
     submit_evaluation,
     submit_ingest,
 )
-from starcat.service.jobs.transitions import MAX_INTERRUPTED, Attempt, claim, interrupt
 from starcat.service.problems import Problem
 from starcat.service.server import run_server
 from starcat.service.service import Service, open_service
@@ -249,7 +249,7 @@ def test_a_user_has_so_much_of_the_disk(opened, spec, small_artifact):
     service = opened(disk_gib=1e-5)
     job = submit_build(service, spec, "anne").job
     end(service, job, "done")
-    folder = service.places.database(job.key[:16])
+    folder = service.paths.database(job.key[:16])
     folder.mkdir()
     (folder / small_artifact.name).symlink_to(small_artifact)
     with pytest.raises(Problem, match=r"the databases of anne take .* \(disk_gib\)") as refused:
@@ -309,7 +309,7 @@ def test_of_each_stage_the_last_event_is_kept(service, spec):
 
 
 def test_a_log_has_an_end(service, spec, monkeypatch):
-    monkeypatch.setattr(transitions, "MAX_LOG_LINES", 3)
+    monkeypatch.setattr(job_states, "MAX_LOG_LINES", 3)
     attempt = begin(service, submit_build(service, spec, "anne").job)
     for number in range(9):
         attempt.tell("info", f"line {number}")
@@ -340,14 +340,14 @@ def test_a_server_takes_up_what_another_has_left(service, spec):
     begin(service, ran)
     waits = submit_ingest(service, "sao", "anne").job
     service.queue.huey.flush()  # the messages are lost
-    service.places.job_work(ran.id).mkdir(parents=True)
-    (service.places.job_work(ran.id) / "half").write_text("")
-    service.places.database("0" * 16).mkdir()
+    service.paths.job_work(ran.id).mkdir(parents=True)
+    (service.paths.job_work(ran.id) / "half").write_text("")
+    service.paths.database("0" * 16).mkdir()
     recover(service)
     assert service.jobs.get(ran.id).state == "queued"
     assert messages(service) == [ran.id, waits.id]
-    assert not service.places.job_work(ran.id).exists()
-    assert list(service.places.databases.iterdir()) == []
+    assert not service.paths.job_work(ran.id).exists()
+    assert list(service.paths.databases.iterdir()) == []
 
 
 def test_messages_that_are_lost_are_sent_again(service, spec):
@@ -436,10 +436,10 @@ def test_a_build_is_done_and_watched_over_http(archive, tmp_path, small_spec):
         listed = client.get(JOBS, params={"kind": "evaluate", "limit": 1}).json()
         assert (listed["total"], listed["jobs"][0]["id"]) == (1, measured)
         service = client.app.state.service
-        folder = service.shelf.database(database).folder
+        folder = service.library.database(database).folder
         assert verify_artifact(folder).findings == ()
         assert {path.stat().st_mode & 0o222 for path in folder.iterdir() if path.is_file()} == {0}
-        assert not list(service.places.jobs.glob("*/work"))
+        assert not list(service.paths.jobs.glob("*/work"))
 
 
 def sent_events(text: str) -> list[tuple[str, int, dict[str, Any]]]:
@@ -546,9 +546,9 @@ def run_until(service: Service, slots: Slots, job: Job, then: Callable[[], None]
     then()
     thread.join(30.0)
     assert not thread.is_alive()
-    assert not service.places.job_work(job.id).exists()
-    assert list(service.places.databases.iterdir()) == []
-    with locked(service.places.job_lock(job.id), wait=False):  # its process is gone
+    assert not service.paths.job_work(job.id).exists()
+    assert list(service.paths.databases.iterdir()) == []
+    with locked(service.paths.job_lock(job.id), wait=False):  # its process is gone
         return service.jobs.get(job.id)
 
 
@@ -612,7 +612,7 @@ def test_a_build_that_fails_says_why(service, spec, archive):
     failed = service.jobs.get(job.id)
     assert (failed.state, failed.error["kind"]) == ("failed", "ParseError")
     assert "sao.dat" in failed.error["detail"]
-    assert service.places.job_stderr(job.id).read_text() == ""
+    assert service.paths.job_stderr(job.id).read_text() == ""
 
 
 @pytest.mark.slow
@@ -623,7 +623,7 @@ def test_a_catalog_is_read_either_way(service, archive):
         done = service.jobs.get(job.id)
         assert done.state == "done", done.error
         assert done.result["rows"] == 600
-        assert (service.places.catalogs / done.result["catalog"]).exists()
+        assert (service.paths.catalogs / done.result["catalog"]).exists()
         assert not submit_ingest(service, "sao", "bob", to=to).is_new
 
 
@@ -631,8 +631,8 @@ def test_a_catalog_is_read_either_way(service, archive):
 def test_a_database_that_is_there_is_not_built_again(service, spec):
     job = submit_build(service, spec, "anne").job
     Slots(service).run_job(job.id)
-    database = service.shelf.database(job.key[:16])
-    with sqlite3.connect(service.places.records) as records:  # killed before that was written
+    database = service.library.database(job.key[:16])
+    with sqlite3.connect(service.paths.records) as records:  # killed before that was written
         records.execute("UPDATE jobs SET state = 'queued', result = NULL")
     records.close()
     before = database.folder.stat()

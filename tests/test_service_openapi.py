@@ -17,8 +17,8 @@ from served import Served, serve
 from shelved import shelve
 
 from starcat.service.access import Role
-from starcat.service.guard.tokens import TokenStore
 from starcat.service.records import Records
+from starcat.service.security.tokens import TokenStore
 
 CHECKS = (
     "status_code_conformance,content_type_conformance,response_headers_conformance,"

@@ -184,7 +184,7 @@ def test_nothing_is_left_in_scratch(client, root):
 
 @pytest.fixture(scope="module")
 def frame(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Path:
-    from starcat.images.identification import write_simulated
+    from starcat.images.render import write_simulated
     from starcat.matcher.database import open_database
     from starcat.simulation.simulate import Noise, simulate_frames
 

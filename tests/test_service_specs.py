@@ -15,17 +15,15 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
+from starcat.pipeline.catalog_snapshot import CatalogSnapshot, read_snapshot
 from starcat.pipeline.estimate import choose_stars
-from starcat.pipeline.stars_read import StarsRead, read_stars
 from starcat.pipeline.starter import starter_spec
 from starcat.service import catalogs as catalogs_module
-from starcat.service import star_cache
 from starcat.service.app import make_app
 from starcat.service.catalogs import Catalogs
 from starcat.service.kept import Kept
 from starcat.service.problems import Problem
 from starcat.service.settings import Settings
-from starcat.service.star_cache import FACTS, STARS, CatalogRead, StarCache
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.reading import content_of_toml, preset, preset_names, spec_from_dict
 
@@ -158,7 +156,7 @@ def test_an_estimate_is_that_of_the_pipeline(client, small, small_spec):
     answer = client.post(f"{API}/specs/estimate", content=small_spec, headers=TOML)
     assert answer.status_code == 200
     found = answer.json()
-    read = read_stars(small, {})
+    read = read_snapshot(small, {})
     choice = choose_stars(read, small)
     assert found["guide_stars"] == len(choice.selected.guide_stars)
     assert found["fields"]["count"] == small.boresights.count
@@ -286,59 +284,16 @@ def test_every_operation_is_described(client):
 # --- What is kept
 
 
-def as_read(small: BuildSpec) -> tuple[StarsRead, CatalogRead]:
-    return read_stars(small, {}), CatalogRead("sao", "V", 2026.0, 600, 2.0, 6.4)
-
-
-def test_what_was_read_is_the_same_from_disk(small, tmp_path):
-    read, facts = as_read(small)
-    cache = StarCache(tmp_path)
-    assert cache.load("0" * 32) is None
-    cache.keep("0" * 32, read, facts)
-    found = cache.load("0" * 32)
-    assert found is not None
-    assert found.stars.equals(read.stars, check_metadata=True)
-    assert choose_stars(found, small).rejected == choose_stars(read, small).rejected
-    assert cache.catalogs() == {"0" * 32: facts}
-
-
-@pytest.mark.parametrize("name", [STARS, FACTS])
-def test_what_cannot_be_read_is_made_again(small, tmp_path, name):
-    read, facts = as_read(small)
-    cache = StarCache(tmp_path)
-    cache.keep("0" * 32, read, facts)
-    (tmp_path / ("0" * 32) / name).chmod(0o644)
-    (tmp_path / ("0" * 32) / name).write_bytes(b"no table")
-    assert cache.load("0" * 32) is None
-    assert not (tmp_path / ("0" * 32)).exists()
-    cache.keep("0" * 32, read, facts)
-    assert cache.load("0" * 32) is not None
-
-
-def test_the_least_recently_used_goes_first(small, tmp_path, monkeypatch):
-    monkeypatch.setattr(star_cache, "MOST_FOLDERS", 2)
-    read, facts = as_read(small)
-    cache = StarCache(tmp_path)
-    for n, key in enumerate(("a", "b", "c")):
-        cache.keep(key, read, facts)
-        if (tmp_path / key).exists():
-            os.utime(tmp_path / key, (n + 1, n + 1))
-        if key == "b":
-            cache.load("a")
-            os.utime(tmp_path / "a", (10, 10))
-    assert set(cache.catalogs()) == {"a", "c"}
-
-
-def test_a_catalog_is_read_once_however_many_ask(small, tmp_path, monkeypatch):
+def test_a_catalog_is_read_once_however_many_ask(small, monkeypatch):
     calls = []
 
-    def counted(*arguments: Any, **options: Any) -> StarsRead:
+    def counted(*arguments: Any, **options: Any) -> CatalogSnapshot:
         calls.append(arguments)
         time.sleep(0.2)
-        return read_stars(*arguments, **options)
+        return read_snapshot(*arguments, **options)
 
-    monkeypatch.setattr(catalogs_module, "read_stars", counted)
-    catalogs = Catalogs(tmp_path)
+    monkeypatch.setattr(catalogs_module, "read_snapshot", counted)
+    catalogs = Catalogs()
     found: list[int] = []
     threads = [
         threading.Thread(target=lambda: found.append(catalogs.estimate(small).cost.stars))
@@ -351,26 +306,23 @@ def test_a_catalog_is_read_once_however_many_ask(small, tmp_path, monkeypatch):
     assert len(calls) == 1
     assert len(set(found)) == 1
     assert len(found) == 6
-    again = Catalogs(tmp_path)
-    assert again.estimate(small).cost.stars == found[0]
-    assert len(calls) == 1  # from the disk
+    assert [(one.source, one.stars) for one in catalogs.offered()[0].read] == [("sao", 600)]
     source = Path(os.environ["STARCAT_CATALOGS"]) / "sao.dat"
     os.utime(source)
-    assert again.estimate(small).cost.stars == found[0]
+    assert catalogs.estimate(small).cost.stars == found[0]
     assert len(calls) == 2  # the file is another one
     catalogs.close()
-    again.close()
 
 
-def test_who_waits_too_long_is_told_when_to_ask_again(small, tmp_path, monkeypatch):
+def test_who_waits_too_long_is_told_when_to_ask_again(small, monkeypatch):
     go_on = threading.Event()
 
-    def slow(*arguments: Any, **options: Any) -> StarsRead:
+    def slow(*arguments: Any, **options: Any) -> CatalogSnapshot:
         go_on.wait(20)
-        return read_stars(*arguments, **options)
+        return read_snapshot(*arguments, **options)
 
-    monkeypatch.setattr(catalogs_module, "read_stars", slow)
-    catalogs = Catalogs(tmp_path, wait_s=0.05)
+    monkeypatch.setattr(catalogs_module, "read_snapshot", slow)
+    catalogs = Catalogs(wait_s=0.05)
     with pytest.raises(Problem) as told:
         catalogs.estimate(small)
     assert told.value.status == 503
@@ -381,9 +333,9 @@ def test_who_waits_too_long_is_told_when_to_ask_again(small, tmp_path, monkeypat
     catalogs.close()
 
 
-def test_files_that_are_too_large_are_read_to_a_limit_only(small, tmp_path, monkeypatch):
+def test_files_that_are_too_large_are_read_to_a_limit_only(small, monkeypatch):
     monkeypatch.setattr(catalogs_module, "MOST_INPUT_BYTES", 1000)
-    catalogs = Catalogs(tmp_path)
+    catalogs = Catalogs()
     with pytest.raises(Problem, match="more than an estimate reads whole") as told:
         catalogs.estimate(small)
     assert (told.value.status, told.value.key) == (413, "catalog.read_limit_mag")

@@ -22,6 +22,7 @@ from httpx2 import Response
 from shelved import shelve
 
 from starcat.errors import QueryError
+from starcat.exchange.formats import response_format
 from starcat.query.session import open_session
 from starcat.service.app import make_app
 from starcat.service.records import Records
@@ -29,7 +30,6 @@ from starcat.service.settings import Settings
 from starcat.service.vo.tap_spool import ClientGone, Spool
 from starcat.service.vo.tap_store import ENDED_WITH_SERVER, TapJobs
 from starcat.vo.documents import ServiceLimits
-from starcat.vo.formats import format_named
 from starcat.vo.parameters import Question
 
 LOCAL = "http://127.0.0.1:8000"
@@ -161,12 +161,12 @@ def test_who_reads_slowly_keeps_nobody_waiting(root):
     settings = Settings(root=root, queries=2)
     with TestClient(make_app(settings), base_url=LOCAL) as client:
         service = client.app.state.service
-        asked = Question("SELECT * FROM small.pairs", format_named("csv"), 1_000_000)
+        asked = Question("SELECT * FROM small.pairs", response_format("csv"), 1_000_000)
         spools = []
         for _ in range(4):
             parts = service.tap.queries.answer(asked, {})
             next(parts)
-            spools.append(Spool(parts, service.places.scratch, threading.Event()))
+            spools.append(Spool(parts, service.paths.scratch, threading.Event()))
             next(iter(spools[-1]))
         assert len(table_of(client.get("/tap/sync", params={"QUERY": BRIGHT}))) > 0
         whole = [b"".join(spool) for spool in spools]
@@ -199,7 +199,7 @@ def test_a_query_ends_when_its_client_goes(root):
             if gone.is_set():
                 raise ClientGone
 
-        asked = Question(SLOW, format_named("csv"), 10)
+        asked = Question(SLOW, response_format("csv"), 10)
         spool = Spool(service.tap.queries.answer(asked, {}, progress=watch), root, gone)
         time.sleep(0.5)
         spool.close()
@@ -566,7 +566,7 @@ def test_jobs_outlive_the_server(tmp_path, small_artifact, bright):
     settings = Settings(root=root)
     with TestClient(make_app(settings), base_url=LOCAL) as client:
         records = Records(root / "records.sqlite")
-        jobs = TapJobs(records, client.app.state.service.places, ServiceLimits(60, 3600, 10, 10))
+        jobs = TapJobs(records, client.app.state.service.paths, ServiceLimits(60, 3600, 10, 10))
         made = [jobs.create("anonymous", [("QUERY", BRIGHT)]).job_id for _ in range(3)]
         for job_id in made[:2]:
             jobs.queue(job_id)

@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 from starcat.artifact.reader import open_artifact
 from starcat.errors import QueryLimitError, SchemaError
 from starcat.exchange import votable_stream
-from starcat.exchange.label import Label
+from starcat.exchange.columns import Label
 from starcat.exchange.votable_stream import Serialization, votable_chunks
 
 SERIALIZATIONS: tuple[Serialization, ...] = get_args(Serialization)

@@ -1,64 +1,26 @@
-"""An artifact as a program holds it: tables, matcher, queries, coverage."""
+"""An artifact as a program holds it, and SQL over artifacts and catalogs."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from functools import cached_property
+import os
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starcat.api.connection import connect
+from starcat.artifact import reader
 from starcat.artifact.manifest import read_manifest
 from starcat.resources import PathLike
 
 if TYPE_CHECKING:  # a program that only matches has none of the libraries behind these
-    import pyarrow as pa
-
     from starcat.artifact.verify import Verification
     from starcat.matcher.matcher import Matcher
-    from starcat.query.answer import Answer
+    from starcat.query.result import Answer
+    from starcat.query.session import Limits
     from starcat.report.coverage_report import CoverageReport
-    from starcat.specs.build_spec import BuildSpec
 
 
-class Products(Mapping[str, "pa.Table"]):
-    """The tables of an artifact by name; each is read when it is asked for.
-
-    Parameters
-    ----------
-    folder : Path
-        The artifact's folder.
-    manifest : dict
-        Its manifest.
-    """
-
-    def __init__(self, folder: Path, manifest: dict[str, Any]) -> None:
-        self._folder = folder
-        self._manifest = manifest
-
-    def __getitem__(self, name: str) -> pa.Table:
-        """Return a product as an Arrow table; `KeyError` if there is none of that name."""
-        from starcat.artifact.reader import Artifact as Reader
-
-        if name not in self._manifest["products"]:
-            raise KeyError(name)
-        return Reader(self._folder, self._manifest).table(name)
-
-    def __iter__(self) -> Iterator[str]:
-        """Go through the names, in the order of the manifest."""
-        return iter(self._manifest["products"])
-
-    def __len__(self) -> int:
-        """Return the number of products."""
-        return len(self._manifest["products"])
-
-    def __repr__(self) -> str:
-        """Return the names and rows in one line."""
-        counts = [(name, one["rows"]) for name, one in self._manifest["products"].items()]
-        return f"<Products: {', '.join(f'{name} ({rows:,})' for name, rows in counts)}>"
-
-
-class Artifact:
+class Artifact(reader.Artifact):
     """A guide-star database on disk, opened by `open_artifact` (``starcat.open``).
 
     Parameters
@@ -68,27 +30,6 @@ class Artifact:
     manifest : dict
         What it is made of: spec, sources, products, digests.
     """
-
-    def __init__(self, folder: Path, manifest: dict[str, Any]) -> None:
-        self.folder = folder
-        self.manifest = manifest
-
-    @property
-    def products(self) -> Products:
-        """The tables by name: ``artifact.products["pairs"]``."""
-        return Products(self.folder, self.manifest)
-
-    @cached_property
-    def stars(self) -> pa.Table:
-        """The guide stars as an Arrow table, by star number."""
-        return self.products["stars"]
-
-    @cached_property
-    def spec(self) -> BuildSpec:
-        """The spec that the artifact was built from."""
-        from starcat.specs.reading import spec_from_dict
-
-        return spec_from_dict(self.manifest["spec"], "manifest.json")
 
     def matcher(self, method: str | None = None, **limits: Any) -> Matcher:
         """Open the database for identifying stars.
@@ -110,13 +51,13 @@ class Artifact:
         return Matcher.open(self.folder, method, **limits)
 
     def sql(self, text: str, **values: Any) -> Answer:
-        """Ask a query about the products.
+        """Run a query over the products.
 
         Parameters
         ----------
         text : str
-            SQL, one statement that reads; every product is a table, the macros of
-            ``docs/sql.md`` are there.
+            SQL, one statement that reads; every product is a table, with the macros of
+            ``docs/sql.md``.
         **values
             Values of the ``$name`` in it.
 
@@ -141,10 +82,9 @@ class Artifact:
         CoverageReport
             As the report of the build has it.
         """
-        from starcat.artifact.reader import Artifact as Reader
-        from starcat.pipeline.facts import artifact_coverage
+        from starcat.pipeline.report_data import artifact_coverage
 
-        return artifact_coverage(Reader(self.folder, self.manifest))
+        return artifact_coverage(self)
 
     def verify(self) -> Verification:
         """Check every file, order, index and reference.
@@ -157,13 +97,6 @@ class Artifact:
         from starcat.artifact.verify import verify_artifact
 
         return verify_artifact(self.folder)
-
-    def __repr__(self) -> str:
-        """Return name, stars and field in one line."""
-        stars = self.manifest["products"]["stars"]["rows"]
-        name = f"{self.manifest['name']}-{self.manifest['version']}"
-        epoch, count = self.manifest["epoch_jyear"], len(self.products)
-        return f"<Artifact {name}: {stars:,} guide stars at J{epoch:g}, {count} products>"
 
     def _repr_html_(self) -> str:
         """Return the products as a table for a notebook."""
@@ -199,3 +132,88 @@ def open_artifact(folder: PathLike) -> Artifact:
     """
     path = Path(folder)
     return Artifact(path, read_manifest(path))
+
+
+class Connection:
+    """Tables to ask in SQL, opened by `connect`; a context manager.
+
+    Parameters
+    ----------
+    targets : sequence of str
+        As for ``starcat sql``.
+    limits : Limits, optional
+        Time and memory of a query.
+    """
+
+    def __init__(self, targets: Sequence[str], limits: Limits | None = None) -> None:
+        from starcat.query.session import open_session
+
+        self._targets = targets
+        self._open = ExitStack()
+        self._session = self._open.enter_context(open_session(targets, limits))
+
+    def sql(self, text: str, **values: Any) -> Answer:
+        """Ask a query.
+
+        Parameters
+        ----------
+        text : str
+            SQL, one statement that reads.
+        **values
+            Values of the ``$name`` in it.
+
+        Returns
+        -------
+        Answer
+            All rows.
+
+        Raises
+        ------
+        QueryError
+            If the text is no query that may run.
+        QueryLimitError
+            If it takes more time or memory than it may.
+        """
+        from starcat.query.result import Answer
+
+        with self._session.ask(text, values) as answer:
+            return Answer(answer.batches().read_all())
+
+    def close(self) -> None:
+        """Forget the tables, and what was made to read them."""
+        self._open.close()
+
+    def __enter__(self) -> Connection:
+        """Return itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close it."""
+        self.close()
+
+    def __repr__(self) -> str:
+        """Return the targets in one line."""
+        return f"<Connection to {', '.join(self._targets)}>"
+
+
+def connect(*targets: PathLike, limits: Limits | None = None) -> Connection:
+    """Open artifacts, star tables and catalogs for questions in SQL.
+
+    Parameters
+    ----------
+    *targets : str or path-like
+        Folders of artifacts, Parquet files, archive files, or names of sources.
+    limits : Limits, optional
+        Time, memory and disk of a query.
+
+    Returns
+    -------
+    Connection
+        To be closed, or used in a ``with`` statement.
+
+    Raises
+    ------
+    QueryError, ProductError, SourceError
+        If a target cannot be read.
+    """
+    return Connection([os.fspath(target) for target in targets], limits)

@@ -30,109 +30,55 @@ _NO_ROWS: NDArray[np.intp] = np.empty(0, dtype=np.intp)
 
 @dataclass(frozen=True)
 class Change:
-    """A value that differs.
+    """A value that differs."""
 
-    Attributes
-    ----------
-    name : str
-        What it is; dotted for a key of the spec.
-    a, b : object
-        Its two values; None where one side has none.
-    """
-
-    name: str
-    a: object
+    name: str  # what it is; dotted for a key of the spec
+    a: object  # its two values; None where one side has none
     b: object
 
 
 @dataclass(frozen=True)
 class OneSided:
-    """A guide star of one artifact that is none of the other.
+    """A guide star of one artifact that is none of the other."""
 
-    Attributes
-    ----------
-    star_id : int
-        Permanent number.
-    designation : str
-        Name.
-    mag : float or None
-        Magnitude, where it is a guide star.
-    reason : str
-        Why the other artifact rejected it, or that it never read it.
-    """
-
-    star_id: int
+    star_id: int  # permanent number
     designation: str
-    mag: float | None
-    reason: str
+    mag: float | None  # magnitude, where it is a guide star
+    reason: str  # why the other artifact rejected it, or that it never read it
 
 
 @dataclass(frozen=True)
 class Moved:
-    """A guide star of both artifacts whose position or magnitude differs.
+    """A guide star of both artifacts whose position or magnitude differs."""
 
-    Attributes
-    ----------
-    star_id : int
-        Permanent number.
-    designation : str
-        Name.
-    moved_arcsec : float
-        Great-circle separation of the two positions.
-    mag_a, mag_b : float or None
-        Magnitudes.
-    """
-
-    star_id: int
+    star_id: int  # permanent number
     designation: str
-    moved_arcsec: float
-    mag_a: float | None
+    moved_arcsec: float  # great-circle separation of the two positions
+    mag_a: float | None  # magnitudes
     mag_b: float | None
 
 
 @dataclass(frozen=True)
 class ProductChange:
-    """A product in both artifacts.
-
-    Attributes
-    ----------
-    product : str
-        Its name.
-    rows_a, rows_b : int or None
-        Records; None where an artifact does not have it.
-    is_same : bool
-        Whether schema and content digest are equal.
-    """
+    """A product in both artifacts."""
 
     product: str
-    rows_a: int | None
+    rows_a: int | None  # records; None where an artifact does not have it
     rows_b: int | None
-    is_same: bool
+    is_same: bool  # whether schema and content digest are equal
 
 
 @dataclass(frozen=True)
 class Difference:
-    """What differs between artifact A and artifact B.
+    """What differs between artifact A and artifact B."""
 
-    Attributes
-    ----------
-    spec, sources, software : tuple of Change
-        Keys of the spec; digests and counts of the sources; versions.
-    came, went : tuple of OneSided
-        Guide stars of B alone, and of A alone.
-    moved : tuple of Moved
-        Guide stars of both, elsewhere or of another magnitude.
-    products : tuple of ProductChange
-        Every product of either.
-    """
-
-    spec: tuple[Change, ...]
+    spec: tuple[Change, ...]  # keys of the spec; digests and counts of the sources; versions
     sources: tuple[Change, ...]
     software: tuple[Change, ...]
-    came: tuple[OneSided, ...]
+    came: tuple[OneSided, ...]  # guide stars of B alone, and of A alone
     went: tuple[OneSided, ...]
-    moved: tuple[Moved, ...]
-    products: tuple[ProductChange, ...]
+    moved: tuple[Moved, ...]  # guide stars of both, elsewhere or of another magnitude
+    products: tuple[ProductChange, ...]  # every product of either
 
     @property
     def is_same(self) -> bool:

@@ -64,31 +64,19 @@ LIBRARIES = ("numpy", "scipy", "pyerfa", "pyarrow", "h5py", "pydantic", "matplot
 
 @dataclass(frozen=True)
 class SourceFacts:
-    """One source of a build as the manifest records it.
+    """One source of a build as the manifest records it."""
 
-    Attributes
-    ----------
-    source, role : str
-        Name of the data source; ``stars``, ``motions``, ``variability`` or ``crossmatch``.
-    files : sequence of FileFacts
-        Its input files.
-    rows_read, kept : int
-        Records, and how many of them became guide stars (of a joined source: were usable).
-    rejected : dict of str to int
-        The others, by reason.
-    joined : int, optional
-        Stars whose amplitude or motion came from this source, or whose counterpart is in it.
-    moved_arcsec : dict of str to float, optional
-        ``median`` and ``largest`` way of the stars whose motion came from this source.
-    """
-
+    # name of the data source; ``stars``, ``motions``, ``variability`` or ``crossmatch``
     source: str
     role: str
-    files: Sequence[FileFacts]
+    files: Sequence[FileFacts]  # its input files
+    # records, and how many of them became guide stars (of a joined source: were usable)
     rows_read: int
     kept: int
-    rejected: dict[str, int]
+    rejected: dict[str, int]  # the others, by reason
+    # stars whose amplitude or motion came from this source, or whose counterpart is in it
     joined: int | None = None
+    # ``median`` and ``largest`` way of the stars whose motion came from this source
     moved_arcsec: dict[str, float] | None = None
 
     def as_dict(self) -> dict[str, Any]:
@@ -110,27 +98,13 @@ class SourceFacts:
 
 @dataclass(frozen=True)
 class ProductFacts:
-    """One product of an artifact as the manifest records it.
+    """One product of an artifact as the manifest records it."""
 
-    Attributes
-    ----------
-    schema : ProductSchema
-        Its contract.
-    rows : int
-        Rows of its table.
-    content_sha256 : str
-        Digest of its values.
-    in_database : bool
-        Whether the HDF5 file has it too.
-    records : int, optional
-        For triangles, the sum over all boresights, which the papers count.
-    """
-
-    schema: ProductSchema
-    rows: int
-    content_sha256: str
-    in_database: bool
-    records: int | None = None
+    schema: ProductSchema  # its contract
+    rows: int  # rows of its table
+    content_sha256: str  # digest of its values
+    in_database: bool  # whether the HDF5 file has it too
+    records: int | None = None  # for triangles, the sum over all boresights, which the papers count
 
     def as_dict(self) -> dict[str, Any]:
         """Return the facts as the manifest holds them."""

@@ -1,38 +1,48 @@
-"""Reading an artifact."""
+"""Reading an artifact: its manifest at once, a table when it is asked for.
+
+Nothing here needs more than the standard library until a table is read.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import pyarrow as pa
-
-from starcat.artifact.manifest import read_manifest
+from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
 from starcat.errors import ProductError
-from starcat.storage.parquet import read_parquet
 from starcat.storage.schema import ProductSchema, product_schema
 
+if TYPE_CHECKING:
+    import pyarrow as pa
 
-@dataclass(frozen=True)
+    from starcat.specs.build_spec import BuildSpec
+
+
 class Artifact:
-    """An artifact on disk.
+    """An artifact on disk."""
 
-    Attributes
-    ----------
-    folder : Path
-        The folder ``<name>-<version>``.
-    manifest : dict
-        Its manifest.
-    """
-
-    folder: Path
-    manifest: dict[str, Any]
+    def __init__(self, folder: Path, manifest: dict[str, Any]) -> None:
+        self.folder = folder
+        self.manifest = manifest
 
     @property
-    def products(self) -> list[str]:
-        """Names of the products, in the order of the manifest."""
-        return list(self.manifest["products"])
+    def products(self) -> Products:
+        """The tables by name: ``artifact.products["pairs"]``."""
+        return Products(self)
+
+    @cached_property
+    def stars(self) -> pa.Table:
+        """The guide stars as an Arrow table, by star number."""
+        return self.table("stars")
+
+    @cached_property
+    def spec(self) -> BuildSpec:
+        """The spec that the artifact was built from."""
+        from starcat.specs.reading import spec_from_dict
+
+        return spec_from_dict(self.manifest["spec"], f"{self.folder.name}/{MANIFEST_NAME}")
 
     def schema(self, product: str) -> ProductSchema:
         """Return the schema that a product was written with."""
@@ -41,7 +51,11 @@ class Artifact:
 
     def table(self, product: str) -> pa.Table:
         """Read a product from its Parquet file."""
-        if product not in self.manifest["products"]:
+        import pyarrow as pa
+
+        from starcat.storage.parquet import read_parquet
+
+        if product not in self.products:
             raise ProductError(
                 f"{self.folder}: no product {product!r}; it has {', '.join(self.products)}",
                 product=product,
@@ -56,6 +70,44 @@ class Artifact:
                 product=product,
                 path=path,
             ) from error
+
+    def __repr__(self) -> str:
+        """Return name, stars and field in one line."""
+        stars = self.manifest["products"]["stars"]["rows"]
+        name = f"{self.manifest['name']}-{self.manifest['version']}"
+        epoch, count = self.manifest["epoch_jyear"], len(self.products)
+        return f"<Artifact {name}: {stars:,} guide stars at J{epoch:g}, {count} products>"
+
+
+class Products(Mapping[str, "pa.Table"]):
+    """The tables of an artifact by name, in the order of the manifest; each is read when used."""
+
+    def __init__(self, artifact: Artifact) -> None:
+        self._artifact = artifact
+        self._facts: dict[str, Any] = artifact.manifest["products"]
+
+    def __getitem__(self, name: str) -> pa.Table:
+        """Return a product as an Arrow table; `KeyError` if there is none of that name."""
+        if name not in self._facts:
+            raise KeyError(name)
+        return self._artifact.table(name)
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether there is a product, without reading it."""
+        return name in self._facts
+
+    def __iter__(self) -> Iterator[str]:
+        """Go through the names."""
+        return iter(self._facts)
+
+    def __len__(self) -> int:
+        """Return the number of products."""
+        return len(self._facts)
+
+    def __repr__(self) -> str:
+        """Return the names and rows in one line."""
+        counts = [f"{name} ({one['rows']:,})" for name, one in self._facts.items()]
+        return f"<Products: {', '.join(counts)}>"
 
 
 def open_artifact(folder: Path) -> Artifact:

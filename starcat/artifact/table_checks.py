@@ -30,27 +30,14 @@ SEPARATION_TOLERANCE_RAD = 1e-12
 
 @dataclass(frozen=True)
 class HeldProduct:
-    """A product as its Parquet file holds it, and what the manifest says of it.
+    """A product as its Parquet file holds it, and what the manifest says of it."""
 
-    Attributes
-    ----------
-    table : pyarrow.Table
-        The product.
-    schema : ProductSchema
-        Its contract.
-    facts : mapping of str to object
-        Its entry in the manifest.
-    directions : ndarray of float64, shape (N, 3)
-        Directions of the artifact's stars, ICRS; no rows where they are not known.
-    stars : pyarrow.Table, optional
-        The artifact's stars; None where they are not known.
-    """
-
-    table: pa.Table
-    schema: ProductSchema
-    facts: Mapping[str, Any]
+    table: pa.Table  # the product
+    schema: ProductSchema  # its contract
+    facts: Mapping[str, Any]  # its entry in the manifest
+    # shape (N, 3): directions of the artifact's stars, ICRS; no rows where they are not known
     directions: NDArray[np.float64]
-    stars: pa.Table | None = None
+    stars: pa.Table | None = None  # the artifact's stars; None where they are not known
 
 
 Check = Callable[[HeldProduct], Iterator[str]]

@@ -49,22 +49,13 @@ MAX_NAMED = 5
 
 @dataclass(frozen=True)
 class Finding:
-    """One problem of an artifact.
+    """One problem of an artifact."""
 
-    Attributes
-    ----------
-    file : str
-        Path within the artifact.
-    product : str
-        Product that the file holds; ``database`` for the HDF5 file as a whole, empty where there
-        is none.
-    problem : str
-        What was found and what was expected.
-    """
-
-    file: str
+    file: str  # path within the artifact
+    # product that the file holds; ``database`` for the HDF5 file as a whole, empty where there is
+    # none
     product: str
-    problem: str
+    problem: str  # what was found and what was expected
 
     def __str__(self) -> str:
         """Return file, product and problem as one line."""
@@ -74,21 +65,11 @@ class Finding:
 
 @dataclass(frozen=True)
 class Verification:
-    """What a verification found.
+    """What a verification found."""
 
-    Attributes
-    ----------
-    folder : Path
-        The artifact.
-    checks : int
-        Number of checks that were done.
-    findings : tuple of Finding
-        Every problem; none for a sound artifact.
-    """
-
-    folder: Path
-    checks: int
-    findings: tuple[Finding, ...]
+    folder: Path  # the artifact
+    checks: int  # number of checks that were done
+    findings: tuple[Finding, ...]  # every problem; none for a sound artifact
 
     def __repr__(self) -> str:
         """Return the outcome in one line."""

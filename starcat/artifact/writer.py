@@ -29,24 +29,12 @@ from starcat.storage.schema import product_schema
 
 @dataclass(frozen=True)
 class Product:
-    """A product on its way into an artifact.
+    """A product on its way into an artifact."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the product, which is that of its schema.
-    table : pyarrow.Table
-        With the columns of the schema, in the schema's order of rows.
-    index : Index
-        What a matcher needs beside the columns.
-    in_database : bool
-        Whether the matcher's HDF5 file holds it.
-    """
-
-    name: str
-    table: pa.Table
-    index: Index = field(default_factory=Index)
-    in_database: bool = True
+    name: str  # name of the product, which is that of its schema
+    table: pa.Table  # with the columns of the schema, in the schema's order of rows
+    index: Index = field(default_factory=Index)  # what a matcher needs beside the columns
+    in_database: bool = True  # whether the matcher's HDF5 file holds it
 
 
 def write_products(

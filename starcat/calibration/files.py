@@ -10,7 +10,7 @@ import numpy as np
 from starcat.calibration.calibrate import Calibration, calibrate_frames
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
-from starcat.images.identification import measure
+from starcat.images.solve_files import IdentifyOptions, measure
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.matcher import Matcher
 from starcat.progress import Progress, no_progress
@@ -49,7 +49,7 @@ def measured_frames(
     frames: list[MeasuredFrame] = []
     size_px: tuple[int, int] | None = None
     for number, path in enumerate(paths, start=1):
-        measured = measure(path, flip=flip)
+        measured = measure(path, IdentifyOptions(flip=flip))
         frames += measured.frames
         if measured.image is not None:
             height, width = measured.image.shape

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,15 +9,14 @@ import numpy as np
 
 from starcat.arrays import Array
 from starcat.calibration.calibrate import Calibration
-from starcat.errors import ConfigError, OutputError, reason
-from starcat.report.plots import headline, own_style
+from starcat.images.figure_file import check_kind, own_style, write_figure
+from starcat.report.plots import STYLE, headline
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
-KINDS = (".png", ".svg")
 _BLUE, _GREY, _RED = "#2c6e9e", "#b9c4cc", "#d1495b"
 _LONG_ARROW = 0.06
 """Length of an arrow of three standard deviations, in widths of the detector."""
@@ -27,28 +25,9 @@ _BINS = 8
 
 def draw_residuals(calibration: Calibration, path: Path) -> None:
     """Draw the residuals of a calibration."""
-    checked_kind(path)
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-
-    drawn = io.BytesIO()
-    with own_style():
-        figure = _figure(calibration)
-        if path.suffix.lower() == ".png":
-            FigureCanvasAgg(figure).print_figure(drawn, dpi=100, metadata={"Software": None})
-        else:
-            nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-            FigureCanvasSVG(figure).print_figure(drawn, metadata=nothing)
-    try:
-        path.write_bytes(drawn.getvalue())
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({reason(error)})", path=path) from error
-
-
-def checked_kind(path: Path | None) -> None:
-    """Refuse a name of a plot before the work for it is done."""
-    if path is not None and path.suffix.lower() not in KINDS:
-        raise ConfigError(f"{path}: a plot is one of {', '.join(KINDS)}; choose another name")
+    check_kind(path)
+    with own_style(STYLE):
+        write_figure(_figure(calibration), path)
 
 
 def _figure(calibration: Calibration) -> Figure:

@@ -16,6 +16,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from starcat.errors import ConfigError, suggest
+from starcat.failures import validation_message
 from starcat.resources import resource_folder
 
 UNITS = frozenset(
@@ -277,10 +278,8 @@ def read_source(path: Path) -> DataSource:
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path.name} is not a TOML file: {error}") from error
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        said = first["msg"].removeprefix("Value error, ")
-        raise ConfigError(f"{path.name}: {key}: {said}", key=key) from error
+        key, found = validation_message(error)
+        raise ConfigError(f"{path.name}: {key}: {found}", key=key) from error
 
 
 @cache

@@ -92,4 +92,4 @@ ANSWERS: dict[str, Answerer] = {
     "S1 L1": bare(_l1),
     "S1 L1 limited": bare(_l1_limited),
 }
-"""Ways to answer, by the name that a trial gives."""
+"""Ways to answer, by the name that an experiment gives."""

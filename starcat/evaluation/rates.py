@@ -1,4 +1,4 @@
-"""Rates, intervals and times of trials, and why frames failed, by SQL over their records."""
+"""Rates, intervals and times of experiments, and why frames failed, by SQL over their records."""
 
 from __future__ import annotations
 
@@ -62,15 +62,9 @@ GROUP BY cause
 
 @dataclass(frozen=True)
 class Share:
-    """So many of so many.
+    """So many of so many."""
 
-    Attributes
-    ----------
-    hits, count : int
-        Successes and frames.
-    """
-
-    hits: int
+    hits: int  # successes and frames
     count: int
 
     @property
@@ -97,40 +91,28 @@ class Share:
 
 
 @dataclass(frozen=True)
-class TrialRates:
-    """How a trial went.
+class ExperimentRates:
+    """How an experiment went."""
 
-    Attributes
-    ----------
-    ceiling : Share
-        Frames with at least four guide stars.
-    by_rule, by_rule_enough : Share
-        Successes by the paper's rule, of all frames and of those with four guide stars.
-    starcat, starcat_enough : Share
-        The same by starcat's own rule: accepted at 1e-9, attitude right, no star wrong.
-    wrong : int
-        Frames that starcat itself would have accepted with a wrong attitude.
-    mean_ms, median_ms, p95_ms : float
-        Time of an identification.
-    """
-
-    ceiling: Share
+    ceiling: Share  # frames with at least four guide stars
+    # successes by the paper's rule, of all frames and of those with four guide stars
     by_rule: Share
     by_rule_enough: Share
+    # the same by starcat's own rule: accepted at 1e-9, attitude right, no star wrong
     starcat: Share
     starcat_enough: Share
-    wrong: int
-    mean_ms: float
+    wrong: int  # frames that starcat itself would have accepted with a wrong attitude
+    mean_ms: float  # time of an identification
     median_ms: float
     p95_ms: float
 
 
-def rates_of(records: Path, rule: str, reach_px: float) -> TrialRates:
-    """Return the rates of a trial."""
+def rates_of(records: Path, rule: str, reach_px: float) -> ExperimentRates:
+    """Return the rates of an experiment."""
     query = _RATES.format(rule=RULES[rule], own=RULES["starcat"], accepted=_ACCEPTED, holds=_HOLDS)
     (row,) = _rows(query, records, reach_px)
     count, enough, hits, hits_enough, own, own_enough, wrong, mean, median, p95 = row
-    return TrialRates(
+    return ExperimentRates(
         Share(enough, count),
         Share(hits, count),
         Share(hits_enough, enough),
@@ -144,7 +126,7 @@ def rates_of(records: Path, rule: str, reach_px: float) -> TrialRates:
 
 
 def failures_of(records: Path, rule: str, reach_px: float) -> dict[str, int]:
-    """Count the frames of a trial that failed, by cause."""
+    """Count the frames of an experiment that failed, by cause."""
     cases = " ".join(f"WHEN {condition} THEN '{cause}'" for cause, condition in CAUSES.items())
     query = _FAILURES.format(cases=cases, rule=RULES[rule])
     return dict.fromkeys(CAUSES, 0) | dict(_rows(query, records, reach_px))

@@ -11,71 +11,74 @@ import csv
 import filecmp
 import io
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 
-from starcat.errors import ConfigError, OutputError
-from starcat.exchange.formats import FORMATS, SUFFIXES, write_batches
+from starcat.artifact.reader import open_artifact
+from starcat.errors import ConfigError, OutputError, SourceError, SourceMissing, suggest
+from starcat.exchange.columns import Label, field_facts
+from starcat.exchange.formats import EXPORT_FORMATS, FORMATS, ONBOARD_FORMATS
 from starcat.exchange.hats import MAX_ROWS, NEEDED, PROPERTIES_NAME, write_hats
-from starcat.exchange.label import Label
-from starcat.exchange.numpy_columns import field_facts
-from starcat.exchange.tables import NamedTables
+from starcat.exchange.writers import write_batches
 from starcat.storage.atomic import whole_folder
+from starcat.storage.parquet import read_parquet
 
-EXPORT_FORMATS = (*FORMATS, "hats")
 COLUMNS_NAME = "columns.csv"
 COLUMNS_HEADER = ("product", "column", "dtype", "unit", "description")
-WITHOUT_UNITS = ("csv", "npz")
+
+
+@dataclass(frozen=True)
+class NamedTables:
+    """Tables by product, of an artifact, a file or a peer; each is read when needed."""
+
+    name: str  # of all of them together, such as the artifact's name and version
+    readers: Mapping[str, Callable[[], pa.Table]]
+    artifact: str = ""  # empty where they are of none
+    version: str = ""
+
+    def label(self, product: str) -> Label:
+        """Return what an exported file says of its table."""
+        return Label(product, self.artifact, self.version)
+
+    def chosen(self, products: Sequence[str] | None) -> list[str]:
+        """Return some names, by default all, in the order of the tables."""
+        for product in products or ():
+            if product not in self.readers:
+                hint = suggest(product, self.readers)
+                raise ConfigError(
+                    f"{self.name} has no product {product!r}; {hint}it has "
+                    f"{', '.join(self.readers)}",
+                    key="product",
+                    value=product,
+                )
+        return [name for name in self.readers if not products or name in products]
 
 
 @dataclass(frozen=True)
 class ExportedFile:
-    """One product as it was written.
-
-    Attributes
-    ----------
-    product, name : str
-        Name of the table, and that of its file or folder.
-    rows, bytes : int
-        Written.
-    left_out : int
-        Rows without a position, which HATS has no place for.
-    """
+    """One product as it was written."""
 
     product: str
-    name: str
+    name: str  # of its file or folder
     rows: int
     bytes: int
-    left_out: int = 0
+    left_out: int = 0  # rows without a position, which HATS has no place for
 
 
 @dataclass(frozen=True)
 class Exported:
-    """An export.
+    """An export, one file a product."""
 
-    Attributes
-    ----------
-    source : str
-        Name of what was exported.
-    file_format : str
-        One of `EXPORT_FORMATS`.
-    folder : Path
-        The folder that was written into.
-    files : tuple of ExportedFile
-        One a product.
-    has_columns : bool
-        Whether ``columns.csv`` says what the columns are.
-    """
-
-    source: str
+    source: str  # name of what was exported
     file_format: str
     folder: Path
     files: tuple[ExportedFile, ...]
-    has_columns: bool
+    has_columns: bool  # whether columns.csv says what the columns are
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -88,6 +91,36 @@ class Exported:
         }
 
 
+def tables_of(path: Path) -> NamedTables:
+    """Return the tables of an artifact, or the one of a Parquet file."""
+    if path.is_dir():
+        artifact = open_artifact(path)
+        readers = {name: partial(artifact.table, name) for name in artifact.products}
+        name, version = artifact.manifest["name"], artifact.manifest["version"]
+        return NamedTables(f"{name}-{version}", readers, name, version)
+    if not path.exists():
+        raise SourceMissing(
+            f"{path}: does not exist; give the folder of an artifact or a Parquet file", path=path
+        )
+    return NamedTables(path.stem, {path.stem: partial(_read_file, path)})
+
+
+def in_memory(name: str, tables: Mapping[str, pa.Table]) -> NamedTables:
+    """Return tables that have been read."""
+    return NamedTables(name, {product: partial(tables.__getitem__, product) for product in tables})
+
+
+def _read_file(path: Path) -> pa.Table:
+    try:
+        return read_parquet(path)
+    except (OSError, pa.ArrowException) as error:
+        raise SourceError(
+            f"{path}: not a readable Parquet file ({error}); give the folder of an artifact or a "
+            "Parquet file, or say with --from-peer whose file it is",
+            path=path,
+        ) from error
+
+
 def export_tables(
     tables: NamedTables,
     file_format: str,
@@ -97,7 +130,10 @@ def export_tables(
     replace: bool = False,
     max_partition_rows: int = MAX_ROWS,
 ) -> Exported:
-    """Write tables in a format, one file a product."""
+    """Write tables in one of `EXPORT_FORMATS`, one file a product; other files in the folder stay.
+
+    Without products all are written, and for HATS all star tables.
+    """
     _check_asked(file_format, folder)
     columns: list[tuple[str, ...]] = []
     with whole_folder(folder) as partial:
@@ -112,7 +148,7 @@ def export_tables(
                 files.append(_write_hats(table, partial / product, name, max_partition_rows))
         if not files:
             raise ConfigError(f"{tables.name} has no star table, which HATS is for")
-        has_columns = file_format in WITHOUT_UNITS
+        has_columns = file_format in FORMATS and not FORMATS[file_format].has_units
         if has_columns:
             _write_columns(partial / COLUMNS_NAME, folder / COLUMNS_NAME, columns)
         _publish(partial, folder, replace=replace)
@@ -124,7 +160,7 @@ def _check_asked(file_format: str, folder: Path) -> None:
     if file_format not in EXPORT_FORMATS:
         raise ConfigError(
             f"format {file_format!r} is unknown; choose one of {', '.join(EXPORT_FORMATS)}, or "
-            "onboard or c",
+            f"{' or '.join(ONBOARD_FORMATS)}",
             key="to",
             value=file_format,
         )
@@ -133,7 +169,7 @@ def _check_asked(file_format: str, folder: Path) -> None:
 
 
 def _write_file(table: pa.Table, folder: Path, label: Label, file_format: str) -> ExportedFile:
-    path = folder / f"{label.table}{SUFFIXES[file_format][0]}"
+    path = folder / f"{label.table}{FORMATS[file_format].suffix}"
     rows = write_batches(table.to_reader(), path, file_format, label)
     return ExportedFile(label.table, path.name, rows, path.stat().st_size)
 

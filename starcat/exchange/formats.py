@@ -1,50 +1,108 @@
-"""Tables in the formats that other tools read: one table in, one file out.
+"""The formats that tables are written in: one table for commands, requests, TAP and pages.
 
-CSV, JSON, Parquet and VOTable are written batch by batch; FITS, ECSV and npz hold the table in
-memory. Units, meanings and UCDs come from the field metadata of the table. The same table gives
-the same bytes.
+`starcat.exchange.writers` writes them. This module loads nothing but the standard library.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import Literal, get_args
 
-import pyarrow as pa
+from starcat.errors import ConfigError, quoted
 
-from starcat.errors import ConfigError, OutputError
-from starcat.exchange.ecsv_file import write_ecsv
-from starcat.exchange.fits_file import write_fits
-from starcat.exchange.label import UNLABELLED, Label
-from starcat.exchange.npz_file import write_npz
-from starcat.exchange.numpy_columns import check_names, numpy_columns
-from starcat.exchange.parquet_stream import write_parquet_stream
-from starcat.exchange.text import csv_chunks, json_chunks
-from starcat.exchange.votable_file import write_votable
-from starcat.storage.atomic import whole_file
-
-SUFFIXES = {
-    "csv": (".csv",),
-    "json": (".json",),
-    "parquet": (".parquet",),
-    "votable": (".vot", ".xml"),
-    "fits": (".fits",),
-    "ecsv": (".ecsv",),
-    "npz": (".npz",),
-}
-"""The names of files by format, the usual one first."""
-
-FORMATS = tuple(SUFFIXES)
-TEXT_FORMATS = ("csv", "json")
-_CHUNKS: dict[str, Callable[[pa.RecordBatchReader], Iterator[tuple[bytes, int]]]] = {
-    "csv": csv_chunks,
-    "json": json_chunks,
-}
+PageFormat = Literal["csv", "json", "parquet", "votable", "fits", "ecsv"]
+FileFormat = Literal[PageFormat, "npz"]
 
 
-def format_of(path: str | Path) -> str:
-    """Return the format that the name of a file asks for.
+@dataclass(frozen=True)
+class Format:
+    """A format of a table."""
+
+    name: str
+    title: str  # as pages call it
+    suffixes: tuple[str, ...]  # of files, with the dot; the usual one first
+    media_type: str  # of a file
+    is_text: bool = False  # whether it may go to a terminal
+    has_units: bool = True  # whether a file says the units and meanings of its columns
+    tap_type: str = ""  # media type of an answer of TAP; empty where TAP does not offer it
+    aliases: tuple[str, ...] = ()  # other values of RESPONSEFORMAT, lower case, without spaces
+    standard_id: str = ""  # identifier of TAPRegExt
+
+    @property
+    def suffix(self) -> str:
+        """The usual end of a file's name, with the dot."""
+        return self.suffixes[0]
+
+    @property
+    def is_votable(self) -> bool:
+        """Whether it is a VOTable, which can say that rows were left out."""
+        return self.suffix == ".vot"
+
+
+_VOTABLE = "application/x-votable+xml"
+_VOTABLE_ID = "ivo://ivoa.net/std/TAPRegExt#output-votable-"
+
+FORMATS = {
+    one.name: one
+    for one in (
+        Format(
+            "csv", "CSV", (".csv",), "text/csv; charset=utf-8",
+            is_text=True, has_units=False,
+            tap_type="text/csv;header=present", aliases=("text/csv",),
+        ),
+        Format(
+            "json", "JSON", (".json",), "application/json",
+            is_text=True, tap_type="application/json",
+        ),
+        Format(
+            "parquet", "Parquet", (".parquet",), "application/vnd.apache.parquet",
+            tap_type="application/vnd.apache.parquet",
+            aliases=("application/x-parquet", "application/parquet"),
+        ),
+        # Rows of a file are text, which every tool reads; rows of an answer of TAP are BINARY2.
+        Format(
+            "votable", "VOTable", (".vot", ".xml"), _VOTABLE,
+            tap_type=f"{_VOTABLE};serialization=binary2",
+            aliases=(
+                _VOTABLE, "text/xml", "votable/b2", "votable/binary2",
+                f"{_VOTABLE};serialization=binary2;content=votable",
+            ),
+            standard_id=f"{_VOTABLE_ID}binary2",
+        ),
+        Format(
+            "fits", "FITS", (".fits",), "application/fits",
+            tap_type="application/fits", aliases=("image/fits",),
+        ),
+        Format("ecsv", "ECSV", (".ecsv",), "text/plain; charset=utf-8"),
+        Format("npz", "npz", (".npz",), "application/octet-stream", has_units=False),
+        Format(
+            "votable/td", "VOTable", (".vot",), _VOTABLE,
+            tap_type=f"{_VOTABLE};serialization=tabledata",
+            aliases=("votable/tabledata",), standard_id=f"{_VOTABLE_ID}td",
+        ),
+        Format(
+            "tsv", "TSV", (".tsv",), "text/tab-separated-values",
+            has_units=False, tap_type="text/tab-separated-values",
+        ),
+    )
+}  # fmt: skip
+"""All formats by name."""
+
+FILE_FORMATS: tuple[FileFormat, ...] = get_args(FileFormat)
+PAGE_FORMATS: tuple[PageFormat, ...] = get_args(PageFormat)
+TEXT_FORMATS = tuple(name for name in FILE_FORMATS if FORMATS[name].is_text)
+EXPORT_FORMATS = (*FILE_FORMATS, "hats")
+ONBOARD_FORMATS = ("onboard", "c")
+
+TAP_FORMATS = tuple(
+    FORMATS[name] for name in ("votable", "votable/td", "fits", "csv", "tsv", "json", "parquet")
+)
+"""What TAP answers in; the first is that of requests that name none."""
+
+
+def format_of(path: str | Path) -> FileFormat:
+    """Return the format that the suffix of a file's name asks for, in any case.
 
     Examples
     --------
@@ -52,86 +110,33 @@ def format_of(path: str | Path) -> str:
     'votable'
     """
     suffix = Path(path).suffix.lower()
-    for file_format, suffixes in SUFFIXES.items():
-        if suffix in suffixes:
-            return file_format
-    choices = ", ".join(suffix for suffixes in SUFFIXES.values() for suffix in suffixes)
+    for name in FILE_FORMATS:
+        if suffix in FORMATS[name].suffixes:
+            return name
+    choices = ", ".join(suffix for name in FILE_FORMATS for suffix in FORMATS[name].suffixes)
     raise ConfigError(
         f"{path}: the name says no format that starcat writes; end it with one of {choices}",
         value=str(path),
     )
 
 
-def write_batches(
-    batches: pa.RecordBatchReader, target: Path, file_format: str, label: Label = UNLABELLED
-) -> int:
-    """Write a table to a file, which appears at its name when it is whole.
+def response_format(text: str | None) -> Format:
+    """Return the format that RESPONSEFORMAT of TAP asks for, by name or media type.
 
-    Notes
-    -----
-    What goes wrong with reading the batches is raised as it comes.
+    Examples
+    --------
+    >>> response_format("text/csv; header=present").name
+    'csv'
     """
-    _check(file_format, FORMATS)
-    failures: list[Exception] = []
-    watched = pa.RecordBatchReader.from_batches(batches.schema, _watched(batches, failures))
-    try:
-        with whole_file(target) as partial:
-            return _write(watched, partial, file_format, label)
-    except OutputError:
-        if failures:  # DuckDB's errors come as those of files do, but it was no writing that failed
-            raise failures[0] from None
-        raise
-
-
-def write_text_batches(batches: pa.RecordBatchReader, stream: IO[str], file_format: str) -> int:
-    """Write a table as text, for instance to the standard output."""
-    _check(file_format, TEXT_FORMATS)
-    rows = 0
-    for text, more in _CHUNKS[file_format](batches):
-        stream.write(text.decode())
-        rows += more
-    return rows
-
-
-def _watched(batches: pa.RecordBatchReader, failures: list[Exception]) -> Iterator[pa.RecordBatch]:
-    """Yield the batches, and remember what goes wrong with reading them."""
-    try:
-        yield from batches
-    except Exception as error:
-        failures.append(error)
-        raise
-
-
-def _write(batches: pa.RecordBatchReader, path: Path, file_format: str, label: Label) -> int:
-    if file_format in TEXT_FORMATS:
-        rows = 0
-        with path.open("wb") as stream:
-            for text, more in _CHUNKS[file_format](batches):
-                stream.write(text)
-                rows += more
-        return rows
-    if file_format == "parquet":
-        return write_parquet_stream(batches, path)
-    if file_format == "votable":
-        return write_votable(batches, path, label)
-    return _write_table(batches.read_all(), path, file_format, label)
-
-
-def _write_table(table: pa.Table, path: Path, file_format: str, label: Label) -> int:
-    columns = numpy_columns(table, signed=file_format == "fits")
-    check_names(table.column_names, file_format)
-    if file_format == "fits":
-        write_fits(columns, len(table), path, label)
-    elif file_format == "ecsv":
-        write_ecsv(columns, path, label)
-    else:
-        write_npz(columns, path)
-    return len(table)
-
-
-def _check(file_format: str, choices: tuple[str, ...]) -> None:
-    if file_format not in choices:
-        raise ConfigError(
-            f"format {file_format!r} is unknown here; choose one of {', '.join(choices)}",
-            value=file_format,
-        )
+    wanted = "".join((text or "votable").lower().split()).replace('"', "")
+    # The plus of a media type that nobody has escaped in an address arrives as a blank.
+    wanted = wanted.replace("x-votablexml", "x-votable+xml")
+    for one in TAP_FORMATS:
+        if wanted in (one.name, one.tap_type, *one.aliases):
+            return one
+    known = ", ".join(one.name for one in TAP_FORMATS)
+    raise ConfigError(
+        f"RESPONSEFORMAT {quoted(text or '')} is not known; choose one of {known}",
+        key="RESPONSEFORMAT",
+        value=text,
+    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,8 +10,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from starcat.arrays import Mask
 from starcat.errors import SchemaError
-from starcat.exchange.column_types import is_list, is_number, plain_schema, time_texts
+from starcat.exchange.columns import field_facts, is_list, is_number, plain_schema, time_texts
 from starcat.exchange.text import json_texts
 
 _WIDER = {
@@ -26,27 +26,16 @@ _WIDER = {
 
 @dataclass(frozen=True)
 class NumpyColumn:
-    """One column as numpy holds it.
-
-    Attributes
-    ----------
-    name : str
-        Name of the column.
-    values : ndarray, shape (N,) or, for a ragged column, all items one after the other
-        Numbers, truth values, or texts as objects. Null is NaN, 0, False or an empty text.
-    is_null : ndarray of bool, shape (N,)
-        Rows without a value.
-    offsets : ndarray of int64, shape (N + 1,), optional
-        Where the list of each row begins and ends in `values`; None where rows are no lists.
-    facts : dict of str to str
-        ``unit``, ``description`` and ``ucd`` where the column has them.
-    """
+    """One column of N rows as numpy holds it."""
 
     name: str
+    # Numbers, truth values, or texts as objects; of a ragged column all items one after the other.
+    # Null is NaN, 0, False or an empty text.
     values: NDArray[Any]
-    is_null: NDArray[np.bool_]
+    is_null: Mask
+    # Shape (N + 1,): where the list of each row begins and ends; None where rows are no lists.
     offsets: NDArray[np.int64] | None
-    facts: dict[str, str]
+    facts: dict[str, str]  # unit, description and ucd where the column has them
 
     @property
     def is_text(self) -> bool:
@@ -61,33 +50,16 @@ class NumpyColumn:
 
 
 def numpy_columns(table: pa.Table, *, signed: bool) -> list[NumpyColumn]:
-    """Return the columns of a table as numpy arrays."""
+    """Return the columns of a table as numpy arrays.
+
+    With `signed`, integers are of the types that FITS and VOTable have: bytes without a sign, and
+    16, 32 and 64 bits with one.
+    """
     table = table.cast(plain_schema(table.schema))
     return [
         _numpy_column(field, table[field.name].combine_chunks(), signed=signed)
         for field in table.schema
     ]
-
-
-def check_names(names: Iterable[str], file_format: str) -> None:
-    """Refuse a column without a name, which these formats have no place for."""
-    for number, name in enumerate(names, start=1):
-        if not name:
-            raise SchemaError(
-                f"column {number} has an empty name, which {file_format} cannot hold; give it "
-                "one with AS",
-                field=name,
-            )
-
-
-def field_facts(field: pa.Field) -> dict[str, str]:
-    """Return what the metadata of a field says about its column."""
-    known = field.metadata or {}
-    return {
-        key: known[key.encode()].decode()
-        for key in ("unit", "description", "ucd")
-        if known.get(key.encode())
-    }
 
 
 def _numpy_column(field: pa.Field, values: pa.Array, *, signed: bool) -> NumpyColumn:

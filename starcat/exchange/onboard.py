@@ -31,27 +31,13 @@ from starcat.storage.atomic import whole_file
 
 @dataclass(frozen=True)
 class ExportedImage:
-    """An onboard image as it was written.
-
-    Attributes
-    ----------
-    made : MadeImage
-        The image.
-    fitted : Fitted
-        What is in it, and what was left out.
-    file_format : {"onboard", "c"}
-        What was written.
-    byte_order : {"little", "big"}
-        That of the target.
-    files : tuple of Path
-        The image, or source and header.
-    """
+    """An onboard image as it was written."""
 
     made: MadeImage
-    fitted: Fitted
+    fitted: Fitted  # what is in it, and what was left out
     file_format: str
     byte_order: str
-    files: tuple[Path, ...]
+    files: tuple[Path, ...]  # the image, or source and header
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""

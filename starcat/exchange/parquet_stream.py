@@ -9,25 +9,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from starcat.exchange.column_types import is_list, plain_batch, plain_schema
+from starcat.exchange.columns import Label, is_list, plain_batch, plain_schema
 from starcat.storage.parquet import ROW_GROUP_ROWS
-from starcat.storage.votable import astropy_metadata, votable_metadata
-
-_DESCRIBED = {
-    pa.bool_(),
-    pa.uint8(),
-    pa.int16(),
-    pa.int32(),
-    pa.int64(),
-    pa.float32(),
-    pa.float64(),
-    pa.string(),
-}
-"""The types that VOParquet's description of a table has words for."""
+from starcat.storage.votable import ARROW_DATATYPES, astropy_metadata, votable_metadata
 
 
-def write_parquet_stream(batches: pa.RecordBatchReader, path: Path) -> int:
-    """Write batches as a Parquet file."""
+def write_parquet_stream(batches: pa.RecordBatchReader, path: Path, label: Label) -> int:
+    """Write a table as a Parquet file, which has no place for a label; return its rows."""
     schema = plain_schema(batches.schema)
     texts = [field.name for field in schema if pa.types.is_string(field.type)]
     floating = [field.name for field in schema if pa.types.is_floating(field.type)]
@@ -71,7 +59,7 @@ def _longest(texts: pa.ChunkedArray) -> str:
 def _footer(schema: pa.Schema, longest: dict[str, str]) -> dict[str, str]:
     """Return what describes the columns; nothing for types that the standard has no words for."""
     kinds = {field.type.value_type if is_list(field.type) else field.type for field in schema}
-    if not kinds <= _DESCRIBED:
+    if not kinds <= set(ARROW_DATATYPES):
         return {}
     # A row with the longest text of each column stands in for the table.
     row = [pa.array([longest.get(field.name)], field.type) for field in schema]

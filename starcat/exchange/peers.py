@@ -25,7 +25,7 @@ from starcat.catalog.ingest import ingest
 from starcat.catalog.quality import Quality
 from starcat.catalog.stars import numbered, sort_rows, table_from_columns
 from starcat.errors import ConfigError, SourceError, SourceMissing, reason
-from starcat.exchange.tables import NamedTables, in_memory
+from starcat.exchange.export import NamedTables, in_memory
 from starcat.geometry.sphere import directions_from_radec
 
 _COLUMNS = 6

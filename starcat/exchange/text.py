@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.csv as pcsv
 
-from starcat.exchange.column_types import is_list, plain_batch, plain_schema, time_texts
+from starcat.exchange.columns import is_list, plain_batch, plain_schema, time_texts
 
 _STEP_ROWS = 1 << 14
 _BREAKS = "[\\t\\r\\n]"

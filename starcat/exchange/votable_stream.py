@@ -13,23 +13,32 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from itertools import chain, islice
+from pathlib import Path
 from typing import Literal
 
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from starcat.errors import StarcatError
-from starcat.exchange.column_types import plain_batch, plain_schema
-from starcat.exchange.first_rows import FirstRows
-from starcat.exchange.label import UNLABELLED, Label
-from starcat.exchange.votable_binary2 import Binary2
-from starcat.exchange.votable_columns import VotableColumn, cells_of, votable_columns
-from starcat.exchange.votable_header import foot, has_places, head, info
-from starcat.exchange.votable_text import Tabledata
+from starcat.exchange.columns import UNLABELLED, FirstRows, Label, plain_batch, plain_schema
+from starcat.exchange.votable_fields import (
+    EPOCH_PLACE,
+    VotableColumn,
+    cells_of,
+    foot,
+    has_places,
+    head,
+    info,
+    votable_columns,
+)
+from starcat.exchange.votable_rows import Binary2, Tabledata
 
 Serialization = Literal["binary2", "tabledata"]
 
 _EPOCH = "epoch_jyear"
+_EPOCH_ROOM = 32
+"""Letters that a file leaves for the epoch, which is known when all rows are written."""
+
 _STEP_ROWS = 1 << 14
 _STEP_BYTES = 8 << 20
 _THREADS = 2
@@ -45,29 +54,24 @@ def votable_chunks(
     maxrec: int | None = None,
     infos: Mapping[str, str] | None = None,
 ) -> Iterator[bytes]:
-    """Yield a table as a VOTable with a status, as services answer.
+    """Yield a table as a VOTable with a status, as DALI 1.1, section 4.4 has services answer.
 
-    Notes
-    -----
-    What goes wrong with the first rows is raised before anything is given. What goes wrong later
-    ends the document with ``QUERY_STATUS`` ``ERROR``.
-
-    References
-    ----------
-    DALI 1.1, section 4.4.
+    With `maxrec` no more rows are given; one row more has to be among the batches for it to be
+    known that some were left out. What goes wrong with the first rows is raised before anything is
+    given. What goes wrong later ends the document with ``QUERY_STATUS`` ``ERROR``.
     """
     schema = plain_schema(batches.schema)
     columns = votable_columns(schema)
     cut = FirstRows(batches, maxrec)
     read = iter(cut)
     epoch = ""
-    if has_epoch(schema, columns):
+    if _has_epoch(schema, columns):
         begun = list(islice(read, 2))
         read = chain(begun, read)
         # The document begins before the rest is known, so it says the epoch of short tables only.
-        epoch = epoch_attribute(epochs_of(begun)) if len(begun) < 2 else ""
+        epoch = _epoch_attribute(_epochs_of(begun)) if len(begun) < 2 else ""
     told = {"QUERY_STATUS": "OK", **(infos or {})}
-    rows = row_chunks(read, schema, columns, serialization)
+    rows = _row_chunks(read, schema, columns, serialization)
     first = next(rows, b"")
     yield head(columns, serialization, label, told, epoch).encode()
     yield first
@@ -83,7 +87,35 @@ def votable_chunks(
     yield foot(serialization, last).encode()
 
 
-def row_chunks(
+def write_votable(batches: pa.RecordBatchReader, path: Path, label: Label) -> int:
+    """Write a table as a VOTable file with rows as text; return its rows."""
+    schema = plain_schema(batches.schema)
+    columns = votable_columns(schema)
+    with_epoch = _has_epoch(schema, columns)
+    epochs: set[float] = set()
+    count = 0
+
+    def watched() -> Iterator[pa.RecordBatch]:
+        nonlocal count, epochs
+        for batch in batches:
+            count += batch.num_rows
+            if with_epoch and len(epochs) < 2:
+                epochs |= _epochs_of([batch])
+            yield batch
+
+    top = head(columns, "tabledata", label, {}, " " * _EPOCH_ROOM if with_epoch else "").encode()
+    with path.open("wb") as stream:
+        stream.write(top)
+        for chunk in _row_chunks(watched(), schema, columns, "tabledata"):
+            stream.write(chunk)
+        stream.write(foot("tabledata").encode())
+        if with_epoch:
+            stream.seek(top.index(EPOCH_PLACE) + len(EPOCH_PLACE))
+            stream.write(_epoch_attribute(epochs).encode())
+    return count
+
+
+def _row_chunks(
     batches: Iterable[pa.RecordBatch],
     schema: pa.Schema,
     columns: Sequence[VotableColumn],
@@ -91,10 +123,7 @@ def row_chunks(
 ) -> Iterator[bytes]:
     """Yield what stands between the head and the foot of a VOTable.
 
-    Notes
-    -----
-    What goes wrong with reading the batches is raised as it comes, after the rows before it were
-    given.
+    What goes wrong with reading the batches is raised after the rows before it were given.
     """
     writer = Binary2(columns) if serialization == "binary2" else Tabledata(columns)
     encode = partial(_encoded, schema=schema, columns=columns, rows=writer.rows)
@@ -118,14 +147,13 @@ def row_chunks(
         raise failure
 
 
-def has_epoch(schema: pa.Schema, columns: Sequence[VotableColumn]) -> bool:
-    """Return whether a table has coordinates and says of which epoch they are."""
+def _has_epoch(schema: pa.Schema, columns: Sequence[VotableColumn]) -> bool:
     place = schema.get_field_index(_EPOCH)
     return place >= 0 and pa.types.is_floating(schema.field(place).type) and has_places(columns)
 
 
-def epochs_of(batches: Iterable[pa.RecordBatch]) -> set[float]:
-    """Return the epochs of the positions of batches."""
+def _epochs_of(batches: Iterable[pa.RecordBatch]) -> set[float]:
+    """Return at most two epochs of each batch; more than one means none in common."""
     found: set[float] = set()
     for batch in batches:
         extremes = pc.min_max(batch.column(_EPOCH)).as_py()
@@ -133,8 +161,7 @@ def epochs_of(batches: Iterable[pa.RecordBatch]) -> set[float]:
     return found
 
 
-def epoch_attribute(epochs: set[float]) -> str:
-    """Return the attribute of the coordinate system with the epoch."""
+def _epoch_attribute(epochs: set[float]) -> str:
     if len(epochs) != 1:
         return ""
     [epoch] = epochs

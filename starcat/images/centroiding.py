@@ -23,9 +23,8 @@ from starcat.images.background import (
     repair_hot_pixels,
     subtract_background,
 )
-from starcat.images.detection import detect
+from starcat.images.detection import detect, trail_px
 from starcat.images.spot_width import SIGMA_RANGE_PX, is_sharp, sigma_of_stars
-from starcat.images.trails import trail_px
 
 _NARROWEST_WINDOW_PX = 1.0  # a narrower window follows the pixel grid (docs/decisions.md)
 _APERTURE_SIGMA, _EDGE_SIGMA = 2.0, 3.0

@@ -24,6 +24,11 @@ _MOST_PARTS = 4096
 """Parts that sep may divide an object into: a Moon with its glow has thousands."""
 _RAISE, _TRIES = 1.5, 4
 """The threshold is raised by this factor, so many times, where the room does not do."""
+_FEWEST, _MOST = 5, 30
+_LONG = 2.5
+"""Length over width from which a spot is long, by standard deviations along its axes."""
+_ALIGNED = 0.9
+"""Length of the mean of unit vectors with twice the angle: 1 if all are parallel."""
 
 
 def detect(levels: Levels, sigma: float, threshold: float) -> NDArray[Any]:
@@ -95,3 +100,18 @@ def _filtered(
     known = levels.noise * np.float32((profile**2).sum())
     noise = np.maximum(background.rms(dtype=np.float32), known)
     return image - background.back(dtype=np.float32), noise
+
+
+def trail_px(found: NDArray[Any]) -> float | None:
+    """Return the length of trails."""
+    bright = found[np.argsort(-found["flux"], kind="stable")[:_MOST]]
+    if len(bright) < _FEWEST:
+        return None
+    long, wide = bright["a"].astype(np.float64), bright["b"].astype(np.float64)
+    is_long = long > _LONG * np.maximum(wide, 0.3)
+    if is_long.mean() <= 0.5:
+        return None
+    if abs(np.exp(2j * bright["theta"][is_long].astype(np.float64)).mean()) < _ALIGNED:
+        return None
+    # The variance of a bar along itself is a twelfth of its length squared.
+    return float(np.median(np.sqrt(12.0 * (long**2 - wide**2)[is_long])))

@@ -25,25 +25,25 @@ from starcat.catalog.stars import directions_of, sort_rows
 from starcat.catalog.variability import AmplitudeTable, join_amplitudes, read_amplitudes
 from starcat.errors import BuildError, ConfigError
 from starcat.matcher.matcher import Matcher
+from starcat.pipeline.acceptance import advice_without_magnitudes, check_rates
 from starcat.pipeline.cost import Cost, check_memory, estimate_cost
 from starcat.pipeline.counterparts import match_catalogs
-from starcat.pipeline.facts import (
-    FilterCoverage,
-    Results,
-    build_facts,
-    filter_coverages,
-    source_facts,
-)
 from starcat.pipeline.guide_stars import select_stars
-from starcat.pipeline.judgement import advice_without_magnitudes, check_rates
 from starcat.pipeline.log import Stopwatch, write_build_log
 from starcat.pipeline.motions import join_motions, motion_notes, motion_product, motion_sources
 from starcat.pipeline.recipes import (
     RECIPES,
-    Ingredients,
+    ProductInputs,
     boresight_product,
-    cook,
     level_product,
+    make_product,
+)
+from starcat.pipeline.report_data import (
+    BuildResults,
+    FilterCoverage,
+    build_facts,
+    filter_coverages,
+    source_facts,
 )
 from starcat.products.boresights import FieldStars
 from starcat.progress import Progress, no_progress
@@ -66,39 +66,18 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Built:
-    """A finished build.
+    """A finished build."""
 
-    Attributes
-    ----------
-    folder : Path
-        The artifact.
-    outcome : {"written", "unchanged", "replaced"}
-        What happened to the folder.
-    manifest : dict
-        Manifest of the artifact.
-    filters : tuple of FilterCoverage
-        What each filter left.
-    coverage : CoverageReport
-        Coverage by the guide stars.
-    rates : tuple of Rates
-        Rates of the self-test: clean and hard frames, and the same without magnitudes.
-    problems : tuple of str
-        The first malformed records.
-    warnings : tuple of str
-        What is worth a second look, such as holes of the tiling.
-    times_s : dict of str to float
-        Seconds by stage.
-    """
-
-    folder: Path
-    outcome: Outcome
-    manifest: dict[str, Any]
-    filters: tuple[FilterCoverage, ...]
-    coverage: CoverageReport
+    folder: Path  # the artifact
+    outcome: Outcome  # "written", "unchanged", "replaced": What happened to the folder
+    manifest: dict[str, Any]  # manifest of the artifact
+    filters: tuple[FilterCoverage, ...]  # what each filter left
+    coverage: CoverageReport  # coverage by the guide stars
+    # rates of the self-test: clean and hard frames, and the same without magnitudes
     rates: tuple[Rates, ...]
-    problems: tuple[str, ...]
-    warnings: tuple[str, ...]
-    times_s: dict[str, float]
+    problems: tuple[str, ...]  # the first malformed records
+    warnings: tuple[str, ...]  # what is worth a second look, such as holes of the tiling
+    times_s: dict[str, float]  # seconds by stage
 
     def __repr__(self) -> str:
         """Return the artifact and how it identifies in one line."""
@@ -178,7 +157,7 @@ def _make(partial: Path, plan: _Plan, clock: Stopwatch, progress: Progress) -> B
     star_source, *others = source_facts(catalog, selected, amplitudes, joined)
     sources = [star_source, *motion_sources(motions, products), *others, *matched.sources]
     filters = filter_coverages(selected.steps, fields, spec)
-    results = Results(spec, sources, products, facts, fields, filters, rates)
+    results = BuildResults(spec, sources, products, facts, fields, filters, rates)
     report = report_build(partial, results)
     clock.lap("report")
     manifest = write_manifest(partial, spec.recorded(), sources, facts)
@@ -239,7 +218,7 @@ def join_all(
     return stars, joined
 
 
-def report_build(folder: Path, results: Results) -> CoverageReport:
+def report_build(folder: Path, results: BuildResults) -> CoverageReport:
     """Write the report of a build."""
     facts = build_facts(folder, results)
     (folder / "report").mkdir()
@@ -265,11 +244,11 @@ def make_products(
         Product("rejected", sort_rows(rejected, order), in_database=False),
         boresight_product(fields, spec.boresights.brightest),
     ]
-    given = Ingredients(directions_of(selected.guide_stars), fields, spec)
+    product_inputs = ProductInputs(directions_of(selected.guide_stars), fields, spec)
     for name in RECIPES:
         if getattr(spec.products, name).enabled:
             progress(f"product {name}", 0, None)
-            products.append(cook(name, given))
+            products.append(make_product(name, product_inputs))
     if spec.products.levels.enabled:
         progress("product levels", 0, None)
         products.append(level_product(selected.guide_stars, spec))

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from starcat.arrays import Array
 from starcat.geometry.sphere import chord_from_separation
-from starcat.pipeline.recipes import RECIPES, Ingredients, field_size
+from starcat.pipeline.recipes import RECIPES, ProductInputs, field_size
 from starcat.products.boresights import FieldStars
 from starcat.products.levels import level_fields, thin_levels
 from starcat.specs.build_spec import BuildSpec
@@ -38,37 +38,26 @@ GOLDEN_RATIO = 0.5 * (1.0 + 5.0**0.5)
 
 @dataclass(frozen=True)
 class Extent:
-    """How large a product will be.
+    """How large a product will be."""
 
-    Attributes
-    ----------
-    rows : float
-        Rows of its table.
-    values : float
-        Entries of its lists, all rows together; 0 where it has none.
-    reached : float
-        Neighbours that are gone through to make it; its rows where these are what it lists.
-    records : float
-        Triangles over all fields, repeats included; 0 for other products.
-    """
-
-    rows: float
-    values: float = 0.0
+    rows: float  # rows of its table
+    values: float = 0.0  # entries of its lists, all rows together; 0 where it has none
+    # neighbours that are gone through to make it; its rows where these are what it lists
     reached: float = 0.0
-    records: float = 0.0
+    records: float = 0.0  # triangles over all fields, repeats included; 0 for other products
 
 
-def count_products(given: Ingredients) -> dict[str, Extent]:
+def count_products(inputs: ProductInputs) -> dict[str, Extent]:
     """Count the rows of the products that are made from guide stars alone."""
-    spec, stars = given.spec, len(given.directions)
+    spec, stars = inputs.spec, len(inputs.directions)
     wanted = [name for name in RECIPES if getattr(spec.products, name).enabled]
-    reach = {name: _reach_rad(name, given) for name in wanted if name != "triangles"}
+    reach = {name: _reach_rad(name, inputs) for name in wanted if name != "triangles"}
     inner = {name: _inner_rad(name, spec) for name in reach}
-    near = _neighbours_within(given.directions, {*reach.values(), *inner.values()})
+    near = _neighbours_within(inputs.directions, {*reach.values(), *inner.values()})
     found: dict[str, Extent] = {}
     for name in wanted:
         if name == "triangles":
-            records, distinct = count_triangles(given.fields, stars, spec.boresights.brightest)
+            records, distinct = count_triangles(inputs.fields, stars, spec.boresights.brightest)
             found[name] = Extent(distinct, reached=distinct, records=records)
             continue
         around = near[reach[name]] - (near[inner[name]] if inner[name] > 0.0 else 0.0)
@@ -90,24 +79,12 @@ def count_products(given: Ingredients) -> dict[str, Extent]:
 
 @dataclass(frozen=True)
 class LevelExtent:
-    """How large the product ``levels`` will be.
-
-    Attributes
-    ----------
-    levels : int
-        Its rows.
-    stars : int
-        Stars of all levels.
-    triangles : float
-        Triangles of all levels.
-    records : float
-        The same over all fields, repeats included.
-    """
+    """How large the product ``levels`` will be."""
 
     levels: int
-    stars: int
-    triangles: float
-    records: float
+    stars: int  # stars of all levels
+    triangles: float  # triangles of all levels
+    records: float  # the same over all fields, repeats included
 
 
 def count_levels(directions: Array, mag: Array, spec: BuildSpec) -> LevelExtent:
@@ -126,14 +103,14 @@ def count_levels(directions: Array, mag: Array, spec: BuildSpec) -> LevelExtent:
     return LevelExtent(len(fields), stars, triangles, records)
 
 
-def _reach_rad(name: str, given: Ingredients) -> float:
+def _reach_rad(name: str, inputs: ProductInputs) -> float:
     """Return how far apart two stars of a row of a product may be."""
-    wanted = getattr(given.spec.products, name)
+    wanted = getattr(inputs.spec.products, name)
     if name == "pairs":
         if wanted.max_separation_deg is None:
-            return given.spec.camera.camera().diagonal_rad
+            return inputs.spec.camera.camera().diagonal_rad
         return float(np.radians(wanted.max_separation_deg))
-    return given.radius_rad(wanted.radius_deg, 4.0 / 3.0 if name == "hausdorff_angular" else 1.0)
+    return inputs.radius_rad(wanted.radius_deg, 4.0 / 3.0 if name == "hausdorff_angular" else 1.0)
 
 
 def _inner_rad(name: str, spec: BuildSpec) -> float:

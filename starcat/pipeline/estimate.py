@@ -22,7 +22,8 @@ from starcat.catalog.verdict import Reason
 from starcat.errors import BuildError
 from starcat.geometry.sphere import saff_kuijlaars
 from starcat.pipeline.build import Inputs
-from starcat.pipeline.cost import Cost, Made, base_memory, check_memory, whole_cost
+from starcat.pipeline.catalog_snapshot import SAMPLE_ROWS, CatalogSnapshot, read_snapshot
+from starcat.pipeline.cost import Cost, base_memory, check_memory, table_bytes, whole_cost
 from starcat.pipeline.guide_stars import (
     MIN_GUIDE_STARS,
     MOST_FIELD_STARS,
@@ -32,8 +33,6 @@ from starcat.pipeline.guide_stars import (
 )
 from starcat.pipeline.motions import motions_of
 from starcat.pipeline.recipes import field_size, tile_guide_stars
-from starcat.pipeline.sizes import table_bytes
-from starcat.pipeline.stars_read import SAMPLE_ROWS, StarsRead, read_stars
 from starcat.products.boresights import FieldStars
 from starcat.products.coverage import (
     CoverageSummary,
@@ -54,21 +53,12 @@ MOST_FOR_GAPS = 50_000
 
 @dataclass(frozen=True)
 class Choice:
-    """The guide stars of a spec and their fields.
+    """The guide stars of a spec and their fields."""
 
-    Attributes
-    ----------
-    selected : Selected
-        Guide stars, and of the others those that were bright enough to be looked at.
-    fields : FieldStars
-        The tiling of the guide stars.
-    rejected : dict of str to int
-        All records that are no guide stars, by reason.
-    """
-
+    # guide stars, and of the others those that were bright enough to be looked at
     selected: Selected
-    fields: FieldStars
-    rejected: Mapping[str, int]
+    fields: FieldStars  # the tiling of the guide stars
+    rejected: Mapping[str, int]  # all records that are no guide stars, by reason
 
     @property
     def nbytes(self) -> int:
@@ -78,7 +68,7 @@ class Choice:
         return int(self.fields.nbytes + sum(each.nbytes for each in (*tables, *steps)))
 
 
-def choose_stars(read: StarsRead, spec: BuildSpec) -> Choice:
+def choose_stars(read: CatalogSnapshot, spec: BuildSpec) -> Choice:
     """Choose the guide stars of a spec, as its build does."""
     order, mag = read.by_brightness
     bright = np.sort(order[: np.searchsorted(mag, _faintest(spec.selection), side="right")])
@@ -134,44 +124,21 @@ def _check_levels(stars: int, spec: BuildSpec) -> None:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a spec will give.
-
-    Attributes
-    ----------
-    spec : BuildSpec
-        The spec.
-    cost : Cost
-        Rows, files, memory, and the time after reading.
-    read_seconds : float
-        Time to read the catalogs.
-    fields : FieldStars
-        The tiling of the guide stars.
-    coverage : CoverageSummary
-        How stars are spread over the fields.
-    enough_share, full_share : float
-        Shares of the fields with at least `MIN_GUIDE_STARS` stars, and with as many as the list
-        of a field is long.
-    filters : tuple of (str, int)
-        The stars that each filter leaves.
-    rejected : mapping of str to int
-        All other records, by reason.
-    refusals : tuple of str
-        Why the build will be refused; empty where it will not.
-    warnings : tuple of str
-        What is worth a second look.
-    """
+    """What a spec will give."""
 
     spec: BuildSpec
-    cost: Cost
-    read_seconds: float
-    fields: FieldStars
-    coverage: CoverageSummary
+    cost: Cost  # rows, files, memory, and the time after reading
+    read_seconds: float  # time to read the catalogs
+    fields: FieldStars  # the tiling of the guide stars
+    coverage: CoverageSummary  # how stars are spread over the fields
+    # shares of the fields with at least `MIN_GUIDE_STARS` stars, and with as many as the list of
+    # a field is long
     enough_share: float
     full_share: float
-    filters: tuple[tuple[str, int], ...]
-    rejected: Mapping[str, int]
-    refusals: tuple[str, ...]
-    warnings: tuple[str, ...]
+    filters: tuple[tuple[str, int], ...]  # the stars that each filter leaves
+    rejected: Mapping[str, int]  # all other records, by reason
+    refusals: tuple[str, ...]  # why the build will be refused; empty where it will not
+    warnings: tuple[str, ...]  # what is worth a second look
 
     @property
     def build_seconds(self) -> float:
@@ -185,19 +152,18 @@ class Estimate:
 
 
 def estimate(
-    read: StarsRead, choice: Choice, spec: BuildSpec, max_memory_bytes: int | None = None
+    read: CatalogSnapshot, choice: Choice, spec: BuildSpec, max_memory_bytes: int | None = None
 ) -> Estimate:
     """Estimate what a spec will give."""
     guide_stars, fields = choice.selected.guide_stars, choice.fields
-    made = Made(
+    cost = whole_cost(
         guide_stars,
         fields,
         spec,
         _rejected_bytes(read, choice, spec),
-        _motion_product(read, guide_stars),
         base_memory(read.held_bytes),
+        _motion_product(read, guide_stars),
     )
-    cost = whole_cost(made)
     refusals = []
     for check in (
         partial(check_fields, fields, spec),
@@ -224,7 +190,7 @@ def estimate(
     )
 
 
-def _rejected_bytes(read: StarsRead, choice: Choice, spec: BuildSpec) -> int:
+def _rejected_bytes(read: CatalogSnapshot, choice: Choice, spec: BuildSpec) -> int:
     """Return the size of the file of rejected records, of which only some are at hand."""
     seen, mag = choice.selected.rejected, floats_of(read.stars, "mag")
     faint = np.flatnonzero(~(mag <= _faintest(spec.selection)))  # or of no magnitude
@@ -236,7 +202,7 @@ def _rejected_bytes(read: StarsRead, choice: Choice, spec: BuildSpec) -> int:
     return size + round(read.rejected_rows * read.rejected_bytes)
 
 
-def _motion_product(read: StarsRead, guide_stars: pa.Table) -> Sequence[Product]:
+def _motion_product(read: CatalogSnapshot, guide_stars: pa.Table) -> Sequence[Product]:
     if read.motions is None:
         return ()
     return (motions_of(read.stars, read.motions, guide_stars),)
@@ -263,5 +229,5 @@ def estimate_spec(
     progress: Progress = no_progress,
 ) -> Estimate:
     """Read the catalogs of a spec and estimate what it will give."""
-    read = read_stars(spec, inputs, workers, progress)
+    read = read_snapshot(spec, inputs, workers, progress)
     return estimate(read, choose_stars(read, spec), spec)

@@ -16,46 +16,25 @@ from starcat.catalog.source import data_source
 from starcat.errors import ChecksumMismatch
 from starcat.pipeline.build import Inputs, build, check_inputs
 from starcat.progress import Progress, no_progress
-from starcat.specs.reading import spec_from_dict
 from starcat.storage.digests import file_sha256
 
 
 @dataclass(frozen=True)
 class FileChange:
-    """A file of an artifact that the rebuild did not reproduce.
+    """A file of an artifact that the rebuild did not reproduce."""
 
-    Attributes
-    ----------
-    file : str
-        Path within the artifact.
-    what : str
-        How it differs, and whether its product does.
-    """
-
-    file: str
-    what: str
+    file: str  # path within the artifact
+    what: str  # how it differs, and whether its product does
 
 
 @dataclass(frozen=True)
 class Rebuilt:
-    """The outcome of a rebuild.
+    """The outcome of a rebuild."""
 
-    Attributes
-    ----------
-    name : str
-        ``<name>-<version>``.
-    files : int
-        Files that were compared.
-    changes : tuple of FileChange
-        Those that differ; none where every byte is the same.
-    software : tuple of Change
-        Versions then (``a``) and now (``b``) that differ.
-    """
-
-    name: str
-    files: int
-    changes: tuple[FileChange, ...]
-    software: tuple[Change, ...]
+    name: str  # ``<name>-<version>``
+    files: int  # files that were compared
+    changes: tuple[FileChange, ...]  # those that differ; none where every byte is the same
+    software: tuple[Change, ...]  # versions then (``a``) and now (``b``) that differ
 
     @property
     def is_identical(self) -> bool:
@@ -75,7 +54,7 @@ def rebuild(
 ) -> Rebuilt:
     """Build an artifact again from its manifest, and compare every file."""
     old = open_artifact(artifact)
-    spec = spec_from_dict(old.manifest["spec"], f"{artifact.name}/{MANIFEST_NAME}")
+    spec = old.spec
     check_inputs(spec, inputs)
     found = _same_inputs(old, inputs, progress)
     if output is not None:

@@ -33,22 +33,12 @@ from starcat.storage.schema import ProductSchema, product_schema
 
 
 @dataclass(frozen=True)
-class Ingredients:
-    """What every recipe starts from.
+class ProductInputs:
+    """What every recipe starts from."""
 
-    Attributes
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        Guide stars, ICRS.
-    fields : FieldStars
-        The tiling of the sphere and the stars in each field.
-    spec : BuildSpec
-        Which products, and their parameters.
-    """
-
-    directions: Array
-    fields: FieldStars
-    spec: BuildSpec
+    directions: Array  # shape (N, 3): guide stars, ICRS
+    fields: FieldStars  # the tiling of the sphere and the stars in each field
+    spec: BuildSpec  # which products, and their parameters
 
     def radius_rad(self, radius_deg: float | None, factor: float = 1.0) -> float:
         """Return a product's radius."""
@@ -57,56 +47,56 @@ class Ingredients:
         return factor * float(np.radians(self.spec.camera.half_field_deg))
 
 
-def _pairs(given: Ingredients) -> Any:
-    wanted = given.spec.products.pairs
-    most = given.spec.camera.camera().diagonal_rad
+def _pairs(inputs: ProductInputs) -> Any:
+    wanted = inputs.spec.products.pairs
+    most = inputs.spec.camera.camera().diagonal_rad
     if wanted.max_separation_deg is not None:
         most = float(np.radians(wanted.max_separation_deg))
-    return find_pairs(given.directions, float(np.radians(wanted.min_separation_deg)), most)
+    return find_pairs(inputs.directions, float(np.radians(wanted.min_separation_deg)), most)
 
 
-def _triangles(given: Ingredients) -> Any:
-    return find_triangles(given.fields, given.directions, given.spec.boresights.brightest)
+def _triangles(inputs: ProductInputs) -> Any:
+    return find_triangles(inputs.fields, inputs.directions, inputs.spec.boresights.brightest)
 
 
-def _neighbours(given: Ingredients) -> Any:
-    wanted = given.spec.products.neighbours
+def _neighbours(inputs: ProductInputs) -> Any:
+    wanted = inputs.spec.products.neighbours
     return find_neighbours(
-        given.directions,
-        given.radius_rad(wanted.radius_deg),
+        inputs.directions,
+        inputs.radius_rad(wanted.radius_deg),
         angle_bin_rad=float(np.radians(wanted.angle_bin_deg)),
         separation_bin_rad=float(np.radians(wanted.separation_bin_deg)),
     )
 
 
-def _hausdorff_angular(given: Ingredients) -> Any:
-    radius_deg = given.spec.products.hausdorff_angular.radius_deg
+def _hausdorff_angular(inputs: ProductInputs) -> Any:
+    radius_deg = inputs.spec.products.hausdorff_angular.radius_deg
     # S5: 4/3 of the field's radius.
-    return angular_reference_sets(given.directions, given.radius_rad(radius_deg, 4.0 / 3.0))
+    return angular_reference_sets(inputs.directions, inputs.radius_rad(radius_deg, 4.0 / 3.0))
 
 
-def _hausdorff_l2(given: Ingredients) -> Any:
-    radius_deg = given.spec.products.hausdorff_l2.radius_deg
-    return planar_reference_sets(given.directions, given.radius_rad(radius_deg))
+def _hausdorff_l2(inputs: ProductInputs) -> Any:
+    radius_deg = inputs.spec.products.hausdorff_l2.radius_deg
+    return planar_reference_sets(inputs.directions, inputs.radius_rad(radius_deg))
 
 
-def _grid(given: Ingredients) -> Any:
-    wanted = given.spec.products.grid
+def _grid(inputs: ProductInputs) -> Any:
+    wanted = inputs.spec.products.grid
     return grid_patterns(
-        given.directions,
-        given.radius_rad(wanted.radius_deg),
+        inputs.directions,
+        inputs.radius_rad(wanted.radius_deg),
         buffer_rad=float(np.radians(wanted.buffer_deg)),
         cells_per_side=wanted.cells_per_side,
     )
 
 
-def _radial(given: Ingredients) -> Any:
-    wanted = given.spec.products.radial
-    radius = given.radius_rad(wanted.radius_deg)
-    return radial_patterns(given.directions, radius, rings=wanted.rings, sectors=wanted.sectors)
+def _radial(inputs: ProductInputs) -> Any:
+    wanted = inputs.spec.products.radial
+    radius = inputs.radius_rad(wanted.radius_deg)
+    return radial_patterns(inputs.directions, radius, rings=wanted.rings, sectors=wanted.sectors)
 
 
-RECIPES: dict[str, Callable[[Ingredients], Any]] = {
+RECIPES: dict[str, Callable[[ProductInputs], Any]] = {
     "pairs": _pairs,
     "triangles": _triangles,
     "neighbours": _neighbours,
@@ -138,9 +128,9 @@ def tile_guide_stars(guide_stars: pa.Table, spec: BuildSpec) -> FieldStars:
     )
 
 
-def cook(name: str, given: Ingredients) -> Product:
+def make_product(name: str, inputs: ProductInputs) -> Product:
     """Make one product."""
-    made = RECIPES[name](given)
+    made = RECIPES[name](inputs)
     return Product(name, table_from_result(made, product_schema(name)), made.index)
 
 

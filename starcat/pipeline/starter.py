@@ -23,10 +23,9 @@ from starcat.catalog.selection import reject_dense, select_guide_stars
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.errors import BuildError, OutputError
 from starcat.geometry.camera import Camera
-from starcat.pipeline.cost import Cost, Made, base_memory, product_cost, whole_cost
+from starcat.pipeline.cost import Cost, base_memory, product_cost, table_bytes, whole_cost
 from starcat.pipeline.guide_stars import brightest_of_fields, check_tiling
-from starcat.pipeline.recipes import RECIPES, Ingredients, field_size, tile_guide_stars
-from starcat.pipeline.sizes import table_bytes
+from starcat.pipeline.recipes import RECIPES, ProductInputs, field_size, tile_guide_stars
 from starcat.products.boresights import tile_sphere
 from starcat.products.coverage import Spread, field_coverage, summarise_coverage
 from starcat.progress import Progress, no_progress
@@ -78,46 +77,22 @@ _SPREAD_PX = 4.0
 
 @dataclass(frozen=True)
 class LimitRow:
-    """What a magnitude limit leaves in the fields of the tiling.
-
-    Attributes
-    ----------
-    faint_limit_mag : float
-        The limit.
-    guide_stars : int
-        Stars of the whole sky that pass the selection.
-    stars : Spread
-        How the stars are spread over the fields.
-    """
+    """What a magnitude limit leaves in the fields of the tiling."""
 
     faint_limit_mag: float
-    guide_stars: int
-    stars: Spread
+    guide_stars: int  # stars of the whole sky that pass the selection
+    stars: Spread  # how the stars are spread over the fields
 
 
 @dataclass(frozen=True)
 class Starter:
-    """A first spec, and what it and its neighbours give.
+    """A first spec, and what it and its neighbours give."""
 
-    Attributes
-    ----------
-    spec : BuildSpec
-        For the camera.
-    limits : tuple of LimitRow
-        The spec's own limit, and some that are brighter and fainter.
-    deepest_mag : float
-        Faintest star of the catalog; fainter limits add none.
-    thinned : LimitRow
-        What the spec's thinning leaves at its own limit.
-    cost : Cost
-        What the build will cost, by estimate.
-    """
-
-    spec: BuildSpec
-    limits: tuple[LimitRow, ...]
-    deepest_mag: float
-    thinned: LimitRow
-    cost: Cost
+    spec: BuildSpec  # for the camera
+    limits: tuple[LimitRow, ...]  # the spec's own limit, and some that are brighter and fainter
+    deepest_mag: float  # faintest star of the catalog; fainter limits add none
+    thinned: LimitRow  # what the spec's thinning leaves at its own limit
+    cost: Cost  # what the build will cost, by estimate
 
     @property
     def left_out(self) -> tuple[str, ...]:
@@ -247,7 +222,7 @@ def _affordable(sky: pa.Table, spec: BuildSpec) -> tuple[BuildSpec, LimitRow, Co
     fields = tile_guide_stars(guide_stars, spec)
     base = base_memory(sky.nbytes)
     directions = directions_of(guide_stars)
-    cost = product_cost(Ingredients(directions, fields, spec), base)
+    cost = product_cost(ProductInputs(directions, fields, spec), base)
     while cost.memory_bytes > MEMORY_BYTES or cost.seconds > SECONDS:
         others = [name for name in cost.rows if name != "triangles"]
         if not others:
@@ -256,9 +231,9 @@ def _affordable(sky: pa.Table, spec: BuildSpec) -> tuple[BuildSpec, LimitRow, Co
         content = spec.model_dump(mode="json")
         content["products"][costly]["enabled"] = False
         spec = BuildSpec.model_validate(content)
-        cost = product_cost(Ingredients(directions, fields, spec), base)
+        cost = product_cost(ProductInputs(directions, fields, spec), base)
     rejected = table_bytes(selected.rejected)
-    cost = whole_cost(Made(guide_stars, fields, spec, rejected, base_bytes=base))
+    cost = whole_cost(guide_stars, fields, spec, rejected, base)
     stars = summarise_coverage(field_coverage(fields, BRIGHTEST)).stars
     return spec, LimitRow(spec.selection.faint_limit_mag, len(guide_stars), stars), cost
 

@@ -43,18 +43,10 @@ _PROGRAM = "import sys; sys.path[:] = sys.argv[1:]; from starcat.query.worker im
 
 @dataclass
 class Allowance:
-    """The time that a query may take.
-
-    Attributes
-    ----------
-    total_s : float
-        Seconds in all.
-    left_s : float
-        Seconds that are left of them. Only waiting for the answer counts.
-    """
+    """The time that a query may take."""
 
     total_s: float
-    left_s: float
+    left_s: float  # of them; only waiting for the answer counts
 
 
 _waiting: list[subprocess.Popen[bytes]] = []

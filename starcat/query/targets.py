@@ -25,29 +25,16 @@ POSITION = ("ra_deg", "dec_deg")
 
 @dataclass(frozen=True)
 class View:
-    """A table as a query sees it.
+    """A table as a query sees it."""
 
-    Attributes
-    ----------
-    name : str
-        The name of the product, or of the file where starcat did not write it.
-    paths : tuple of Path
-        Its Parquet files: one, or many of a store.
-    columns : tuple of str
-        Names of its columns.
-    schema : ProductSchema, optional
-        The schema of the product, with units and meanings of its columns.
-    position : tuple of str, optional
-        Columns with right ascension and declination, where they have other names than in starcat.
-    pixels : tuple of Pixel
-        For each file the part of the sky that its rows are in; empty where that is not known.
-    """
-
-    name: str
-    paths: tuple[Path, ...]
+    name: str  # the name of the product, or of the file where starcat did not write it
+    paths: tuple[Path, ...]  # its Parquet files: one, or many of a store
     columns: tuple[str, ...]
+    # The schema of the product, with units and meanings of its columns.
     schema: ProductSchema | None = None
+    # Columns with right ascension and declination, where they have other names than in starcat.
     position: tuple[str, str] | None = None
+    # For each file the part of the sky that its rows are in; empty where that is not known.
     pixels: tuple[Pixel, ...] = ()
 
     @cached_property
@@ -58,20 +45,10 @@ class View:
 
 @dataclass(frozen=True)
 class Target:
-    """Something that a query is about.
+    """Something that a query is about."""
 
-    Attributes
-    ----------
-    name : str
-        The schema of its views: the name of the artifact, the source or the file.
-    version : str
-        The version of an artifact; empty for anything else.
-    views : tuple of View
-        A view for each table.
-    """
-
-    name: str
-    version: str
+    name: str  # the schema of its views: the name of the artifact, the source or the file
+    version: str  # the version of an artifact; empty for anything else
     views: tuple[View, ...]
 
 

@@ -25,21 +25,11 @@ DECIMALS = 6
 
 @dataclass(frozen=True)
 class CoverageReport:
-    """What a report says about coverage.
+    """What a report says about coverage."""
 
-    Attributes
-    ----------
-    coverage : Coverage
-        Stars, pairs and triangles by boresight.
-    summary : CoverageSummary
-        The coverage in a few numbers.
-    gap : TilingGap
-        The widest gap between the boresights.
-    """
-
-    coverage: Coverage
-    summary: CoverageSummary
-    gap: TilingGap
+    coverage: Coverage  # stars, pairs and triangles by boresight
+    summary: CoverageSummary  # the coverage in a few numbers
+    gap: TilingGap  # the widest gap between the boresights
 
     def __repr__(self) -> str:
         """Return the stars of a field in one line."""

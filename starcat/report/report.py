@@ -21,45 +21,21 @@ from starcat.storage.digests import json_bytes
 
 @dataclass(frozen=True)
 class BuildFacts:
-    """What a report is made of.
+    """What a report is made of."""
 
-    Attributes
-    ----------
-    spec : mapping
-        The whole build spec.
-    sources : sequence of mapping
-        The sources, as the manifest has them.
-    reasons : mapping of str to str
-        What each reason means.
-    products : mapping of str to mapping
-        The products as the manifest has them, by name, with ``bytes``.
-    database_bytes : int
-        Size of the matcher's file.
-    filters : sequence of mapping
-        What each filter left in the fields of the tiling, in order.
-    coverage : CoverageReport
-        Coverage by the guide stars.
-    self_test : sequence of mapping
-        Rates.
-    software : mapping of str to str
-        Versions.
-    band : str
-        Band of the magnitudes.
-    guide_star_mag, rejected_mag : ndarray of float64, shape (N,) and (M,)
-        Magnitudes; NaN where there is none.
-    """
-
-    spec: Mapping[str, Any]
-    sources: Sequence[Mapping[str, Any]]
-    reasons: Mapping[str, str]
+    spec: Mapping[str, Any]  # the whole build spec
+    sources: Sequence[Mapping[str, Any]]  # the sources, as the manifest has them
+    reasons: Mapping[str, str]  # what each reason means
+    # the products as the manifest has them, by name, with ``bytes``
     products: Mapping[str, Mapping[str, Any]]
-    database_bytes: int
+    database_bytes: int  # size of the matcher's file
+    # what each filter left in the fields of the tiling, in order
     filters: Sequence[Mapping[str, Any]]
-    coverage: CoverageReport
+    coverage: CoverageReport  # coverage by the guide stars
     self_test: Sequence[Mapping[str, Any]]
     software: Mapping[str, str]
-    band: str
-    guide_star_mag: Array
+    band: str  # band of the magnitudes
+    guide_star_mag: Array  # shape (N,) and (M,): magnitudes; NaN where there is none
     rejected_mag: Array
 
     @property

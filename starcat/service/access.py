@@ -1,7 +1,7 @@
 """Who asks, and what they may do.
 
 A request has one principal: that of its token, or the one that everybody has without. The
-middleware of `starcat.service.guard` finds it out; handlers say which role they need.
+middleware of `starcat.service.security` finds it out; handlers say which role they need.
 """
 
 from __future__ import annotations

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcat.errors import QueryLimitError
-from starcat.exchange.first_rows import FirstRows
-from starcat.service.confined import Confined
+from starcat.exchange.columns import FirstRows
+from starcat.service.sandbox.sandbox import Sandbox
 from starcat.service.uploading import sent_once
 
 if TYPE_CHECKING:
@@ -36,8 +36,8 @@ def keep_rows(batches: pa.RecordBatchReader, path: Path, most: int) -> tuple[int
 
 
 def file_of_rows(
-    confined: Confined, rows: Path, target: Path, form: str
+    sandbox: Sandbox, rows: Path, target: Path, form: str
 ) -> tuple[Iterator[bytes], int]:
     """Have a file made of rows that were kept, by a process that may hold a table in memory."""
-    confined.call("convert", {"source": str(rows), "target": str(target), "form": form})
+    sandbox.call("convert", {"source": str(rows), "target": str(target), "form": form})
     return sent_once(target)

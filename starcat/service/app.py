@@ -22,20 +22,20 @@ from starcat.service.api import (
     sql,
     work,
 )
-from starcat.service.guard import health, signing
-from starcat.service.guard.bodies import Bodies
-from starcat.service.guard.headers import SafeHeaders
-from starcat.service.guard.identities import Identities
-from starcat.service.guard.logs import Defects, RequestLog
-from starcat.service.guard.metrics import Counted, Metrics
-from starcat.service.guard.origin import Origin
-from starcat.service.guard.request_id import RequestId
-from starcat.service.guard.retention import keep_removing
-from starcat.service.guard.shape import Shape
-from starcat.service.guard.who import Who
 from starcat.service.jobs.pool import WorkerPool
 from starcat.service.pages.rendering import add_missing_page
 from starcat.service.problems import REFUSALS, add_problem_handlers
+from starcat.service.security import health, signing
+from starcat.service.security.auth import Who
+from starcat.service.security.bodies import Bodies
+from starcat.service.security.headers import SafeHeaders
+from starcat.service.security.identities import Identities
+from starcat.service.security.logs import Defects, RequestLog
+from starcat.service.security.metrics import Counted, Metrics
+from starcat.service.security.origin import Origin
+from starcat.service.security.request_id import RequestId
+from starcat.service.security.request_limits import Shape
+from starcat.service.security.retention import keep_removing
 from starcat.service.service import Service, open_service
 from starcat.service.settings import Settings
 from starcat.service.vo import cone_search, tap, tap_jobs
@@ -120,6 +120,6 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         service.queue.close()
         service.tap.close()
         service.catalogs.close()
-        service.sessions.close()
-        service.confined.close()
+        service.query_pool.close()
+        service.sandbox.close()
         service.records.close()

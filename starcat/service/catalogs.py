@@ -1,7 +1,7 @@
 """The catalogs that a service offers, and estimates of specs from them.
 
-Reading takes seconds, so what was read is kept, on disk and in memory. So are the guide stars of
-the last specs, and a slider that does not change them is answered at once.
+Reading takes seconds, so catalogs stay in memory. So do the guide stars of the last specs, and a
+slider that does not change them is answered at once.
 """
 
 from __future__ import annotations
@@ -10,26 +10,28 @@ import hashlib
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Any, TypeVar
+
+from cachetools import LRUCache
 
 from starcat.catalog.blocks import CATALOGS
 from starcat.catalog.fetching.locate import locate
 from starcat.catalog.source import DataSource, data_source
 from starcat.errors import SourceMissing
+from starcat.pipeline.catalog_snapshot import CatalogSnapshot, read_snapshot, reading_keys
 from starcat.pipeline.estimate import Choice, Estimate, choose_stars, estimate
 from starcat.pipeline.guide_stars import MOST_FIELD_STARS
-from starcat.pipeline.stars_read import StarsRead, read_stars, what_is_read
 from starcat.pipeline.starter import Starter, starter_spec
 from starcat.service.jobs.keys import source_files
-from starcat.service.kept import Kept
 from starcat.service.problems import Problem
-from starcat.service.star_cache import CatalogRead, StarCache
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.reading import preset, preset_names
 from starcat.storage.digests import json_bytes
 from starcat.version import __version__
+
+T = TypeVar("T")
 
 WAIT_S = 25.0
 """Seconds that a request waits for a catalog to be read, or for its turn."""
@@ -48,6 +50,18 @@ MOST_WAITING = 8
 
 AT_ONCE = 2
 """Estimates that are made at the same time."""
+
+
+@dataclass(frozen=True)
+class CatalogRead:
+    """What is known of a catalog that was read."""
+
+    source: str
+    band: str
+    epoch_jyear: float  # its stars were moved to this Julian year
+    stars: int  # that can be chosen from
+    brightest_mag: float | None  # of the stars that have a magnitude
+    faintest_mag: float | None
 
 
 @dataclass(frozen=True)
@@ -72,24 +86,27 @@ class Offered:
 class Catalogs:
     """The catalogs of a service, and estimates from them."""
 
-    def __init__(
-        self, folder: Path, max_memory_bytes: int | None = None, wait_s: float = WAIT_S
-    ) -> None:
-        self._cache = StarCache(folder)
+    def __init__(self, max_memory_bytes: int | None = None, wait_s: float = WAIT_S) -> None:
         self._max_memory_bytes = max_memory_bytes
         self._wait_s = wait_s
-        self._read: Kept[StarsRead] = Kept(READ_BYTES)
-        self._choices: Kept[Choice] = Kept(CHOICE_BYTES)
-        self._estimates: Kept[Estimate] = Kept(ESTIMATE_BYTES)
+        # Pairs of CatalogSnapshot and CatalogRead; one that is larger than the limit is alone.
+        self._read: LRUCache[str, tuple[CatalogSnapshot, CatalogRead]] = LRUCache(
+            READ_BYTES, lambda pair: min(pair[0].nbytes, READ_BYTES)
+        )
+        self._choices: LRUCache[Any, Choice] = LRUCache(CHOICE_BYTES, lambda choice: choice.nbytes)
+        self._estimates: LRUCache[Any, Estimate] = LRUCache(
+            ESTIMATE_BYTES, lambda found: found.fields.nbytes
+        )
         self._turns = threading.Semaphore(AT_ONCE)
         self._lock = threading.RLock()
-        self._underway: dict[str, Future[StarsRead]] = {}
+        self._underway: dict[str, Future[CatalogSnapshot]] = {}
         # One at a time: a catalog takes memory.
         self._reader = ThreadPoolExecutor(1, "catalog-reader")
 
     def offered(self) -> list[Offered]:
         """Return the catalogs that a spec may name."""
-        known = list(self._cache.catalogs().values())
+        with self._lock:
+            known = [catalog for _, catalog in self._read.values()]
         found = []
         for name in CATALOGS:
             read = tuple(one for one in known if one.source == name)
@@ -100,14 +117,13 @@ class Catalogs:
         """Estimate what a spec will give."""
         key = self._key(spec)
         whole = (key, spec.model_dump_json())
-        found = self._estimates.get(whole)
-        if found is not None:
-            return found
-        read = self.read(spec, key)
-        with self._turn():
-            choice = self._choice(read, key, spec)
-            found = estimate(read, choice, spec, self._max_memory_bytes)
-        self._estimates.put(whole, found, found.fields.nbytes)
+        found = self._cached(self._estimates, whole)
+        if found is None:
+            read = self.read(spec, key)
+            with self._turn():
+                choice = self._choice(read, key, spec)
+                found = estimate(read, choice, spec, self._max_memory_bytes)
+            self._cache(self._estimates, whole, found)
         return found
 
     def starter(
@@ -130,19 +146,19 @@ class Catalogs:
                 most_field_stars=MOST_FIELD_STARS,
             )
 
-    def read(self, spec: BuildSpec, key: str | None = None) -> StarsRead:
+    def read(self, spec: BuildSpec, key: str | None = None) -> CatalogSnapshot:
         """Return the catalogs of a spec; read them where that was not done yet."""
         key = self._key(spec) if key is None else key
-        found = self._read.get(key)
+        found = self._cached(self._read, key)
         if found is not None:
-            return found
+            return found[0]
         check_size(spec)
         with self._lock:
             future = self._underway.get(key)
             if future is None:
                 if len(self._underway) >= MOST_WAITING:
                     raise _busy("too many catalogs wait to be read", RETRY_S)
-                future = self._reader.submit(self._from_disk_or_files, key, spec)
+                future = self._reader.submit(self._read_files, key, spec)
                 self._underway[key] = future
                 future.add_done_callback(lambda _: self._forget(key))
         try:
@@ -163,23 +179,28 @@ class Catalogs:
         with self._lock:
             self._underway.pop(key, None)
 
-    def _from_disk_or_files(self, key: str, spec: BuildSpec) -> StarsRead:
-        found = self._cache.load(key)
-        if found is None:
-            found = read_stars(spec, {})
-            self._cache.keep(key, found, _facts(spec, found))
-        self._read.put(key, found, found.nbytes)
+    def _read_files(self, key: str, spec: BuildSpec) -> CatalogSnapshot:
+        found = read_snapshot(spec, {})
+        self._cache(self._read, key, (found, _facts(spec, found)))
         return found
 
-    def _choice(self, read: StarsRead, key: str, spec: BuildSpec) -> Choice:
+    def _cached(self, cache: LRUCache[Any, T], key: Any) -> T | None:
+        with self._lock:
+            return cache.get(key)
+
+    def _cache(self, cache: LRUCache[Any, T], key: Any, value: T) -> None:
+        with self._lock, suppress(ValueError):  # larger than the cache
+            cache[key] = value
+
+    def _choice(self, read: CatalogSnapshot, key: str, spec: BuildSpec) -> Choice:
         content = spec.model_dump(mode="json")
         own = {name: content[name] for name in ("selection", "camera", "boresights")}
         own["levels"] = content["products"]["levels"]
         part = (key, json_bytes(own))
-        found = self._choices.get(part)
+        found = self._cached(self._choices, part)
         if found is None:
             found = choose_stars(read, spec)
-            self._choices.put(part, found, found.nbytes)
+            self._cache(self._choices, part, found)
         return found
 
     @contextmanager
@@ -195,7 +216,7 @@ class Catalogs:
     def _key(spec: BuildSpec) -> str:
         """Return what the catalogs of a spec are kept under: what was asked for, of which files."""
         files = {name: _stamps(name) for name in _sources_read(spec)}
-        content = {"starcat": __version__, "asked": what_is_read(spec), "files": files}
+        content = {"starcat": __version__, "asked": reading_keys(spec), "files": files}
         return hashlib.sha256(json_bytes(content)).hexdigest()[:32]
 
 
@@ -245,7 +266,7 @@ def _stamps(name: str) -> list[tuple[str, int, int]]:
     return found
 
 
-def _facts(spec: BuildSpec, read: StarsRead) -> CatalogRead:
+def _facts(spec: BuildSpec, read: CatalogSnapshot) -> CatalogRead:
     mags = read.magnitudes
     band = spec.catalog.band or data_source(spec.catalog.source).bands[0]
     return CatalogRead(

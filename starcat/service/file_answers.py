@@ -16,6 +16,7 @@ from fastapi.responses import FileResponse, Response
 from starlette.types import Receive, Scope, Send
 
 from starcat.errors import TargetMissing
+from starcat.exchange.formats import FILE_FORMATS, FORMATS
 from starcat.service.problems import MEDIA_TYPE, Problem, ProblemDetails
 
 IMMUTABLE = "private, max-age=31536000, immutable"
@@ -28,16 +29,11 @@ SMALL_BYTES = 1 << 20
 """Files that are sent as a whole, and not bit by bit."""
 
 TYPES = {
-    ".parquet": "application/vnd.apache.parquet",
+    **{FORMATS[name].suffix: FORMATS[name].media_type for name in FILE_FORMATS},
     ".h5": "application/x-hdf5",
-    ".json": "application/json",
-    ".csv": "text/csv; charset=utf-8",
     ".html": "text/html; charset=utf-8",
     ".svg": "image/svg+xml",
     ".png": "image/png",
-    ".fits": "application/fits",
-    ".vot": "application/x-votable+xml",
-    ".ecsv": "text/plain; charset=utf-8",
     ".toml": "application/toml",
 }
 """Content types by suffix; all else are bytes."""

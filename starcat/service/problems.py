@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
+from fastapi.routing import APIRoute
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 
@@ -27,7 +29,7 @@ from starcat.errors import (
     StarcatError,
     TargetMissing,
 )
-from starcat.failures import DEFECT, failure_of, shown
+from starcat.failures import DEFECT, failure_of, shown, validation_message
 
 MEDIA_TYPE = "application/problem+json"
 
@@ -81,27 +83,40 @@ class Problem(Exception):  # noqa: N818 - the name is that of RFC 9457
 
 
 def problem_of(error: Exception) -> ProblemDetails:
-    """Return what to say of an exception."""
+    """Return what is said of any exception that a handler raised."""
     if isinstance(error, Problem):
-        title = HTTPStatus(error.status).phrase
-        return ProblemDetails(title=title, status=error.status, detail=error.detail, key=error.key)
+        return _problem(error.status, error.detail, key=error.key)
+    if isinstance(error, HTTPException):
+        return _problem(error.status_code, shown(str(error.detail), 500))
+    if isinstance(error, RequestValidationError):
+        where, found = validation_message(error)
+        part, _, name = where.partition(".")
+        detail = f"{part} {name}".strip() + f": {found}; /api/docs says what is expected"
+        return ProblemDetails(
+            title="Unprocessable Content",
+            status=422,
+            detail=shown(detail, 500),
+            code=2,
+            key=name or None,
+        )
     status = next((number for kind, number in STATUS if isinstance(error, kind)), 500)
-    title = HTTPStatus(status).phrase
     if status == 500:
         detail = "this is a defect of starcat; the log of the server says more"
-        return ProblemDetails(title=title, status=500, detail=detail, code=DEFECT)
+        return _problem(500, detail, code=DEFECT)
     failure = failure_of(error, "starcat serve")
-    hint = None if failure.hint is None else without_folders(failure.hint)
     key = getattr(error, "key", None)
-    return ProblemDetails(
-        title=title,
-        status=status,
-        detail=without_folders(failure.message),
+    return _problem(
+        status,
+        without_folders(failure.message),
         code=failure.code,
         kind=failure.kind,
-        hint=hint,
+        hint=None if failure.hint is None else without_folders(failure.hint),
         key=str(key) if key else None,
     )
+
+
+def _problem(status: int, detail: str, **facts: Any) -> ProblemDetails:
+    return ProblemDetails(title=HTTPStatus(status).phrase, status=status, detail=detail, **facts)
 
 
 _FOLDERS = re.compile(r"(?<![\w.:/])/(?:[^\s/:;,'\"()]+/)+")
@@ -119,42 +134,41 @@ def without_folders(message: str) -> str:
     return _FOLDERS.sub("", message)
 
 
-def problem_response(problem: ProblemDetails, headers: Mapping[str, str] | None = None) -> Response:
-    """Return the answer that tells a problem."""
-    content = problem.model_dump(exclude_none=True)
-    return JSONResponse(content, problem.status, dict(headers or {}), MEDIA_TYPE)
+class RenderingRoute(APIRoute, ABC):
+    """A route that answers its errors in a form of its own: pages, or the documents of TAP."""
+
+    @abstractmethod
+    def render(self, error: Exception, request: Request) -> Response:
+        """Return the answer that tells an error."""
+
+
+def problem_response(error: Exception, request: Request) -> Response:
+    """Return the answer that tells an error, as the route of the request has it."""
+    route = request.scope.get("route")
+    return route.render(error, request) if isinstance(route, RenderingRoute) else as_json(error)
+
+
+def as_json(error: Exception) -> Response:
+    """Return the problem details of an error."""
+    problem = problem_of(error)
+    headers = dict(getattr(error, "headers", None) or {})
+    return JSONResponse(problem.model_dump(exclude_none=True), problem.status, headers, MEDIA_TYPE)
 
 
 def add_problem_handlers(app: FastAPI) -> None:
-    """Make an application tell all of its errors as problem details."""
+    """Make an application tell all of its errors."""
 
     @app.exception_handler(StarcatError)
     @app.exception_handler(Problem)
-    def refuse(request: Request, error: Exception) -> Response:
-        return problem_response(problem_of(error), getattr(error, "headers", None))
-
     @app.exception_handler(RequestValidationError)
-    def refuse_parameters(request: Request, error: RequestValidationError) -> Response:
-        first: dict[str, Any] = dict(error.errors()[0])
-        key = ".".join(str(step) for step in first["loc"][1:])
-        where = f"{first['loc'][0]} {key}".strip()
-        detail = shown(f"{where}: {first['msg']}; /api/docs says what is expected", 500)
-        problem = ProblemDetails(
-            title="Unprocessable Content", status=422, detail=detail, code=2, key=key or None
-        )
-        return problem_response(problem)
-
     @app.exception_handler(HTTPException)
-    def refuse_http(request: Request, error: HTTPException) -> Response:
-        title = HTTPStatus(error.status_code).phrase
-        detail = shown(f"{error.detail}", 500)
-        problem = ProblemDetails(title=title, status=error.status_code, detail=detail)
-        return problem_response(problem, error.headers)
+    def refuse(request: Request, error: Exception) -> Response:
+        return problem_response(error, request)
 
     @app.exception_handler(Exception)
     def tell_defect(request: Request, error: Exception) -> Response:
         _logger.exception("a defect", exc_info=error)
-        return problem_response(problem_of(error))
+        return problem_response(error, request)
 
 
 REFUSALS: dict[int | str, dict[str, Any]] = {

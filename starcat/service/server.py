@@ -15,12 +15,12 @@ from fastapi import FastAPI
 from starcat.errors import ConfigError, OutputError, reason
 from starcat.service.access import Role
 from starcat.service.app import make_app
-from starcat.service.guard.logs import log_settings
-from starcat.service.guard.patience import Patience
-from starcat.service.guard.shape import MOST_HEADER_BYTES, MOST_TARGET_BYTES
-from starcat.service.guard.tokens import TokenStore
 from starcat.service.jobs.pool import WorkerPool
-from starcat.service.places import Places
+from starcat.service.paths import ServicePaths
+from starcat.service.security.header_timeout import HeaderTimeout
+from starcat.service.security.logs import log_settings
+from starcat.service.security.request_limits import MOST_HEADER_BYTES, MOST_TARGET_BYTES
+from starcat.service.security.tokens import TokenStore
 from starcat.service.service import Service
 from starcat.service.settings import Settings
 from starcat.storage.atomic import make_folder
@@ -42,31 +42,31 @@ Announce = Callable[[str], None]
 
 def run_server(settings: Settings, announce: Announce) -> None:
     """Serve until a signal ends it."""
-    places = Places(settings.root)
-    if not settings.is_private and not places.records.exists():
+    paths = ServicePaths(settings.root)
+    if not settings.is_private and not paths.records.exists():
         raise _without_token(settings)  # before anything is made
-    with _only_server(places):
-        shutil.rmtree(places.scratch, ignore_errors=True)
+    with _only_server(paths):
+        shutil.rmtree(paths.scratch, ignore_errors=True)
         _serve(settings, announce)
 
 
 @contextmanager
-def _only_server(places: Places) -> Iterator[None]:
+def _only_server(paths: ServicePaths) -> Iterator[None]:
     """See that no other server uses a root."""
     with ExitStack() as stack:
         try:
-            make_folder(places.root)
-            stack.enter_context(locked(places.lock, wait=False))
+            make_folder(paths.root)
+            stack.enter_context(locked(paths.lock, wait=False))
         except BlockingIOError:
             raise ConfigError(
-                f"another server runs with --root {places.root}; stop it, or choose another root",
+                f"another server runs with --root {paths.root}; stop it, or choose another root",
                 key="root",
-                value=str(places.root),
+                value=str(paths.root),
             ) from None
         except OSError as error:
             raise OutputError(
-                f"{places.root}: cannot be used ({reason(error)}); choose another --root",
-                path=places.root,
+                f"{paths.root}: cannot be used ({reason(error)}); choose another --root",
+                path=paths.root,
             ) from error
         yield
 
@@ -78,7 +78,7 @@ def _serve(settings: Settings, announce: Announce) -> None:
     listening = listen(settings)
     config = uvicorn.Config(
         app,
-        http=Patience,
+        http=HeaderTimeout,
         log_config=log_settings(),
         access_log=False,
         server_header=False,

@@ -9,18 +9,15 @@ from typing import Annotated
 from fastapi import Depends, Request
 
 from starcat.service.catalogs import Catalogs
-from starcat.service.confined import Confined
 from starcat.service.jobs.job import JobStore
 from starcat.service.jobs.queue import JobQueue, open_queue
-from starcat.service.places import Places
+from starcat.service.library import Library
+from starcat.service.paths import ServicePaths
+from starcat.service.query_pool import QueryPool
 from starcat.service.records import Records
-from starcat.service.sessions import Sessions
+from starcat.service.sandbox.sandbox import Sandbox
 from starcat.service.settings import Settings
-from starcat.service.shelf import Shelf
 from starcat.service.vo.tap_service import Tap
-
-READ = "read"
-"""Folder, among the catalogs, of what estimates start from."""
 
 GIB = 2**30
 
@@ -33,19 +30,19 @@ class Service:
     ----------
     settings : Settings
         What the operator set.
-    places : Places
+    paths : ServicePaths
         What lies where.
     records : Records
         What is remembered.
-    shelf : Shelf
+    library : Library
         The databases there are.
     jobs : JobStore
         The jobs there are.
-    sessions : Sessions
+    query_pool : QueryPool
         Open query sessions.
     queue : JobQueue
         What waits for workers.
-    confined : Confined
+    sandbox : Sandbox
         Processes that read uploads and make files.
     tap : Tap
         What TAP needs.
@@ -56,12 +53,12 @@ class Service:
     """
 
     settings: Settings
-    places: Places
+    paths: ServicePaths
     records: Records
-    shelf: Shelf
+    library: Library
     jobs: JobStore
-    sessions: Sessions
-    confined: Confined
+    query_pool: QueryPool
+    sandbox: Sandbox
     tap: Tap
     queue: JobQueue
     catalogs: Catalogs
@@ -70,23 +67,23 @@ class Service:
 
 def open_service(settings: Settings) -> Service:
     """Open a service: its folders and its records."""
-    places = Places(settings.root)
-    places.make()
-    records = Records(places.records)
-    shelf, sessions = Shelf(places), Sessions(settings)
+    paths = ServicePaths(settings.root)
+    paths.make()
+    records = Records(paths.records)
+    library, query_pool = Library(paths), QueryPool(settings)
     most = round(settings.job_memory_gib * GIB)
-    confined = Confined(settings, places.scratch)
+    sandbox = Sandbox(settings, paths.scratch)
     return Service(
         settings=settings,
-        places=places,
+        paths=paths,
         records=records,
-        shelf=shelf,
+        library=library,
         jobs=JobStore(records),
-        sessions=sessions,
-        confined=confined,
-        tap=Tap(settings, places, records, shelf, sessions, confined),
-        queue=open_queue(settings, places),
-        catalogs=Catalogs(places.catalogs / READ, most),
+        query_pool=query_pool,
+        sandbox=sandbox,
+        tap=Tap(settings, paths, records, library, query_pool, sandbox),
+        queue=open_queue(settings, paths),
+        catalogs=Catalogs(most),
     )
 
 

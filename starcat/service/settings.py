@@ -10,6 +10,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from starcat.errors import ConfigError, suggest
+from starcat.failures import validation_message
 
 FILE_NAME = "service.toml"
 
@@ -108,13 +109,8 @@ def read_settings(root: Path, **options: object) -> Settings:
     try:
         return Settings.model_validate({**content, "root": root.resolve()})
     except ValidationError as error:
-        first = error.errors(include_url=False, include_context=False)[0]
-        key = ".".join(str(step) for step in first["loc"])
+        key, found = validation_message(error, show_input=True)
         known = ", ".join(Settings.model_fields)
-        hint = f"{suggest(key, Settings.model_fields)}known: {known}"
-        advice = f"; {hint}" if first["type"] == "extra_forbidden" else ""
-        raise ConfigError(
-            f"{path}: {key}: {first['msg']} (found {str(first['input'])[:80]!r}){advice}",
-            key=key,
-            value=first["input"],
-        ) from None
+        hint = f"; {suggest(key, Settings.model_fields)}known: {known}"
+        advice = "" if key.partition(".")[0] in Settings.model_fields else hint
+        raise ConfigError(f"{path}: {key}: {found}{advice}", key=key) from None

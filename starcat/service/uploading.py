@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
-from starcat.service.places import Places
+from starcat.service.paths import ServicePaths
 
 CHUNK_BYTES = 1 << 18
 
@@ -18,9 +18,9 @@ _UNUSUAL = re.compile(r"[^A-Za-z0-9_-]+", re.ASCII)
 
 
 @contextmanager
-def scratch_folder(places: Places) -> Iterator[Path]:
+def scratch_folder(paths: ServicePaths) -> Iterator[Path]:
     """Give a new folder, which is removed afterwards."""
-    folder = places.scratch / secrets.token_hex(16)
+    folder = paths.scratch / secrets.token_hex(16)
     folder.mkdir(mode=0o700)
     try:
         yield folder

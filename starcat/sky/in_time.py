@@ -9,7 +9,8 @@ attitude is fitted to them again.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -97,6 +98,10 @@ class SkyInTime:
     sun_angle_deg: float
     moon_angle_deg: float
     earth_limb_angle_deg: float | None
+
+    def content(self) -> dict[str, Any]:
+        """Return it as JSON has it, under the key ``in_time`` of an answer."""
+        return {**asdict(self), "q_body_from_icrs": self.q_body_from_icrs.tolist()}
 
 
 def sky_in_time(

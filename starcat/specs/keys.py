@@ -29,36 +29,16 @@ REQUIRED = object()
 
 @dataclass(frozen=True)
 class SpecKey:
-    """One key of a spec.
+    """One key of a spec."""
 
-    Attributes
-    ----------
-    section : tuple of str
-        Names of the tables around it; empty at the top.
-    name : str
-        The key itself.
-    kind : str
-        ``text``, ``whole number``, ``number``, ``true or false``, ``list`` or ``one of``.
-    unit : str
-        Unit of a number; empty where it has none.
-    range : str
-        Smallest and largest value, or the choices; empty where all are allowed.
-    default : object
-        `REQUIRED` where the spec has to say it.
-    example : object
-        A value that is allowed; None where the default is example enough.
-    description : str
-        What it means.
-    """
-
-    section: tuple[str, ...]
-    name: str
-    kind: str
-    unit: str
-    range: str
-    default: Any
-    example: Any
-    description: str
+    section: tuple[str, ...]  # names of the tables around it; empty at the top
+    name: str  # the key itself
+    kind: str  # ``text``, ``whole number``, ``number``, ``true or false``, ``list`` or ``one of``
+    unit: str  # unit of a number; empty where it has none
+    range: str  # smallest and largest value, or the choices; empty where all are allowed
+    default: Any  # `REQUIRED` where the spec has to say it
+    example: Any  # A value that is allowed; None where the default is example enough
+    description: str  # what it means
 
     @property
     def path(self) -> str:
@@ -68,21 +48,11 @@ class SpecKey:
 
 @dataclass(frozen=True)
 class SpecSection:
-    """One table of a spec.
+    """One table of a spec."""
 
-    Attributes
-    ----------
-    path : tuple of str
-        Names of the tables around it and its own; empty for the top.
-    description : str
-        What it is about, in one sentence.
-    keys : tuple of SpecKey
-        In the order of the definition.
-    """
-
-    path: tuple[str, ...]
-    description: str
-    keys: tuple[SpecKey, ...]
+    path: tuple[str, ...]  # names of the tables around it and its own; empty for the top
+    description: str  # what it is about, in one sentence
+    keys: tuple[SpecKey, ...]  # in the order of the definition
 
 
 @cache

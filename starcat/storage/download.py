@@ -46,30 +46,17 @@ class NotFound(DownloadError):  # noqa: N818 - the name reads as the fact
 
 @dataclass(frozen=True)
 class DownloadOptions:
-    """How to download.
+    """How to download."""
 
-    Attributes
-    ----------
-    retries : int
-        Further attempts after the first has failed.
-    timeout_s : float
-        Seconds to wait for a connection, and for each block of data.
-    backoff_s : float
-        Seconds before the second attempt; doubled for each further one, up to 60.
-    progress : Progress
-        Called with file name, bytes there are, and bytes in all or None.
-    fixed_bytes : int, optional
-        Size of content that never changes at its address; a body of another size is refused.
-    most_bytes : int, optional
-        A longer body is refused.
-    """
-
-    retries: int = 3
-    timeout_s: float = 60.0
+    retries: int = 3  # further attempts after the first has failed
+    timeout_s: float = 60.0  # seconds to wait for a connection, and for each block of data
+    # seconds before the second attempt; doubled for each further one, up to 60
     backoff_s: float = 1.0
+    # called with file name, bytes there are, and bytes in all or None
     progress: Progress = no_progress
+    # size of content that never changes at its address; a body of another size is refused
     fixed_bytes: int | None = None
-    most_bytes: int | None = None
+    most_bytes: int | None = None  # A longer body is refused
 
 
 class _PartState(BaseModel):

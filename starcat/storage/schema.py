@@ -26,34 +26,16 @@ _FILE_NAME = re.compile(r"(?P<product>[a-z0-9_]+)-(?P<version>\d+\.\d+\.\d+)\.js
 
 @dataclass(frozen=True)
 class SchemaColumn:
-    """One column of a product.
+    """One column of a product."""
 
-    Attributes
-    ----------
-    name : str
-        As in every file and query.
-    dtype : str
-        ``int32``, ``float64``, ``string`` …, or ``list<int32>`` for a ragged column.
-    unit : str
-        Empty where the column has none.
-    nullable : bool
-        Whether a row may lack a value.
-    description, ucd : str
-        Meaning, and the IVOA content descriptor where there is one.
-    refers_to : str
-        Product whose rows the values are; empty where they are no rows.
-    in_database : bool
-        Whether the matcher's HDF5 file has the column.
-    """
-
-    name: str
-    dtype: str
-    unit: str
-    nullable: bool
-    description: str
+    name: str  # as in every file and query
+    dtype: str  # ``int32``, ``float64``, ``string`` …, or ``list<int32>`` for a ragged column
+    unit: str  # empty where the column has none
+    nullable: bool  # whether a row may lack a value
+    description: str  # meaning, and the IVOA content descriptor where there is one
     ucd: str
-    refers_to: str = ""
-    in_database: bool = True
+    refers_to: str = ""  # product whose rows the values are; empty where they are no rows
+    in_database: bool = True  # whether the matcher's HDF5 file has the column
 
     @property
     def is_list(self) -> bool:
@@ -80,24 +62,12 @@ class SchemaColumn:
 
 @dataclass(frozen=True)
 class ProductSchema:
-    """The contract of one product at one version.
+    """The contract of one product at one version."""
 
-    Attributes
-    ----------
-    product, version : str
-        Name and semantic version; the file is ``<product>-<version>.json``.
-    description : str
-        What a row is.
-    order : tuple of str
-        Columns that the rows are sorted by; together they are unique.
-    columns : tuple of SchemaColumn
-        In order.
-    """
-
-    product: str
+    product: str  # name and semantic version; the file is ``<product>-<version>.json``
     version: str
-    description: str
-    order: tuple[str, ...]
+    description: str  # what a row is
+    order: tuple[str, ...]  # columns that the rows are sorted by; together they are unique
     columns: tuple[SchemaColumn, ...]
 
     @property

@@ -14,16 +14,21 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 VOTABLE_NAMESPACE = "http://www.ivoa.net/xml/VOTable/v1.3"
-_DATATYPES = {
-    "bool": "boolean",
-    "uint8": "unsignedByte",
-    "int16": "short",
-    "int32": "int",
-    "int64": "long",
-    "float": "float",
-    "double": "double",
-    "string": "char",
-}
+DATATYPES = (
+    # VOTable, Arrow, DuckDB
+    ("boolean", pa.bool_(), "BOOLEAN"),
+    ("unsignedByte", pa.uint8(), "UTINYINT"),
+    ("short", pa.int16(), "SMALLINT"),
+    ("int", pa.int32(), "INTEGER"),
+    ("long", pa.int64(), "BIGINT"),
+    ("float", pa.float32(), "FLOAT"),
+    ("double", pa.float64(), "DOUBLE"),
+    ("unicodeChar", pa.string(), "VARCHAR"),
+)
+"""The types that VOTable has words for; texts that are sure to be ASCII are ``char`` there."""
+
+ARROW_DATATYPES = {arrow: name for name, arrow, _ in DATATYPES}
+DUCKDB_DATATYPES = {duckdb: name for name, _, duckdb in DATATYPES}
 
 
 def votable_metadata(table: pa.Table) -> dict[str, str]:
@@ -59,8 +64,10 @@ def votable_xml(table: pa.Table) -> str:
     for field in table.schema:
         facts = _facts(field)
         is_list = pa.types.is_list(field.type)
-        kind = str(field.type.value_type if is_list else field.type)
-        attributes = {"name": field.name, "datatype": _DATATYPES[kind]}
+        datatype = ARROW_DATATYPES[field.type.value_type if is_list else field.type]
+        # Parquet's texts are UTF-8, which VOParquet calls char.
+        datatype = "char" if datatype == "unicodeChar" else datatype
+        attributes = {"name": field.name, "datatype": datatype}
         if is_list or field.name in longest:
             # A reader makes room for texts by their longest one.
             attributes["arraysize"] = "*" if is_list else str(longest[field.name])

@@ -34,18 +34,11 @@ _MAX_INTEGER = 2**63 - 1
 
 @dataclass(frozen=True)
 class Translation:
-    """A query as the session runs it.
+    """A query as the session runs it."""
 
-    Attributes
-    ----------
-    sql : str
-        SQL of DuckDB.
-    columns : tuple of Column, optional
-        What is known of the columns of the answer; None where their names are not known before it
-        runs.
-    """
-
-    sql: str
+    sql: str  # SQL of DuckDB
+    # What is known of the columns of the answer; None where their names are not known before it
+    # runs.
     columns: Columns | None
 
 

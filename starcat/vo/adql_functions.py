@@ -7,25 +7,15 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Function:
-    """A function.
+    """A function."""
 
-    Attributes
-    ----------
-    least, most : int
-        How many arguments it takes.
-    written : str
-        SQL of DuckDB with ``{0}``, ``{1}`` for the arguments; ``{all}`` for all of them.
-    shortened : str
-        The same where the last argument is left out; empty where that is no matter.
-    is_set : bool
-        Whether it takes many rows, and DISTINCT or ALL before its argument.
-    """
-
+    # How many arguments it takes.
     least: int
     most: int
-    written: str
+    written: str  # SQL of DuckDB with {0}, {1} for the arguments; {all} for all of them
+    # The same where the last argument is left out; empty where that is no matter.
     shortened: str = ""
-    is_set: bool = False
+    is_set: bool = False  # whether it takes many rows, and DISTINCT or ALL before its argument
 
     def sql(self, arguments: list[str]) -> str:
         """Return the call as DuckDB writes it."""

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from starcat.errors import ConfigError, TargetMissing, quoted
-from starcat.exchange.votable_header import error_document
+from starcat.exchange.formats import Format, response_format
+from starcat.exchange.votable_fields import error_document
 from starcat.query.names import quoted as sql_text
 from starcat.query.names import quoted_name
 from starcat.query.session import Session
 from starcat.query.targets import POSITION, View
-from starcat.vo.formats import Format, format_named
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -40,31 +40,16 @@ _RANGES = {"RA": (0.0, 360.0), "DEC": (-90.0, 90.0), "SR": (0.0, 180.0)}
 
 @dataclass(frozen=True)
 class ConeRequest:
-    """A circle on the sky, and what is wanted of the stars in it.
+    """A circle on the sky, and what is wanted of the stars in it."""
 
-    Attributes
-    ----------
-    ra_deg, dec_deg : float
-        Its centre, ICRS.
-    radius_deg : float
-        Its radius; 0 asks for the columns only.
-    verbosity : int
-        1 for identity and place, 2 for all columns with a UCD, 3 for all.
-    maxrec : int, optional
-        Rows at most; None where that is not said.
-    form : Format
-        How the answer is written.
-    media_type : str
-        What it is sent as.
-    """
-
+    # Its centre, ICRS.
     ra_deg: float
     dec_deg: float
-    radius_deg: float
-    verbosity: int
-    maxrec: int | None
-    form: Format
-    media_type: str
+    radius_deg: float  # its radius; 0 asks for the columns only
+    verbosity: int  # 1 for identity and place, 2 for all columns with a UCD, 3 for all
+    maxrec: int | None  # rows at most; None where that is not said
+    form: Format  # how the answer is written
+    media_type: str  # what it is sent as
 
 
 def cone_request(parameters: Iterable[tuple[str, str]]) -> ConeRequest:
@@ -182,9 +167,9 @@ def _degrees(given: Mapping[str, str], key: str) -> float:
 def _form(text: str) -> tuple[Format, str]:
     """Return a format and its media type; by default what readers of all ages know."""
     if text.strip().lower() in ("", "text/xml"):
-        return format_named("votable/td"), MEDIA_TYPE
-    form = format_named(text)
-    return form, form.media_type
+        return response_format("votable/td"), MEDIA_TYPE
+    form = response_format(text)
+    return form, form.tap_type
 
 
 def _whole(

@@ -36,9 +36,9 @@ from vo_models.vosi.availability.models import Availability
 from vo_models.vosi.capabilities.models import VOSICapabilities
 from vo_models.vosi.tables.models import VOSITable, VOSITableSet
 
+from starcat.exchange.formats import TAP_FORMATS
 from starcat.vo.adql import GEOMETRY
 from starcat.vo.adql_functions import USER_FUNCTIONS
-from starcat.vo.formats import FORMATS
 from starcat.vo.tables import Column, Schema, Table, Tables, adql_name, full_name
 from starcat.vo.uws import xml_text
 
@@ -66,18 +66,12 @@ they read know no name for it yet."""
 
 @dataclass(frozen=True)
 class ServiceLimits:
-    """What the service grants.
+    """What the service grants."""
 
-    Attributes
-    ----------
-    run_s, keep_s : int
-        Seconds that a query may take, and that its answer is kept.
-    rows, upload_bytes : int
-        Rows of an answer, and bytes of an upload at most.
-    """
-
+    # Seconds that a query may take, and that its answer is kept.
     run_s: int
     keep_s: int
+    # Rows of an answer, and bytes of an upload at most.
     rows: int
     upload_bytes: int
 
@@ -132,11 +126,11 @@ def _table_access(base_url: str, limits: ServiceLimits) -> TableAccess:
         language=[language],
         output_format=[
             OutputFormat(
-                mime=one.media_type,
+                mime=one.tap_type,
                 alias=[one.name, *(a for a in one.aliases if "/" not in a or ";" not in a)],
                 ivo_id=one.standard_id or None,
             )
-            for one in FORMATS
+            for one in TAP_FORMATS
         ],
         upload_method=[
             UploadMethod(ivo_id=f"ivo://ivoa.net/std/TAPRegExt#upload-{kind}")

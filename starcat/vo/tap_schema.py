@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcat.errors import SchemaError
-from starcat.exchange.units import unit_text
-from starcat.query.columns import Facts, column_facts
+from starcat.exchange.columns import unit_text
 from starcat.query.names import identifier
+from starcat.query.result import Facts, column_facts
 from starcat.query.session import Session
 from starcat.query.targets import View
 from starcat.storage.parquet import write_parquet

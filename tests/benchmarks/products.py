@@ -23,7 +23,7 @@ from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest
 from starcat.catalog.selection import select_guide_stars
 from starcat.catalog.stars import directions_of
-from starcat.pipeline.recipes import RECIPES, Ingredients, cook, tile_guide_stars
+from starcat.pipeline.recipes import RECIPES, ProductInputs, make_product, tile_guide_stars
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset
 from starcat.storage.parquet import write_parquet
@@ -40,12 +40,12 @@ def measure(spec: BuildSpec) -> dict[str, dict[str, float]]:
     stars = select_guide_stars(read.stars, spec.selection).guide_stars
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     start = time.perf_counter()
-    sky = Ingredients(directions_of(stars), tile_guide_stars(stars, spec), spec)
+    sky = ProductInputs(directions_of(stars), tile_guide_stars(stars, spec), spec)
     found = {"tiling": {"seconds": time.perf_counter() - start, "rows": float(len(stars))}}
     with tempfile.TemporaryDirectory() as folder:
         for name in RECIPES:
             start = time.perf_counter()
-            product = cook(name, sky)
+            product = make_product(name, sky)
             seconds = time.perf_counter() - start
             parquet, database = Path(folder, f"{name}.parquet"), Path(folder, f"{name}.h5")
             write_parquet(product.table, parquet)

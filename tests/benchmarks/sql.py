@@ -22,7 +22,7 @@ from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest
 from starcat.catalog.selection import select_guide_stars
 from starcat.catalog.stars import directions_of
-from starcat.pipeline.recipes import Ingredients, cook, tile_guide_stars
+from starcat.pipeline.recipes import ProductInputs, make_product, tile_guide_stars
 from starcat.query.session import Session, open_session
 from starcat.specs.reading import preset, spec_from_dict
 from starcat.storage.parquet import write_parquet
@@ -70,10 +70,10 @@ def make_tables(folder: Path) -> tuple[Path, Path]:
     spec = spec_from_dict(content, "bench")
     read = ingest("gaia", [embedded_sky()], epoch_jyear=spec.epoch_jyear)
     stars = select_guide_stars(read.stars, spec.selection).guide_stars
-    given = Ingredients(directions_of(stars), tile_guide_stars(stars, spec), spec)
+    given = ProductInputs(directions_of(stars), tile_guide_stars(stars, spec), spec)
     paths = folder / "stars.parquet", folder / "pairs.parquet"
     write_parquet(stars, paths[0])
-    write_parquet(cook("pairs", given).table, paths[1])
+    write_parquet(make_product("pairs", given).table, paths[1])
     return paths
 
 

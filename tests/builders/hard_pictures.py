@@ -24,10 +24,9 @@ from starcat.catalog.stars import floats_of
 from starcat.geometry.attitude import matrix_from_quaternion, random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import directions_from_radec
-from starcat.images.identification import identify_frames, measure
 from starcat.images.image_file import write_image
-from starcat.images.render import Optics, render_image
-from starcat.images.scene import Scene, in_file_steps, scene_light
+from starcat.images.render import Optics, Scene, in_file_steps, render_image, scene_light
+from starcat.images.solve_files import identify_file
 from starcat.matcher.matcher import Matcher
 
 Array = NDArray[np.float64]
@@ -168,7 +167,8 @@ def worst_px(taken: Taken, q_body_from_icrs: Array, camera: Camera) -> float:
 def verdict(matcher: Matcher, taken: Taken) -> str:
     """``right``, ``wrong`` or the status, as the command would find it without an option."""
     camera = matcher.database.camera
-    [result] = identify_frames(matcher, measure(taken.path), camera)
+    [answer] = identify_file(taken.path, matcher)
+    result = answer.result
     if result.status != "identified":
         return result.status
     return "right" if worst_px(taken, result.q_body_from_icrs, camera) < RIGHT_PX else "wrong"

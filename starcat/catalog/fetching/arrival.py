@@ -32,6 +32,7 @@ from starcat.errors import (
     SourceError,
     SourceMissing,
 )
+from starcat.failures import validation_message
 from starcat.storage.locks import locked
 
 LOCK_NAME = "starcat-sources.lock"
@@ -178,10 +179,9 @@ def read_lock(folder: Path) -> dict[str, LockEntry]:
     try:
         return _ENTRIES.validate_json(path.read_bytes())
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(step) for step in first["loc"])
+        where, found = validation_message(error)
         raise SourceError(
-            f"{path} is not a lock file that starcat wrote ({where or 'file'}: {first['msg']}). "
+            f"{path} is not a lock file that starcat wrote ({where or 'file'}: {found}). "
             "Restore it, or delete it to accept the files as they are now.",
             path=path,
         ) from error

@@ -10,14 +10,12 @@ import typer
 
 from starcat.cli.commands.shared import Json
 from starcat.errors import ConfigError
+from starcat.exchange.formats import EXPORT_FORMATS, ONBOARD_FORMATS
 
 if TYPE_CHECKING:
-    from starcat.exchange.tables import NamedTables
+    from starcat.exchange.export import NamedTables
 
 app = typer.Typer()
-
-ONBOARD_FORMATS = ("onboard", "c")
-"""The formats of `export` that are no tables."""
 
 
 @app.command()
@@ -34,8 +32,8 @@ def export(
             "--to",
             "--format",
             metavar="FORMAT",
-            help="csv, json, parquet, votable, fits, ecsv, npz or hats; onboard or c for flight "
-            "software.",
+            help=f"{', '.join(EXPORT_FORMATS[:-1])} or {EXPORT_FORMATS[-1]}; "
+            f"{' or '.join(ONBOARD_FORMATS)} for flight software.",
         ),
     ] = "csv",
     output: Annotated[
@@ -127,8 +125,8 @@ def _named(source: Path | None) -> Path:
 
 
 def _tables(source: Path | None, peer: str | None) -> NamedTables:
+    from starcat.exchange.export import tables_of
     from starcat.exchange.peers import peer_tables
-    from starcat.exchange.tables import tables_of
 
     if peer is not None:
         return peer_tables(peer, source)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -32,14 +33,46 @@ from starcat.cli.commands.shared import (
     Velocity,
     WcsFile,
     field_range,
-    limits_of_options,
     observer_of_options,
     share_of_percent,
     size_in_px,
     unknown_field,
 )
 
+if TYPE_CHECKING:
+    from starcat.cli.terminal.matches import Tally
+    from starcat.images.solve_files import FileAnswers
+
 app = typer.Typer()
+
+Folder = Annotated[Path, typer.Argument(help="The folder <name>-<version>.")]
+FrameFile = Annotated[
+    Path,
+    typer.Argument(help="Centroids (CSV, JSON, - for stdin) or image (FITS, PNG, TIFF, JPEG)."),
+]
+CameraFile = Annotated[
+    Path | None, typer.Option(help="Camera file (TOML); default: the database's camera.")
+]
+TolerancePx = Annotated[
+    float | None, typer.Option(min=0.01, max=200, help="Largest error of a centroid; default: 2.")
+]
+CentroidNoise = Annotated[
+    float | None,
+    typer.Option(min=0.01, max=50, help="Noise of a centroid, each axis; for --tolerance-px."),
+]
+MagnitudeNoise = Annotated[
+    float | None,
+    typer.Option(min=0.001, max=10, help="Noise of magnitudes in the database's band."),
+]
+Certainty = Annotated[
+    float, typer.Option(min=0.0, max=1.0, help="Less certain answers are withheld.")
+]
+Flip = Annotated[
+    bool | None, typer.Option("--flip/--no-flip", help="First row at the bottom; y upwards.")
+]
+Picture = Annotated[
+    Path | None, typer.Option(help="PNG or SVG of the first frame, its stars named.")
+]
 
 
 @app.command()
@@ -55,7 +88,7 @@ def methods(json: Json = False) -> None:
 
 @app.command()
 def simulate(
-    artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
+    artifact: Folder,
     output: Annotated[Path, typer.Option("--output", "-o", help="CSV, FITS, PNG, TIFF, JPEG.")],
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same frame.")] = 0,
     noise_px: NoisePx = 0.5,
@@ -67,7 +100,7 @@ def simulate(
     Example: starcat simulate dist/gaia-12deg-1.0.0 -o frame.csv --seed 7
     """
     from starcat.cli.terminal.matches import print_simulated
-    from starcat.images.identification import write_simulated
+    from starcat.images.render import write_simulated
     from starcat.matcher.database import open_database
     from starcat.simulation.simulate import Noise, simulate_frames
 
@@ -82,39 +115,21 @@ def simulate(
 @app.command()
 def identify(
     context: typer.Context,
-    artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
-    file: Annotated[
-        Path,
-        typer.Argument(help="Centroids (CSV, JSON, - for stdin) or image (FITS, PNG, TIFF, JPEG)."),
-    ],
+    artifact: Folder,
+    file: FrameFile,
     method: MethodName = None,
-    camera: Annotated[
-        Path | None, typer.Option(help="Camera file (TOML); default: the database's camera.")
-    ] = None,
-    tolerance_px: Annotated[
-        float | None,
-        typer.Option(min=0.01, max=200, help="Largest error of a centroid; default: 2."),
-    ] = None,
-    noise_px: Annotated[
-        float | None,
-        typer.Option(min=0.01, max=50, help="Noise of a centroid, each axis; for --tolerance-px."),
-    ] = None,
-    noise_mag: Annotated[
-        float | None,
-        typer.Option(min=0.001, max=10, help="Noise of magnitudes in the database's band."),
-    ] = None,
-    max_false_match_probability: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="Less certain answers are withheld.")
-    ] = 1e-9,
+    camera: CameraFile = None,
+    tolerance_px: TolerancePx = None,
+    noise_px: CentroidNoise = None,
+    noise_mag: MagnitudeNoise = None,
+    max_false_match_probability: Certainty = 1e-9,
     fov_error: FovError = None,
     fov: FieldRange = None,
     size: FrameSize = None,
     min_share: MinShare = None,
     max_steps: MaxSteps = None,
     time_limit_s: TimeLimit = None,
-    flip: Annotated[
-        bool | None, typer.Option("--flip/--no-flip", help="First row at the bottom; y upwards.")
-    ] = None,
+    flip: Flip = None,
     psf_sigma_px: PsfSigmaPx = None,
     threshold: Threshold = 5.0,
     most_spots: MostSpots = 200,
@@ -122,9 +137,7 @@ def identify(
     bayer: Mosaic = False,
     dark: Dark = None,
     mask: Mask = None,
-    picture: Annotated[
-        Path | None, typer.Option(help="PNG or SVG of the first frame, its stars named.")
-    ] = None,
+    picture: Picture = None,
     time: Time = None,
     velocity: Velocity = None,
     orbit: Orbit = None,
@@ -145,54 +158,66 @@ def identify(
 
         identify_there(context, artifact.name, file)
         return
-    from starcat.cli.terminal.console import say
-    from starcat.cli.terminal.matches import print_answers
-    from starcat.images.answering import answer_each, camera_of_size, measure_input, write_extras
-    from starcat.images.identification import PictureOptions
-    from starcat.matcher.centroids import said_of_columns
-    from starcat.matcher.matcher import Matcher
-    from starcat.matcher.tracking import Tracker
+    answers = _file_answers(file, artifact, context.params)
+    tally = _print_file_answers(answers, picture, wcs, as_json=json, as_lines=ndjson)
+    if fail_on_no_match:
+        tally.expect_all_identified()
+
+
+def _file_answers(file: Path, artifact: Path, given: Mapping[str, Any]) -> FileAnswers:
+    """Return the answers to the frames of a file, by the options of the command line."""
+    from starcat.images.solve_files import (
+        IdentifyOptions,
+        LocalInputs,
+        identify_file,
+        open_matcher,
+    )
     from starcat.specs.camera_file import read_camera
 
-    prior = chosen_prior(prior_q, prior_error_deg, track=track)
-    observer = observer_of_options(time, velocity, orbit)
-    matcher = Matcher.open(
-        artifact,
-        method,
-        tolerance_px=tolerance_px,
-        max_false_match_probability=max_false_match_probability,
-        noise_px=noise_px,
-        noise_mag=noise_mag,
-        **limits_of_options(min_share, max_steps, time_limit_s),
+    prior = chosen_prior(given["prior_q"], given["prior_error_deg"], track=given["track"])
+    observer = observer_of_options(given["time"], given["velocity"], given["orbit"])
+    error = share_of_percent(given["fov_error"])
+    size_px, fov_deg = unknown_field(given["size"], given["fov"], given["fov_error"])
+    options = {name: given[name] for name in IdentifyOptions.model_fields if name in given}
+    options |= {"fov_error": error, "size_px": size_px, "fov_deg": fov_deg}
+    options |= {"camera": None, "prior_q": prior[0] if prior else None}
+    # The command line has checked what its options may be, and calls them by their own names.
+    chosen = IdentifyOptions.model_construct(**options)
+    matcher, path = open_matcher(artifact, chosen), given["camera"]
+    local = LocalInputs(
+        camera=read_camera(path) if path else None,
+        **{name: given[name] for name in ("dark", "mask", "track")},
+        observer=observer,
     )
-    eye = read_camera(camera) if camera else matcher.database.camera
-    how = PictureOptions(threshold, psf_sigma_px, most_spots, plane, bayer, dark, mask)
-    measured = measure_input(file, flip=flip, wcs=wcs, options=how)
-    error, (size_px, fov_deg) = share_of_percent(fov_error), unknown_field(size, fov, fov_error)
-    if fov_deg is not None:
-        eye = camera_of_size(measured, size_px, eye)
-    near = Tracker(matcher) if track else prior
-    answered = answer_each(
-        *(matcher, measured, eye, observer), flip=flip, fov_error=error, near=near, fov_deg=fov_deg
-    )
-    told = print_answers(
-        answered, matcher.database, as_json=json, as_lines=ndjson, observer=observer
-    )
-    if told.first and (unknown := said_of_columns([told.first[0]])):
-        say(unknown)
-    if measured.image is not None and not told.identified:
-        say("An image that was read upside down is never identified: try --flip or --no-flip.")
-    if told.first is not None:
-        write_extras(
-            file, measured, *told.first, eye, picture=picture, wcs=wcs, flip=flip, observer=observer
-        )
-    if fail_on_no_match:
-        told.expect_all_identified()
+    return identify_file(file, matcher, chosen, local)
+
+
+def _print_file_answers(
+    answers: FileAnswers, picture: Path | None, wcs: Path | None, *, as_json: bool, as_lines: bool
+) -> Tally:
+    """Print answers with what a user should know of them, and write what is asked for beside."""
+    from starcat.cli.terminal.console import say
+    from starcat.cli.terminal.matches import print_answers
+    from starcat.images.image_file import expect_room_for_wcs
+
+    is_picture = answers.measured.image is not None
+    if wcs is not None:
+        expect_room_for_wcs(wcs, answers.path, is_picture=is_picture)
+    database = answers.matcher.database
+    tally = print_answers(answers, database, as_json=as_json, as_lines=as_lines)
+    is_any = tally.identified > 0
+    for note in answers.notes(tally.first, is_any_identified=is_any, flip="--flip or --no-flip"):
+        say(note)
+    if tally.first is not None and picture is not None:
+        answers.draw(picture, tally.first)
+    if tally.first is not None and wcs is not None:
+        answers.write_wcs(wcs, tally.first)
+    return tally
 
 
 @app.command()
 def calibrate(
-    artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
+    artifact: Folder,
     files: Annotated[
         list[Path], typer.Argument(metavar="FRAMES...", help="As 'starcat identify' takes them.")
     ],
@@ -217,13 +242,14 @@ def calibrate(
     """
     from starcat.calibration.camera_text import write_camera
     from starcat.calibration.files import calibrate_files
-    from starcat.calibration.residual_plot import checked_kind, draw_residuals
+    from starcat.calibration.residual_plot import draw_residuals
     from starcat.cli.terminal.calibrations import print_calibration
     from starcat.cli.terminal.console import progress_bars
+    from starcat.images.figure_file import check_kind
     from starcat.matcher.matcher import Matcher
     from starcat.specs.camera_file import read_camera
 
-    checked_kind(plot)
+    check_kind(plot)
     known = read_camera(camera) if camera else None
     size_px, fov_deg = size_in_px(size), field_range(fov)
     with progress_bars() as progress:
@@ -239,7 +265,7 @@ def calibrate(
 
 @app.command()
 def selftest(
-    artifact: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
+    artifact: Folder,
     frames: Annotated[int, typer.Option(min=1, help="Fields of each kind.")] = 500,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same fields.")] = 1,
     noise_px: NoisePx = 0.5,

@@ -11,10 +11,11 @@ import typer
 
 from starcat.cli.commands.shared import Json
 from starcat.errors import QueryError
+from starcat.exchange.formats import FILE_FORMATS
 
 app = typer.Typer()
 
-FORMATS = "table, csv, json, parquet, votable, fits, ecsv or npz"
+FORMATS = f"{', '.join(('table', *FILE_FORMATS[:-1]))} or {FILE_FORMATS[-1]}"
 
 
 @app.command()

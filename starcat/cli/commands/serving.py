@@ -14,7 +14,7 @@ from starcat.cli.commands.shared import Json
 from starcat.errors import ConfigError, TargetMissing
 
 if TYPE_CHECKING:
-    from starcat.service.guard.tokens import Token, TokenStore
+    from starcat.service.security.tokens import Token, TokenStore
 
 app = typer.Typer()
 tokens = typer.Typer(
@@ -166,20 +166,20 @@ def _print_tokens(found: Sequence[Token], *, as_json: bool) -> None:
 def _tokens_of(root: Path, new: str | None = None) -> Iterator[TokenStore]:
     """Return the tokens of a service, which is made where a new one is to be its first."""
     try:
-        from starcat.service.guard.tokens import TokenStore, check_name
-        from starcat.service.places import Places
+        from starcat.service.paths import ServicePaths
         from starcat.service.records import Records
+        from starcat.service.security.tokens import TokenStore, check_name
     except ModuleNotFoundError as error:
         raise _not_installed(error) from error
     from starcat.service.settings import read_settings
 
-    places = Places(read_settings(root).root)
+    paths = ServicePaths(read_settings(root).root)
     if new is not None:
         check_name(new)
-    elif not places.records.exists():
+    elif not paths.records.exists():
         raise TargetMissing(f"{root}: no service has kept anything here; give its --root")
-    places.make()
-    records = Records(places.records)
+    paths.make()
+    records = Records(paths.records)
     try:
         yield TokenStore(records)
     finally:

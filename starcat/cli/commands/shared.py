@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypedDict, overload
+from typing import TYPE_CHECKING, Annotated, overload
 
 import typer
 
@@ -196,28 +196,6 @@ def inputs_by_source(given: list[str] | None, only: str | None = None) -> Mappin
             raise ConfigError(f"--input {text!r} is not SOURCE=PATH, such as sao=sao.dat.gz")
         inputs.setdefault(data_source(name).name, []).append(Path(path))
     return inputs
-
-
-class SearchLimits(TypedDict, total=False):
-    """The limits of a search, as keywords of `Matcher.open`."""
-
-    min_share: float
-    max_steps: float
-    time_limit_s: float
-
-
-def limits_of_options(
-    min_share: float | None, max_steps: int | None, time_limit_s: float | None
-) -> SearchLimits:
-    """Return the limits of a search that are given."""
-    given: SearchLimits = {}
-    if min_share is not None:
-        given["min_share"] = min_share
-    if max_steps is not None:
-        given["max_steps"] = max_steps
-    if time_limit_s is not None:
-        given["time_limit_s"] = time_limit_s
-    return given
 
 
 def unknown_field(

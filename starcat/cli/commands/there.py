@@ -100,8 +100,9 @@ def sql_there(
     """Ask a service a question in SQL, and print or keep the answer."""
     from starcat.cli.terminal.asking import Wish, format_of_wish
     from starcat.cli.terminal.console import say
-    from starcat.cli.terminal.queries import Told, print_answer
+    from starcat.cli.terminal.queries import print_result
     from starcat.query.gallery import guessed
+    from starcat.query.result import ResultTable
 
     client = _client(context)
     if query is None and named is None:
@@ -114,9 +115,7 @@ def sql_there(
         found = client.sql(
             targets, query, texts, named=named, max_rows=rows, time_limit_s=time_limit_s
         )
-        lines = found["rows"]
-        # One more than to show says that there are more.
-        print_answer(Told(found["columns"]), lines + lines[-1:] * found["is_cut"], rows)
+        print_result(ResultTable.from_json(found))
         return
     asked = (targets, query, texts)
     if output is not None:

@@ -13,8 +13,7 @@ from starcat.cli.terminal.console import progress_bars, say
 from starcat.cli.terminal.queries import print_first_rows, print_views
 from starcat.errors import QueryError
 from starcat.query.gallery import guessed, named_query
-from starcat.query.preamble import preamble_of
-from starcat.query.session import Limits, Session, open_session
+from starcat.query.session import Limits, Session, open_session, preamble_of
 
 
 @dataclass(frozen=True)
@@ -85,11 +84,11 @@ def format_of_wish(wish: Wish) -> str:
     """Return the format that an answer is wanted in."""
     if wish.form in (None, "table") and wish.output is None:
         return "table"
-    from starcat.exchange.formats import FORMATS, TEXT_FORMATS, format_of
+    from starcat.exchange.formats import FILE_FORMATS, TEXT_FORMATS, format_of
 
     form = wish.form or (format_of(wish.output) if wish.output else "table")
-    if form not in ("table", *FORMATS):
-        raise QueryError(f"--format {form!r}: choose table, {', '.join(FORMATS)}")
+    if form not in ("table", *FILE_FORMATS):
+        raise QueryError(f"--format {form!r}: choose table, {', '.join(FILE_FORMATS)}")
     if wish.output is None and form not in ("table", *TEXT_FORMATS):
         raise QueryError(f"--format {form} is no text for a terminal; give a file with -o")
     if wish.output is not None and form == "table":
@@ -122,7 +121,7 @@ def _give(
     if form == "table":
         print_first_rows(session, query, values, rows)
         return
-    from starcat.exchange.formats import write_batches, write_text_batches
+    from starcat.exchange.writers import write_batches, write_text_batches
 
     with progress_bars() as progress, session.ask(query, values, progress) as found:
         if output is None:

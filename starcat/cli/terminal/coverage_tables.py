@@ -18,7 +18,7 @@ _BARS, _BAR_WIDTH = 20, 50
 
 def print_coverage(artifact: Artifact, folder: Path | None, *, as_json: bool) -> None:
     """Print the coverage of an artifact, and write its tables and plots where asked to."""
-    from starcat.pipeline.facts import artifact_coverage
+    from starcat.pipeline.report_data import artifact_coverage
     from starcat.report.coverage_report import holes_warning, write_coverage
 
     report = artifact_coverage(artifact)

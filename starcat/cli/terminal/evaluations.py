@@ -6,13 +6,14 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from starcat.cli.terminal.console import print_json, print_table, say
-from starcat.evaluation.report.columns import SHORT, verdict
 from starcat.evaluation.report.tables import (
+    SHORT,
     Table,
     failure_table,
     rate_tables,
     statistic_tables,
     summary_table,
+    verdict,
 )
 
 if TYPE_CHECKING:

@@ -4,49 +4,41 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from starcat.cli.terminal.console import print_json, print_json_line, print_table
-from starcat.cli.terminal.sky_in_time import print_sky_in_time, sky_as_dict
 from starcat.errors import NotIdentifiedError
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
-from starcat.images.answering import sky_of_answer
-from starcat.matcher.answer_json import answer_content, facts
-from starcat.matcher.centroids import MeasuredFrame
+from starcat.images.solve_files import FrameAnswer, facts
 from starcat.matcher.database import Database
 from starcat.matcher.methods.table import METHODS
-from starcat.matcher.result import MatchResult
 from starcat.simulation.simulate import Frame
-from starcat.sky.observer import Observer
-
-Answered = tuple[MeasuredFrame, MatchResult]
+from starcat.sky.in_time import SkyInTime
 
 NAMED = 3
 """Frames that are named where some were not identified."""
 
 
-@dataclass(frozen=True)
-class Told:
-    """What was said of the frames of a file.
+@dataclass
+class Tally:
+    """How many frames of a file there were and how many were identified, and the first answer."""
 
-    Attributes
-    ----------
-    frames, identified : int
-        How many there were, and how many of them were identified.
-    first : (MeasuredFrame, MatchResult) or None
-        The first frame and its answer; None where a stream had no frame.
-    unidentified : tuple of str
-        Names of the first frames that were not, at most `NAMED` of them.
-    """
+    frames: int = 0
+    identified: int = 0
+    first: FrameAnswer | None = None
+    unidentified: list[str] = field(default_factory=list)
 
-    frames: int
-    identified: int
-    first: Answered | None
-    unidentified: tuple[str, ...]
+    def add(self, name: str, status: str) -> None:
+        """Count a frame."""
+        self.frames += 1
+        if status == "identified":
+            self.identified += 1
+        elif len(self.unidentified) < NAMED:
+            self.unidentified.append(f"{name}: {status}")
 
     def expect_all_identified(self) -> None:
         """Raise `NotIdentifiedError` unless every frame was identified."""
@@ -61,92 +53,77 @@ class Told:
 
 
 def print_answers(
-    answered: Iterable[Answered],
-    database: Database,
-    *,
-    as_json: bool,
-    as_lines: bool = False,
-    observer: Observer | None = None,
-) -> Told:
+    answers: Iterable[FrameAnswer], database: Database, *, as_json: bool, as_lines: bool = False
+) -> Tally:
     """Print the answers to the frames of a file."""
-    kept: list[Answered] = []
-    first: Answered | None = None
-    count = identified = 0
-    missing: list[str] = []
-    for frame, result in answered:
-        first = first or (frame, result)
-        count, identified = count + 1, identified + result.ok
-        if not result.ok and len(missing) < NAMED:
-            missing.append(f"{frame.name}: {result.status}")
+    tally, kept = Tally(), []
+    for answer in answers:
+        tally.first = tally.first or answer
+        tally.add(answer.frame.name, answer.result.status)
         if as_lines:
-            print_json_line(_content(frame, result, observer))
+            print_json_line(answer.content())
         else:
-            kept.append((frame, result))
-    if as_json and not as_lines:
-        print_json([_content(frame, result, observer) for frame, result in kept])
-    elif len(kept) == 1:
-        _print_one(*kept[0], database)
+            kept.append(answer)
+    if as_lines:
+        return tally
+    if as_json:
+        print_json([answer.content() for answer in kept])
+        return tally
+    if len(kept) == 1:
+        _print_one(kept[0], database)
     elif kept:
         _print_many(kept, database)
-    if observer is not None and not (as_json or as_lines):
-        skies = [sky_of_answer(frame, result, observer) for frame, result in kept]
-        print_sky_in_time([frame.name for frame, _ in kept], skies)
-    return Told(count, identified, first, tuple(missing))
+    print_sky_in_time([(answer.frame.name, sky) for answer in kept if (sky := answer.sky)])
+    return tally
 
 
 def print_contents(
     contents: Sequence[dict[str, Any]], database: str, *, as_json: bool, as_lines: bool = False
-) -> Told:
+) -> Tally:
     """Print the answers that a service gives to the frames of a file."""
-    if as_lines:
-        for one in contents:
+    tally = Tally()
+    for one in contents:
+        tally.add(one["frame"], one["status"])
+        if as_lines:
             print_json_line(one)
-    elif as_json:
-        print_json(list(contents))
-    else:
-        for one in contents:
+        elif not as_json:
             _print_content(one, database)
-    missing = [one for one in contents if one["status"] != "identified"]
-    named = tuple(f"{one['frame']}: {one['status']}" for one in missing[:NAMED])
-    return Told(len(contents), len(contents) - len(missing), None, named)
+    if as_json and not as_lines:
+        print_json(list(contents))
+    return tally
 
 
 def _print_content(content: dict[str, Any], database: str) -> None:
-    rows: list[tuple[str, Any]] = []
-    for name, value in content.items():
-        if name == "refusal":
-            rows += [("because", value["words"]), ("try", value["advice"])]
-        elif value is not None and not isinstance(value, list):
-            rows.append((name, f"{value:.9g}" if isinstance(value, float) else value))
+    rows = [row for name, value in content.items() for row in _rows_of_fact(name, value)]
     print_table(f"{len(content['stars'])} centroids, {database}", ("", ""), rows)
     if content["status"] == "identified":
         _print_stars(content["stars"])
 
 
-def _content(
-    frame: MeasuredFrame, result: MatchResult, observer: Observer | None
-) -> dict[str, Any]:
-    content = answer_content(frame, result)
-    if observer is not None:
-        content["in_time"] = sky_as_dict(sky_of_answer(frame, result, observer))
-    return content
+def _rows_of_fact(name: str, value: Any) -> list[tuple[str, Any]]:
+    if name == "refusal":
+        return [("because", value["words"]), ("try", value["advice"])]
+    if value is None or isinstance(value, list):
+        return []
+    return [(name, f"{value:.9g}" if isinstance(value, float) else value)]
 
 
-def _print_one(frame: MeasuredFrame, result: MatchResult, database: Database) -> None:
+def _print_one(answer: FrameAnswer, database: Database) -> None:
+    frame, result = answer.frame, answer.result
     rows: list[tuple[str, Any]] = []
     for name, value in facts(result).items():
         if name == "covariance_arcsec2":
             sigma = np.sqrt(result.covariance_arcsec2.diagonal())
             rows.append(("error about x, y, z arcsec", ", ".join(f"{one:.3g}" for one in sigma)))
-        elif name == "refusal":
-            rows += [("because", value["words"]), ("try", value["advice"])]
-        elif value is not None:
-            rows.append((name, f"{value:.9g}" if isinstance(value, float) else value))
+        elif name == "q_body_from_icrs":
+            rows.append((name, value))
+        else:
+            rows += _rows_of_fact(name, value)
     for reason, count in sorted(Counter(reason for _, reason in result.dropped).items()):
         rows.append((f"dropped, {reason.replace('_', ' ')}", count))
     print_table(f"{len(frame.centroids_px)} centroids, {database.name}", ("", ""), rows)
     if result.ok:
-        _print_stars(answer_content(frame, result)["stars"])
+        _print_stars(answer.content()["stars"])
 
 
 def _print_stars(stars: Sequence[dict[str, Any]]) -> None:
@@ -166,10 +143,11 @@ def _shown(value: float | None) -> str:
     return "" if value is None else f"{value:.2f}"
 
 
-def _print_many(answered: Sequence[Answered], database: Database) -> None:
+def _print_many(answers: Sequence[FrameAnswer], database: Database) -> None:
     rows = []
-    is_tracked = any(result.origin == "tracking" for _, result in answered)
-    for frame, result in answered:
+    is_tracked = any(answer.result.origin == "tracking" for answer in answers)
+    for answer in answers:
+        frame, result = answer.frame, answer.result
         origin = (result.origin.replace("_", " "),) if is_tracked else ()
         angles = (result.boresight_ra_deg, result.boresight_dec_deg, result.roll_deg)
         why = result.refusal
@@ -186,7 +164,50 @@ def _print_many(answered: Sequence[Answered], database: Database) -> None:
         )
     names = ("frame", "status", "stars", "RA deg", "Dec deg", "roll deg", "rms arcsec", "chance")
     heads = (*names, "origin") if is_tracked else names
-    print_table(f"{len(answered)} frames, {database.name}", heads, rows, numbers=(2, 3, 4, 5, 6, 7))
+    print_table(f"{len(answers)} frames, {database.name}", heads, rows, numbers=(2, 3, 4, 5, 6, 7))
+
+
+def print_sky_in_time(known: Sequence[tuple[str, SkyInTime]]) -> None:
+    """Print true attitudes, exclusion angles and the bodies of frames by name."""
+    if not known:
+        return
+    print_table(
+        f"With aberration, at {known[0][1].time}",
+        ("frame", "RA deg", "Dec deg", "roll deg", "corrected arcsec", "rms arcsec", "Sun deg",
+         "Moon deg", "Earth limb deg"),
+        [(name, *_angles(sky)) for name, sky in known],
+        numbers=(1, 2, 3, 4, 5, 6, 7, 8),
+    )  # fmt: skip
+    bodies = [
+        (
+            name,
+            body.name,
+            f"{body.x_px:.1f}",
+            f"{body.y_px:.1f}",
+            f"{body.mag:.1f}",
+            f"{body.from_boresight_deg:.2f}",
+            "yes" if body.row is not None else "no",
+        )
+        for name, sky in known
+        for body in sky.bodies
+    ]
+    if bodies:
+        heads = ("frame", "body", "x px", "y px", "mag", "from boresight deg", "spot")
+        print_table("Planets in the frame", heads, bodies, numbers=(2, 3, 4, 5))
+
+
+def _angles(sky: SkyInTime) -> tuple[str, ...]:
+    limb = sky.earth_limb_angle_deg
+    return (
+        f"{sky.boresight_ra_deg:.5f}",
+        f"{sky.boresight_dec_deg:.5f}",
+        f"{sky.roll_deg:.5f}",
+        f"{sky.correction_arcsec:.2f}",
+        f"{sky.residual_arcsec:.2f}",
+        f"{sky.sun_angle_deg:.2f}",
+        f"{sky.moon_angle_deg:.2f}",
+        "" if limb is None else f"{limb:.2f}",
+    )
 
 
 def print_simulated(frame: Frame, output: Path, *, as_json: bool) -> None:

@@ -10,8 +10,7 @@ from pathlib import Path
 from starcat.cli.terminal.console import say
 from starcat.cli.terminal.queries import print_first_rows, print_gallery, print_macros, print_views
 from starcat.errors import StarcatError
-from starcat.query.gallery import gallery, named_query
-from starcat.query.macros import macros
+from starcat.query.gallery import gallery, macros, named_query
 from starcat.query.session import Session
 
 HELP = """\

@@ -6,14 +6,13 @@ import re
 import sys
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
 
 from starcat.cli.terminal.console import MAX_WIDTH, print_json, print_table, progress_bars, say
-from starcat.query.answer import cell_text
 
 if TYPE_CHECKING:
-    from starcat.query.columns import Facts
+    from starcat.query.result import ResultTable
     from starcat.query.session import Session
     from starcat.query.targets import Target, View
 
@@ -23,76 +22,24 @@ FOLDED_CHARACTERS = 28
 
 def print_first_rows(session: Session, query: str, values: Mapping[str, Any], rows: int) -> None:
     """Ask a query, with a bar while it runs, and print the first rows of its answer."""
-    with progress_bars() as progress, session.ask(query, values, progress) as answer:
-        found = answer.rows(rows + 1)
-    print_answer(answer, found, rows)
+    with progress_bars() as progress, session.ask(query, values, progress) as running:
+        found = running.table(rows)
+    print_result(found)
 
 
-class Described(Protocol):
-    """What is known of an answer: names and types of its columns, their units and meanings."""
-
-    @property
-    def columns(self) -> Sequence[str]:
-        """Names."""
-        ...
-
-    @property
-    def types(self) -> Sequence[str]:
-        """DuckDB's names of their types."""
-        ...
-
-    @property
-    def facts(self) -> Sequence[Facts]:
-        """Unit and meaning of each."""
-        ...
-
-
-@dataclass(frozen=True)
-class Told:
-    """An answer as a service tells of it.
-
-    Attributes
-    ----------
-    described : sequence of mapping
-        ``name``, ``type``, ``unit`` and ``description`` of each column.
-    """
-
-    described: Sequence[Mapping[str, str]]
-
-    @property
-    def columns(self) -> list[str]:
-        """Names."""
-        return [one["name"] for one in self.described]
-
-    @property
-    def types(self) -> list[str]:
-        """DuckDB's names of their types."""
-        return [one["type"] for one in self.described]
-
-    @property
-    def facts(self) -> list[Facts]:
-        """Unit and meaning of each."""
-        from starcat.query.columns import Facts
-
-        return [Facts(one["unit"], one["description"]) for one in self.described]
-
-
-def print_answer(answer: Described, found: Sequence[Sequence[Any]], rows: int) -> None:
-    """Print the first rows of an answer: as a table, or one below the other if that is too wide."""
-    cells = [[cell_text(value) for value in row] for row in found[:rows]]
-    units = [facts.unit for facts in answer.facts]
-    headings = [
-        f"{name}\n[{unit}]" if unit else name
-        for name, unit in zip(answer.columns, units, strict=True)
-    ]
+def print_result(found: ResultTable) -> None:
+    """Print rows as a table, or one below the other if that is too wide."""
+    cells = found.texts
+    headings = [f"{c.name}\n[{c.unit}]" if c.unit else c.name for c in found.columns]
     if _width(headings, cells) <= MAX_WIDTH:
-        print_table("", headings, cells, _numbers(answer.types))
+        numbers = [k for k, column in enumerate(found.columns) if column.is_number]
+        print_table("", headings, cells, numbers)
     else:
         for k, row in enumerate(cells):
-            facts = zip(answer.columns, row, units, strict=True)
-            print_table(f"row {k + 1}", ["column", "value", "unit"], list(facts))
-    if len(found) > rows:
-        say(f"the first {rows} rows; --rows N shows more, -o FILE writes all")
+            facts = [(c.name, cell, c.unit) for c, cell in zip(found.columns, row, strict=True)]
+            print_table(f"row {k + 1}", ["column", "value", "unit"], facts)
+    if found.is_cut:
+        say(f"the first {len(cells)} rows; --rows N shows more, -o FILE writes all")
 
 
 def _width(headings: Sequence[str], cells: Sequence[Sequence[str]]) -> int:
@@ -104,12 +51,6 @@ def _width(headings: Sequence[str], cells: Sequence[Sequence[str]]) -> int:
         max(head, min(most, FOLDED_CHARACTERS)) for head, most in zip(heads, widest, strict=True)
     ]
     return sum(wanted) + 2 * (len(wanted) - 1)
-
-
-def _numbers(types: Sequence[str]) -> list[int]:
-    """Return which columns are numbers, to be aligned at the right."""
-    numeric = re.compile(r"[UH]*(TINY|SMALL|BIG|HUGE)?INT|DOUBLE|FLOAT|DECIMAL")
-    return [k for k, kind in enumerate(types) if numeric.match(kind) and "[" not in kind]
 
 
 def print_views(session: Session, *, as_json: bool) -> None:
@@ -154,7 +95,7 @@ def _row_count(session: Session, view: str) -> int:
 
 def print_macros(*, as_json: bool) -> None:
     """Print the macros, each with an example."""
-    from starcat.query.macros import macros
+    from starcat.query.gallery import macros
 
     listed = sorted((m for m in macros()), key=lambda m: (m.is_table, m.name))
     if as_json:

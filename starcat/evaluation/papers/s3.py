@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.evaluation.catalog_sky import catalog_of_artifact
+from starcat.evaluation.experiment import catalog_of_artifact
 from starcat.evaluation.paper import Paper, Row, Statistic
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera

@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
-from starcat.service.shelf import Database
+from starcat.service.library import Database
 
 
 class DatabaseFacts(BaseModel):

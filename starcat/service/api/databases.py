@@ -21,10 +21,10 @@ from starcat.service.api.database_models import (
 )
 from starcat.service.archive import archive_bytes, archive_chunks
 from starcat.service.file_answers import FILE, REVALIDATED, file_answer, has_already, type_of
+from starcat.service.library import Database
 from starcat.service.problems import Problem
 from starcat.service.removal import remove_database
 from starcat.service.service import Service, TheService
-from starcat.service.shelf import Database
 
 router = APIRouter(prefix="/databases", tags=["databases"])
 
@@ -40,13 +40,13 @@ SAME: dict[int | str, dict[str, Any]] = {304: FILE[304]}
 @router.get("", summary="All databases")
 def all_databases(service: TheService, reader: Reader) -> Databases:
     """Return what databases there are, by name and version."""
-    return Databases(databases=[facts_of(one) for one in service.shelf.databases()])
+    return Databases(databases=[facts_of(one) for one in service.library.databases()])
 
 
 @router.get("/{database}", summary="One database")
 def one_database(database: DatabaseId, service: TheService, reader: Reader) -> DatabaseFacts:
     """Return what a database was made from, and what it holds."""
-    return facts_of(service.shelf.database(database))
+    return facts_of(service.library.database(database))
 
 
 @router.get("/{database}/manifest", summary="Manifest", responses=SAME)
@@ -68,7 +68,7 @@ def coverage(
     database: DatabaseId, request: Request, service: TheService, reader: Reader
 ) -> Response:
     """Return stars, pairs and triangles by field, and their summary."""
-    found = service.shelf.database(database)
+    found = service.library.database(database)
     digest = _listed(found, FIELDS).sha256
     headers = {"ETag": f'"{digest}"', "Cache-Control": REVALIDATED}
     if has_already(request, digest):
@@ -94,14 +94,14 @@ async def difference(
 
     ``counts`` says how many stars came, went and moved, however many are listed.
     """
-    return await service.sessions.run(_difference, service, database, other, most)
+    return await service.query_pool.run(_difference, service, database, other, most)
 
 
 def _difference(service: Service, one: str, other: str, most: int) -> dict[str, Any]:
     from starcat.artifact.diff import diff_artifacts
     from starcat.artifact.reader import open_artifact
 
-    a, b = (open_artifact(service.shelf.database(name).folder) for name in (one, other))
+    a, b = (open_artifact(service.library.database(name).folder) for name in (one, other))
     content = diff_artifacts(a, b).as_dict()
     stars = ("came", "went", "moved")
     counts = {name: len(content[name]) for name in stars}
@@ -111,7 +111,7 @@ def _difference(service: Service, one: str, other: str, most: int) -> dict[str, 
 @router.get("/{database}/files", summary="Files")
 def files(database: DatabaseId, service: TheService, reader: Reader) -> list[DatabaseFile]:
     """Return the files of a database with sizes and digests, the manifest first."""
-    found = service.shelf.database(database)
+    found = service.library.database(database)
     return [
         DatabaseFile(path=name, content_type=type_of(name), **blob.model_dump())
         for name, blob in found.files.items()
@@ -143,7 +143,7 @@ router.head("/{database}/files/{path:path}", include_in_schema=False)(file)
 )
 def archive(database: DatabaseId, service: TheService, reader: Reader) -> StreamingResponse:
     """Return the folder of a database as a tar archive, the same bytes each time."""
-    found = service.shelf.database(database)
+    found = service.library.database(database)
     contents = found.files
     return StreamingResponse(
         archive_chunks(found.folder, contents),
@@ -175,7 +175,7 @@ def _listed(database: Database, name: str) -> Blob:
 def _file(
     service: Service, database: str, name: str, request: Request, cache: str | None = None
 ) -> Response:
-    found = service.shelf.database(database)
+    found = service.library.database(database)
     blob = _listed(found, name)
     path = found.folder / name
     if path.is_symlink() or not path.resolve().is_relative_to(found.folder.resolve()):

@@ -39,7 +39,7 @@ def registry_file(
 
     ``starcat pull NAME --registry http://HOST:PORT/registry`` reads these.
     """
-    root = service.places.registry
+    root = service.paths.registry
     # A name is of one of the forms that the tree has, or there is no such file: no other text
     # becomes part of a path.
     blob = BLOB.fullmatch(path)

@@ -111,8 +111,8 @@ def publish(
 
 
 def _publish(service: Service, wanted: ToPublish, owner: str) -> PublishedRelease:
-    database = service.shelf.database(wanted.database)
-    published = publish_artifact(database.folder, str(service.places.registry))
+    database = service.library.database(wanted.database)
+    published = publish_artifact(database.folder, str(service.paths.registry))
     publications = Publications(service.records)
     publications.add(published, database.id, wanted.note, owner)
     facts = _facts(service, published.release, publications.all())
@@ -126,7 +126,7 @@ def _publish(service: Service, wanted: ToPublish, owner: str) -> PublishedReleas
 
 def _listed(service: Service) -> list[Listed]:
     """Return the releases by their own files: one that was just published is among them."""
-    root = service.places.registry
+    root = service.paths.registry
     return recorded(root) if root.is_dir() else []
 
 

@@ -8,6 +8,7 @@ from fastapi import Depends, Request
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from starcat.errors import ConfigError
+from starcat.failures import validation_message
 from starcat.service.problems import Problem
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import (
@@ -95,12 +96,10 @@ def _spec_of(request: Request, body: Annotated[bytes, Depends(_body_of)]) -> Bui
     try:
         given = GivenSpec.model_validate_json(body)
     except ValidationError as error:
-        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
-        key = ".".join(str(part)[:100] for part in first["loc"][:5])
-        said = first["msg"].removeprefix("Value error, ")[:500]
+        key, found = validation_message(error)
         where = f"{key}: " if key else ""
         raise ConfigError(
-            f"body: {where}{said}; give one of toml, spec and preset, and changes if wanted",
+            f"body: {where}{found[:500]}; give one of toml, spec and preset, and changes if wanted",
             key=key or None,
         ) from error
     return given.checked()

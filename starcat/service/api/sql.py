@@ -9,24 +9,16 @@ from fastapi import APIRouter, Query
 from fastapi.responses import JSONResponse, Response, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
-from starcat.query.gallery import gallery
-from starcat.query.macros import macros
+from starcat.exchange.formats import FILE_FORMATS, FORMATS, FileFormat
+from starcat.query.gallery import gallery, macros
 from starcat.service.access import Reader
-from starcat.service.asking import Question, file_of, named_text, rows_of
-from starcat.service.file_answers import type_of
 from starcat.service.problems import Problem
 from starcat.service.service import Service, TheService
-from starcat.service.targets import target_paths
+from starcat.service.sql import SqlQuery, named_text, result_file, result_table
 
 router = APIRouter(prefix="/sql", tags=["sql"])
 
-Form = Literal["rows", "csv", "json", "parquet", "votable", "fits", "ecsv", "npz"]
-
-SUFFIXES = {"votable": ".vot"}
-"""Suffixes of files that are not the name of the format."""
-
-OTHERS = (".csv", ".parquet", ".vot", ".fits", ".ecsv", ".npz")
-"""Suffixes of all but JSON."""
+Form = Literal["rows", FileFormat]
 
 MAX_SHOWN = 100_000
 """Rows of an answer that is no file."""
@@ -140,7 +132,11 @@ class ViewFacts(BaseModel):
         200: {
             "description": "Rows, or a file; ``X-Starcat-Rows`` says how many rows it has, and "
             "``X-Starcat-Cut`` whether there are more.",
-            "content": {type_of(f"answer{suffix}").partition(";")[0]: {} for suffix in OTHERS},
+            "content": {
+                FORMATS[name].media_type.partition(";")[0]: {}
+                for name in FILE_FORMATS
+                if name != "json"
+            },
         }
     },
 )
@@ -148,8 +144,8 @@ async def ask(question: SqlQuestion, service: TheService, reader: Reader) -> Res
     """Ask a question about databases and catalogs in SQL; nothing is ever written."""
     asked = _checked(service, question)
     if question.format == "rows":
-        return await service.sessions.run(_rows, service, asked)
-    return await service.sessions.run(_file, service, asked, question.format)
+        return await service.query_pool.run(_rows, service, asked)
+    return await service.query_pool.run(_file, service, asked, question.format)
 
 
 @router.get("/queries", summary="Queries by name")
@@ -176,10 +172,10 @@ async def views(
     ],
 ) -> list[ViewFacts]:
     """Return the tables that a query about some targets sees."""
-    return await service.sessions.run(_views, service, target)
+    return await service.query_pool.run(_views, service, target)
 
 
-def _checked(service: Service, question: SqlQuestion) -> Question:
+def _checked(service: Service, question: SqlQuestion) -> SqlQuery:
     """Return what is asked, within the limits that the operator set."""
     if (question.query is None) == (question.named is None):
         raise Problem(422, "give either a query or the name of one", key="query")
@@ -193,29 +189,29 @@ def _checked(service: Service, question: SqlQuestion) -> Question:
     else:
         text, values = question.query or "", dict(question.values)  # type: ignore[arg-type]
     time_s = min(question.time_limit_s or settings.query_time_s, settings.query_time_s)
-    return Question(question.targets, text, values, min(question.max_rows or default, most), time_s)
+    return SqlQuery(question.targets, text, values, min(question.max_rows or default, most), time_s)
 
 
-def _rows(service: Service, asked: Question) -> Response:
-    found = rows_of(service, asked)
+def _rows(service: Service, asked: SqlQuery) -> Response:
+    found = result_table(service, asked).as_json()
     # What JSON has was made sure of: a model would check every value once more.
-    return JSONResponse({"columns": found.columns, "rows": found.rows, "is_cut": found.is_cut})
+    return JSONResponse(found)
 
 
-def _file(service: Service, asked: Question, form: str) -> Response:
-    found = file_of(service, asked, form)
-    name = "answer" + SUFFIXES.get(form, f".{form}")
+def _file(service: Service, asked: SqlQuery, form: str) -> Response:
+    found = result_file(service, asked, form)
+    kind = FORMATS[form]
     headers = {
         "Content-Length": str(found.size),
-        "Content-Disposition": f'attachment; filename="{name}"',
+        "Content-Disposition": f'attachment; filename="answer{kind.suffix}"',
         "X-Starcat-Rows": str(found.rows),
         "X-Starcat-Cut": str(found.is_cut).lower(),
     }
-    return StreamingResponse(found.chunks, media_type=type_of(name), headers=headers)
+    return StreamingResponse(found.chunks, media_type=kind.media_type, headers=headers)
 
 
 def _views(service: Service, targets: list[str]) -> list[ViewFacts]:
-    with service.sessions.session(target_paths(service, targets)) as session:
+    with service.query_pool.session([service.library.target(name) for name in targets]) as session:
         return [
             ViewFacts(
                 target=target.name,

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from starcat.service.access import Publisher
 from starcat.service.api.jobs import JobId, JobView, view_of
-from starcat.service.jobs.transitions import Attempt, claim
+from starcat.service.jobs.job_states import Attempt, claim
 from starcat.service.jobs.unpacking import unpack_database
 from starcat.service.jobs.work import place_database
 from starcat.service.problems import Problem
@@ -130,7 +130,7 @@ async def bring(
 ) -> JobView:
     """Take the database that a job was to make: a tar archive, checked before it has its place."""
     await to_thread.run_sync(_attempt, service, job_id, number)
-    folder = service.places.scratch / f"brought-{secrets.token_hex(8)}"
+    folder = service.paths.scratch / f"brought-{secrets.token_hex(8)}"
     await to_thread.run_sync(folder.mkdir)
     try:
         async with await open_file(folder / "database.tar", "xb") as file:
@@ -146,6 +146,6 @@ def _take(service: Service, job_id: str, number: int, folder: Path) -> JobView:
     database_id = job.key[:16]
     unpack_database(folder / "database.tar", job, folder / database_id)
     attempt = _attempt(service, job_id, number)  # it may be over by now
-    place_database(folder / database_id, service.places.database(database_id))
+    place_database(folder / database_id, service.paths.database(database_id))
     attempt.succeed({"database": database_id})
     return view_of(service.jobs.get(job_id))

@@ -69,11 +69,11 @@ class AwaySlots(Slots):
             return
         if job is None:
             return
-        places = self.service.places
+        paths = self.service.paths
         try:
             Run(self, AwayAttempt(self, self._server, job)).run()
         finally:
-            for folder in (places.job(job.id), places.database(job.key[:16])):
+            for folder in (paths.job(job.id), paths.database(job.key[:16])):
                 shutil.rmtree(folder, ignore_errors=True)
 
     def _begun(self, job_id: str) -> Job | None:
@@ -133,9 +133,9 @@ class AwayAttempt:
     def succeed(self, result: Mapping[str, Any]) -> None:
         """Send the database."""
         self._tell_all()
-        places = self._slots.service.places
-        archive = places.job(self.job.id) / "database.tar"
-        pack(places.database(str(result["database"])), archive)
+        paths = self._slots.service.paths
+        archive = paths.job(self.job.id) / "database.tar"
+        pack(paths.database(str(result["database"])), archive)
 
         def send() -> requests.Response:
             headers = {**self._server._headers, "Content-Type": "application/x-tar"}

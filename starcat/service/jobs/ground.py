@@ -7,10 +7,10 @@ from typing import Protocol
 
 from starcat.service.jobs.job import JobStore
 from starcat.service.jobs.queue import JobQueue, open_queue
-from starcat.service.places import Places
+from starcat.service.library import Library
+from starcat.service.paths import ServicePaths
 from starcat.service.records import Records
 from starcat.service.settings import Settings
-from starcat.service.shelf import Shelf
 
 
 class Ground(Protocol):
@@ -21,7 +21,7 @@ class Ground(Protocol):
         """What the operator set."""
 
     @property
-    def places(self) -> Places:
+    def paths(self) -> ServicePaths:
         """What lies where."""
 
     @property
@@ -29,7 +29,7 @@ class Ground(Protocol):
         """What is remembered."""
 
     @property
-    def shelf(self) -> Shelf:
+    def library(self) -> Library:
         """The databases there are."""
 
     @property
@@ -46,17 +46,17 @@ class WorkerGround:
     """The part of a service that a worker has; attributes as those of `Ground`."""
 
     settings: Settings
-    places: Places
+    paths: ServicePaths
     records: Records
-    shelf: Shelf
+    library: Library
     jobs: JobStore
     queue: JobQueue
 
 
 def open_ground(settings: Settings) -> WorkerGround:
     """Open what a worker needs."""
-    places = Places(settings.root)
-    places.make()
-    records = Records(places.records)
-    queue = open_queue(settings, places)
-    return WorkerGround(settings, places, records, Shelf(places), JobStore(records), queue)
+    paths = ServicePaths(settings.root)
+    paths.make()
+    records = Records(paths.records)
+    queue = open_queue(settings, paths)
+    return WorkerGround(settings, paths, records, Library(paths), JobStore(records), queue)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from starcat.errors import TargetMissing
-from starcat.service.places import JOB_ID, checked
+from starcat.service.paths import JOB_ID, checked
 from starcat.service.records import Records
 
 Kind = Literal["build", "ingest", "evaluate"]

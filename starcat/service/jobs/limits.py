@@ -24,7 +24,7 @@ def check_room(service: Ground, owner: str) -> None:
 
 def disk_shortage(service: Ground) -> str | None:
     """Return what to say where the disk is nearly full."""
-    free_gib = shutil.disk_usage(service.places.root).free / GIB
+    free_gib = shutil.disk_usage(service.paths.root).free / GIB
     if free_gib >= service.settings.free_gib:
         return None
     return (
@@ -55,7 +55,7 @@ def owned_bytes(service: Ground, owner: str) -> int:
     taken = 0
     for [database_id] in rows:
         try:
-            files = service.shelf.database(str(database_id)).manifest["files"]
+            files = service.library.database(str(database_id)).manifest["files"]
         except (TargetMissing, ProductError, OSError):
             continue
         taken += sum(int(facts["bytes"]) for facts in files.values())

@@ -17,7 +17,7 @@ from huey.registry import Message
 from huey.serializer import Serializer
 
 from starcat.errors import ConfigError
-from starcat.service.places import Places
+from starcat.service.paths import ServicePaths
 from starcat.service.settings import Settings
 
 NAME = "starcat"
@@ -91,11 +91,11 @@ class JobQueue:
         self.huey.storage.close()
 
 
-def open_queue(settings: Settings, places: Places) -> JobQueue:
+def open_queue(settings: Settings, paths: ServicePaths) -> JobQueue:
     """Open the queue of a service."""
     options = {"results": False, "serializer": JsonMessages(), "utc": True}
     if settings.queue_url is None:
-        huey = SqliteHuey(NAME, filename=str(places.queue), strict_fifo=True, **options)
+        huey = SqliteHuey(NAME, filename=str(paths.queue), strict_fifo=True, **options)
         return JobQueue(huey)
     try:
         huey = RedisHuey(NAME, url=settings.queue_url, blocking=True, read_timeout=1, **options)

@@ -9,8 +9,8 @@ from contextlib import suppress
 
 from starcat.service.jobs.ground import Ground
 from starcat.service.jobs.job import Job
-from starcat.service.jobs.transitions import interrupt, running_here, silent_since
-from starcat.service.places import JOB_ID, Places
+from starcat.service.jobs.job_states import interrupt, running_here, silent_since
+from starcat.service.paths import JOB_ID, ServicePaths
 from starcat.storage.locks import locked
 
 WAIT_S = 10.0
@@ -22,7 +22,7 @@ _logger = logging.getLogger(__name__)
 def recover(service: Ground) -> None:
     """Take up the jobs of a service where nobody runs any on this machine."""
     for job_id, attempt in running_here(service.records):
-        _wait_for_end(service.places, job_id)
+        _wait_for_end(service.paths, job_id)
         _logger.warning("job %s was interrupted in attempt %d", job_id, attempt)
         interrupt(service.records, job_id, attempt)
     _remove_halves(service)
@@ -47,9 +47,9 @@ def _all(service: Ground, state: str) -> list[Job]:
     return service.jobs.all(state=state, most=1_000_000)  # type: ignore[arg-type]
 
 
-def _wait_for_end(places: Places, job_id: str) -> None:
+def _wait_for_end(paths: ServicePaths, job_id: str) -> None:
     """Wait until the process of a job is gone; the next attempt waits too, if it is not."""
-    lock = places.job_lock(job_id)
+    lock = paths.job_lock(job_id)
     if not lock.exists():
         return
     until_s = time.monotonic() + WAIT_S
@@ -61,11 +61,11 @@ def _wait_for_end(places: Places, job_id: str) -> None:
 
 
 def _remove_halves(service: Ground) -> None:
-    places = service.places
+    paths = service.paths
     running = {job.id for job in _all(service, "running")}
-    for folder in places.jobs.iterdir():
+    for folder in paths.jobs.iterdir():
         if JOB_ID.fullmatch(folder.name) and folder.name not in running:
-            shutil.rmtree(places.job_work(folder.name), ignore_errors=True)
-    for folder in places.databases.iterdir():
+            shutil.rmtree(paths.job_work(folder.name), ignore_errors=True)
+    for folder in paths.databases.iterdir():
         with suppress(OSError):  # it is not empty
             folder.rmdir()

@@ -23,9 +23,9 @@ from typing import IO, Any, Protocol
 
 from starcat.service.jobs.ground import Ground
 from starcat.service.jobs.job import Job
+from starcat.service.jobs.job_states import Attempt, claim
 from starcat.service.jobs.limits import disk_shortage, folder_bytes, owner_excess
 from starcat.service.jobs.task import PROGRAM, memory_problem
-from starcat.service.jobs.transitions import Attempt, claim
 from starcat.service.jobs.work import threads_of
 from starcat.storage.atomic import make_folder
 
@@ -44,7 +44,7 @@ STOPPED = "the service stops"
 
 
 class Told(Protocol):
-    """Who remembers what becomes of an attempt; as `starcat.service.jobs.transitions.Attempt`."""
+    """Who remembers what becomes of an attempt; as `starcat.service.jobs.job_states.Attempt`."""
 
     job: Job
 
@@ -102,14 +102,14 @@ class Slots:
         try:
             Run(self, attempt).run()
         finally:
-            shutil.rmtree(self.service.places.job_work(job.id), ignore_errors=True)
+            shutil.rmtree(self.service.paths.job_work(job.id), ignore_errors=True)
 
     @contextmanager
     def process(self, job: Job) -> Iterator[subprocess.Popen[bytes]]:
         """Start the process of a job, in a group of its own, and see that it has ended."""
-        places = self.service.places
-        make_folder(places.job(job.id))
-        with places.job_stderr(job.id).open("wb") as stderr:
+        paths = self.service.paths
+        make_folder(paths.job(job.id))
+        with paths.job_stderr(job.id).open("wb") as stderr:
             process = subprocess.Popen(
                 [sys.executable, "-c", PROGRAM, *sys.path],
                 stdin=subprocess.PIPE,
@@ -136,7 +136,7 @@ class Slots:
     def _order(self, job: Job) -> dict[str, Any]:
         settings = self.service.settings
         return {
-            "root": str(self.service.places.root),
+            "root": str(self.service.paths.root),
             "job_id": job.id,
             "kind": job.kind,
             "key": job.key,
@@ -226,7 +226,7 @@ class Run:
             return None
         self._disk_at_s = now
         service, job = self._slots.service, self._attempt.job
-        made = folder_bytes(service.places.job(job.id))
+        made = folder_bytes(service.paths.job(job.id))
         return disk_shortage(service) or owner_excess(service, job.owner, made)
 
     def _tell_death(self, code: int) -> None:
@@ -234,7 +234,7 @@ class Run:
             self._attempt.wait_again()
             return
         service, job = self._slots.service, self._attempt.job
-        last_words = _tail(service.places.job_stderr(job.id)).lower()
+        last_words = _tail(service.paths.job_stderr(job.id)).lower()
         if any(word in last_words for word in NO_MEMORY):
             problem = memory_problem(int(service.settings.job_memory_gib * 2**30))
             self._attempt.fail(problem)

@@ -14,9 +14,9 @@ from starcat.catalog.ingest import check_band, star_catalog
 from starcat.errors import TargetMissing
 from starcat.service.access import Principal, Role
 from starcat.service.jobs.job import Job, Kind
+from starcat.service.jobs.job_states import add_once, cancel, retry
 from starcat.service.jobs.keys import build_key, key_of, source_digests
 from starcat.service.jobs.limits import check_room
-from starcat.service.jobs.transitions import add_once, cancel, retry
 from starcat.service.problems import Problem
 from starcat.service.service import Service
 from starcat.specs.build_spec import BuildSpec
@@ -82,7 +82,7 @@ def submit_evaluation(
     seed: int | None = None,
 ) -> Submitted:
     """Have it measured how often frames are identified with a database."""
-    database = service.shelf.database(database_id)
+    database = service.library.database(database_id)
     test = spec_from_dict(database.manifest["spec"], database.title).self_test
     request = {
         "database": database_id,
@@ -121,9 +121,9 @@ def has_result(service: Service, job: Job) -> bool:
         return "rates" in result
     if job.kind == "ingest":
         name = str(result.get("catalog", ""))
-        return bool(name) and (service.places.catalogs / Path(name).name).exists()
+        return bool(name) and (service.paths.catalogs / Path(name).name).exists()
     try:
-        service.shelf.database(str(result.get("database", "")))
+        service.library.database(str(result.get("database", "")))
     except TargetMissing:
         return False
     return True

@@ -23,7 +23,7 @@ from typing import IO, Any
 from starcat.errors import StarcatError
 from starcat.query.confinement import limit_memory
 from starcat.service.jobs.work import Order, do_job, prepare
-from starcat.service.places import Places
+from starcat.service.paths import ServicePaths
 from starcat.storage.locks import locked
 
 NICENESS = 10
@@ -105,7 +105,7 @@ def main() -> None:
     logger = logging.getLogger("starcat")
     logger.setLevel(logging.INFO)
     logger.addHandler(_Lines(teller))
-    with locked(order.places.job_lock(order.job_id)):
+    with locked(order.paths.job_lock(order.job_id)):
         prepare(order.kind)
         limit_memory(order.memory_bytes)
         try:
@@ -132,8 +132,8 @@ def _end_with_input() -> None:
 
 
 def _order(content: dict[str, Any]) -> Order:
-    places = Places(Path(content.pop("root")))
-    return Order(places=places, **content)
+    paths = ServicePaths(Path(content.pop("root")))
+    return Order(paths=paths, **content)
 
 
 def _told(error: Exception, order: Order) -> dict[str, Any]:

@@ -17,8 +17,8 @@ from typing import Any
 from starcat.errors import TargetMissing
 from starcat.progress import Progress
 from starcat.service.jobs.job import Kind
-from starcat.service.places import Places
-from starcat.service.shelf import Shelf
+from starcat.service.library import Library
+from starcat.service.paths import ServicePaths
 from starcat.storage.atomic import sync
 
 Tell = Callable[[str, str], None]
@@ -31,7 +31,7 @@ class Order:
 
     Attributes
     ----------
-    places : Places
+    paths : ServicePaths
         What lies where.
     job_id, kind, key, request
         As those of `starcat.service.jobs.job.Job`.
@@ -43,7 +43,7 @@ class Order:
         Threads that it may use.
     """
 
-    places: Places
+    paths: ServicePaths
     job_id: str
     kind: Kind
     key: str
@@ -55,7 +55,7 @@ class Order:
     @property
     def work(self) -> Path:
         """The folder that it makes things in."""
-        return self.places.job_work(self.job_id)
+        return self.paths.job_work(self.job_id)
 
 
 def prepare(kind: Kind) -> None:
@@ -73,10 +73,10 @@ def do_job(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
 
 def _build(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
     database_id = order.key[:16]
-    shelf = Shelf(order.places)
+    library = Library(order.paths)
     result = {"database": database_id}
     try:
-        shelf.database(database_id)
+        library.database(database_id)
     except TargetMissing:
         pass
     else:
@@ -106,7 +106,7 @@ def _build(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
         f"{clean.identified} of {clean.identifiable} clean frames were identified, "
         f"{clean.wrong} wrongly",
     )
-    place_database(made, order.places.database(database_id))
+    place_database(made, order.paths.database(database_id))
     return result
 
 
@@ -130,7 +130,7 @@ def _ingest(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
     paths = locate(source, {})
     name = f"{source}-{order.key[:16]}" + (".parquet" if to == "parquet" else "")
     result: dict[str, Any] = {"catalog": name, "source": source}
-    final = order.places.catalogs / name
+    final = order.paths.catalogs / name
     made = order.work / name
     if to == "hats":
         from starcat.store.ingest import ingest_to_store
@@ -165,7 +165,7 @@ def _evaluate(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
     from starcat.simulation.selftest import self_test
 
     asked = order.request
-    database = Shelf(order.places).database(str(asked["database"]))
+    database = Library(order.paths).database(str(asked["database"]))
     noise_px = float(asked["noise_px"])
     matcher = Matcher.open(database.folder, None, tolerance_px=max(0.5, 4.0 * noise_px))
     tell("info", f"{asked['frames']} frames of each kind, of {database.title}")

@@ -16,10 +16,10 @@ import time
 
 from huey.consumer import Consumer
 
-from starcat.service.guard.logs import log_settings
 from starcat.service.jobs.ground import open_ground
 from starcat.service.jobs.runner import Slots
 from starcat.service.jobs.task import end_with_parent
+from starcat.service.security.logs import log_settings
 from starcat.service.settings import Settings
 
 PROGRAM = (

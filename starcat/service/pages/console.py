@@ -12,28 +12,17 @@ from fastapi.responses import Response, StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
 from starcat.errors import QueryError, StarcatError, TargetMissing
-from starcat.query.answer import cell_text
-from starcat.query.gallery import NamedQuery, gallery, guessed, named_query
-from starcat.query.macros import macros
+from starcat.exchange.formats import FORMATS, PAGE_FORMATS, PageFormat
+from starcat.query.gallery import NamedQuery, gallery, guessed, macros, named_query
+from starcat.query.result import ResultTable
 from starcat.service.access import Reader
-from starcat.service.asking import Question, Rows, file_of, rows_of
-from starcat.service.file_answers import type_of
 from starcat.service.pages.facts import database_row, products_of
 from starcat.service.pages.rendering import page_router, render
 from starcat.service.problems import Problem, ProblemDetails, problem_of
 from starcat.service.service import Service, TheService
+from starcat.service.sql import SqlQuery, result_file, result_table
 
 router = page_router()
-
-FORMATS = {
-    "csv": "CSV",
-    "json": "JSON",
-    "parquet": "Parquet",
-    "votable": "VOTable",
-    "fits": "FITS",
-    "ecsv": "ECSV",
-}
-"""What an answer can be downloaded as."""
 
 ROWS = (20, 100, 500, 2000)
 """Rows that can be shown."""
@@ -48,9 +37,6 @@ FIRST = "SELECT designation, mag, ra_deg, dec_deg\nFROM stars\nORDER BY mag\nLIM
 """What stands in the console before anything was asked."""
 
 _NAMES = re.compile(r"\$([A-Za-z_]\w{0,63})")
-_NUMERIC = re.compile(r"[UH]*(TINY|SMALL|BIG|HUGE)?INT|DOUBLE|FLOAT|DECIMAL")
-
-Form = Literal["csv", "json", "parquet", "votable", "fits", "ecsv"]
 
 
 @dataclass(frozen=True)
@@ -79,33 +65,11 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Cells:
-    """An answer as the page shows it.
-
-    Attributes
-    ----------
-    columns : list of mapping
-        ``name``, ``unit`` and ``description`` of each.
-    numbers : list of bool
-        Which columns are numbers.
-    rows : list of list of str
-        Texts.
-    is_cut : bool
-        Whether there are more.
-    """
-
-    columns: list[dict[str, str]]
-    numbers: list[bool]
-    rows: list[list[str]]
-    is_cut: bool
-
-
-@dataclass(frozen=True)
 class _Shown:
     """What the console shows, or its answer alone."""
 
     asked: Asked
-    answer: Cells | None
+    answer: ResultTable | None
     problem: ProblemDetails | None
     is_part: bool
 
@@ -139,12 +103,11 @@ async def console(
     part: Annotated[Literal["", "answer"], Query()] = "",
 ) -> Response:
     """Show the console with the answer to what was asked; the script wants the answer alone."""
-    answer: Cells | None = None
+    answer: ResultTable | None = None
     problem: ProblemDetails | None = None
     if asked.query:
         try:
-            found = await service.sessions.run(_rows, service, database_id, asked)
-            answer = cells_of(found)
+            answer = await service.query_pool.run(_rows, service, database_id, asked)
         except TargetMissing:
             raise  # the page itself is not there
         except (StarcatError, Problem) as error:
@@ -155,21 +118,21 @@ async def console(
 
 @router.get("/databases/{database_id}/sql/file")
 async def answer_file(
-    service: TheService, _: Reader, database_id: str, asked: TheAsked, form: Form = "csv"
+    service: TheService, _: Reader, database_id: str, asked: TheAsked, form: PageFormat = "csv"
 ) -> Response:
     """Give all rows of an answer as a file."""
-    database = service.shelf.database(database_id)
+    database = service.library.database(database_id)
     question = question_of(service, database.id, asked, service.settings.max_rows)
-    found = await service.sessions.run(file_of, service, question, form)
-    name = f"{database.title}{'.vot' if form == 'votable' else f'.{form}'}"
+    found = await service.query_pool.run(result_file, service, question, form)
+    kind = FORMATS[form]
     headers = {
         "Content-Length": str(found.size),
-        "Content-Disposition": f'attachment; filename="{name}"',
+        "Content-Disposition": f'attachment; filename="{database.title}{kind.suffix}"',
     }
-    return StreamingResponse(found.chunks, media_type=type_of(name), headers=headers)
+    return StreamingResponse(found.chunks, media_type=kind.media_type, headers=headers)
 
 
-def question_of(service: Service, database_id: str, asked: Asked, most: int) -> Question:
+def question_of(service: Service, database_id: str, asked: Asked, most: int) -> SqlQuery:
     """Return what is asked as the service answers it."""
     if not asked.query.strip():
         raise QueryError('the query is empty; try "SELECT count(*) FROM stars"')
@@ -183,23 +146,24 @@ def question_of(service: Service, database_id: str, asked: Asked, most: int) -> 
         values = chosen.with_values({n: t for n, t in asked.values.items() if n in known})
     else:
         values = {name: guessed(text) for name, text in asked.values.items()}
-    return Question(targets, asked.query, values, most, service.settings.query_time_s)
+    return SqlQuery(targets, asked.query, values, most, service.settings.query_time_s)
 
 
-def _rows(service: Service, database_id: str, asked: Asked) -> Rows:
+def _rows(service: Service, database_id: str, asked: Asked) -> ResultTable:
     most = min(asked.rows, service.settings.max_rows)
-    return rows_of(service, question_of(service, database_id, asked, most))
+    found = result_table(service, question_of(service, database_id, asked, most))
+    return found.with_json_values()
 
 
 def _page(request: Request, service: Service, database_id: str, shown: _Shown) -> Response:
-    database = service.shelf.database(database_id)
+    database = service.library.database(database_id)
     asked, problem = shown.asked, shown.problem
     content = {
         "row": database_row(service, database),
         "asked": asked,
         "answer": shown.answer,
         "problem": problem,
-        "formats": FORMATS,
+        "formats": {name: FORMATS[name].title for name in PAGE_FORMATS},
     }
     status = 200 if problem is None else problem.status
     if shown.is_part:
@@ -215,7 +179,9 @@ def _page(request: Request, service: Service, database_id: str, shown: _Shown) -
         text=text,
         chosen=chosen,
         values=values_in(text, chosen, asked.values),
-        others=[(one.id, one.title) for one in service.shelf.databases() if one.id != database.id],
+        others=[
+            (one.id, one.title) for one in service.library.databases() if one.id != database.id
+        ],
         queries=list(gallery().values()),
         macros=sorted(macros(), key=lambda macro: (not macro.is_table, macro.name)),
         products=products_of(database.manifest),
@@ -241,13 +207,3 @@ def values_in(
         )
         for name in dict.fromkeys(_NAMES.findall(text))
     ]
-
-
-def cells_of(found: Rows) -> Cells:
-    """Return an answer as the page shows it."""
-    numbers = [
-        bool(_NUMERIC.match(column["type"])) and "[" not in column["type"]
-        for column in found.columns
-    ]
-    rows = [[cell_text(value) for value in row] for row in found.rows]
-    return Cells(found.columns, numbers, rows, found.is_cut)

@@ -14,6 +14,7 @@ from starcat.errors import TargetMissing
 from starcat.matcher.methods.table import METHODS
 from starcat.service.access import Builder, Reader, Role
 from starcat.service.jobs.submission import submit_evaluation
+from starcat.service.library import Database
 from starcat.service.pages import sky
 from starcat.service.pages.facts import (
     MANIFEST_DIGEST,
@@ -25,7 +26,6 @@ from starcat.service.pages.facts import (
 from starcat.service.pages.rendering import page_router, render
 from starcat.service.pages.simulated import camera_of
 from starcat.service.service import Service, TheService
-from starcat.service.shelf import Database
 
 router = page_router()
 
@@ -56,7 +56,7 @@ def one_database(
     request: Request, service: TheService, reader: Reader, database_id: str
 ) -> Response:
     """Show what is known of a database."""
-    database = service.shelf.database(database_id)
+    database = service.library.database(database_id)
     manifest = database.manifest
     return render(
         request,
@@ -85,7 +85,7 @@ def coverage_page(
     page: Annotated[int, Query(ge=1, le=1_000_000)] = 1,
 ) -> Response:
     """Show the map of the sky and the fields of the tiling."""
-    database = service.shelf.database(database_id)
+    database = service.library.database(database_id)
     fields = sky.fields_of(database)
     pages = max(1, -(-len(fields) // FIELDS_SHOWN))
     page = min(page, pages)
@@ -108,7 +108,7 @@ def coverage_page(
 @router.get("/databases/{database_id}/coverage.png")
 def coverage_raster(service: TheService, _: Reader, database_id: str) -> Response:
     """Give the raster of the map of the sky."""
-    database = service.shelf.database(database_id)
+    database = service.library.database(database_id)
     raster = sky.map_png(database.id, sky.fields_of(database))
     return Response(raster, media_type="image/png", headers=KEPT)
 
@@ -116,7 +116,7 @@ def coverage_raster(service: TheService, _: Reader, database_id: str) -> Respons
 @router.get("/databases/{database_id}/fields.json")
 def fields_of_map(service: TheService, _: Reader, database_id: str) -> Response:
     """Give the fields of the tiling to the script of the map."""
-    fields = sky.fields_of(service.shelf.database(database_id))
+    fields = sky.fields_of(service.library.database(database_id))
     content = {
         "ra_deg": fields.ra_deg.round(4).tolist(),
         "dec_deg": fields.dec_deg.round(4).tolist(),
@@ -128,7 +128,7 @@ def fields_of_map(service: TheService, _: Reader, database_id: str) -> Response:
 @router.get("/databases/{database_id}/report")
 def build_report(service: TheService, _: Reader, database_id: str) -> Response:
     """Give the page that the build wrote; it cannot do anything."""
-    database = service.shelf.database(database_id)
+    database = service.library.database(database_id)
     path = database.folder / REPORT_PAGE
     if REPORT_PAGE not in database.manifest["files"] or not path.is_file():
         raise TargetMissing(f"{database.title} has no report; build it again to get one")
@@ -148,12 +148,12 @@ async def compare(
     difference = None
     if other:
         # In its turn among the queries: it reads whole tables.
-        difference = await service.sessions.run(_difference, service, database_id, other)
+        difference = await service.query_pool.run(_difference, service, database_id, other)
     return await run_in_threadpool(_comparison, request, service, database_id, other, difference)
 
 
 def _difference(service: Service, database_id: str, other: str) -> Difference:
-    sides = (service.shelf.database(one) for one in (database_id, other))
+    sides = (service.library.database(one) for one in (database_id, other))
     return diff_artifacts(*(Artifact(one.folder, one.manifest) for one in sides))
 
 
@@ -164,8 +164,8 @@ def _comparison(
     other: str,
     difference: Difference | None,
 ) -> Response:
-    database = service.shelf.database(database_id)
-    others = [one for one in service.shelf.databases() if one.id != database.id]
+    database = service.library.database(database_id)
+    others = [one for one in service.library.databases() if one.id != database.id]
     versions = [one.id for one in others if one.name == database.name]
     return render(
         request,
@@ -173,7 +173,7 @@ def _comparison(
         **_head(service, database, "compare"),
         others=others,
         suggested=other or (versions[-1] if versions else ""),
-        later=service.shelf.database(other) if other else None,
+        later=service.library.database(other) if other else None,
         difference=difference,
         most=DIFFERENCES_SHOWN,
     )

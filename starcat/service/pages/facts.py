@@ -13,9 +13,9 @@ from typing import Any
 from starcat.errors import ProductError, reason
 from starcat.releases.publishing import recorded
 from starcat.service.jobs.job import Job
-from starcat.service.places import Places
+from starcat.service.library import Database
+from starcat.service.paths import ServicePaths
 from starcat.service.service import Service
-from starcat.service.shelf import Database
 from starcat.specs.build_spec import CameraSpec
 from starcat.storage.schema import product_schema
 
@@ -97,20 +97,20 @@ class Product:
 
 def database_rows(service: Service) -> list[Row]:
     """Return all databases as the list shows them."""
-    released = released_digests(service.places)
+    released = released_digests(service.paths)
     built = built_times(service.jobs.all(state="done", most=MAX_JOBS))
-    return [_row(one, released, built) for one in service.shelf.databases()]
+    return [_row(one, released, built) for one in service.library.databases()]
 
 
 def database_row(service: Service, database: Database) -> Row:
     """Return one database as the list shows it."""
     built = built_times(service.jobs.all(state="done", most=MAX_JOBS))
-    return _row(database, released_digests(service.places), built)
+    return _row(database, released_digests(service.paths), built)
 
 
-def released_digests(places: Places) -> dict[str, str]:
+def released_digests(paths: ServicePaths) -> dict[str, str]:
     """Return what was published."""
-    return {release.title: release.manifest.sha256 for release in recorded(places.registry)}
+    return {release.title: release.manifest.sha256 for release in recorded(paths.registry)}
 
 
 def built_times(jobs: Iterable[Job]) -> dict[str, float]:

@@ -5,11 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import math
-import shutil
-from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any
 
 from fastapi import Query, Request
 from fastapi.responses import Response
@@ -18,44 +14,27 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData, UploadFile
 
 from starcat.errors import StarcatError
-from starcat.images.identification import IMAGE_SUFFIXES
+from starcat.failures import validation_message
+from starcat.images.solve_files import IdentifyOptions
 from starcat.matcher.methods.table import METHODS
 from starcat.service.access import Reader
-from starcat.service.identifying import IdentifyOptions
+from starcat.service.api.identify import MIB, SUFFIXES, FrameUpload, identify_upload
+from starcat.service.library import Database
 from starcat.service.pages.centroid_text import centroid_file
 from starcat.service.pages.rendering import page_router, render
 from starcat.service.pages.simulated import camera_of, frame_suffix, write_frame
 from starcat.service.problems import Problem, problem_of
 from starcat.service.service import Service, TheService
-from starcat.service.shelf import Database
-from starcat.service.uploading import safe_name, scratch_folder
+from starcat.service.uploading import scratch_folder
 
 router = page_router()
 
-SUFFIXES = (*IMAGE_SUFFIXES, ".csv", ".json")
-MIB = 2**20
 MAX_SEED = 2**31 - 1
 
 FIELDS = (
     "database", "method", "field_error", "tolerance_px", "centroids", "brightness", "seed",
 )  # fmt: skip
 """Fields of the form that are texts."""
-
-
-@dataclass(frozen=True)
-class Frame:
-    """What is to be identified.
-
-    Attributes
-    ----------
-    name : str
-        Name that its file may have.
-    keep : callable
-        Writes the file to a path.
-    """
-
-    name: str
-    keep: Callable[[Path], None]
 
 
 @router.get("/identify")
@@ -75,7 +54,7 @@ async def identify(request: Request, service: TheService, _: Reader) -> Response
     async with request.form(max_files=1, max_fields=20) as form:
         given = {name: str(form.get(name) or "")[:MIB] for name in FIELDS}
         try:
-            answer = await service.confined.run(_answer, service, form, given)
+            answer = await service.sandbox.run(_answer, service, form, given)
         except (StarcatError, Problem) as error:
             answer = {"problem": problem_of(error)}
     return await run_in_threadpool(_page, request, service, given, **answer)
@@ -83,9 +62,9 @@ async def identify(request: Request, service: TheService, _: Reader) -> Response
 
 def _answer(service: Service, form: FormData, given: dict[str, str]) -> dict[str, Any]:
     """Return what the page shows of an answer."""
-    database = service.shelf.database(given["database"])
-    frame, options = frame_of(form, given, database, service), options_of(given)
-    found, picture = identified(service, database, frame, options)
+    database = service.library.database(given["database"])
+    frame, options = frame_of(form, given, database, service), options_of(given, service)
+    found, picture = identify_upload(service, database.folder, frame, options, "png")
     first = found["frames"][0]
     return {
         "found": found,
@@ -103,16 +82,16 @@ async def simulated_frame(
     seed: Annotated[int, Query(ge=0, le=MAX_SEED)] = 0,
 ) -> Response:
     """Give a simulated frame of a database's camera, to try things with."""
-    database = service.shelf.database(database_id)
+    database = service.library.database(database_id)
     name = f"{database.title}-{seed}{frame_suffix(database)}"
-    content = await service.confined.run(_simulated, service, database, name, seed)
+    content = await service.sandbox.run(_simulated, service, database, name, seed)
     kind = "image/png" if name.endswith(".png") else "text/csv; charset=utf-8"
     headers = {"Content-Disposition": f'attachment; filename="{name}"'}
     return Response(content, media_type=kind, headers=headers)
 
 
 def _page(request: Request, service: Service, given: dict[str, str], **answer: Any) -> Response:
-    databases = service.shelf.databases()
+    databases = service.library.databases()
     problem = answer.get("problem")
     nothing = dict.fromkeys(("found", "picture", "problem", "errors", "field_deg"))
     return render(
@@ -128,19 +107,18 @@ def _page(request: Request, service: Service, given: dict[str, str], **answer: A
     )
 
 
-def frame_of(form: FormData, given: dict[str, str], database: Database, service: Service) -> Frame:
+def frame_of(
+    form: FormData, given: dict[str, str], database: Database, service: Service
+) -> FrameUpload:
     """Return the frame that a form brings."""
     if given["seed"]:
         number = _number(given["seed"], "seed")
         seed = int(min(max(number or 0, 0), MAX_SEED))
         name = f"simulated-{seed}{frame_suffix(database)}"
-        return Frame(name, lambda path: write_frame(path, database, seed))
+        return FrameUpload(name, io.BytesIO(_simulated(service, database, name, seed)))
     upload = form.get("file")
     if isinstance(upload, UploadFile) and upload.filename:
-        if upload.size is None or upload.size > service.settings.upload_mib * MIB:
-            raise Problem(413, f"the file is larger than {service.settings.upload_mib:g} MiB")
-        file = upload.file
-        return Frame(safe_name(upload.filename, SUFFIXES, "frame"), lambda path: _copy(file, path))
+        return FrameUpload.of_form(upload, service.settings.upload_mib)
     if not given["centroids"].strip():
         raise Problem(
             422,
@@ -150,10 +128,10 @@ def frame_of(form: FormData, given: dict[str, str], database: Database, service:
         )
     is_mag = given["brightness"] == "mag"
     suffix, text = centroid_file(given["centroids"], "mag" if is_mag else "light")
-    return Frame(f"pasted{suffix}", lambda path: _write(path, text))
+    return FrameUpload(f"pasted{suffix}", io.BytesIO(text.encode()))
 
 
-def options_of(given: dict[str, str]) -> IdentifyOptions:
+def options_of(given: dict[str, str], service: Service) -> IdentifyOptions:
     """Return how a frame is to be identified."""
     percent = _number(given["field_error"], "field_error")
     content = {
@@ -162,34 +140,15 @@ def options_of(given: dict[str, str]) -> IdentifyOptions:
         "tolerance_px": _number(given["tolerance_px"], "tolerance_px"),
     }
     try:
-        return IdentifyOptions.model_validate(content)
+        options = IdentifyOptions.model_validate(content)
     except ValidationError as error:
-        first = error.errors(include_url=False, include_context=False)[0]
-        key = str(first["loc"][0])
-        raise Problem(422, f"{key}: {first['msg']} (found {first['input']!r})", key=key) from None
-
-
-def identified(
-    service: Service, database: Database, frame: Frame, options: IdentifyOptions
-) -> tuple[dict[str, Any], bytes]:
-    """Identify a frame and draw it, in a confined process."""
-    limited = options.model_copy(update={"time_limit_s": service.settings.query_time_s})
-    with scratch_folder(service.places) as folder:
-        frame.keep(folder / frame.name)
-        arguments = {
-            "folder": str(folder),
-            "file": frame.name,
-            "artifact": str(database.folder),
-            "options": limited.model_dump(),
-            "picture": "png",
-        }
-        found = service.confined.call("identify", arguments)
-        drawn = folder / "picture.png"
-        return found, drawn.read_bytes() if drawn.is_file() else b""
+        key, found = validation_message(error, show_input=True)
+        raise Problem(422, f"{key}: {found}", key=key) from None
+    return options.model_copy(update={"time_limit_s": service.settings.query_time_s})
 
 
 def _simulated(service: Service, database: Database, name: str, seed: int) -> bytes:
-    with scratch_folder(service.places) as folder:
+    with scratch_folder(service.paths) as folder:
         write_frame(folder / name, database, seed)
         return (folder / name).read_bytes()
 
@@ -231,12 +190,3 @@ def _number(text: str, name: str) -> float | None:
         raise Problem(
             422, f"{name}: {text[:40]!r} is not a number; give one, or leave it empty", key=name
         ) from None
-
-
-def _copy(file: BinaryIO, path: Path) -> None:
-    with path.open("wb") as kept:
-        shutil.copyfileobj(file, kept)
-
-
-def _write(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")

@@ -58,7 +58,7 @@ def new_page(
     if job is not None:
         spec = service.jobs.get(job).request.get("spec")
     elif database is not None:
-        spec = service.shelf.database(database).manifest["spec"]
+        spec = service.library.database(database).manifest["spec"]
     else:
         chosen = chosen or preset_names()[0]
         spec = preset(chosen).recorded()

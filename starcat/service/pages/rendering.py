@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Coroutine
 from datetime import UTC, datetime
 from typing import Any
 from urllib.parse import quote
 
 from fastapi import APIRouter, FastAPI, Request
-from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
-from fastapi.routing import APIRoute
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from starlette.exceptions import HTTPException
 
-from starcat.errors import StarcatError
-from starcat.failures import shown
 from starcat.service.access import principal_of
 from starcat.service.pages.static_files import static_address
-from starcat.service.problems import Problem, ProblemDetails, problem_of, problem_response
+from starcat.service.problems import Problem, RenderingRoute, as_json, problem_of
 from starcat.version import __version__
 
 NAVIGATION = (
@@ -125,27 +120,18 @@ def render(request: Request, template: str, *, status: int = 200, **content: Any
     return HTMLResponse(page, status, {"Cache-Control": "no-store"})
 
 
-class _PageRoute(APIRoute):
+class _PageRoute(RenderingRoute):
     """A route whose errors are pages, in the words that the REST interface has for them."""
 
-    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        handler = super().get_route_handler()
-
-        async def handle(request: Request) -> Response:
-            try:
-                return await handler(request)
-            except (StarcatError, Problem) as error:
-                return error_page(request, problem_of(error))
-            except RequestValidationError as error:
-                first = error.errors()[0]
-                where = ".".join(str(step) for step in first["loc"])
-                problem = Problem(422, shown(f"{where}: {first['msg']}", 500))
-                return error_page(request, problem_of(problem))
-            except HTTPException as error:
-                problem = Problem(error.status_code, shown(str(error.detail), 500))
-                return error_page(request, problem_of(problem))
-
-        return handle
+    def render(self, error: Exception, request: Request) -> Response:
+        """Return the page of an error; who only has to sign in is led there."""
+        if isinstance(error, HTTPException) and error.status_code == 405:
+            return as_json(error)
+        problem = problem_of(error)
+        if problem.status == 401 and request.method == "GET":
+            asked = request.url.path + (f"?{request.url.query}" if request.url.query else "")
+            return RedirectResponse(f"/sign-in?next={quote(asked, safe='')}", 303)
+        return _error_page(request, error)
 
 
 def page_router() -> APIRouter:
@@ -158,18 +144,13 @@ def add_missing_page(app: FastAPI) -> None:
 
     @app.exception_handler(404)
     def tell_missing(request: Request, error: Exception) -> Response:
-        detail = "there is nothing at this address; the head of the page leads to all that there is"
-        problem = problem_of(Problem(404, detail))
         is_for_people = "text/html" in request.headers.get("accept", "")
         if is_for_people and request.method == "GET" and not request.url.path.startswith("/api/"):
-            return error_page(request, problem)
-        told = shown(str(getattr(error, "detail", "Not Found")), 500)
-        return problem_response(problem.model_copy(update={"detail": told}))
+            detail = "there is nothing at this address; every part of the service is linked above"
+            return _error_page(request, Problem(404, detail))
+        return as_json(error)
 
 
-def error_page(request: Request, problem: ProblemDetails) -> Response:
-    """Return the page of an error; who only has to sign in is led there."""
-    if problem.status == 401 and request.method == "GET":
-        asked = request.url.path + (f"?{request.url.query}" if request.url.query else "")
-        return RedirectResponse(f"/sign-in?next={quote(asked, safe='')}", 303)
+def _error_page(request: Request, error: Exception) -> Response:
+    problem = problem_of(error)
     return render(request, "error.html", status=problem.status, problem=problem)

@@ -1,4 +1,4 @@
-"""The page to sign in at; what it sends is taken by `starcat.service.guard`."""
+"""The page to sign in at; what it sends is taken by `starcat.service.security`."""
 
 from __future__ import annotations
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from starcat.geometry.camera import Camera
-from starcat.images.identification import write_simulated
+from starcat.images.render import write_simulated
 from starcat.matcher.database import open_database
-from starcat.service.shelf import Database
+from starcat.service.library import Database
 from starcat.simulation.simulate import Noise, simulate_frames
 from starcat.specs.build_spec import CameraSpec
 

@@ -25,7 +25,7 @@ from starcat.report.sky_map import (
     nearest_raster,
     project,
 )
-from starcat.service.shelf import Database
+from starcat.service.library import Database
 
 Counts = NDArray[np.int64]
 

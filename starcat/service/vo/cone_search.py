@@ -11,7 +11,8 @@ from fastapi import APIRouter, Request
 from fastapi.responses import Response, StreamingResponse
 
 from starcat.errors import QueryLimitError, StarcatError, TargetMissing
-from starcat.exchange.label import Label
+from starcat.exchange.columns import Label
+from starcat.exchange.writers import result_chunks
 from starcat.service.access import Reader
 from starcat.service.problems import Problem, problem_of
 from starcat.service.service import Service, TheService
@@ -25,7 +26,6 @@ from starcat.vo.cone import (
     star_view,
     with_ucds,
 )
-from starcat.vo.results import result_chunks
 
 router = APIRouter(prefix="/scs", tags=["cone search"])
 
@@ -84,7 +84,7 @@ async def search(catalog: str, request: Request, service: TheService, reader: Re
     """
     try:
         asked = cone_request(request.query_params.multi_items())
-        found = await service.sessions.run(_answer, service, catalog, asked)
+        found = await service.query_pool.run(_answer, service, catalog, asked)
     except (StarcatError, Problem) as error:
         told = problem_of(error)
         headers = error.headers if isinstance(error, Problem) else {}
@@ -94,12 +94,12 @@ async def search(catalog: str, request: Request, service: TheService, reader: Re
 
 def target_of(service: Service, name: str) -> tuple[Path, Label]:
     """Return the database or the catalog of a name."""
-    named = [one for one in service.shelf.databases() if name in (one.id, one.name, one.title)]
+    named = [one for one in service.library.databases() if name in (one.id, one.name, one.title)]
     if named:
         newest = named[-1]
         return newest.folder, Label("stars", newest.name, newest.version)
     if _NAME.fullmatch(name):
-        for path in _read_ones(service.places.catalogs, name):
+        for path in _read_ones(service.paths.catalogs, name):
             if path.is_file() or (path.is_dir() and is_store(path)):
                 return path, Label(name)
     raise TargetMissing(
@@ -120,11 +120,11 @@ def _answer(service: Service, name: str, asked: ConeRequest) -> SpooledTemporary
     folder, label = target_of(service, name)
     max_rows = service.settings.max_rows
     maxrec = max_rows if asked.maxrec is None else min(asked.maxrec, max_rows)
-    with service.sessions.session([folder]) as session:
+    with service.query_pool.session([folder]) as session:
         view = star_view(session)
         with session.ask(cone_query(view, asked, maxrec)) as running:
             rows = with_ucds(running.batches(), view)
-            scratch = service.places.scratch
+            scratch = service.paths.scratch
             chunks = result_chunks(rows, asked.form, scratch, label=label, maxrec=maxrec)
             held: SpooledTemporaryFile[bytes]
             held = SpooledTemporaryFile(_HELD_BYTES, dir=str(scratch))  # noqa: SIM115

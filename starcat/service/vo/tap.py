@@ -65,9 +65,9 @@ class _Closing(StreamingResponse):
 async def sync(given: TheRequest, service: TheService, who: Reader) -> Response:
     """Answer a query; parameters as TAP 1.1 has them."""
     asked = question(given.parameters, service.settings.max_rows)
-    first, rest = await service.sessions.run(_begun, service, asked, given, who.name)
-    answer = _Closing(first, rest, asked.form.media_type)
-    name = f"result.{asked.form.suffix}"
+    first, rest = await service.query_pool.run(_begun, service, asked, given, who.name)
+    answer = _Closing(first, rest, asked.form.tap_type)
+    name = f"result{asked.form.suffix}"
     answer.headers["Content-Disposition"] = f'inline; filename="{name}"'
     return answer
 
@@ -80,7 +80,7 @@ def _begun(service: Service, asked: Question, given: TapRequest, owner: str) -> 
         if gone.is_set():
             raise ClientGone
 
-    scratch = service.places.scratch
+    scratch = service.paths.scratch
     with tempfile.TemporaryDirectory(prefix="sync-", dir=scratch) as folder:
         files = given.keep(Path(folder)) | service.tap.jobs.answers(asked.uploads, owner)
         parts = service.tap.queries.answer(asked, files, progress=watch)

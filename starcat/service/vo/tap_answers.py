@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from starcat.exchange.label import Label
+from starcat.exchange.columns import Label
+from starcat.exchange.formats import Format
+from starcat.exchange.writers import result_chunks
 from starcat.service.answer_files import file_of_rows, keep_rows
-from starcat.service.confined import Confined
-from starcat.service.places import Places
+from starcat.service.paths import ServicePaths
+from starcat.service.sandbox.sandbox import Sandbox
 from starcat.service.uploading import scratch_folder
-from starcat.vo.formats import Format
-from starcat.vo.results import result_chunks
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -22,22 +22,22 @@ _LABEL = Label("result")
 class Answers:
     """What makes bytes of answers."""
 
-    def __init__(self, places: Places, confined: Confined) -> None:
-        self._places = places
-        self._confined = confined
+    def __init__(self, paths: ServicePaths, sandbox: Sandbox) -> None:
+        self._paths = paths
+        self._sandbox = sandbox
 
     def chunks(self, batches: pa.RecordBatchReader, form: Format, max_rows: int) -> Iterator[bytes]:
         """Yield an answer in a format."""
         if form.name == "fits":
             yield from self._fits(batches, max_rows)
         else:
-            scratch = self._places.scratch
+            scratch = self._paths.scratch
             yield from result_chunks(batches, form, scratch, label=_LABEL, maxrec=max_rows)
 
     def _fits(self, batches: pa.RecordBatchReader, max_rows: int) -> Iterator[bytes]:
         """Have a FITS file made, which is held in memory as a whole, by another process."""
-        with scratch_folder(self._places) as folder:
+        with scratch_folder(self._paths) as folder:
             rows = folder / "rows.arrow"
             keep_rows(batches, rows, max_rows)
-            chunks, _ = file_of_rows(self._confined, rows, folder / "answer.fits", "fits")
+            chunks, _ = file_of_rows(self._sandbox, rows, folder / "answer.fits", "fits")
         yield from chunks

@@ -12,12 +12,12 @@ from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
 
 from starcat.errors import ConfigError, TargetMissing, quoted
+from starcat.exchange.formats import TAP_FORMATS
 from starcat.service.access import Reader
 from starcat.service.service import Service, TheService
 from starcat.service.vo.tap_request import FORM, PREFIX, TapRoute, TheRequest, base_url
 from starcat.service.vo.tap_store import RESULT
 from starcat.vo.documents import MEDIA_TYPE, VOTABLE_TYPE, error_votable
-from starcat.vo.formats import FORMATS
 from starcat.vo.uws import (
     ACTIVE,
     JobFacts,
@@ -220,11 +220,11 @@ def get_result(job: TheJob, service: TheService) -> Response:
         raise TargetMissing(
             f"the job is {job.phase} and has no answer; its phase tells when it has"
         )
-    suffix = next((one.suffix for one in FORMATS if one.media_type == job.media_type), "vot")
+    suffix = next((one.suffix for one in TAP_FORMATS if one.tap_type == job.media_type), ".vot")
     return FileResponse(
         path,
         media_type=job.media_type,
-        filename=f"result.{suffix}",
+        filename=f"result{suffix}",
         content_disposition_type="inline",
     )
 

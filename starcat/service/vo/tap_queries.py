@@ -9,11 +9,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from starcat.errors import ConfigError
-from starcat.exchange.label import Label
+from starcat.exchange.columns import Label
 from starcat.progress import Progress, no_progress
-from starcat.service.confined import Confined
-from starcat.service.places import Places
-from starcat.service.sessions import Sessions
+from starcat.service.paths import ServicePaths
+from starcat.service.query_pool import QueryPool
+from starcat.service.sandbox.sandbox import Sandbox
 from starcat.service.vo.tap_answers import Answers
 from starcat.service.vo.tap_tables import TapTables
 from starcat.vo.adql import translate
@@ -31,18 +31,18 @@ class TapQueries:
 
     def __init__(
         self,
-        places: Places,
+        paths: ServicePaths,
         tables: TapTables,
-        sessions: Sessions,
-        confined: Confined,
+        sessions: QueryPool,
+        sandbox: Sandbox,
         most_rows: int,
     ) -> None:
-        self._confined = confined
+        self._sandbox = sandbox
         self.most_rows = most_rows
-        self._places = places
+        self._paths = paths
         self._tables = tables
         self._sessions = sessions
-        self._answers = Answers(places, confined)
+        self._answers = Answers(paths, sandbox)
 
     def answer(
         self,
@@ -78,7 +78,7 @@ class TapQueries:
                     "part of multipart/form-data with that name",
                     key="UPLOAD",
                 )
-        top = Path(tempfile.mkdtemp(prefix="upload-", dir=self._places.scratch))
+        top = Path(tempfile.mkdtemp(prefix="upload-", dir=self._paths.scratch))
         try:
             folder = top / UPLOADS
             folder.mkdir()
@@ -91,4 +91,4 @@ class TapQueries:
 
     def _read(self, file: Path, upload: Upload, folder: Path) -> Table:
         given = {"path": str(file), "name": upload.table, "folder": str(folder)}
-        return table_of_facts(self._confined.call("upload", given))
+        return table_of_facts(self._sandbox.call("upload", given))

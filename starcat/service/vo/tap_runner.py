@@ -95,7 +95,7 @@ class TapRunner:
             if error.status == 503:
                 return False
             raise
-        self._jobs.complete(job.job_id, asked.form.media_type)
+        self._jobs.complete(job.job_id, asked.form.tap_type)
         return True
 
     def _check(self, job_id: str) -> None:

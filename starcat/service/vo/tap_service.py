@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from starcat.service.confined import Confined
-from starcat.service.places import Places
+from starcat.service.library import Library
+from starcat.service.paths import ServicePaths
+from starcat.service.query_pool import QueryPool
 from starcat.service.records import Records
-from starcat.service.sessions import Sessions
+from starcat.service.sandbox.sandbox import Sandbox
 from starcat.service.settings import Settings
-from starcat.service.shelf import Shelf
 from starcat.service.vo.tap_queries import TapQueries
 from starcat.service.vo.tap_runner import TapRunner
 from starcat.service.vo.tap_store import TapJobs
@@ -37,11 +37,11 @@ class Tap:
     def __init__(
         self,
         settings: Settings,
-        places: Places,
+        paths: ServicePaths,
         records: Records,
-        shelf: Shelf,
-        sessions: Sessions,
-        confined: Confined,
+        library: Library,
+        sessions: QueryPool,
+        sandbox: Sandbox,
     ) -> None:
         self.limits = ServiceLimits(
             run_s=int(settings.job_time_s),
@@ -49,9 +49,9 @@ class Tap:
             rows=settings.max_rows,
             upload_bytes=int(settings.upload_mib * 2**20),
         )
-        self.tables = TapTables(places, shelf, sessions)
-        self.queries = TapQueries(places, self.tables, sessions, confined, settings.max_rows)
-        self.jobs = TapJobs(records, places, self.limits)
+        self.tables = TapTables(paths, library, sessions)
+        self.queries = TapQueries(paths, self.tables, sessions, sandbox, settings.max_rows)
+        self.jobs = TapJobs(records, paths, self.limits)
         # One of the queries that run at the same time is left to those who wait for the answer.
         self.runner = TapRunner(self.jobs, self.queries, max(1, settings.queries - 1))
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from starcat.errors import ConfigError, TargetMissing
-from starcat.service.places import JOB_ID, Places, checked
+from starcat.service.paths import JOB_ID, ServicePaths, checked
 from starcat.service.records import Records
 from starcat.storage.atomic import make_folder
 from starcat.vo.documents import ServiceLimits
@@ -32,9 +32,9 @@ ENDED_WITH_SERVER = (
 class TapJobs:
     """The asynchronous queries there are."""
 
-    def __init__(self, records: Records, places: Places, limits: ServiceLimits) -> None:
+    def __init__(self, records: Records, paths: ServicePaths, limits: ServiceLimits) -> None:
         self._records = records
-        self._places = places
+        self._paths = paths
         self._limits = limits
 
     def create(self, owner: str, parameters: Sequence[tuple[str, str]]) -> JobFacts:
@@ -43,9 +43,9 @@ class TapJobs:
         job_id, now = secrets.token_hex(16), time.time()
         make_folder(self.folder(job_id))
         with self._records.writing() as connection:
-            places = ", ".join("?" * len(ACTIVE))
+            paths = ", ".join("?" * len(ACTIVE))
             [waiting] = connection.execute(
-                f"SELECT count(*) FROM tap_jobs WHERE owner = ? AND phase IN ({places})",
+                f"SELECT count(*) FROM tap_jobs WHERE owner = ? AND phase IN ({paths})",
                 (owner, *ACTIVE),
             ).fetchone()
             if waiting >= MAX_WAITING:
@@ -90,7 +90,7 @@ class TapJobs:
 
     def folder(self, job_id: str) -> Path:
         """Return the folder with the uploads and the answer of a job."""
-        return self._places.results / checked(job_id, JOB_ID, "job")
+        return self._paths.results / checked(job_id, JOB_ID, "job")
 
     def files(self, job_id: str) -> dict[str, Path]:
         """Return the uploads of a job by the names of their parts."""

@@ -1,6 +1,6 @@
 """The tables that TAP shows: those of all databases, and of the catalogs that were read.
 
-What is known of them is found out once for each state of the shelf, and written as TAP_SCHEMA's
+What is known of them is found out once for each state of the library, and written as TAP_SCHEMA's
 tables, which queries read like any others.
 """
 
@@ -14,9 +14,9 @@ from pathlib import Path
 
 from starcat.catalog.star_files import rejected_path
 from starcat.errors import StarcatError
-from starcat.service.places import Places
-from starcat.service.sessions import Sessions
-from starcat.service.shelf import Shelf
+from starcat.service.library import Library
+from starcat.service.paths import ServicePaths
+from starcat.service.query_pool import QueryPool
 from starcat.store.layout import is_store
 from starcat.vo.tables import Schema, Tables
 from starcat.vo.tap_schema import NAME, own_schema, session_schemas, write_tap_schema
@@ -43,9 +43,9 @@ class TapState:
 class TapTables:
     """The tables of a service, as they are now."""
 
-    def __init__(self, places: Places, shelf: Shelf, sessions: Sessions) -> None:
-        self._places = places
-        self._shelf = shelf
+    def __init__(self, paths: ServicePaths, library: Library, sessions: QueryPool) -> None:
+        self._paths = paths
+        self._shelf = library
         self._sessions = sessions
         self._looking = threading.Lock()
         self._state: tuple[str, TapState] | None = None
@@ -67,7 +67,7 @@ class TapTables:
             database.folder: f"Guide-star database {database.name}, version {database.version}"
             for database in self._shelf.databases()
         }
-        for path in sorted(self._places.catalogs.iterdir()):
+        for path in sorted(self._paths.catalogs.iterdir()):
             is_table = path.suffix == ".parquet" and path != rejected_path(path)
             if path.is_file() and is_table and not path.stem.endswith("rejected"):
                 found[path] = f"Stars of the catalog {path.stem}"
@@ -91,7 +91,7 @@ class TapTables:
 
     def _opened(self, about: dict[Path, str], key: str) -> TapState:
         own = own_schema()
-        folder = self._places.scratch / f"tap-{key}" / NAME
+        folder = self._paths.scratch / f"tap-{key}" / NAME
         schemas: tuple[Schema, ...] = ()
         if about:
             with self._sessions.session(list(about)) as session:

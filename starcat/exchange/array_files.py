@@ -1,0 +1,254 @@
+"""Tables as FITS, ECSV and npz: formats that are written from arrays of the whole table.
+
+FITS 4.0 has a binary table. Its text is ASCII, and an empty text is its null. Nulls are NaN in
+floating-point columns, TNULL (the smallest number that the column does not use) in integer ones,
+and an empty list in ragged ones. A column of truth values with nulls becomes bytes 0 and 1 with
+TNULL, since readers take the null of a logical column for False. Texts of the header that are
+longer than a card go on in the next, which ``LONGSTRN`` announces.
+
+ECSV 1.0 is text with a header that says types, units and meanings.
+
+npz has one array a column, for numpy alone: ``<column>`` holds the values; null is NaN, 0, False
+or an empty text, and ``<column>.is_null`` says where, if anywhere. A ragged column has all items
+in ``<column>`` and ``<column>.offsets``: row i is ``values[offsets[i]:offsets[i + 1]]``.
+"""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from starcat.errors import SchemaError
+from starcat.exchange.columns import Label, check_names, unit_text
+from starcat.exchange.numpy_columns import NumpyColumn, numpy_columns
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+_CODES = {"b1": "L", "u1": "B", "i2": "I", "i4": "J", "i8": "K", "f4": "E", "f8": "D"}
+_NAME_LETTERS = 68
+"""What a card of a FITS header has room for; a quotation mark counts twice."""
+
+_HEAP_LIMIT_BYTES = 2**31 - 1
+"""What a descriptor of 32 bits reaches; beyond it FITS has one of 64 bits."""
+
+_BREAKS = re.compile(r"\0|[^\S \t\n]")
+"""White space that is neither blank, tab nor newline: Python ends lines at most of it."""
+
+_ENTRY_NAME_BYTES = (1 << 16) - 1
+"""What an entry of a zip file has room for."""
+
+
+def write_fits(batches: pa.RecordBatchReader, path: Path, label: Label) -> int:
+    """Write a table as a FITS file with one binary table; return its rows."""
+    from astropy.io import fits
+
+    columns, rows = _arrays(batches, "fits")
+    _check_fits_names(columns)
+    heap = sum(column.values.nbytes for column in columns if column.offsets is not None)
+    descriptor = "P" if heap <= _HEAP_LIMIT_BYTES else "Q"
+    table = fits.BinTableHDU.from_columns(
+        [_fits_column(column, descriptor) for column in columns], nrows=rows
+    )
+    named = {"EXTNAME": label.table, "ARTIFACT": label.artifact, "VERSION": label.version}
+    for key, text in named.items():
+        if text:
+            table.header[key] = _header_text(text)
+    table.header["LONGSTRN"] = ("OGIP 1.0", "long texts go on in CONTINUE")
+    for number, column in enumerate(columns, start=1):
+        for key, fact in (("TCOMM", "description"), ("TUCD", "ucd")):
+            if column.facts.get(fact):
+                table.header[f"{key}{number}"] = _header_text(column.facts[fact])
+    fits.HDUList([fits.PrimaryHDU(), table]).writeto(path, overwrite=True)
+    return rows
+
+
+def _header_text(text: str) -> str:
+    """Return a text as a header may have it: printable ASCII."""
+    return "".join(letter if letter.isascii() and letter.isprintable() else "?" for letter in text)
+
+
+def _check_fits_names(columns: list[NumpyColumn]) -> None:
+    seen: dict[str, str] = {}
+    for column in columns:
+        name = column.name
+        if not (name.isascii() and name.isprintable()):
+            raise SchemaError(
+                f"column {name!r}: names are ASCII in FITS; rename it with AS", field=name
+            )
+        if len(name.replace("'", "''")) > _NAME_LETTERS:
+            raise SchemaError(
+                f"column {name[:20]}... has a name of {len(name)} letters, and FITS has room for "
+                f"{_NAME_LETTERS}; rename it with AS",
+                field=name,
+            )
+        if name.lower() in seen:
+            raise SchemaError(
+                f"columns {seen[name.lower()]!r} and {name!r}: FITS does not tell capitals from "
+                "small letters in names; rename one with AS",
+                field=name,
+            )
+        seen[name.lower()] = name
+
+
+def _fits_column(column: NumpyColumn, descriptor: str) -> Any:
+    from astropy.io import fits
+
+    null = None
+    array: NDArray[Any]
+    if column.is_text:
+        array = _ascii(column)
+        code = f"{max(1, array.dtype.itemsize)}A"
+    elif column.offsets is not None:
+        array = np.empty(len(column.is_null), dtype=np.object_)
+        array[:] = column.lists()
+        code = f"{descriptor}{_CODES[column.values.dtype.str[1:]]}()"
+    else:
+        array, null = _with_null(column)
+        code = _CODES[array.dtype.str[1:]]
+    unit = unit_text(column.name, column.facts.get("unit"), "fits")
+    return fits.Column(name=column.name, format=code, array=array, null=null, unit=unit)
+
+
+def _ascii(column: NumpyColumn) -> NDArray[np.bytes_]:
+    for text in column.values:
+        if not text.isascii() or "\0" in text:
+            raise SchemaError(
+                f"column {column.name!r}: text is ASCII in FITS, and {text!r} is not; leave the "
+                "column out, or export to votable",
+                field=column.name,
+                found=text,
+            )
+    return column.values.astype(np.bytes_) if len(column.values) else np.empty(0, "S1")
+
+
+def _with_null(column: NumpyColumn) -> tuple[NDArray[Any], int | None]:
+    """Return the values of a column, and which of them means null."""
+    values = column.values
+    if values.dtype.kind == "f" or not column.is_null.any():
+        return values, None
+    if values.dtype.kind == "b":
+        return np.where(column.is_null, 255, values).astype(np.uint8), 255
+    if values.dtype == np.uint8:
+        values = values.astype(np.int16)  # all 256 values may be in use
+    used = values[~column.is_null]
+    null = int(np.iinfo(values.dtype).min)
+    while np.isin(null, used):
+        null += 1
+    return np.where(column.is_null, values.dtype.type(null), values), null
+
+
+def write_ecsv(batches: pa.RecordBatchReader, path: Path, label: Label) -> int:
+    """Write a table as ECSV; return its rows."""
+    columns, rows = _arrays(batches, "ecsv")
+    _check_ecsv_texts(columns)
+    table = astropy_table(columns)
+    table.meta |= {**({"name": label.table} if label.table else {}), **label.origin}
+    table.write(path, format="ascii.ecsv", overwrite=True)
+    return rows
+
+
+def astropy_table(columns: list[NumpyColumn]) -> Table:
+    """Return columns as an astropy table."""
+    from astropy.table import Table
+
+    table = Table()
+    for column in columns:
+        table[column.name] = _astropy_column(column)
+    return table
+
+
+def _astropy_column(column: NumpyColumn) -> Any:
+    from astropy.table import Column, MaskedColumn
+
+    facts = column.facts
+    values: Any = column.values
+    if column.is_text:
+        values = values.astype(np.str_)
+    elif column.offsets is not None:
+        values = np.empty(len(column.is_null), dtype=np.object_)
+        values[:] = column.lists()
+    said = {
+        "unit": unit_text(column.name, facts.get("unit"), "generic"),
+        "description": facts.get("description"),
+        "meta": {"ucd": facts["ucd"]} if "ucd" in facts else None,
+    }
+    has_empty = column.is_text and bool(np.any((values == "") & ~column.is_null))
+    if not column.is_null.any() and not has_empty:
+        return Column(values, **said)
+    masked = MaskedColumn(values, mask=column.is_null, **said)
+    if has_empty:
+        # An empty cell means null to readers, unless the mask is a column of its own.
+        masked.info.serialize_method["ecsv"] = "data_mask"
+    return masked
+
+
+def _check_ecsv_texts(columns: list[NumpyColumn]) -> None:
+    """Refuse texts that a reader would take for the end of a line, or for a comment."""
+    for place, column in enumerate(columns):
+        for text in [column.name, *(column.values if column.is_text else ())]:
+            if _BREAKS.search(text) or (place == 0 and text.startswith("#")):
+                raise SchemaError(
+                    f"column {column.name!r}: readers of ECSV would misread the text {text!r} "
+                    "there; take the character out, or choose another format",
+                    field=column.name,
+                    found=text,
+                )
+
+
+def write_npz(batches: pa.RecordBatchReader, path: Path, label: Label) -> int:
+    """Write a table as an npz file, which has no place for a label; return its rows."""
+    columns, rows = _arrays(batches, "npz")
+    # Not numpy.savez: it takes a column named "file" for its own argument.
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for column in columns:
+            values = _fixed_texts(column) if column.is_text else column.values
+            _add_array(archive, column.name, values)
+            if column.offsets is not None:
+                _add_array(archive, f"{column.name}.offsets", column.offsets)
+            if column.is_null.any():
+                _add_array(archive, f"{column.name}.is_null", column.is_null)
+    return rows
+
+
+def _arrays(batches: pa.RecordBatchReader, file_format: str) -> tuple[list[NumpyColumn], int]:
+    table = batches.read_all()
+    columns = numpy_columns(table, signed=file_format == "fits")
+    check_names(table.column_names, file_format)
+    return columns, len(table)
+
+
+def _fixed_texts(column: NumpyColumn) -> NDArray[np.str_]:
+    for text in column.values:
+        if text.endswith("\0"):
+            raise SchemaError(
+                f"column {column.name!r}: numpy would lose the end of the text {text!r}; take the "
+                "null character out, or choose another format",
+                field=column.name,
+                found=text,
+            )
+    return column.values.astype(np.str_)
+
+
+def _add_array(archive: zipfile.ZipFile, name: str, values: NDArray[Any]) -> None:
+    if len(f"{name}.npy".encode()) > _ENTRY_NAME_BYTES:
+        raise SchemaError(
+            f"column {name[:20]}... has a name of {len(name)} letters, which npz has no room for; "
+            "rename it with AS",
+            field=name,
+        )
+    if f"{name}.npy" in archive.namelist():
+        raise SchemaError(
+            f"column {name!r}: the file has an array of that name already, for a column's lists "
+            "or nulls; rename the column with AS",
+            field=name,
+        )
+    # An entry opened by its name is dated 1980, so that the bytes are the same every time.
+    with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
+        np.lib.format.write_array(stream, np.ascontiguousarray(values), allow_pickle=False)

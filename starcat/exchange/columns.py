@@ -1,0 +1,202 @@
+"""Columns of any query brought to the few types that files of other tools can hold.
+
+Products have numbers, texts, truth values and lists of them. A query can give more: dates,
+decimals, records. What can be said in a plainer type is; the rest is refused by name.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from starcat.errors import SchemaError
+
+_CASTS = {
+    "interval": "epoch(column) for seconds",
+    "duration": "epoch(column) for seconds",
+    "binary": "hex(column) for text",
+    "map": "map_entries(column) for a list of records",
+    "union": "one of its types",
+}
+
+
+@dataclass(frozen=True)
+class Label:
+    """What a file says of its table as a whole; what is not known is empty."""
+
+    table: str = ""  # name of the product, or of the file that was exported
+    artifact: str = ""  # the artifact that it is a product of
+    version: str = ""
+
+    @property
+    def origin(self) -> dict[str, str]:
+        """Artifact and version, where they are known."""
+        known = {"artifact": self.artifact, "version": self.version}
+        return {name: text for name, text in known.items() if text}
+
+
+UNLABELLED = Label()
+
+
+class FirstRows:
+    """The first rows of a table that is read batch by batch, and whether there were more.
+
+    For that one row more than `count` has to be among the batches. None gives all rows; with 0
+    nothing is read.
+    """
+
+    def __init__(self, batches: pa.RecordBatchReader, count: int | None) -> None:
+        self._batches = batches
+        self._left = count
+        self.were_more = count == 0
+
+    def __iter__(self) -> Iterator[pa.RecordBatch]:
+        """Yield the batches; `were_more` is known when the last one was given."""
+        if self.were_more:
+            return
+        for batch in self._batches:
+            if self._left is None:
+                yield batch
+            elif batch.num_rows <= self._left:
+                self._left -= batch.num_rows
+                yield batch
+            else:
+                self.were_more = True
+                yield batch.slice(0, self._left)
+                return
+
+    def reader(self) -> pa.RecordBatchReader:
+        """Return the rows as a reader."""
+        return pa.RecordBatchReader.from_batches(self._batches.schema, iter(self))
+
+
+def plain_schema(schema: pa.Schema) -> pa.Schema:
+    """Return a schema with the plain types; SchemaError says what to cast a column to."""
+    twice = [name for name, times in Counter(schema.names).items() if times > 1]
+    if twice:
+        raise SchemaError(
+            f"column {twice[0]!r} is there twice; give one of them another name with AS",
+            field=twice[0],
+            found=schema.names,
+        )
+    return pa.schema([f.with_type(_plain(f.type, f.name)) for f in schema], schema.metadata)
+
+
+def plain_batch(batch: pa.RecordBatch, schema: pa.Schema) -> pa.RecordBatch:
+    """Return a batch with the types of a plain schema."""
+    columns = [
+        column if column.type == field.type else column.cast(field.type)
+        for column, field in zip(batch.columns, schema, strict=True)
+    ]
+    return pa.RecordBatch.from_arrays(columns, schema=schema)
+
+
+def described(
+    batches: pa.RecordBatchReader, facts: Iterable[dict[str, str] | None]
+) -> pa.RecordBatchReader:
+    """Return rows with other facts in the metadata of each field; None leaves a field as it is."""
+    schema = pa.schema(
+        field if known is None else field.with_metadata(known)
+        for field, known in zip(batches.schema, facts, strict=True)
+    )
+    rows = (pa.record_batch(batch.columns, schema=schema) for batch in batches)
+    return pa.RecordBatchReader.from_batches(schema, rows)
+
+
+def field_facts(field: pa.Field) -> dict[str, str]:
+    """Return ``unit``, ``description`` and ``ucd`` where the metadata of a field has them."""
+    known = field.metadata or {}
+    return {
+        key: known[key.encode()].decode()
+        for key in ("unit", "description", "ucd")
+        if known.get(key.encode())
+    }
+
+
+def check_names(names: Iterable[str], file_format: str) -> None:
+    """Refuse a column without a name, which only text formats and Parquet can hold."""
+    for number, name in enumerate(names, start=1):
+        if not name:
+            raise SchemaError(
+                f"column {number} has an empty name, which {file_format} cannot hold; give it "
+                "one with AS",
+                field=name,
+            )
+
+
+def unit_text(name: str, unit: str | None, standard: str) -> str | None:
+    """Return the unit of a column in the spelling of a standard: generic, fits or vounit.
+
+    Those of our schemas are plain, such as ``mas/yr``.
+    """
+    if not unit:
+        return None
+    from astropy import units
+
+    try:
+        return str(units.Unit(unit).to_string(standard))
+    except (ValueError, TypeError) as error:
+        raise SchemaError(
+            f"column {name!r}: unit {unit!r} is not one that {standard} knows; "
+            "mend the unit, or export to CSV or JSON",
+            field=name,
+            found=unit,
+        ) from error
+
+
+def is_list(kind: pa.DataType) -> bool:
+    """Return whether a plain type is a list."""
+    return bool(pa.types.is_list(kind))
+
+
+def is_number(kind: pa.DataType) -> bool:
+    """Return whether a type is an integer or a floating-point number."""
+    return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))
+
+
+def time_texts(values: pa.Array) -> pa.Array:
+    """Return dates and times as ISO 8601 text, those with a zone in UTC."""
+    if pa.types.is_timestamp(values.type):
+        if values.type.tz is not None:
+            values = values.cast(pa.timestamp(values.type.unit, "UTC"))
+        return pc.replace_substring(values.cast(pa.string()), " ", "T", max_replacements=1)
+    return values.cast(pa.string())
+
+
+def _plain(kind: pa.DataType, name: str) -> pa.DataType:
+    if isinstance(kind, pa.BaseExtensionType):
+        return _plain(kind.storage_type, name)
+    if pa.types.is_dictionary(kind):
+        return _plain(kind.value_type, name)
+    if pa.types.is_null(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind):
+        return pa.string()
+    if pa.types.is_float16(kind):
+        return pa.float32()
+    if pa.types.is_struct(kind):
+        return pa.struct([f.with_type(_plain(f.type, f"{name}.{f.name}")) for f in kind])
+    if _is_any_list(kind):
+        item = kind.value_field
+        return pa.list_(item.with_type(_plain(item.type, name)))
+    for word, way_out in _CASTS.items():
+        if word in str(kind):
+            raise SchemaError(
+                f"column {name!r} is of type {kind}, which has no place in a file; "
+                f"select {way_out.replace('column', name)}",
+                field=name,
+                found=str(kind),
+            )
+    return kind
+
+
+def _is_any_list(kind: pa.DataType) -> bool:
+    return bool(
+        pa.types.is_list(kind)
+        or pa.types.is_large_list(kind)
+        or pa.types.is_fixed_size_list(kind)
+        or pa.types.is_list_view(kind)
+        or pa.types.is_large_list_view(kind)
+    )

@@ -1,0 +1,145 @@
+"""Tables in the formats of `starcat.exchange.formats`: to a file, to a terminal, to a client.
+
+Text, Parquet and VOTable are written batch by batch; FITS, ECSV and npz hold the table in memory.
+Units, meanings and UCDs come from the field metadata of the table. The same table gives the same
+bytes.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Collection, Iterator
+from itertools import chain
+from pathlib import Path
+from typing import IO
+
+import pyarrow as pa
+
+from starcat.errors import ConfigError, OutputError
+from starcat.exchange.array_files import write_ecsv, write_fits, write_npz
+from starcat.exchange.columns import UNLABELLED, FirstRows, Label
+from starcat.exchange.formats import FILE_FORMATS, FORMATS, TEXT_FORMATS, Format
+from starcat.exchange.parquet_stream import write_parquet_stream
+from starcat.exchange.text import csv_chunks, json_chunks, tsv_chunks
+from starcat.exchange.votable_stream import Serialization, votable_chunks, write_votable
+from starcat.storage.atomic import whole_file
+
+_CHUNK_BYTES = 1 << 18
+_TEXTS: dict[str, Callable[[pa.RecordBatchReader], Iterator[tuple[bytes, int]]]] = {
+    "csv": csv_chunks,
+    "tsv": tsv_chunks,
+    "json": json_chunks,
+}
+_FILES: dict[str, Callable[[pa.RecordBatchReader, Path, Label], int]] = {
+    "parquet": write_parquet_stream,
+    "votable": write_votable,
+    "fits": write_fits,
+    "ecsv": write_ecsv,
+    "npz": write_npz,
+}
+
+
+def write_batches(
+    batches: pa.RecordBatchReader, target: Path, file_format: str, label: Label = UNLABELLED
+) -> int:
+    """Write a table to a file, which appears at its name when it is whole; return its rows.
+
+    What goes wrong with reading the batches is raised as it comes. SchemaError says what to cast
+    a column to that the format cannot hold; the label is for VOTable, FITS and ECSV.
+    """
+    _check(file_format, FILE_FORMATS)
+    failures: list[Exception] = []
+    watched = pa.RecordBatchReader.from_batches(batches.schema, _watched(batches, failures))
+    try:
+        with whole_file(target) as partial:
+            if file_format in _FILES:
+                return _FILES[file_format](watched, partial, label)
+            with partial.open("wb") as stream:
+                return _write_text(watched, stream.write, file_format)
+    except OutputError:
+        if failures:  # DuckDB's errors come as those of files do, but it was no writing that failed
+            raise failures[0] from None
+        raise
+
+
+def write_text_batches(batches: pa.RecordBatchReader, stream: IO[str], file_format: str) -> int:
+    """Write a table as text, for instance to the standard output; return its rows."""
+    _check(file_format, TEXT_FORMATS)
+    return _write_text(batches, lambda text: stream.write(text.decode()), file_format)
+
+
+def result_chunks(
+    batches: pa.RecordBatchReader,
+    form: Format,
+    scratch: Path,
+    *,
+    label: Label = UNLABELLED,
+    maxrec: int | None = None,
+) -> Iterator[bytes]:
+    """Begin an answer of the service: what goes wrong with the first rows is raised here.
+
+    VOTable says at its end that rows beyond `maxrec` were left out. Formats that are no streams
+    are written into a file in the folder `scratch` first.
+    """
+    chunks: Iterator[bytes]
+    if form.is_votable:
+        serialization: Serialization = "tabledata" if form.name == "votable/td" else "binary2"
+        chunks = votable_chunks(batches, serialization=serialization, label=label, maxrec=maxrec)
+    else:
+        rows = _begun(FirstRows(batches, maxrec).reader())
+        if form.name in _TEXTS:
+            chunks = (text for text, _ in _TEXTS[form.name](rows))
+        else:
+            chunks = _through_file(rows, form.name, scratch, label)
+    return _primed(next(chunks), chunks)
+
+
+def _write_text(
+    batches: pa.RecordBatchReader, write: Callable[[bytes], object], file_format: str
+) -> int:
+    rows = 0
+    for text, more in _TEXTS[file_format](batches):
+        write(text)
+        rows += more
+    return rows
+
+
+def _watched(batches: pa.RecordBatchReader, failures: list[Exception]) -> Iterator[pa.RecordBatch]:
+    """Yield the batches, and remember what goes wrong with reading them."""
+    try:
+        yield from batches
+    except Exception as error:
+        failures.append(error)
+        raise
+
+
+def _begun(batches: pa.RecordBatchReader) -> pa.RecordBatchReader:
+    """Return a reader whose first batch was read."""
+    first = next(iter(batches), None)
+    begun = [] if first is None else [first]
+    return pa.RecordBatchReader.from_batches(batches.schema, chain(begun, batches))
+
+
+def _primed(first: bytes, rest: Iterator[bytes]) -> Iterator[bytes]:
+    yield first
+    yield from rest
+
+
+def _through_file(
+    batches: pa.RecordBatchReader, file_format: str, scratch: Path, label: Label
+) -> Iterator[bytes]:
+    """Write a file, and yield what is in it."""
+    with tempfile.TemporaryDirectory(dir=scratch, prefix="result-") as folder:
+        path = Path(folder) / f"table{FORMATS[file_format].suffix}"
+        write_batches(batches, path, file_format, label)
+        with path.open("rb") as file:
+            while chunk := file.read(_CHUNK_BYTES):
+                yield chunk
+
+
+def _check(file_format: str, choices: Collection[str]) -> None:
+    if file_format not in choices:
+        raise ConfigError(
+            f"format {file_format!r} is unknown here; choose one of {', '.join(choices)}",
+            value=file_format,
+        )

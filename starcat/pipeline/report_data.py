@@ -1,0 +1,165 @@
+"""What a build hands to its report: the results of its stages as plain data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.artifact.manifest import (
+    DATABASE_NAME,
+    ProductFacts,
+    SourceFacts,
+    software_versions,
+)
+from starcat.artifact.reader import Artifact
+from starcat.artifact.writer import Product
+from starcat.catalog.ingest import Ingested, count_by_reason
+from starcat.catalog.selection import Selected, Step
+from starcat.catalog.stars import floats_of
+from starcat.catalog.variability import AmplitudeTable
+from starcat.catalog.verdict import Reason
+from starcat.pipeline.guide_stars import MIN_GUIDE_STARS
+from starcat.pipeline.recipes import field_size
+from starcat.products.boresights import FieldStars, tile_sphere
+from starcat.products.coverage import Coverage, coverage_from_counts, field_coverage
+from starcat.report.coverage_report import CoverageReport, report_coverage
+from starcat.report.report import BuildFacts
+from starcat.simulation.selftest import Rates
+from starcat.specs.build_spec import BuildSpec
+
+
+@dataclass(frozen=True)
+class FilterCoverage:
+    """What one filter leaves in the fields of the tiling."""
+
+    step: str  # the filter
+    stars: int  # stars left
+    median_per_field: float  # stars in the field of a boresight
+    min_per_field: int
+    share_below_4: float  # share of the fields with fewer than 4 stars
+
+
+def _counts(step: Step, spec: BuildSpec) -> NDArray[np.int64]:
+    """Return the stars in each field of the tiling."""
+    return tile_sphere(
+        spec.boresights.count,
+        step.directions,
+        np.zeros(len(step.directions)),
+        field_size(spec),
+        spec.boresights.field,
+    ).count
+
+
+def _filter_coverage(step: Step, count: NDArray[np.int64]) -> FilterCoverage:
+    return FilterCoverage(
+        step.name,
+        len(step.directions),
+        float(np.median(count)),
+        int(count.min()),
+        round(float((count < MIN_GUIDE_STARS).mean()), 9),
+    )
+
+
+def filter_coverages(
+    steps: Sequence[Step], fields: FieldStars, spec: BuildSpec
+) -> tuple[FilterCoverage, ...]:
+    """Count what each filter leaves in the fields of the tiling."""
+    found: dict[int, FilterCoverage] = {}
+    for step in steps:
+        stars = len(step.directions)
+        if stars not in found:
+            count = fields.count if stars == len(steps[-1].directions) else _counts(step, spec)
+            found[stars] = _filter_coverage(step, count)
+    return tuple(replace(found[len(step.directions)], step=step.name) for step in steps)
+
+
+def coverage_report(coverage: Coverage, spec: BuildSpec) -> CoverageReport:
+    """Return what a report says about coverage."""
+    size = field_size(spec)
+    return report_coverage(coverage, 0.5 * float(np.radians(min(size.fov_x_deg, size.fov_y_deg))))
+
+
+def source_facts(
+    catalog: Ingested,
+    selected: Selected,
+    amplitudes: Sequence[AmplitudeTable],
+    joined: Mapping[str, int],
+) -> list[SourceFacts]:
+    """Return what went into a build as the manifest has it."""
+    rejected = {**catalog.rejected_by_reason, **count_by_reason(selected.rejected)}
+    for reason in catalog.rejected_by_reason.keys() & count_by_reason(selected.rejected).keys():
+        rejected[reason] += catalog.rejected_by_reason[reason]
+    facts = [
+        SourceFacts(
+            catalog.source,
+            "stars",
+            catalog.files,
+            catalog.rows_read,
+            len(selected.guide_stars),
+            rejected,
+        )
+    ]
+    for table in amplitudes:
+        read = sum(file.rows for file in table.files)
+        facts.append(
+            SourceFacts(
+                table.source,
+                "variability",
+                table.files,
+                read,
+                table.kept,
+                table.rejected,
+                joined[table.source],
+            )
+        )
+    return facts
+
+
+@dataclass(frozen=True)
+class BuildResults:
+    """The results of a build's stages."""
+
+    spec: BuildSpec
+    sources: Sequence[SourceFacts]  # what went in
+    products: Sequence[Product]  # what came out
+    facts: Mapping[str, ProductFacts]  # the same as the manifest has it
+    fields: FieldStars  # the tiling of the guide stars
+    filters: Sequence[FilterCoverage]  # what each filter left
+    rates: Sequence[Rates]  # rates of the self-test
+
+
+def build_facts(folder: Path, results: BuildResults) -> BuildFacts:
+    """Return what the report of a build is made of."""
+    spec, tables = results.spec, {product.name: product.table for product in results.products}
+    products = {name: facts.as_dict() for name, facts in results.facts.items()}
+    for facts in products.values():
+        facts["bytes"] = (folder / facts["parquet"]).stat().st_size
+    sources = [source.as_dict() for source in results.sources]
+    found = {name for source in sources for name in source["rejected"]}
+    return BuildFacts(
+        spec=spec.recorded(),
+        sources=sources,
+        reasons={reason.name: reason.value for reason in Reason if reason.name in found},
+        products=products,
+        database_bytes=(folder / DATABASE_NAME).stat().st_size,
+        filters=[asdict(step) for step in results.filters],
+        coverage=coverage_report(field_coverage(results.fields, spec.boresights.brightest), spec),
+        self_test=[rates.as_dict() for rates in results.rates],
+        software=software_versions(),
+        band=str(tables["stars"]["band"][0]),
+        guide_star_mag=floats_of(tables["stars"], "mag"),
+        rejected_mag=floats_of(tables["rejected"], "mag"),
+    )
+
+
+def artifact_coverage(artifact: Artifact) -> CoverageReport:
+    """Return the coverage of an artifact, from its own boresights."""
+    table = artifact.table("boresights")
+    boresights = np.stack([table[name].to_numpy() for name in ("x", "y", "z")], axis=-1)
+    counts = table["star_count"].to_numpy()
+    coverage = coverage_from_counts(boresights, counts, artifact.spec.boresights.brightest)
+    return coverage_report(coverage, artifact.spec)

@@ -1,0 +1,158 @@
+"""Query sessions of the service: kept, bounded, and thrown away when their process was ended."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import shutil
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from starcat.errors import QueryError, QueryLimitError
+from starcat.query.session import MAX_CHECKED, Session
+from starcat.service.problems import Problem
+from starcat.service.query_pool import IDLE, QueryPool
+from starcat.service.sandbox import pool
+from starcat.service.settings import Settings
+
+COUNT = "SELECT count(*) FROM stars"
+
+
+@pytest.fixture
+def sessions(tmp_path: Path) -> Iterator[QueryPool]:
+    opened = QueryPool(Settings(root=tmp_path, queries=1))
+    yield opened
+    opened.close()
+
+
+def process_of(session: Session) -> int:
+    return session._engine._process.pid
+
+
+def count(session: Session) -> int:
+    with session.ask(COUNT) as running:
+        return int(running.rows(1)[0][0])
+
+
+def is_there(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_the_next_question_has_the_same_process(sessions: QueryPool, small_artifact: Path) -> None:
+    with sessions.session([small_artifact]) as session:
+        first = process_of(session)
+        assert count(session) > 100
+    with pytest.raises(QueryError, match="nowhere"), sessions.session([small_artifact]) as session:
+        count_nowhere(session)
+    with sessions.session([small_artifact]) as session:
+        assert process_of(session) == first
+    sessions.close()
+    assert not is_there(first)
+
+
+def count_nowhere(session: Session) -> None:
+    with session.ask("SELECT count(*) FROM nowhere") as running:
+        running.rows(1)
+
+
+def test_one_that_took_too_long_is_thrown_away(sessions: QueryPool, small_artifact: Path) -> None:
+    processes: list[int] = []
+
+    def ask() -> None:
+        with sessions.session([small_artifact], time_s=0.3) as session:
+            processes.append(process_of(session))
+            with session.ask(
+                "SELECT sum(a.mag + d.mag) FROM stars a, stars b, stars c, stars d"
+            ) as running:
+                running.rows(1)
+
+    with pytest.raises(QueryLimitError, match=r"stopped after 0\.3 s"):
+        ask()
+    assert not is_there(processes[0])
+    with sessions.session([small_artifact]) as session:
+        assert session.limits.time_s == 60.0
+        assert count(session) > 100
+
+
+def test_one_that_was_left_halfway_is_thrown_away(
+    sessions: QueryPool, small_artifact: Path
+) -> None:
+    processes: list[int] = []
+
+    def leave() -> None:
+        with (
+            sessions.session([small_artifact]) as session,
+            session.ask("SELECT * FROM stars") as running,
+        ):
+            processes.append(process_of(session))
+            next(iter(running.batches()))
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        leave()
+    assert not is_there(processes[0])
+
+
+def test_only_some_are_kept(sessions: QueryPool, artifact_version: Callable[[str], Path]) -> None:
+    processes = []
+    for number in range(IDLE + 1):
+        with sessions.session([artifact_version(f"1.0.{number}")]) as session:
+            processes.append(process_of(session))
+    assert [is_there(one) for one in processes] == [False] + [True] * IDLE
+
+
+def test_a_target_that_was_replaced_is_opened_anew(
+    sessions: QueryPool, small_artifact: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / small_artifact.name
+    shutil.copytree(small_artifact, folder)
+    with sessions.session([folder]) as session:
+        first = process_of(session)
+    folder.rename(tmp_path / "old")
+    shutil.copytree(small_artifact, folder)
+    with sessions.session([folder]) as session:
+        second = process_of(session)
+    assert second != first
+    sessions.forget(folder)
+    assert not is_there(second)
+
+
+def test_who_waits_too_long_is_told_to_come_again(
+    sessions: QueryPool, small_artifact: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pool, "WAIT_S", 0.05)
+    with (
+        sessions.session([small_artifact]),
+        pytest.raises(Problem, match="ask again later") as caught,
+        sessions.session([small_artifact]),
+    ):
+        pass
+    assert caught.value.status == 503
+    assert int(caught.value.headers["Retry-After"]) >= 0
+
+    held = threading.Event()
+
+    async def both() -> list[object]:
+        holding = asyncio.create_task(sessions.run(held.wait, 10.0))
+        waiting = asyncio.create_task(sessions.run(held.is_set))
+        [refused] = await asyncio.gather(waiting, return_exceptions=True)
+        held.set()
+        return [refused, await holding]
+
+    refused, answer = asyncio.run(both())
+    assert isinstance(refused, Problem)
+    assert answer is True
+
+
+def test_checked_queries_do_not_grow_without_end(sessions: QueryPool, small_artifact: Path) -> None:
+    with sessions.session([small_artifact]) as session:
+        for number in range(MAX_CHECKED + 20):
+            session.check(f"SELECT {number}")
+        assert len(session._checked) == MAX_CHECKED
