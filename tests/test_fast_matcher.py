@@ -21,8 +21,7 @@ from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import TriangleOrder
-from starcat.simulation.simulate import Frame, Noise, simulate_frame, simulate_frames
-from starcat.simulation.sky import Sky
+from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame, simulate_frames
 
 needs_c = pytest.mark.skipif(
     not c_engine.is_compiled(), reason="starcat was installed without a C compiler"

@@ -26,8 +26,7 @@ from starcat.pipeline.starter import STARS_A_FIELD, Starter, advice, starter_spe
 from starcat.products.boresights import stars_in_fields, tile_sphere
 from starcat.products.coverage import TilingGap
 from starcat.products.triangles import find_triangles
-from starcat.simulation.interval import wilson_interval
-from starcat.simulation.selftest import Rates
+from starcat.simulation.selftest import Rates, wilson_interval
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.reading import preset
 

@@ -33,7 +33,7 @@ SINGLE_MODULES = {
 }
 
 GEOMETRY = ("attitude", "camera", "distortion", "kvector", "patterns", "sphere", "zones")
-ONBOARD = ("blocks", "grid", "image", "layout", "reading", "structure")
+ONBOARD = ("grid", "image", "layout", "reading")
 LIGHT = {
     "starcat.arrays",
     "starcat.errors",

@@ -33,8 +33,7 @@ from starcat.matcher.pose import pose_at
 from starcat.matcher.settings import REACH, TriangleOrder
 from starcat.matcher.verification import BestOf, agree, agreeing_centroids, verify
 from starcat.simulation.selftest import answers_rightly, self_test
-from starcat.simulation.simulate import Frame, Noise, simulate_frame, simulate_frames
-from starcat.simulation.sky import Sky
+from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame, simulate_frames
 
 CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
 

@@ -23,8 +23,7 @@ from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.matcher.tracking import MOST_STEPS, Tracker
-from starcat.simulation.simulate import Frame, Noise, simulate_frame, simulate_frames
-from starcat.simulation.sky import Sky
+from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame, simulate_frames
 
 HARD = Noise(0.5, drop_probability=0.1, false_stars=3)
 

@@ -36,8 +36,7 @@ from starcat.matcher.c_engine import library_version
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.settings import MIN_SHARE, REACH, TriangleOrder
 from starcat.progress import Progress, no_progress
-from starcat.simulation.simulate import Noise, simulate_frame
-from starcat.simulation.sky import Sky
+from starcat.simulation.simulate import Noise, Sky, simulate_frame
 from starcat.storage.atomic import whole_file
 
 _TYPES = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}

@@ -23,8 +23,7 @@ from starcat.matcher.methods import triangle
 from starcat.matcher.methods.order import select_triangles
 from starcat.matcher.settings import CERTAIN
 from starcat.simulation.selftest import HARD, answers_rightly
-from starcat.simulation.simulate import Frame, Noise, simulate_frame, simulate_frames
-from starcat.simulation.sky import Sky
+from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame, simulate_frames
 
 Array = NDArray[np.float64]
 
