@@ -26,7 +26,7 @@ from starcat.matcher.matcher import Matcher
 from starcat.matcher.observation import compatible_pairs
 from starcat.matcher.pose import pose_at
 from starcat.matcher.verification import agree
-from starcat.products.pairs import find_pairs
+from starcat.products.pairs_and_triangles import find_pairs
 from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame
 
 CAMERA = Camera(1024, 1024, fov_x_deg=30.0)

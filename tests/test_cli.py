@@ -17,7 +17,7 @@ import pytest
 from every_command import every_command
 
 import starcat as package
-from starcat.artifact.content import content_sha256
+from starcat.artifact.writer import content_sha256
 from starcat.catalog.source import source_names
 from starcat.matcher.c_engine import library_version
 from starcat.matcher.methods.table import METHODS

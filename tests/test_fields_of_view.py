@@ -16,8 +16,12 @@ from starcat.catalog.stars import directions_of
 from starcat.errors import BuildError
 from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
-from starcat.geometry.sphere import chord_from_separation, radec_from_directions, tangent_axes
-from starcat.geometry.zones import zones_of
+from starcat.geometry.sphere import (
+    chord_from_separation,
+    radec_from_directions,
+    tangent_axes,
+    zones_of,
+)
 from starcat.pipeline.acceptance import advice_without_magnitudes, causes, check_rates
 from starcat.pipeline.build import Built, build
 from starcat.pipeline.cost import Cost, product_cost
@@ -25,7 +29,7 @@ from starcat.pipeline.recipes import ProductInputs, make_product
 from starcat.pipeline.starter import STARS_A_FIELD, Starter, advice, starter_spec
 from starcat.products.boresights import stars_in_fields, tile_sphere
 from starcat.products.coverage import TilingGap
-from starcat.products.triangles import find_triangles
+from starcat.products.pairs_and_triangles import find_triangles
 from starcat.simulation.selftest import Rates, wilson_interval
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.reading import preset
@@ -97,8 +101,8 @@ def test_rows_are_estimated(name: str, limit_mag: float, sky_of: Any) -> None:
 
 @pytest.fixture(scope="module")
 def sky_of() -> Any:
-    from starcat.catalog.fetching.locate import locate
     from starcat.catalog.ingest import ingest
+    from starcat.catalog.source_files import locate
     from starcat.pipeline.guide_stars import select_stars
 
     stars = ingest("gaia", locate("gaia", {})).stars

@@ -42,8 +42,7 @@ from starcat.matcher.methods.reference_sets import (
 )
 from starcat.matcher.methods.table import METHODS
 from starcat.matcher.observation import Observation
-from starcat.products.hausdorff_angular import angular_reference_sets
-from starcat.products.hausdorff_l2 import planar_reference_sets
+from starcat.products.neighbours import angular_reference_sets, planar_reference_sets
 from starcat.simulation.simulate import Noise, simulate_frames
 
 CAMERA = Camera(1024, 1024, fov_x_deg=20.0)

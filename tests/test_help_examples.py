@@ -29,7 +29,6 @@ COMMANDS = every_command()
 NETWORK = {"fetch": "downloads an archive from its servers; test_fetch has servers of its own"}
 LASTING = {
     "serve": "runs until it is ended; test_howto_serve runs and ends it",
-    "work": "runs until it is ended, beside a server and a Redis",
 }
 NEEDS = {
     "token list": ("token create",),

@@ -32,7 +32,7 @@ SINGLE_MODULES = {
     "cli": ["", "__main__"],  # "" is starcat itself
 }
 
-GEOMETRY = ("attitude", "camera", "distortion", "kvector", "patterns", "sphere", "zones")
+GEOMETRY = ("attitude", "camera", "distortion", "kvector", "patterns", "sphere")
 ONBOARD = ("grid", "image", "layout", "reading")
 LIGHT = {
     "starcat.arrays",

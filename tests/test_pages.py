@@ -12,8 +12,8 @@ from fastapi.testclient import TestClient
 
 from starcat.service.app import make_app
 from starcat.service.jobs.job_states import Attempt, claim
-from starcat.service.pages.draft import draft_of_form, draft_of_text, plain_toml
-from starcat.service.pages.static_files import DIGEST, FILES
+from starcat.service.pages.draft import draft_of_form, draft_of_text
+from starcat.service.pages.rendering import DIGEST, FILES
 from starcat.service.settings import Settings
 from starcat.specs.reading import preset, preset_names, read_spec
 
@@ -351,14 +351,39 @@ def test_a_text_that_is_no_spec_is_told_and_nothing_is_lost(text):
     assert (again.error is None) == (again.spec is not None)
 
 
-def test_text_of_any_content_is_read_again_as_the_same():
-    import tomllib
+@pytest.mark.parametrize(
+    "text",
+    [
+        "# mine\n" + SPEC.replace("faint_limit_mag = 4.5", "faint_limit_mag = 4.5  # seen"),
+        SPEC.replace("[selection]\nfaint_limit_mag = 4.5", "") + "[selection]  # mine\n"
+        "faint_limit_mag = 4.5\n",
+    ],
+)
+def test_a_form_changes_its_keys_and_keeps_comments(text):
+    known = draft_of_text(text)
+    assert known.spec is not None
+    changes = {"selection.faint_limit_mag": "4", "selection.max_stars_per_field": "20"}
+    draft = draft_of_form(_form(text, **changes))
+    assert draft.error is None
+    assert "# mine" in draft.text
+    assert draft.spec.selection.faint_limit_mag == 4.0
+    assert draft.spec.selection.max_stars_per_field == 20
 
-    content = {
-        "a b": 'x"\n\x7f',
-        "t": {"n": [1, 2.5, True, "z"], "u": {"v": float("inf")}, "list": [{"k": [{"l": 1}]}]},
-    }
-    assert tomllib.loads(plain_toml(content)) == content
+
+def test_a_form_changes_any_way_to_write_a_spec():
+    text = (
+        'name = "mycam"\nversion = "1.0.0"\nepoch_jyear = 2016.0\ncatalog.source = "gaia"\n'
+        "selection.faint_limit_mag = 6.0\n"
+        "camera = { width_px = 1024, height_px = 1024, fov_x_deg = 12.0 }\n"
+    )
+    changes = {"catalog.source": "sao", "selection.faint_limit_mag": "5", "camera.width_px": "512"}
+    form = _form(text, **changes, lens="focal")
+    del form["products.grid.enabled"]
+    draft = draft_of_form(form)
+    assert draft.error is None
+    assert (draft.spec.catalog.band, draft.spec.camera.width_px) == ("V", 512)
+    assert draft.spec.camera.fov_x_deg is None
+    assert not draft.spec.products.grid.enabled
 
 
 # What the page answers

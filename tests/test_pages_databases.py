@@ -17,14 +17,14 @@ from fastapi.testclient import TestClient
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-from shelved import DATABASE, shelve
+from shelved import DATABASE, shelve, waiting_build
 
 from starcat.errors import QueryError
 from starcat.query.gallery import gallery, named_query
 from starcat.query.session import open_session
+from starcat.report import coverage_map, sky_map
 from starcat.report.sky_map import project
 from starcat.service.app import make_app
-from starcat.service.pages import sky
 from starcat.service.pages.rendering import time_text
 from starcat.service.settings import Settings
 
@@ -191,26 +191,25 @@ def test_the_map_has_the_colour_of_each_field_at_its_boresight(client, small_art
     width, height = picture.size
     pixels = np.asarray(picture.convert("RGBA"))
     assert pixels[0, 0, 3] == 0  # outside of the ellipse
-    fields = sky.Fields(
+    fields = coverage_map.Fields(
         *(np.array(content[name]) for name in ("ra_deg", "dec_deg", "stars", "stars", "stars"))
     )
     x, y = project(fields.ra_deg, fields.dec_deg)
-    column = ((x / sky.HALF_WIDTH + 1.0) * 0.5 * width).astype(int).clip(0, width - 1)
-    row = ((1.0 - y / sky.HALF_HEIGHT) * 0.5 * height).astype(int).clip(0, height - 1)
-    bins = sky.bins_of(fields)
+    column = ((x / sky_map.HALF_WIDTH + 1.0) * 0.5 * width).astype(int).clip(0, width - 1)
+    row = ((1.0 - y / sky_map.HALF_HEIGHT) * 0.5 * height).astype(int).clip(0, height - 1)
+    bins = coverage_map.bins_of(fields.stars)
     inside = pixels[row, column, 3] > 0
     assert inside.mean() > 0.95  # some lie in the last pixel of the edge
     for number in np.flatnonzero(inside):
         stars = content["stars"][number]
         [one] = [b for b in bins if b.least <= stars and (b.most is None or stars <= b.most)]
-        expected = bytes.fromhex(sky.COLOURS[int(one.name[1:])])
+        expected = bytes.fromhex(one.colour)
         assert bytes(pixels[row[number], column[number], :3].tolist()) == expected
 
 
 @given(st.lists(st.integers(0, 400), min_size=1, max_size=60))
 def test_every_number_of_stars_has_one_colour(stars):
-    nothing = np.zeros(len(stars))
-    bins = sky.bins_of(sky.Fields(nothing, nothing, *([np.array(stars)] * 3)))
+    bins = coverage_map.bins_of(np.array(stars))
     assert len({one.name for one in bins}) == len(bins) <= 10
     for count in range(min(stars), max(stars) + 1):
         fitting = [b for b in bins if b.least <= count and (b.most is None or count <= b.most)]
@@ -386,7 +385,7 @@ def test_the_time_of_a_build_is_that_of_its_job(tmp_path, small_artifact):
     ended_s = time.time() - 86_400.0
     with TestClient(app, base_url=LOCAL) as client:
         service = app.state.service
-        job = service.jobs.add("build", {}, key=DATABASE + 48 * "0", title="t", owner="o")
+        job = waiting_build(service, DATABASE)
         with service.records.writing() as connection:
             connection.execute(
                 "UPDATE jobs SET state = 'done', ended_s = ?, result = ? WHERE id = ?",

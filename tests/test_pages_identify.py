@@ -23,7 +23,7 @@ from starcat.matcher.centroids import read_frames
 from starcat.matcher.database import open_database
 from starcat.service.app import make_app
 from starcat.service.pages.centroid_text import centroid_file
-from starcat.service.pages.simulated import NOISE_PX
+from starcat.service.pages.identify import NOISE_PX
 from starcat.service.settings import Settings
 from starcat.simulation.simulate import Noise, simulate_frames
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from fastapi.testclient import TestClient
-from shelved import DATABASE, shelve
+from shelved import DATABASE, shelve, waiting_build
 
 from starcat.artifact.verify import verify_artifact
 from starcat.releases.pulling import pull_release
@@ -194,8 +194,7 @@ def test_a_removed_database_is_gone_and_its_release_stays(client, root):
 
 
 def test_a_database_that_a_job_makes_is_not_removed(client):
-    jobs = client.app.state.service.jobs
-    job = jobs.add("build", {}, key=DATABASE.ljust(64, "0"), title="small 1.0.0", owner="me")
+    job = waiting_build(client.app.state.service, DATABASE)
     answer = client.delete(API)
     assert answer.status_code == 409
     assert job.id in answer.json()["detail"]

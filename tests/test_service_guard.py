@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from shelved import waiting_build
 
 pytest.importorskip("fastapi")
 
@@ -464,9 +465,9 @@ def test_metrics_count_by_template_and_say_what_there_is(client: Make) -> None:
 def test_ready_says_what_is_wrong(client: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     at = client()
     app: Any = at.app
-    monkeypatch.setattr(type(app.state.workers), "is_alive", False)
-    assert "has jobs done has ended" in " ".join(at.get("/readyz").json()["reasons"])
-    monkeypatch.setattr(type(app.state.workers), "is_alive", True)
+    monkeypatch.setattr(type(app.state.slots), "is_alive", False)
+    assert "a slot of jobs has ended" in " ".join(at.get("/readyz").json()["reasons"])
+    monkeypatch.setattr(type(app.state.slots), "is_alive", True)
     found = at.get("/readyz")
     assert (found.status_code, found.json()) == (200, {"ready": True, "reasons": []})
     monkeypatch.setattr("starcat.service.security.health.free_gib", lambda folder: 0.2)
@@ -486,7 +487,7 @@ def test_what_is_old_is_removed_and_databases_and_releases_stay(client: Make) ->
     app: Any = at.app
     service = app.state.service
     places = service.paths
-    jobs = [service.jobs.add("build", {}, key="0" * 64, title="t", owner="o") for _ in range(3)]
+    jobs = [waiting_build(service, f"{number}") for number in range(3)]
     now_s = time.time()
     with service.records.writing() as connection:
         for job, state, days in (

@@ -21,7 +21,6 @@ from starcat.pipeline.starter import starter_spec
 from starcat.service import catalogs as catalogs_module
 from starcat.service.app import make_app
 from starcat.service.catalogs import Catalogs
-from starcat.service.kept import Kept
 from starcat.service.problems import Problem
 from starcat.service.settings import Settings
 from starcat.specs.build_spec import BuildSpec, CameraSpec
@@ -343,16 +342,3 @@ def test_files_that_are_too_large_are_read_to_a_limit_only(small, monkeypatch):
     content["catalog"]["read_limit_mag"] = 6.2
     assert catalogs.estimate(spec_from_dict(content, "small")).cost.stars > 0
     catalogs.close()
-
-
-def test_what_is_kept_in_memory_is_bounded():
-    kept: Kept[str] = Kept(100)
-    for name in "abc":
-        kept.put(name, name.upper(), 40)
-    assert [kept.get(name) for name in "abc"] == [None, "B", "C"]
-    kept.get("b")
-    kept.put("d", "D", 40)
-    assert [kept.get(name) for name in "bcd"] == ["B", None, "D"]
-    kept.put("e", "E", 101)
-    kept.put("d", "DD", 60)
-    assert [kept.get(name) for name in "bde"] == ["B", "DD", None]

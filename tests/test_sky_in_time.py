@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 
 from starcat.cli.terminal.matches import print_sky_in_time
 from starcat.errors import ConfigError
-from starcat.geometry.aberration import LIGHT_KM_S, aberrated
 from starcat.geometry.attitude import (
     matrix_from_quaternion,
     matrix_from_radec_roll,
@@ -45,10 +44,9 @@ from starcat.images.solve_files import FileAnswers, IdentifyOptions, LocalInputs
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
-from starcat.sky.bodies import bodies_seen
+from starcat.sky.bodies import PHASE_CURVES, apparent_magnitude, bodies_seen
 from starcat.sky.in_time import earth_limb_angle_deg, sky_in_time
-from starcat.sky.magnitudes import PHASE_CURVES, apparent_magnitude
-from starcat.sky.observer import Observer, numbers_of
+from starcat.sky.observer import LIGHT_KM_S, Observer, aberrated, numbers_of
 from starcat.sky.spots import identify_in_time, planets_among
 
 Array = NDArray[np.float64]

@@ -17,8 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.calibration.fit import Fit, Seen, fit_camera
-from starcat.calibration.lens import CENTRE, FOCAL, camera_of, cropped, values_of
+from starcat.calibration.fit import (
+    CENTRE,
+    FOCAL,
+    Fit,
+    Seen,
+    camera_of,
+    cropped,
+    fit_camera,
+    values_of,
+)
 from starcat.calibration.models import choose_model, chosen, is_enough, start_of
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import matrix_from_quaternion
@@ -74,22 +82,13 @@ ROUND_MODELS = (
 
 @dataclass(frozen=True)
 class Identified:
-    """What the matcher says about the frames.
+    """What the matcher says about the frames."""
 
-    Attributes
-    ----------
-    results : tuple of MatchResult
-        One a frame, about the centroids as they were given; those outside of the part of the
-        frame that was asked about have no star.
-    camera : Camera
-        That they were identified with.
-    tolerance_px : float
-        Within which.
-    """
-
+    # one a frame, about the centroids as they were given; those outside of the part of the frame
+    # that was asked about have no star
     results: tuple[MatchResult, ...]
-    camera: Camera
-    tolerance_px: float
+    camera: Camera  # that they were identified with
+    tolerance_px: float  # within which
 
     @property
     def found(self) -> list[int]:

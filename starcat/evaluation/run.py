@@ -134,7 +134,6 @@ def _quick(name: str, is_quick: bool) -> str:
 
 
 def _machine() -> str:
-    """Say what the times were measured on."""
     return (
         f"mean over the frames, processors: {os.cpu_count()} ({platform.machine()}), "
         f"starcat {__version__}, Python {platform.python_version()}"

@@ -47,7 +47,6 @@ class Parameter:
 
 
 def _noise(name: str, label: str, usual: tuple[float, ...], low: float, high: float) -> Parameter:
-    """Return the axis of a field of `Noise`."""
     is_count = isinstance(getattr(Noise, name), int)
 
     def write(experiment: Experiment, value: float) -> Experiment:
@@ -62,7 +61,6 @@ def _noise(name: str, label: str, usual: tuple[float, ...], low: float, high: fl
 
 
 def _cameras(experiment: Experiment) -> tuple[Camera, Camera]:
-    """Return the camera as it is and as the matcher takes it to be."""
     if experiment.camera is None or experiment.assumed is None:
         raise ValueError("expected an experiment that says which cameras it has")
     return experiment.camera, experiment.assumed

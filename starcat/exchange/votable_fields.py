@@ -23,7 +23,7 @@ from starcat.exchange.columns import (
     unit_text,
 )
 from starcat.exchange.numpy_columns import list_items, plain_values
-from starcat.storage.votable import ARROW_DATATYPES
+from starcat.storage.parquet import ARROW_DATATYPES
 
 _NOT_XML = re.compile("[^\t\n -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 """Characters that no XML 1.0 document can hold, and the carriage return, which readers change."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Mask, Pixels
 from starcat.errors import ConfigError
 from starcat.images.background import (
     PIXEL_VARIANCE,
@@ -34,36 +34,20 @@ _PLATEAU_NOISE, _PLATEAU_DEPTH, _PLATEAU_PIXELS = 6.0, 0.005, 3
 
 @dataclass(frozen=True)
 class Spots:
-    """What was found in one image, brightest first.
+    """What was found in one image, brightest first."""
 
-    Attributes
-    ----------
-    centroids_px : ndarray of float64, shape (N, 2)
-        Pixels (x right, y down, origin at the outer corner of the top-left pixel).
-    flux : ndarray of float64, shape (N,)
-        Light above the background, in the units of the image.
-    mag : ndarray of float64, shape (N,)
-        Instrumental magnitude, -2.5 log10 flux: its zero point is unknown.
-    snr : ndarray of float64, shape (N,)
-        Flux over its standard deviation, in an aperture of two sigma.
-    saturated : ndarray of bool, shape (N,)
-        The brightest pixel is at the detector's limit: measured too faint.
-    blended : ndarray of bool, shape (N,)
-        Touches another spot: each pulls at the other's centroid.
-    at_edge : ndarray of bool, shape (N,)
-        Cut by the edge of the image: the centroid is pulled inwards.
-    psf_sigma_px : float
-        Standard deviation of a star's spot before the pixels sample it.
-    """
-
-    centroids_px: Array
-    flux: Array
-    mag: Array
-    snr: Array
-    saturated: NDArray[np.bool_]
-    blended: NDArray[np.bool_]
-    at_edge: NDArray[np.bool_]
-    psf_sigma_px: float
+    # shape (N, 2): pixels (x right, y down, origin at the outer corner of the top-left pixel)
+    centroids_px: Pixels
+    flux: Array  # shape (N,): light above the background, in the units of the image
+    mag: Array  # shape (N,): instrumental magnitude, -2.5 log10 flux: its zero point is unknown
+    snr: Array  # shape (N,): flux over its standard deviation, in an aperture of two sigma
+    # shape (N,): the brightest pixel is at the detector's limit: measured too faint
+    saturated: Mask
+    # shape (N,): touches another spot: each pulls at the other's centroid
+    blended: Mask
+    # shape (N,): cut by the edge of the image: the centroid is pulled inwards
+    at_edge: Mask
+    psf_sigma_px: float  # standard deviation of a star's spot before the pixels sample it
 
     def __len__(self) -> int:
         """Return the number of spots."""
@@ -86,8 +70,6 @@ def find_spots(
 ) -> Spots:
     """Find the spots of an image and measure them.
 
-    References
-    ----------
     Bertin and Arnouts 1996, A&AS 117, 393. Barbary 2016, JOSS 1 (6), 58.
     """
     _check_positive(
@@ -139,7 +121,6 @@ def _measured(
     saturation: float | None,
     gain: float | None,
 ) -> Spots:
-    """Measure place and light of what was found, and put it into order."""
     seen = float(np.sqrt(sigma**2 + PIXEL_VARIANCE))
     centroids = _windowed(levels, found, max(seen, _NARROWEST_WINDOW_PX))
     x, y = (centroids - 0.5).T
@@ -168,14 +149,12 @@ def _measured(
     )
 
 
-def brightest_first(flux: Array, centroids_px: Array) -> NDArray[np.int64]:
+def brightest_first(flux: Array, centroids_px: Pixels) -> NDArray[np.int64]:
     """Return the order of spots."""
     return np.lexsort((centroids_px[:, 1], centroids_px[:, 0], -flux))
 
 
-def _is_saturated(
-    levels: Levels, found: NDArray[Any], saturation: float | None
-) -> NDArray[np.bool_]:
+def _is_saturated(levels: Levels, found: NDArray[Any], saturation: float | None) -> Mask:
     """Return which spots reach the limit, given or seen as a plateau at the image's maximum."""
     around = pixels_around(levels.raw, found["xpeak"], found["ypeak"])
     if saturation is not None:
@@ -196,5 +175,5 @@ def _windowed(levels: Levels, found: NDArray[Any], window: float) -> Array:
     return np.asarray(np.where(drifts[:, None], start, centroids) + 0.5, dtype=np.float64)
 
 
-def _is_blended(found: NDArray[Any]) -> NDArray[np.bool_]:
+def _is_blended(found: NDArray[Any]) -> Mask:
     return np.asarray((found["flag"] & load_sep().OBJ_MERGED) > 0)

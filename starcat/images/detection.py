@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
+from starcat.arrays import Array, Mask
 from starcat.errors import ConfigError
 from starcat.images.background import Levels, load_sep
 
@@ -34,8 +35,6 @@ _ALIGNED = 0.9
 def detect(levels: Levels, sigma: float, threshold: float) -> NDArray[Any]:
     """Return what stands out after smoothing with a star's shape.
 
-    Notes
-    -----
     Where noise is white, its part that is left by the filter is known. Where it is not
     (`Levels.is_rough`: coarse digits, a clipped background, JPEG, clouds), the noise is measured
     in the filtered image.
@@ -43,7 +42,7 @@ def detect(levels: Levels, sigma: float, threshold: float) -> NDArray[Any]:
     reach = np.arange(-int(np.ceil(2.5 * sigma)), int(np.ceil(2.5 * sigma)) + 1)
     profile = np.exp(-0.5 * (reach / sigma) ** 2)
     profile /= profile.sum()
-    kernel: NDArray[np.float64] | None = np.outer(profile, profile)
+    kernel: Array | None = np.outer(profile, profile)
     image, noise, least = levels.above, levels.noise, threshold * float((profile**2).sum())
     if levels.is_rough:
         image, noise = _filtered(levels, profile)
@@ -65,8 +64,8 @@ def _extract(
     image: NDArray[np.float32],
     least: float,
     noise: NDArray[np.float32],
-    mask: NDArray[np.bool_],
-    kernel: NDArray[np.float64] | None,
+    mask: Mask,
+    kernel: Array | None,
 ) -> NDArray[Any]:
     """Call sep.
 
@@ -89,9 +88,7 @@ def _extract(
         sep.set_sub_object_limit(before[1])
 
 
-def _filtered(
-    levels: Levels, profile: NDArray[np.float64]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _filtered(levels: Levels, profile: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the filtered image above its own background, and its own noise."""
     image = convolve1d(levels.above, profile, axis=0, mode="nearest")
     image = convolve1d(image, profile, axis=1, mode="nearest")

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
+from starcat.arrays import Array
 from starcat.errors import ConfigError, OutputError, reason
 from starcat.matcher.result import MatchResult
 from starcat.version import install_command
@@ -31,7 +32,7 @@ from starcat.version import install_command
 if TYPE_CHECKING:
     from astropy.io.fits import Header
 
-Grey = NDArray[np.float32] | NDArray[np.float64]
+Grey = NDArray[np.float32] | Array
 
 _log = logging.getLogger(__name__)
 
@@ -67,8 +68,6 @@ def read_image(
 ) -> Grey:
     """Read the grey values of an image.
 
-    Notes
-    -----
     The FITS standard does not say which row is the top one. Programs that write arrays put the
     top row first, which is what is assumed here; viewers show the first row at the bottom. A
     frame that is read upside down is a mirror image, and no mirror image is ever identified.
@@ -152,7 +151,6 @@ def _shapes_told(shapes: list[tuple[int, ...]]) -> str:
 
 
 def _read_picture(data: bytes) -> tuple[NDArray[Any], bool]:
-    """Return the grey values of a PNG or TIFF file, whose first row is the top."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about tags beside the image, and about its size
         return _grey_of_picture(data), False

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Directions, Matrix
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, separation
 from starcat.images.frame_axes import LABEL_PT, LETTER_PT, SKY, FrameAxes
@@ -31,25 +31,16 @@ _INTERVALS = 5
 
 @dataclass(frozen=True)
 class Overlay:
-    """Lines and planets in pixels.
+    """Lines and planets in pixels."""
 
-    Attributes
-    ----------
-    grid : tuple of (str, ndarray of float64, shape (P, 2))
-        What a line of the grid is called, and its points; NaN where there is no image.
-    figures : tuple of ndarray of float64, shape (P, 2)
-        Lines of constellations.
-    bodies : tuple of BodyInFrame
-        Planets, the Sun and the Moon.
-    """
-
+    # shape (P, 2): what a line of the grid is called, and its points; NaN where there is no image
     grid: tuple[tuple[str, Array], ...] = ()
-    figures: tuple[Array, ...] = ()
-    bodies: tuple[BodyInFrame, ...] = ()
+    figures: tuple[Array, ...] = ()  # shape (P, 2): lines of constellations
+    bodies: tuple[BodyInFrame, ...] = ()  # planets, the Sun and the Moon
 
 
 def overlay_from_attitude(
-    matrix: Array, camera: Camera, epoch_jyear: float, bodies: tuple[BodyInFrame, ...] = ()
+    matrix: Matrix, camera: Camera, epoch_jyear: float, bodies: tuple[BodyInFrame, ...] = ()
 ) -> Overlay:
     """Return what lies behind the stars of a frame."""
     return Overlay(_grid(matrix, camera), _figures(matrix, camera, epoch_jyear), bodies)
@@ -68,8 +59,7 @@ def draw_overlay(frame: FrameAxes, overlay: Overlay) -> Array:
     return np.array(taken).reshape(-1, 4)
 
 
-def _grid(matrix: Array, camera: Camera) -> tuple[tuple[str, Array], ...]:
-    """Return parallels and meridians that cross the frame."""
+def _grid(matrix: Matrix, camera: Camera) -> tuple[tuple[str, Array], ...]:
     step_deg, reach_deg = _step(camera), float(np.degrees(camera.radius_rad))
     _, dec = radec_from_directions(matrix[2])
     lowest, highest = float(dec) - reach_deg, float(dec) + reach_deg
@@ -99,8 +89,7 @@ def _step(camera: Camera) -> float:
     return max((step for step in _STEPS_DEG if step <= most), default=_STEPS_DEG[0])
 
 
-def _figures(matrix: Array, camera: Camera, epoch_jyear: float) -> tuple[Array, ...]:
-    """Return the lines between neighbouring stars of constellations that cross the frame."""
+def _figures(matrix: Matrix, camera: Camera, epoch_jyear: float) -> tuple[Array, ...]:
     stars = named_stars()
     places, seen = stars.at(epoch_jyear), []
     for hips in constellation_lines():
@@ -121,7 +110,7 @@ def _great_circle(start: Array, end: Array) -> Array:
     return np.asarray(chord / np.sqrt(np.einsum("ij,ij->i", chord, chord))[:, None])
 
 
-def _on_detector(points: Array, camera: Camera) -> Array:
+def _on_detector(points: Directions, camera: Camera) -> Array:
     """Return the points on the detector with those next to them, NaN for the others between."""
     inside = camera.contains(points)
     near = inside.copy()
@@ -134,7 +123,7 @@ def _on_detector(points: Array, camera: Camera) -> Array:
 
 
 def _write_at_edge(
-    frame: FrameAxes, name: str, points: Array, taken: list[list[float]]
+    frame: FrameAxes, name: str, points: Directions, taken: list[list[float]]
 ) -> list[list[float]]:
     """Write the name of a line of the grid at the edge of the frame, unless another is there."""
     size = np.array(frame.size, dtype=np.float64)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Matrix, Pixels
 from starcat.geometry.attitude import matrix_from_quaternion, radec_roll_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.images.figure_file import check_kind, own_style, write_figure
@@ -116,7 +116,7 @@ def draw_identified(
     path: Path,
     image: NDArray[Any] | None,
     camera_size: tuple[int, int],
-    centroids_px: Array,
+    centroids_px: Pixels,
     names: Sequence[str | None],
     title: str,
     *,
@@ -142,7 +142,7 @@ def draw_identified(
         write_figure(figure, path)
 
 
-def compass_from_matrix(matrix: Array) -> tuple[Array, Array]:
+def compass_from_matrix(matrix: Matrix) -> tuple[Array, Array]:
     """Return where north and east are in the middle of a frame.
 
     Examples
@@ -160,7 +160,7 @@ def compass_from_matrix(matrix: Array) -> tuple[Array, Array]:
 def _check(
     image: NDArray[Any] | None,
     camera_size: tuple[int, int],
-    centroids_px: Array,
+    centroids_px: Pixels,
     names: Sequence[str | None],
     mag: Array | None,
 ) -> None:

@@ -9,14 +9,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 from scipy.special import erf
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Pixels
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.images.image_file import WRITTEN_KINDS, write_image
@@ -38,40 +36,22 @@ _MOST_ELECTRONS = 1e15
 class Optics:
     """A lens and a detector, for one exposure.
 
-    Attributes
-    ----------
-    psf_sigma_px : float
-        Standard deviation of the Gaussian spot, pixels.
-    zero_point_e : float
-        Electrons of a star of magnitude 0. The default is 19,100 electrons per second and mm2
-        [1]_ through an aperture of 20 mm in 0.1 s.
-    background_e : float
-        Electrons of sky and dark current in a pixel.
-    read_noise_e : float
-        Standard deviation of the read-out, electrons.
-    gain_e_per_adu : float
-        Electrons of one step of the file.
-    bias_adu : float
-        Steps added to every pixel, so that noise does not fall below zero.
-    full_well_e : float
-        Electrons that a pixel can hold; what is above is lost.
-    hot_pixels : int
-        Pixels with a high dark current, at places that the seed gives.
-
     References
     ----------
     .. [1] Liebe 2002, "Accuracy performance of star trackers - a tutorial", IEEE Transactions
        on Aerospace and Electronic Systems 38 (2), 587-599.
     """
 
-    psf_sigma_px: float = 1.0
+    psf_sigma_px: float = 1.0  # standard deviation of the Gaussian spot, pixels
+    # electrons of a star of magnitude 0. The default is 19,100 electrons per second and mm2
+    # through an aperture of 20 mm in 0.1 s.
     zero_point_e: float = 600_000.0
-    background_e: float = 20.0
-    read_noise_e: float = 8.0
-    gain_e_per_adu: float = 1.0
-    bias_adu: float = 100.0
-    full_well_e: float = 50_000.0
-    hot_pixels: int = 0
+    background_e: float = 20.0  # electrons of sky and dark current in a pixel
+    read_noise_e: float = 8.0  # standard deviation of the read-out, electrons
+    gain_e_per_adu: float = 1.0  # electrons of one step of the file
+    bias_adu: float = 100.0  # steps added to every pixel, so that noise does not fall below zero
+    full_well_e: float = 50_000.0  # electrons that a pixel can hold; what is above is lost
+    hot_pixels: int = 0  # pixels with a high dark current, at places that the seed gives
 
     def __post_init__(self) -> None:
         for name in ("psf_sigma_px", "gain_e_per_adu", "full_well_e"):
@@ -83,7 +63,7 @@ class Optics:
 
 
 def star_electrons(
-    centroids_px: Array, mag: Array, camera_size: tuple[int, int], optics: Optics
+    centroids_px: Pixels, mag: Array, camera_size: tuple[int, int], optics: Optics
 ) -> Array:
     """Return the mean number of electrons that stars release, without background or noise."""
     width, height = camera_size
@@ -105,7 +85,7 @@ def star_electrons(
     return image
 
 
-def _check(centroids_px: Array, mag: Array, camera_size: tuple[int, int]) -> None:
+def _check(centroids_px: Pixels, mag: Array, camera_size: tuple[int, int]) -> None:
     if centroids_px.ndim != 2 or centroids_px.shape[1] != 2 or mag.shape != centroids_px.shape[:1]:
         raise ValueError(
             f"centroids_px of shape {centroids_px.shape} and mag of shape {mag.shape}; "
@@ -126,7 +106,7 @@ def _profiles(centre: Array, sigma: float) -> tuple[Array, NDArray[np.int64]]:
 
 
 def render_image(
-    centroids_px: Array,
+    centroids_px: Pixels,
     mag: Array,
     camera_size: tuple[int, int],
     optics: Optics,
@@ -135,13 +115,9 @@ def render_image(
 ) -> NDArray[np.uint16]:
     """Return the image of stars as a detector would record it.
 
-    Notes
-    -----
     Electrons of stars, background and hot pixels are Poisson variates; the full well cuts
     them; the read-out adds Gaussian noise and rounds to whole ADU.
 
-    Examples
-    --------
     >>> import numpy as np
     >>> image = render_image(np.array([[10.5, 20.5]]), np.array([3.0]), (64, 48), Optics(), 1)
     >>> image.shape, np.unravel_index(image.argmax(), image.shape) == (20, 10)
@@ -160,93 +136,6 @@ def render_image(
     return np.clip(adu, 0, 65_535).astype(np.uint16)
 
 
-@dataclass(frozen=True)
-class Scene:
-    """The sky behind the stars, and what is left of it in a file.
-
-    Attributes
-    ----------
-    town_light_e : float
-        Electrons of the gradient in the brightest corner or at the brightest edge; it is a tenth
-        of that on the opposite side.
-    town_light_deg : float
-        Direction in which it becomes brighter: 0 to the right, 90 down.
-    moon_px : pair of float, optional
-        Middle of the Moon; it may be outside of the frame.
-    moon_radius_px : float
-        Radius of its disk, which fills the well.
-    glow_e : float
-        Electrons of its glow at the edge of the disk.
-    glow_px : float
-        Distance from the Moon's middle at which the glow is half as bright.
-    nebula_e : float
-        Standard deviation of nebulous light, electrons.
-    nebula_px : float
-        Size of its structure.
-    black_adu : float
-        Step of the detector that is 0 in the file: what is darker is lost.
-    adu_per_step : float
-        Steps of the detector in a step of the file.
-    bits : int
-        8 or 16: what is brighter than the largest number is lost.
-    """
-
-    town_light_e: float = 0.0
-    town_light_deg: float = 90.0
-    moon_px: tuple[float, float] | None = None
-    moon_radius_px: float = 22.0
-    glow_e: float = 0.0
-    glow_px: float = 60.0
-    nebula_e: float = 0.0
-    nebula_px: float = 20.0
-    black_adu: float = 0.0
-    adu_per_step: float = 1.0
-    bits: int = 16
-
-    def __post_init__(self) -> None:
-        if self.bits not in (8, 16):
-            raise ValueError(f"bits is {self.bits}; expected 8 or 16")
-        for name in ("moon_radius_px", "glow_px", "nebula_px", "adu_per_step"):
-            if not 0.0 < getattr(self, name) < np.inf:
-                raise ValueError(f"{name} is {getattr(self, name)}; expected a positive number")
-        for name in ("town_light_e", "glow_e", "nebula_e", "black_adu"):
-            if not 0.0 <= getattr(self, name) < np.inf:
-                raise ValueError(f"{name} is {getattr(self, name)}; expected 0 or more")
-
-
-def scene_light(scene: Scene, camera_size: tuple[int, int], full_well_e: float, seed: int) -> Array:
-    """Return the mean number of electrons that a scene adds to the background."""
-    width, height = camera_size
-    y, x = np.mgrid[:height, :width] + 0.5
-    light = np.zeros((height, width))
-    if scene.town_light_e:
-        direction = np.radians(scene.town_light_deg)
-        along = np.cos(direction) * (x - 0.5 * width) + np.sin(direction) * (y - 0.5 * height)
-        part = (along - along.min()) / (along.max() - along.min())
-        light += scene.town_light_e * 10.0 ** (part - 1.0)
-    if scene.moon_px is not None:
-        distance = np.hypot(x - scene.moon_px[0], y - scene.moon_px[1])
-        light += scene.glow_e / (1.0 + (distance / scene.glow_px) ** 2)
-        light[distance < scene.moon_radius_px] += 2.0 * full_well_e
-    if scene.nebula_e:
-        noise = np.random.default_rng(seed).normal(size=(height, width))
-        cloud = gaussian_filter(noise, scene.nebula_px, mode="wrap")
-        light += np.maximum(scene.nebula_e * (cloud / cloud.std() + 1.0), 0.0)
-    return light
-
-
-def in_file_steps(adu: NDArray[Any], scene: Scene) -> NDArray[Any]:
-    """Return an image of a detector as the file of a camera has it.
-
-    Examples
-    --------
-    >>> in_file_steps(np.array([[90.0, 130.0, 9e4]]), Scene(black_adu=100.0, bits=8))
-    array([[  0,  30, 255]], dtype=uint8)
-    """
-    steps = np.rint((adu.astype(np.float64) - scene.black_adu) / scene.adu_per_step)
-    return np.clip(steps, 0, 2**scene.bits - 1).astype(np.uint8 if scene.bits == 8 else np.uint16)
-
-
 def write_simulated(path: Path, frame: Frame, camera: Camera, seed: int) -> None:
     """Write a simulated frame as centroids, or as the image that a camera would take."""
     suffix = path.suffix.lower()
@@ -258,9 +147,9 @@ def write_simulated(path: Path, frame: Frame, camera: Camera, seed: int) -> None
             f"{path}: the name says no kind of frame that starcat writes; end it with one of "
             f"{CENTROIDS_SUFFIX} (centroids), {', '.join(WRITTEN_KINDS)} (images)"
         )
-    eight_bits = Scene(bits=8, black_adu=90.0, adu_per_step=4.0)  # of the default optics
     size = camera.width_px, camera.height_px
     image = render_image(frame.centroids_px, frame.mag, size, Optics(), seed)
     if WRITTEN_KINDS[suffix] == "JPEG":
-        image = in_file_steps(image, eight_bits)
+        # Eight bits from a black point below the sky of the default optics.
+        image = np.clip(np.rint((image.astype(np.float64) - 90.0) / 4.0), 0, 255).astype(np.uint8)
     write_image(path, image)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Directions, Mask, Rows
-from starcat.geometry.zones import Zones, zones_of
+from starcat.geometry.sphere import Zones, zones_of
 from starcat.matcher.database import Database
 
 MIN_SIDE = 0.02

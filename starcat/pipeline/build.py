@@ -18,9 +18,9 @@ import pyarrow as pa
 
 from starcat.artifact.verify import check_artifact
 from starcat.artifact.writer import Product, write_manifest, write_products
-from starcat.catalog.fetching.locate import locate
 from starcat.catalog.ingest import Ingested
 from starcat.catalog.selection import Selected
+from starcat.catalog.source_files import locate
 from starcat.catalog.stars import directions_of, sort_rows
 from starcat.catalog.variability import AmplitudeTable, join_amplitudes, read_amplitudes
 from starcat.errors import BuildError, ConfigError
@@ -41,11 +41,13 @@ from starcat.pipeline.recipes import (
 from starcat.pipeline.report_data import (
     BuildResults,
     FilterCoverage,
-    build_facts,
+    coverage_report,
     filter_coverages,
+    report_content,
     source_facts,
 )
 from starcat.products.boresights import FieldStars
+from starcat.products.coverage import field_coverage
 from starcat.progress import Progress, no_progress
 from starcat.report.coverage_report import CoverageReport, holes_warning
 from starcat.report.report import write_report
@@ -130,7 +132,6 @@ class _Plan:
 
 
 def _make(partial: Path, plan: _Plan, clock: Stopwatch, progress: Progress) -> Built:
-    """Go through all stages up to the manifest, in a folder that has no name yet."""
     spec, inputs, workers = plan.spec, plan.inputs, plan.workers
     catalog, amplitudes = read_sources(spec, inputs, workers, progress)
     motions = join_motions(catalog, spec, inputs, workers, progress)
@@ -220,13 +221,15 @@ def join_all(
 
 def report_build(folder: Path, results: BuildResults) -> CoverageReport:
     """Write the report of a build."""
-    facts = build_facts(folder, results)
+    spec = results.spec
+    counted = field_coverage(results.fields, spec.boresights.brightest)
+    coverage = coverage_report(counted, spec)
+    content = report_content(folder, results, coverage)
     (folder / "report").mkdir()
-    write_report(folder / "report", facts)
-    warning = holes_warning(facts.coverage.gap)
-    if warning is not None:
-        _logger.warning("%s: %s", facts.title, warning)
-    return facts.coverage
+    write_report(folder / "report", content, coverage)
+    for warning in content["warnings"]:
+        _logger.warning("%s-%s: %s", spec.name, spec.version, warning)
+    return coverage
 
 
 def make_products(

@@ -358,7 +358,6 @@ def _index_bytes(name: str, extent: Extent, stars: int, spec: BuildSpec) -> floa
 
 
 def _bins(spec: BuildSpec) -> float:
-    """Return the bins of the look-up table of neighbours."""
     wanted = spec.products.neighbours
     radius_deg = wanted.radius_deg or spec.camera.half_field_deg
     return float(

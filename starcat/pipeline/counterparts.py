@@ -24,9 +24,9 @@ from starcat.artifact.crossmatch_table import (
 )
 from starcat.artifact.manifest import SourceFacts
 from starcat.artifact.writer import Product
-from starcat.catalog.fetching.locate import locate
 from starcat.catalog.ingest import Ingested
 from starcat.catalog.selection import Selected
+from starcat.catalog.source_files import locate
 from starcat.catalog.stars import sort_rows
 from starcat.catalog.verdict import Reason
 from starcat.errors import ParseError, SchemaError, SourceMissing, reason

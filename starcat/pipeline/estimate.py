@@ -14,10 +14,9 @@ import numpy as np
 import pyarrow as pa
 
 from starcat.artifact.writer import Product
-from starcat.catalog.blocks import reject_rows
 from starcat.catalog.ingest import count_by_reason
 from starcat.catalog.selection import Selected
-from starcat.catalog.stars import floats_of, sort_rows
+from starcat.catalog.stars import floats_of, reject_rows, sort_rows
 from starcat.catalog.verdict import Reason
 from starcat.errors import BuildError
 from starcat.geometry.sphere import saff_kuijlaars

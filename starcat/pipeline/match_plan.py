@@ -11,9 +11,9 @@ import pyarrow as pa
 
 from starcat.artifact.crossmatch_table import moving_stars
 from starcat.pipeline.star_rows import opened, rows_of_partition
-from starcat.products.census import Census
 from starcat.products.crossmatch import MovingStars
 from starcat.products.match_figures import Figures, MatchModel
+from starcat.products.star_counts import Census
 from starcat.store.pixels import Pixel, border_order
 
 PLACED = (

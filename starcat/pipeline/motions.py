@@ -21,12 +21,17 @@ from starcat.arrays import Array
 from starcat.artifact.manifest import SourceFacts
 from starcat.artifact.motion_table import JOINED, NO_CANDIDATE, NO_MOTION, OWN_MOTION
 from starcat.artifact.writer import Product
-from starcat.catalog.fetching.locate import locate
 from starcat.catalog.ingest import Ingested, unmoved_stars
-from starcat.catalog.nearest import add_nearest_neighbours
 from starcat.catalog.proper_motion import Motion, propagate
-from starcat.catalog.quality import Quality
-from starcat.catalog.stars import directions_of, floats_of, move_to_epoch, with_columns
+from starcat.catalog.source_files import locate
+from starcat.catalog.stars import (
+    add_nearest_neighbours,
+    directions_of,
+    floats_of,
+    move_to_epoch,
+    with_columns,
+)
+from starcat.catalog.verdict import Quality
 from starcat.geometry.sphere import separation
 from starcat.pipeline.counterparts import match_tables
 from starcat.progress import Progress, no_progress

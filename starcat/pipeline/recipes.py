@@ -19,15 +19,15 @@ from starcat.artifact.writer import Product
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.geometry.sphere import radec_from_directions
 from starcat.products.boresights import FieldSize, FieldStars, NominalField, tile_sphere
-from starcat.products.grid import grid_patterns
-from starcat.products.hausdorff_angular import angular_reference_sets
-from starcat.products.hausdorff_l2 import planar_reference_sets
 from starcat.products.index import Index, Ragged
 from starcat.products.levels import find_levels, level_fields
-from starcat.products.neighbours import find_neighbours
-from starcat.products.pairs import find_pairs
-from starcat.products.radial import radial_patterns
-from starcat.products.triangles import find_triangles
+from starcat.products.neighbours import (
+    angular_reference_sets,
+    find_neighbours,
+    planar_reference_sets,
+)
+from starcat.products.pairs_and_triangles import find_pairs, find_triangles
+from starcat.products.star_patterns import grid_patterns, radial_patterns
 from starcat.specs.build_spec import BuildSpec
 from starcat.storage.schema import ProductSchema, product_schema
 

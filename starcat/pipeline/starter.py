@@ -17,9 +17,9 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from starcat.catalog.fetching.locate import locate
 from starcat.catalog.ingest import ingest
 from starcat.catalog.selection import reject_dense, select_guide_stars
+from starcat.catalog.source_files import locate
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.errors import BuildError, OutputError
 from starcat.geometry.camera import Camera
@@ -30,8 +30,8 @@ from starcat.products.boresights import tile_sphere
 from starcat.products.coverage import Spread, field_coverage, summarise_coverage
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import BuildSpec, CameraSpec
+from starcat.specs.keys import spec_toml
 from starcat.specs.reading import spec_from_dict
-from starcat.specs.spec_toml import spec_toml
 from starcat.storage.atomic import whole_file
 
 SOURCE, BAND = "gaia", "G"
@@ -141,7 +141,6 @@ def starter_spec(
 
 
 def _is_quick(mag: NDArray[np.float64], limit: float, spec: BuildSpec, most: int) -> bool:
-    """Return whether what a limit leaves is counted in a moment."""
     if spec.boresights.count > MOST_BORESIGHTS:
         return False
     try:

@@ -17,10 +17,10 @@ from scipy.spatial import cKDTree
 
 from starcat.arrays import Array, Mask
 from starcat.geometry.sphere import chord_from_separation, separation
-from starcat.products.census import Census
 from starcat.products.match_figures import Figures, MatchModel, figures_of, measure
 from starcat.products.match_odds import Odds, match_odds
 from starcat.products.match_probability import runs
+from starcat.products.star_counts import Census
 
 Rows = NDArray[np.int64]
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
-from starcat.products.census import Census, MagnitudeCounts, PositionsAndMagnitudes
+from starcat.products.star_counts import Census, MagnitudeCounts, PositionsAndMagnitudes
 
 Rows = NDArray[np.int64]
 

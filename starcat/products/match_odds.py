@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.products.census import PositionsAndMagnitudes, tiles_of
 from starcat.products.match_figures import CandidatePairs, Figures, MatchModel
 from starcat.products.match_probability import pair_probabilities
+from starcat.products.star_counts import PositionsAndMagnitudes, tiles_of
 
 Rows = NDArray[np.int64]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
-from starcat.catalog.star_files import rejected_path
+from starcat.catalog.verdict import rejected_path
 from starcat.errors import ProductError, QueryError, TargetMissing
 from starcat.progress import Progress, no_progress
 from starcat.query.engine import Engine
@@ -217,8 +217,8 @@ def _product_view(name: str, path: Path, schema: ProductSchema) -> View:
 
 def _source_of(text: str, path: Path) -> tuple[str | None, list[Path]]:
     """Return the source that a text names, and the files it names of it."""
-    from starcat.catalog.readers.files import source_of_file
     from starcat.catalog.source import data_source, source_names
+    from starcat.catalog.source_files import source_of_file
 
     name, separator, given = text.partition("=")
     if separator and not path.exists():
@@ -230,8 +230,8 @@ def _source_of(text: str, path: Path) -> tuple[str | None, list[Path]]:
 
 def _archive(source: str, inputs: list[Path], scratch: Path, progress: Progress) -> Target:
     """Read an archive's files into Parquet files that a query can see."""
-    from starcat.catalog.fetching.locate import locate
     from starcat.catalog.ingest import ingest
+    from starcat.catalog.source_files import locate
     from starcat.storage.parquet import write_parquet
 
     read = ingest(source, locate(source, {source: inputs}), progress=progress)

@@ -137,7 +137,6 @@ def _cut(x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def _chart(title: str, below: str) -> tuple[Figure, Axes]:
-    """Return an empty chart with a headline and horizontal lines."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.2, 4.0))

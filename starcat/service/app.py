@@ -16,13 +16,11 @@ from starcat.service.api import (
     databases,
     identify,
     jobs,
-    registry,
     releases,
     specs,
     sql,
-    work,
 )
-from starcat.service.jobs.pool import WorkerPool
+from starcat.service.jobs.slots import JobSlots
 from starcat.service.pages.rendering import add_missing_page
 from starcat.service.problems import REFUSALS, add_problem_handlers
 from starcat.service.security import health, signing
@@ -36,9 +34,9 @@ from starcat.service.security.origin import Origin
 from starcat.service.security.request_id import RequestId
 from starcat.service.security.request_limits import Shape
 from starcat.service.security.retention import keep_removing
-from starcat.service.service import Service, open_service
+from starcat.service.service import Service
 from starcat.service.settings import Settings
-from starcat.service.vo import cone_search, tap, tap_jobs
+from starcat.service.vo import cone_search, tap, tap_async
 from starcat.version import __version__
 
 API = "/api/v1"
@@ -51,17 +49,16 @@ RESOURCES: tuple[APIRouter, ...] = (
     releases.router,
     identify.router,
     sql.router,
-    work.router,
 )
 """Routers of the REST interface, under `API`."""
 
 OTHERS: tuple[APIRouter, ...] = (
-    registry.router,
+    releases.registry_router,
     health.router,
     signing.router,
     cone_search.router,
     tap.router,
-    tap_jobs.router,
+    tap_async.router,
     *pages.ROUTERS,
 )
 """Routers of everything else: pages, the registry, TAP, cone searches, health."""
@@ -69,7 +66,7 @@ OTHERS: tuple[APIRouter, ...] = (
 
 def make_app(settings: Settings) -> FastAPI:
     """Make the application."""
-    service = open_service(settings)
+    service = Service(settings)
     metrics, identities = Metrics(service), Identities(service)
     app = FastAPI(
         title="starcat",
@@ -92,7 +89,7 @@ def make_app(settings: Settings) -> FastAPI:
         ],
     )
     app.state.service, app.state.metrics, app.state.identities = service, metrics, identities
-    app.state.workers = WorkerPool(service)
+    app.state.slots = JobSlots(service)
     add_problem_handlers(app)
     add_missing_page(app)
     for router in RESOURCES:
@@ -105,9 +102,8 @@ def make_app(settings: Settings) -> FastAPI:
 @asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     service: Service = app.state.service
-    pool: WorkerPool = app.state.workers
-    await to_thread.run_sync(pool.start)
-    service.tap.runner.start()
+    slots: JobSlots = app.state.slots
+    await to_thread.run_sync(slots.start)
     removing = asyncio.create_task(keep_removing(service))
     try:
         yield
@@ -116,10 +112,5 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         removing.cancel()
         with suppress(asyncio.CancelledError):
             await removing
-        await to_thread.run_sync(pool.stop)
-        service.queue.close()
-        service.tap.close()
-        service.catalogs.close()
-        service.query_pool.close()
-        service.sandbox.close()
-        service.records.close()
+        await to_thread.run_sync(slots.stop)
+        service.close()

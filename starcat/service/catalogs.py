@@ -16,9 +16,9 @@ from typing import Any, TypeVar
 
 from cachetools import LRUCache
 
-from starcat.catalog.blocks import CATALOGS
-from starcat.catalog.fetching.locate import locate
+from starcat.catalog.parts import CATALOGS
 from starcat.catalog.source import DataSource, data_source
+from starcat.catalog.source_files import locate
 from starcat.errors import SourceMissing
 from starcat.pipeline.catalog_snapshot import CatalogSnapshot, read_snapshot, reading_keys
 from starcat.pipeline.estimate import Choice, Estimate, choose_stars, estimate
@@ -66,21 +66,11 @@ class CatalogRead:
 
 @dataclass(frozen=True)
 class Offered:
-    """A catalog that a spec may name.
+    """A catalog that a spec may name."""
 
-    Attributes
-    ----------
-    source : DataSource
-        What it is.
-    is_here : bool
-        Whether its files are.
-    read : tuple of CatalogRead
-        What is known of it where it was read.
-    """
-
-    source: DataSource
-    is_here: bool
-    read: tuple[CatalogRead, ...]
+    source: DataSource  # what it is
+    is_here: bool  # whether its files are
+    read: tuple[CatalogRead, ...]  # what is known of it where it was read
 
 
 class Catalogs:
@@ -166,10 +156,10 @@ class Catalogs:
         except TimeoutError:
             if future.done():
                 raise
-            what = (
-                f"{', '.join(_sources_read(spec))}: being read, which takes longer than you waited"
-            )
-            raise _busy(what, RETRY_S) from None
+            names = ", ".join(_sources_read(spec))
+            raise _busy(
+                f"{names}: being read, which takes longer than a request waits", RETRY_S
+            ) from None
 
     def close(self) -> None:
         """Begin no more reading; what is underway is not waited for."""

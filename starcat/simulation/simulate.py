@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from starcat.arrays import Array
 from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
-from starcat.geometry.zones import Zones, zones_of
+from starcat.geometry.sphere import Zones, zones_of
 
 
 @dataclass(frozen=True)

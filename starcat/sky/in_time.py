@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starcat.arrays import Array
-from starcat.geometry.aberration import AU_KM
+from starcat.arrays import Array, Matrix
 from starcat.geometry.attitude import (
     matrix_from_quaternion,
     quaternion_from_matrix,
@@ -29,7 +28,7 @@ from starcat.matcher.database import Database
 from starcat.matcher.observation import as_frame
 from starcat.matcher.result import MatchResult
 from starcat.sky.bodies import RADII_KM, Bodies, bodies_seen
-from starcat.sky.observer import Observer
+from starcat.sky.observer import AU_KM, Observer
 
 
 @dataclass(frozen=True)
@@ -166,19 +165,9 @@ def sky_in_time(
 
 
 def earth_limb_angle_deg(boresight: Array, observer: Observer) -> float | None:
-    """Return the angle from a boresight to the limb of the Earth.
+    """Return the angle from a boresight (apparent, ICRS axes) to the limb of the Earth.
 
-    Parameters
-    ----------
-    boresight : ndarray of float64, shape (3,)
-        Apparent direction, ICRS axes.
-    observer : Observer
-        With a position.
-
-    Returns
-    -------
-    float or None
-        Degrees, negative where the Earth is in the boresight; None without a position.
+    Degrees, negative where the Earth is in the boresight; None without a position.
     """
     if not observer.is_placed:
         return None
@@ -202,7 +191,7 @@ def _angle_arcsec(rotation: Array) -> float:
 
 
 def _in_frame(
-    seen: Bodies, matrix: Array, camera: Camera, angle_deg: Array, rows: dict[str, int]
+    seen: Bodies, matrix: Matrix, camera: Camera, angle_deg: Array, rows: dict[str, int]
 ) -> tuple[BodyInFrame, ...]:
     places = camera.pixels_from_directions(seen.directions @ matrix.T)
     inside = camera.contains(places)

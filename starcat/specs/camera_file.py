@@ -82,7 +82,6 @@ def camera_toml(camera: Camera) -> str:
 
 
 def _camera(table: dict[str, Any], path: Path, prefix: str) -> Camera:
-    """Return the camera of a table whose keys stand behind a prefix."""
     _refuse_unknown(table, KEYS, path, prefix)
     for key in SIZES:
         if key not in table:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from starcat.catalog.blocks import Reading
+from starcat.catalog.parts import IngestOptions
 from starcat.catalog.verdict import Reason
 from starcat.errors import BuildError
 from starcat.storage.digests import json_bytes
@@ -43,7 +43,9 @@ class Written:
     margins: Sequence[tuple[Pixel, Facts]]
 
 
-def make_manifest(name: str, how: Reading, written: Written, notes: Sequence[str] = ()) -> Facts:
+def make_manifest(
+    name: str, how: IngestOptions, written: Written, notes: Sequence[str] = ()
+) -> Facts:
     """Return what a store says of itself, after checking that no record is missing."""
     rejected = {Reason.duplicate_record.name: written.repeated}
     for part in written.parts:

@@ -20,12 +20,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.catalog.blocks import Reading
-from starcat.catalog.file_parts import NAMED_PROBLEMS, FileFacts
-from starcat.catalog.ingest import check_band, given_files, missing_files, star_catalog
-from starcat.catalog.readers.files import InputFile
-from starcat.catalog.repeats import check_contents
+from starcat.catalog.ingest import ingest_options
+from starcat.catalog.parts import NAMED_PROBLEMS, IngestOptions
 from starcat.catalog.source import data_source
+from starcat.catalog.source_files import FileFacts, InputFile, SourceFiles
 from starcat.errors import OutputError
 from starcat.progress import Progress, no_progress
 from starcat.storage.atomic import Outcome, move_into_place, remove_partial, writing
@@ -85,8 +83,8 @@ class _Ingest:
 
     work: Work
     name: str
-    files: Sequence[InputFile]
-    how: Reading
+    files: SourceFiles
+    how: IngestOptions
     options: StoreOptions
     client: Client
     progress: Progress
@@ -138,15 +136,13 @@ def ingest_to_store(
 ) -> Stored:
     """Read a star catalog of any size into a catalog store."""
     options = options or StoreOptions()
-    source = star_catalog(source_name)
-    how = Reading(source_name, check_band(source, band), epoch_jyear, read_limit_mag)
-    files = given_files(source, paths)
+    how = ingest_options(source_name, band, epoch_jyear, read_limit_mag)
+    files = SourceFiles.find(data_source(source_name), paths)
     rows_of_a_run(options)
     _check_output(output, options)
     work = Work.of(output)
-    work.begin(_all_options(files, how, options), resume=options.resume)
-    size = sum(file.path.stat().st_size for file in files)
-    is_small = size < _SMALL_BYTES
+    work.begin(_all_options(files.files, how, options), resume=options.resume)
+    is_small = sum(files.sizes) < _SMALL_BYTES
     with cluster(options.workers, options.scheduler, is_small=is_small) as client:
         run = _Ingest(work, output.name, files, how, options, client, progress)
         with writing(output.absolute().parent, RESUME_ADVICE):
@@ -166,7 +162,9 @@ def _check_output(output: Path, options: StoreOptions) -> None:
         )
 
 
-def _all_options(files: Sequence[InputFile], how: Reading, options: StoreOptions) -> dict[str, Any]:
+def _all_options(
+    files: Sequence[InputFile], how: IngestOptions, options: StoreOptions
+) -> dict[str, Any]:
     """Return all that the bytes of a store depend on."""
     return {
         "source": how.source_name,
@@ -184,13 +182,12 @@ def _make(run: _Ingest) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Go through all steps, in the hidden folder."""
     for folder in (run.store / REJECTED, run.work / "runs"):
         folder.mkdir(parents=True, exist_ok=True)
-    order = _order(run.files)
+    order = _order(run.files.files)
     parts = _split_all(run, order)
     facts = [FileFacts(**part["file"]) for part in parts]
-    source = data_source(run.how.source_name)
-    check_contents(run.files, facts, source)
+    run.files.check_contents(facts)
     content = _begin_partitions(run, facts)
-    indexes = [run.work / f"runs/file-{number:05}.npz" for number in range(len(run.files))]
+    indexes = [run.work / f"runs/file-{number:05}.npz" for number in range(len(run.files.files))]
     runs = [
         one
         for path, part in zip(indexes, parts, strict=True)
@@ -206,7 +203,7 @@ def _make(run: _Ingest) -> tuple[dict[str, Any], tuple[str, ...]]:
     margins = _margins_all(run, beside, finished, content)
     partitions = list(zip(pixels, finished, strict=True))
     written = Written(parts, len(places), partitions, margins)
-    manifest = make_manifest(run.name, run.how, written, missing_files(source, run.files))
+    manifest = make_manifest(run.name, run.how, written, run.files.notes)
     describe_store(run.store, run.name, manifest, written, run.options)
     problems = tuple(problem for part in parts for problem in part["problems"])
     return manifest, problems[:NAMED_PROBLEMS]
@@ -220,10 +217,10 @@ def _order(files: Sequence[InputFile]) -> int:
 def _split_all(run: _Ingest, order: int) -> list[dict[str, Any]]:
     rows = rows_of_a_run(run.options)
     jobs = []
-    for number, file in enumerate(run.files):
+    for number, file in enumerate(run.files.files):
         asked = Split(number, file, run.how, order, rows, run.work / "runs", run.store / REJECTED)
         jobs.append(Job(run.work, asked.name, split, asked, is_unchanged))
-    sizes = [file.path.stat().st_size for file in run.files]
+    sizes = [file.path.stat().st_size for file in run.files.files]
     return run.run(jobs, f"rows {run.how.source_name}", sizes)
 
 

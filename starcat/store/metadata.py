@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from starcat.storage.votable import votable_metadata
+from starcat.storage.parquet import votable_metadata
 from starcat.store.layout import DATASET, PARTITIONS_NAME, write_properties
 from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, Pixel
 from starcat.version import __version__

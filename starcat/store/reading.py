@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,19 +19,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from starcat.catalog.blocks import Reading, join_parts
-from starcat.catalog.file_parts import NAMED_PROBLEMS, FileFacts
-from starcat.catalog.ingest import (
-    Ingested,
-    check_balance,
-    check_band,
-    ingest,
-    star_catalog,
-    unmoved_stars,
-)
-from starcat.catalog.nearest import add_nearest_neighbours
-from starcat.catalog.readers.files import map_in_order
-from starcat.catalog.stars import floats_of, move_to_epoch, with_columns
+from starcat.catalog.ingest import Ingested, StarTables, ingest, ingest_options, ingested
+from starcat.catalog.parts import NAMED_PROBLEMS, IngestOptions
+from starcat.catalog.readers.blocks import map_in_order
+from starcat.catalog.source_files import FileFacts
+from starcat.catalog.stars import add_nearest_neighbours, floats_of, move_to_epoch, with_columns
 from starcat.catalog.verdict import Reason
 from starcat.errors import ConfigError, ProductError, SchemaError, SchemaVersionError
 from starcat.progress import Progress, no_progress
@@ -74,29 +66,18 @@ def read_catalog(
             key="input",
             value=[str(path) for path in paths],
         )
-    wanted = check_band(star_catalog(source_name), band)
-    how = Reading(source_name, wanted, epoch_jyear, read_limit_mag)
+    how = ingest_options(source_name, band, epoch_jyear, read_limit_mag)
     read = _read_store(open_store(paths[0]), how, workers, progress)
-    check_balance(read)
     return replace(read, stars=add_nearest_neighbours(read.stars, workers)) if neighbours else read
 
 
-@dataclass
-class _Found:
-    """What has been read of a store so far."""
-
-    stars: list[pa.Table] = field(default_factory=list)
-    rejected: list[pa.Table] = field(default_factory=list)
-    beyond: int = 0
-
-
-def _read_store(store: Store, how: Reading, workers: int, progress: Progress) -> Ingested:
+def _read_store(store: Store, how: IngestOptions, workers: int, progress: Progress) -> Ingested:
     manifest = read_manifest(store)
     if manifest is not None:
         _check_made_for(store, manifest, how)
     stage = f"rows {how.source_name}"
     partitions = [(number, path) for number, path in enumerate(_paths(store))]
-    found = _Found()
+    found = StarTables()
 
     def read(numbered: tuple[int, Path]) -> tuple[pa.Table, int]:
         return _bright_rows(*numbered, how, is_ours=manifest is not None)
@@ -106,46 +87,28 @@ def _read_store(store: Store, how: Reading, workers: int, progress: Progress) ->
     for (number, _), (stars, beyond) in zip(
         partitions, map_in_order(read, iter(partitions), workers), strict=True
     ):
-        found.stars.append(stars)
-        found.beyond += beyond
+        found.add(stars, counted=beyond)
         rows[number] = len(stars) + beyond
         done += rows[number]
         progress(stage, done, None if manifest is None else manifest["kept"])
     if manifest is not None:
         # What is beyond the limit of the store itself was only counted when it was made.
-        found.beyond += manifest["rejected"].get(Reason.beyond_read_limit.name, 0)
+        found.counted += manifest["rejected"].get(Reason.beyond_read_limit.name, 0)
         _read_beside(store, how, found)
         files = tuple(FileFacts(**file) for file in manifest["files"])
     else:
         files = _own_files(store, [path for _, path in partitions], rows)
-    return _joined(found, how, files, manifest)
-
-
-def _joined(
-    found: _Found,
-    how: Reading,
-    files: tuple[FileFacts, ...],
-    manifest: dict[str, Any] | None,
-) -> Ingested:
-    """Return what was read as reading the archive's files returns it."""
-    rejected = product_schema("rejected").arrow_schema.empty_table()
-    stars, left_out = join_parts(found.stars, [rejected, *found.rejected])
+    stars, rejected = found.joined()
     if manifest is None or manifest["epoch_jyear"] is None:
         stars = _moved(stars, how.epoch_jyear)
-    product_schema("stars").check(stars)
-    malformed = left_out.filter(pc.equal(left_out["reason"], Reason.malformed_record.name))
+    malformed = rejected.filter(pc.equal(rejected["reason"], Reason.malformed_record.name))
     malformed = malformed.sort_by([("source_file", "ascending"), ("source_line", "ascending")])
-    problems = tuple(
+    problems = [
         f"{files[row['source_file']].name} {row['detail']}"
         for row in malformed.slice(0, NAMED_PROBLEMS).to_pylist()
-    )
-    notes = (
-        *(manifest or {}).get("notes", ()),
-        *unmoved_stars(how.source_name, stars, how.epoch_jyear),
-    )
-    return Ingested(
-        how.source_name, how.band, stars, left_out, files, problems, notes, found.beyond
-    )
+    ]
+    notes = (manifest or {}).get("notes", ())
+    return ingested(how, stars, rejected, found.counted, files, problems, notes)
 
 
 def read_manifest(store: Store) -> dict[str, Any] | None:
@@ -176,7 +139,7 @@ def read_manifest(store: Store) -> dict[str, Any] | None:
     return manifest
 
 
-def _check_made_for(store: Store, manifest: dict[str, Any], how: Reading) -> None:
+def _check_made_for(store: Store, manifest: dict[str, Any], how: IngestOptions) -> None:
     """Check that a store was made of what a build asks for."""
     limit = manifest["read_limit_mag"]
     kept = [
@@ -210,7 +173,9 @@ def _paths(store: Store) -> list[Path]:
     return [path for partition in store.catalog.partitions for path in partition.paths]
 
 
-def _bright_rows(number: int, path: Path, how: Reading, *, is_ours: bool) -> tuple[pa.Table, int]:
+def _bright_rows(
+    number: int, path: Path, how: IngestOptions, *, is_ours: bool
+) -> tuple[pa.Table, int]:
     """Return a file's stars within the limit, and how many are beyond it."""
     names = product_schema("stars").arrow_schema.names
     try:
@@ -259,7 +224,7 @@ def _check_columns(path: Path, has: Sequence[str]) -> None:
         )
 
 
-def _as_stars(table: pa.Table, number: int, how: Reading, *, is_ours: bool) -> pa.Table:
+def _as_stars(table: pa.Table, number: int, how: IngestOptions, *, is_ours: bool) -> pa.Table:
     """Return rows as a table of the stars schema, with what a catalog of others lacks."""
     schema = product_schema("stars").arrow_schema
     count = len(table)
@@ -302,27 +267,26 @@ def _moved(stars: pa.Table, epoch_jyear: float | None) -> pa.Table:
     return with_columns(stars, move_to_epoch(columns, epoch_jyear))
 
 
-def _read_beside(store: Store, how: Reading, found: _Found) -> None:
+def _read_beside(store: Store, how: IngestOptions, found: StarTables) -> None:
     """Read rejected records, and those whose star was read before."""
     limit = how.read_limit_mag
     for path in sorted((store.folder / REPEATED).glob("*.parquet")):
         again = pq.read_table(path)
+        total = len(again)
         if limit is not None:
-            within = again.filter(pc.less_equal(again["mag"], limit))
-            found.beyond += len(again) - len(within)
-            again = within
-        found.stars.append(_as_stars(again, 0, how, is_ours=True))
+            again = again.filter(pc.less_equal(again["mag"], limit))
+        found.add(_as_stars(again, 0, how, is_ours=True), counted=total - len(again))
     for path in sorted((store.folder / REJECTED).glob("*.parquet")):
         rejected = pq.read_table(path, schema=product_schema("rejected").arrow_schema)
+        total = len(rejected)
         if limit is not None:
             listed = pc.or_(
                 pc.fill_null(pc.less_equal(rejected["mag"], limit), False),
                 pc.equal(rejected["reason"], Reason.malformed_record.name),
             )
-            found.beyond += len(rejected)
             rejected = rejected.filter(listed)
-            found.beyond -= len(rejected)
         found.rejected.append(rejected)
+        found.counted += total - len(rejected)
 
 
 def _own_files(store: Store, paths: Sequence[Path], rows: Sequence[int]) -> tuple[FileFacts, ...]:

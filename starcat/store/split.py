@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from starcat.catalog.blocks import Part, Reading
-from starcat.catalog.file_parts import FileReading
 from starcat.catalog.ingest import count_by_reason
-from starcat.catalog.readers.files import InputFile
+from starcat.catalog.parts import FileReading, IngestOptions, Part, merged, parse_block, read_files
 from starcat.catalog.source import data_source
+from starcat.catalog.source_files import InputFile
 from starcat.catalog.verdict import Reason
 from starcat.storage.atomic import placed
 from starcat.storage.digests import file_sha256
@@ -48,7 +48,7 @@ class Split:
 
     number: int
     file: InputFile
-    how: Reading
+    how: IngestOptions
     order: int
     run_rows: int
     runs: Path
@@ -113,14 +113,16 @@ def split(asked: Split) -> tuple[dict[str, Any], Digests]:
     """Split a file."""
     (asked.rejected / f"{asked.name}.parquet").unlink(missing_ok=True)
     written = _Written(asked)
-    reading = FileReading(asked.file, asked.number, data_source(asked.how.source_name), asked.how)
+    reading = FileReading(asked.file, asked.number, data_source(asked.how.source_name))
     counts: dict[str, int] = {}
+    parse = partial(parse_block, options=asked.how)
     with written.closing:
-        for stars, rejected in _joined(_counted(reading, counts), asked.run_rows):
-            if len(stars):
-                written.stars(stars)
-            if len(rejected):
-                written.rejected(rejected)
+        for _, parts in read_files([reading], parse):
+            for part in merged(_counted(parts, counts), asked.run_rows):
+                if len(part.stars):
+                    written.stars(part.stars)
+                if len(part.rejected):
+                    written.rejected(part.rejected)
     kept = sum(int(run.rows.sum()) for run in written.runs)
     facts = reading.facts
     result = {
@@ -132,7 +134,7 @@ def split(asked: Split) -> tuple[dict[str, Any], Digests]:
         },
         "kept": kept,
         "rejected": {r.name: counts[r.name] for r in Reason if counts.get(r.name)},
-        "problems": list(reading.problems),
+        "problems": list(reading.named_problems),
         "runs": len(written.runs),
     }
     written.index()
@@ -150,22 +152,3 @@ def _counted(parts: Iterable[Part], counts: dict[str, int]) -> Iterator[Part]:
         for name, count in count_by_reason(part.rejected, part.counted).items():
             counts[name] = counts.get(name, 0) + count
         yield part
-
-
-def _joined(parts: Iterable[Part], rows: int) -> Iterator[tuple[pa.Table, pa.Table]]:
-    """Join blocks until there are about so many rows."""
-    held: list[Part] = []
-    for part in parts:
-        held.append(replace(part, problems=[]))
-        if sum(len(each.stars) + len(each.rejected) for each in held) >= rows:
-            yield _tables(held)
-            held = []
-    if held:
-        yield _tables(held)
-
-
-def _tables(parts: list[Part]) -> tuple[pa.Table, pa.Table]:
-    return (
-        pa.concat_tables([part.stars for part in parts]),
-        pa.concat_tables([part.rejected for part in parts]),
-    )

@@ -8,11 +8,12 @@ Simple Cone Search 1.03, IVOA Recommendation, February 2008.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from starcat.errors import ConfigError, TargetMissing, quoted
+from starcat.exchange.columns import described, field_facts
 from starcat.exchange.formats import Format, response_format
 from starcat.exchange.votable_fields import error_document
 from starcat.query.names import quoted as sql_text
@@ -95,22 +96,13 @@ def cone_query(view: View, asked: ConeRequest, maxrec: int) -> str:
 
 def with_ucds(batches: pa.RecordBatchReader, view: View) -> pa.RecordBatchReader:
     """Return rows whose columns have the UCDs that the standard asks for."""
-    import pyarrow as pa
-
     ra, dec = view.position or POSITION
     ucds = {_name_of(view): _ID, ra: _RA, dec: _DEC, SEPARATION: "pos.angDistance"}
-    schema = pa.schema(
-        field.with_metadata({**(field.metadata or {}), b"ucd": ucds[field.name].encode()})
-        if field.name in ucds
-        else field
+    facts = (
+        {**field_facts(field), "ucd": ucds[field.name]} if field.name in ucds else None
         for field in batches.schema
     )
-
-    def rows() -> Iterator[pa.RecordBatch]:
-        for batch in batches:
-            yield pa.record_batch(batch.columns, schema=schema)
-
-    return pa.RecordBatchReader.from_batches(schema, rows())
+    return described(batches, facts)
 
 
 def cone_error(text: str) -> bytes:

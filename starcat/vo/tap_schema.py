@@ -18,8 +18,17 @@ from starcat.query.result import Facts, column_facts
 from starcat.query.session import Session
 from starcat.query.targets import View
 from starcat.storage.parquet import write_parquet
-from starcat.vo.tables import Column, Key, Schema, Table, Tables, adql_name, full_name
-from starcat.vo.types import is_time, votable_type
+from starcat.vo.tables import (
+    Column,
+    Key,
+    Schema,
+    Table,
+    Tables,
+    adql_name,
+    full_name,
+    is_time,
+    votable_type,
+)
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -43,8 +43,9 @@ def fetch(
 
     Example: starcat fetch tycho2
     """
-    from starcat.catalog.fetching.fetch import cache_folder, fetch_source
+    from starcat.catalog.fetch import fetch_source
     from starcat.catalog.source import data_source
+    from starcat.catalog.source_files import cache_folder
     from starcat.cli.terminal.builds import print_fetched
     from starcat.cli.terminal.console import progress_bars
 
@@ -107,7 +108,7 @@ def ingest(
 
     Example: starcat ingest sao --input sao.dat.gz -o sao.parquet --epoch-jyear 2026.0
     """
-    from starcat.catalog.fetching.locate import locate
+    from starcat.catalog.source_files import locate
     from starcat.errors import ConfigError
     from starcat.store.options import StoreOptions
 
@@ -156,7 +157,7 @@ def _ingest_to_file(
     *,
     as_json: bool,
 ) -> None:
-    from starcat.catalog.star_files import write_star_tables
+    from starcat.catalog.ingest import write_star_tables
     from starcat.cli.terminal.builds import print_ingested
     from starcat.cli.terminal.console import progress_bars
     from starcat.store.reading import read_catalog

@@ -71,33 +71,6 @@ def serve(
     run_server(read_settings(root, host=host, port=port, workers=workers), announce)
 
 
-@app.command()
-def work(
-    server: Annotated[str, typer.Option(metavar="URL", help="Address of the service.")],
-    queue: Annotated[str, typer.Option(metavar="redis://HOST:PORT/N", help="Its queue_url.")],
-    token: Annotated[
-        str,
-        typer.Option(envvar="STARCAT_TOKEN", help="Token of a publisher; best in the variable."),
-    ],
-    root: Annotated[Path, typer.Option(help="Folder for what is being built.")] = Path("worker"),
-    workers: Annotated[int, typer.Option(min=1, max=64, help="Jobs at the same time.")] = 1,
-) -> None:
-    """Do builds of a service that runs on another machine, with the catalogs of this one.
-
-    Both need the same starcat and the same catalogs; limits are those of service.toml under
-    --root. It ends at Ctrl-C or a termination signal; what it was at waits again.
-
-    Example: starcat work --server http://10.0.0.1:8000 --queue redis://10.0.0.1:6379/0
-    """
-    try:
-        from starcat.service.jobs.away import work_away
-    except ModuleNotFoundError as error:
-        raise _not_installed(error) from error
-    from starcat.service.settings import read_settings
-
-    work_away(read_settings(root, queue_url=queue, workers=workers), server, token)
-
-
 @tokens.command()
 def create(
     name: Annotated[str, typer.Argument(help="Of who gets it: letters, digits and ._@-.")],

@@ -36,8 +36,8 @@ def presets(
     Example: starcat presets gaia-12deg --toml
     """
     from starcat.cli.terminal.specs import print_preset, print_presets
+    from starcat.specs.keys import spec_toml
     from starcat.specs.reading import preset
-    from starcat.specs.spec_toml import spec_toml
 
     if toml:
         if name is None:

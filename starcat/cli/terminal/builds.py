@@ -12,7 +12,7 @@ from starcat.errors import SourceError
 
 if TYPE_CHECKING:
     from starcat.artifact.reader import Artifact
-    from starcat.catalog.fetching.fetch import FetchReport
+    from starcat.catalog.fetch import FetchReport
     from starcat.catalog.ingest import Ingested
     from starcat.pipeline.build import Built
     from starcat.pipeline.cost import Cost
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 def print_sources(*, as_json: bool) -> None:
     """Print the data sources and where each would be read from."""
-    from starcat.catalog.fetching.locate import locate
     from starcat.catalog.source import data_source, source_names
+    from starcat.catalog.source_files import locate
 
     found: list[dict[str, Any]] = []
     for name in source_names():
@@ -87,7 +87,7 @@ def print_fetched(report: FetchReport, *, as_json: bool) -> None:
 
 def print_ingested(read: Ingested, output: Path, *, as_json: bool) -> None:
     """Print what became of the records of a catalog."""
-    from starcat.catalog.star_files import rejected_path
+    from starcat.catalog.verdict import rejected_path
 
     facts = {
         "source": read.source,

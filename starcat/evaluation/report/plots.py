@@ -80,7 +80,6 @@ def _places(x: Iterable[float]) -> dict[float, float]:
 def _draw_curves(
     axes: Axes, lines: Sequence[Line], series: Sequence[str], places: Mapping[float, float]
 ) -> list[Any]:
-    """Draw all curves; return what the legend shows."""
     shown = list(dict.fromkeys(series_of(line) for line in lines))
     width = max(places.values()) - min(places.values())
     handles = []

@@ -69,7 +69,6 @@ def _times(line: Line) -> str:
 
 
 def _goal(line: Line) -> str:
-    """Return a row's goal in words."""
     wants = []
     if line["goal_percent"] is not None:
         over = " of 4+" if line["goal_over"] == "4+" else ""

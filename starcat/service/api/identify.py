@@ -20,10 +20,9 @@ from starlette.datastructures import UploadFile
 from starcat.failures import validation_message
 from starcat.images.solve_files import IMAGE_SUFFIXES, IdentifyOptions
 from starcat.service.access import Reader
-from starcat.service.file_answers import type_of
 from starcat.service.problems import MEDIA_TYPE, Problem, ProblemDetails
 from starcat.service.service import Service, TheService
-from starcat.service.uploading import safe_name, scratch_folder
+from starcat.service.transfers import safe_name, scratch_folder, type_of
 
 UNKNOWN_TYPE: dict[int | str, dict[str, Any]] = {
     415: {

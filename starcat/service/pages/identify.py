@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import math
+from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import Query, Request
@@ -15,21 +16,29 @@ from starlette.datastructures import FormData, UploadFile
 
 from starcat.errors import StarcatError
 from starcat.failures import validation_message
+from starcat.images.render import write_simulated
 from starcat.images.solve_files import IdentifyOptions
+from starcat.matcher.database import open_database
 from starcat.matcher.methods.table import METHODS
 from starcat.service.access import Reader
 from starcat.service.api.identify import MIB, SUFFIXES, FrameUpload, identify_upload
 from starcat.service.library import Database
 from starcat.service.pages.centroid_text import centroid_file
 from starcat.service.pages.rendering import page_router, render
-from starcat.service.pages.simulated import camera_of, frame_suffix, write_frame
 from starcat.service.problems import Problem, problem_of
 from starcat.service.service import Service, TheService
-from starcat.service.uploading import scratch_folder
+from starcat.service.transfers import scratch_folder
+from starcat.simulation.simulate import Noise, simulate_frames
 
 router = page_router()
 
 MAX_SEED = 2**31 - 1
+
+MAX_PIXELS = 2**23
+"""Frames with more are given as centroids, not as pictures."""
+
+NOISE_PX = 0.3
+"""Noise of a centroid, each axis."""
 
 FIELDS = (
     "database", "method", "field_error", "tolerance_px", "centroids", "brightness", "seed",
@@ -177,7 +186,7 @@ def _field_deg(answer: dict[str, Any], database: Database) -> float | None:
     focal_length_px = answer.get("focal_length_px")
     if not focal_length_px:
         return None
-    half = 0.5 * camera_of(database).width_px / float(focal_length_px)
+    half = 0.5 * database.camera.width_px / float(focal_length_px)
     return 2.0 * math.degrees(math.atan(half))
 
 
@@ -190,3 +199,18 @@ def _number(text: str, name: str) -> float | None:
         raise Problem(
             422, f"{name}: {text[:40]!r} is not a number; give one, or leave it empty", key=name
         ) from None
+
+
+def frame_suffix(database: Database) -> str:
+    """Return the suffix of the file of a simulated frame: a picture unless it were too large."""
+    camera = database.camera
+    return ".png" if camera.width_px * camera.height_px <= MAX_PIXELS else ".csv"
+
+
+def write_frame(path: Path, database: Database, seed: int) -> None:
+    """Write a simulated frame."""
+    stars = open_database(database.folder, ())
+    frame = next(
+        simulate_frames(stars.directions, stars.camera, 1, Noise(NOISE_PX), seed, mag=stars.mag)
+    )
+    write_simulated(path, frame, stars.camera, seed)

@@ -11,6 +11,7 @@ from prometheus_client import CONTENT_TYPE_PLAIN_0_0_4
 from pydantic import BaseModel, Field
 
 from starcat.service.access import Reader
+from starcat.service.jobs.slots import JobSlots
 from starcat.service.security.bodies import free_gib
 from starcat.service.service import Service, TheService
 
@@ -42,10 +43,13 @@ def alive() -> Alive:
     responses={503: {"model": Readiness, "description": "Something is wrong."}},
 )
 def ready(request: Request, service: TheService, who: Reader) -> Response:
-    """Look at the records, the disk and the process that has jobs done."""
+    """Look at the records, the disk and the slots of jobs."""
     reasons = [reason for check in CHECKS if (reason := check(service)) is not None]
-    if not request.app.state.workers.is_alive:
-        reasons.append("the process that has jobs done has ended; it is started again")
+    slots: JobSlots = request.app.state.slots
+    if not slots.is_alive:
+        reasons.append("a slot of jobs has ended; start the service again")
+    if slots.cluster is not None and slots.cluster.problem is not None:
+        reasons.append(f"jobs wait for the cluster: {slots.cluster.problem}")
     content = Readiness(ready=not reasons, reasons=reasons)
     return JSONResponse(content.model_dump(), 503 if reasons else 200)
 

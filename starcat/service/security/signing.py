@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
 
-from starcat.service.pages.sign_in import own_path, sign_in_form
+from starcat.service.pages.home import own_path, sign_in_form
 from starcat.service.security.auth import network_of
 from starcat.service.security.identities import Identities
 from starcat.service.security.login_sessions import cookie_name, session_in
