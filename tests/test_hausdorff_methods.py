@@ -12,6 +12,7 @@ import pytest
 from frames import observe
 from hypothesis import given
 from hypothesis import strategies as st
+from set_skies import CAMERA, frame_centred_on, set_sky
 
 from starcat.evaluation import bare_methods
 from starcat.evaluation.bare_methods import (
@@ -21,9 +22,8 @@ from starcat.evaluation.bare_methods import (
     rank_by_ratios,
 )
 from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
-from starcat.geometry.camera import Camera
-from starcat.geometry.sphere import radec_from_directions, separation
-from starcat.matcher.database import Database, ProductArrays
+from starcat.geometry.sphere import separation
+from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods import hausdorff, reference_sets
 from starcat.matcher.methods.consensus import (
@@ -40,41 +40,17 @@ from starcat.matcher.methods.reference_sets import (
     means_of_minima,
     within_reach,
 )
-from starcat.matcher.methods.table import METHODS
 from starcat.matcher.observation import Observation
-from starcat.products.neighbours import angular_reference_sets, planar_reference_sets
 from starcat.simulation.simulate import Noise, simulate_frames
 
-CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
 FOCAL_PX = CAMERA.focal_length_px
-NAMES = ("hausdorff_angular", "hausdorff_l2", "hausdorff_l1")
 TURNING = ("hausdorff_angular", "hausdorff_l2")
 """The methods that do not mind a roll."""
 
 
-def make_database(u: np.ndarray, radius_deg: tuple[float, float] = (13.3, 10.0)) -> Database:
-    """A database with both products, rows in 16 bits as in a file."""
-    products = {}
-    for name, make, values, radius in (
-        ("hausdorff_angular", angular_reference_sets, "separation_rad", radius_deg[0]),
-        ("hausdorff_l2", planar_reference_sets, "ratio", radius_deg[1]),
-    ):
-        sets = make(u, np.radians(radius))
-        columns = {
-            "star": sets.star.astype(np.uint16),
-            "neighbour": sets.neighbour.astype(np.uint16),
-            values: getattr(sets, values),
-        }
-        products[name] = ProductArrays({**columns, **sets.index.datasets}, sets.index.attributes)
-    count = len(u)
-    mag = np.random.default_rng(count).uniform(2.0, 6.0, count)
-    named = np.full(count, b"star")
-    return Database("sky", CAMERA, 2026.0, np.arange(count), u, mag, named, products)
-
-
 @pytest.fixture(scope="module")
 def sky(random_directions) -> Database:
-    return make_database(random_directions(1500, 1))
+    return set_sky(random_directions(1500, 1))
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +59,7 @@ def small_sky(random_directions) -> Database:
     u = random_directions(150, 2)
     pole = np.array([0.0, 0.0, 1.0])
     lonely = u[u @ pole < np.cos(np.radians(40.0))]
-    return make_database(np.concatenate([pole[None, :], lonely]), (30.0, 25.0))
+    return set_sky(np.concatenate([pole[None, :], lonely]), (30.0, 25.0))
 
 
 def frames(sky: Database, count: int, noise: Noise | None = None, seed: int = 3):
@@ -92,21 +68,6 @@ def frames(sky: Database, count: int, noise: Noise | None = None, seed: int = 3)
 
 def observed(centroids_px, magnitudes=None, tolerance_px: float = 2.0) -> Observation:
     return observe(centroids_px, CAMERA, tolerance_px, magnitudes)
-
-
-def frame_of(
-    sky: Database, matrix: np.ndarray, scale: float = 1.0
-) -> tuple[np.ndarray, np.ndarray]:
-    """Centroids and stars at an attitude, stretched about the middle of the frame."""
-    star = np.flatnonzero(sky.directions @ matrix[2] > 0.9)
-    px = 512.0 + scale * (CAMERA.pixels_from_directions(sky.directions[star] @ matrix.T) - 512.0)
-    inside = CAMERA.contains(px)
-    return px[inside], star[inside]
-
-
-def frame_centred_on(sky: Database, star: int, roll_deg: float, scale: float = 1.0):
-    ra, dec = radec_from_directions(sky.directions[star])
-    return frame_of(sky, matrix_from_radec_roll(float(ra), float(dec), roll_deg), scale)
 
 
 def members(sky: Database, product: str, values: str, star: int) -> list[float]:
@@ -165,7 +126,7 @@ def things_made(database: Database) -> list[str]:
 
 
 def test_what_is_cached_is_made_once_and_let_go_with_its_database(random_directions):
-    database = make_database(random_directions(20, 5))
+    database = set_sky(random_directions(20, 5))
     one = database.cached(things_made)
     assert database.cached(things_made) is one
     other = replace(database, name="other")
@@ -224,7 +185,7 @@ def test_many_pairs_are_scored_in_parts(small_sky, monkeypatch):
 
 
 def test_separations_beyond_the_radius_are_not_used(random_directions):
-    near = make_database(random_directions(300, 4), (5.0, 5.0))
+    near = set_sky(random_directions(300, 4), (5.0, 5.0))
     seen = observed([[100.0, 100.0], [150.0, 100.0], [900.0, 900.0]])
     stars, scores = rank_by_separations(seen, near, cap_rad=0.01, count=2)
     alone = int(np.argmax(seen.centroids_px[:, 0]))
@@ -370,7 +331,7 @@ def test_the_smallest_distance_is_one_that_is_not_zero(small_sky):
 
 @given(st.integers(0, 1499), st.floats(0.0, 360.0))
 def test_l2_does_not_mind_a_roll(sky, star, roll_deg):
-    upright, star_of = frame_centred_on(sky, star, 0.0)
+    upright, star_of, _ = frame_centred_on(sky, star, 0.0)
     # A turn takes no star in the inscribed circle off the frame.
     kept = np.hypot(*(upright - 512.0).T) < 500.0
     turn = np.radians(roll_deg)
@@ -387,7 +348,7 @@ def test_l2_does_not_mind_a_roll(sky, star, roll_deg):
 
 @given(st.integers(0, 1499), st.floats(0.3, 1.0))
 def test_l2_does_not_mind_the_scale_of_a_centred_frame(sky, star, scale):
-    nominal, _ = frame_centred_on(sky, star, 0.0)
+    nominal, *_ = frame_centred_on(sky, star, 0.0)
     inside = np.hypot(*(nominal - 512.0).T) / FOCAL_PX < np.tan(np.radians(9.9))
     if inside.sum() < 3:
         return
@@ -401,7 +362,7 @@ def test_l2_names_the_star_at_the_centre_of_noiseless_frames(sky):
     right = 0
     for star in range(40):
         for roll_deg, scale in ((0.0, 1.0), (77.0, 1.0), (180.0, 1.4)):
-            px, _ = frame_centred_on(sky, star, roll_deg, scale)
+            px, *_ = frame_centred_on(sky, star, roll_deg, scale)
             right += int(rank_by_ratios(observed(px), sky, count=1)[0][0]) == star
     assert right >= 0.95 * 120
 
@@ -422,7 +383,7 @@ def test_another_radius_serves_frames_of_another_scale(sky):
 def test_another_divisor_finds_what_the_smallest_distance_misses(sky, spoilt):
     bare = likely = first_round = tried = 0
     for star in range(60):
-        px, _ = frame_centred_on(sky, star, 30.0)
+        px, *_ = frame_centred_on(sky, star, 30.0)
         away = np.hypot(*(px - 512.0).T)
         nearest = np.argsort(away)[1]
         if len(px) < 8 or away[nearest] > 300.0:
@@ -680,7 +641,7 @@ def test_neighbours_that_agree_are_those_of_loops(sky, double, tolerance_px):
         # Companions 2 px away, nearer than the tolerance.
         u = sky.directions[:400] + 2.0 / FOCAL_PX * np.roll(sky.directions[:400], 1, axis=0)
         companions = u / np.linalg.norm(u, axis=1)[:, None]
-        sky = make_database(np.concatenate([sky.directions[:400], companions]))
+        sky = set_sky(np.concatenate([sky.directions[:400], companions]))
     product = sky.products["hausdorff_l2"]
     generator = np.random.default_rng(16)
     for frame in frames(sky, 4, Noise(0.5, 0.1, 2), seed=16):
@@ -726,106 +687,10 @@ def test_neighbours_that_agree_are_those_of_loops(sky, double, tolerance_px):
 # The matcher
 
 
-@pytest.fixture(scope="module", params=NAMES)
-def matcher(request, sky) -> Matcher:
-    return Matcher(sky, request.param)
-
-
-def own_frames(matcher: Matcher, count: int, noise: Noise, seed: int = 20):
-    """Frames that the method is made for: for the baseline, upright ones."""
-    if matcher.method in TURNING:
-        return [
-            (frame.centroids_px, frame.star_index)
-            for frame in frames(matcher.database, count, noise, seed)
-        ]
-    generator = np.random.default_rng(seed)
-    found = []
-    for star in generator.choice(len(matcher.database.directions), count):
-        px, star_of = frame_centred_on(matcher.database, int(star), 0.0)
-        kept = generator.random(len(px)) >= noise.drop_probability
-        px = px[kept] + generator.normal(scale=noise.noise_px, size=(kept.sum(), 2))
-        false = generator.uniform(0.0, 1024.0, (noise.false_stars, 2))
-        inside = np.append(CAMERA.contains(px), np.full(noise.false_stars, True))
-        names = np.append(star_of[kept], np.full(noise.false_stars, -1))
-        found.append((np.concatenate([px, false])[inside], names[inside]))
-    return found
-
-
-@pytest.mark.parametrize(
-    ("noise", "least"), [(Noise(), 1.0), (Noise(0.5), 0.98), (Noise(0.5, 0.1, 3), 0.93)]
-)
-@pytest.mark.parametrize("known", [True, False])
-def test_frames_of_the_own_sky_are_identified(matcher, noise, least, known):
-    done = 0
-    generator = np.random.default_rng(21)
-    trials = own_frames(matcher, 60, noise)
-    for px, star in trials:
-        mag = matcher.database.mag[star] + generator.normal(scale=0.3, size=len(star))
-        found = matcher.identify(px, magnitudes=mag if known else None)
-        if found.status == "identified":
-            named = found.star_index >= 0
-            # A false spot beside the place of a star may pass for it.
-            assert (found.star_index[named] == star[named]).mean() > 0.7
-            done += 1
-    assert done >= least * len(trials)
-
-
-def test_the_order_of_the_centroids_does_not_matter(matcher):
-    generator = np.random.default_rng(22)
-    for px, star in own_frames(matcher, 10, Noise(0.5, 0.1, 3)):
-        order = generator.permutation(len(px))
-        mag = matcher.database.mag[star].round()
-        for one_mag, other_mag in ((None, None), (mag, mag[order])):
-            one = matcher.identify(px, magnitudes=one_mag)
-            other = matcher.identify(px[order], magnitudes=other_mag)
-            assert other.star_index.tolist() == one.star_index[order].tolist()
-            assert np.array_equal(other.q_body_from_icrs, one.q_body_from_icrs, equal_nan=True)
-
-
-def test_without_magnitudes_nothing_depends_on_brightness(matcher):
-    fainter = replace(matcher.database, mag=matcher.database.mag[::-1].copy())
-    for px, _ in own_frames(matcher, 5, Noise(0.5, 0.1, 3)):
-        seen = observed(px)
-        proposed = []
-        for database in (matcher.database, fainter):
-            batches = list(METHODS[matcher.method].propose(seen, database))[:20]
-            proposed.append([(b.centroids.tolist(), b.stars.tolist()) for b in batches])
-        assert proposed[0]
-        assert proposed[0] == proposed[1]
-
-
-def test_a_mirrored_frame_is_not_identified(matcher):
-    for px, _ in own_frames(matcher, 8, Noise(0.3)):
-        mirrored = np.stack([1023.99 - px[:, 0], px[:, 1]], axis=-1)
-        assert matcher.identify(mirrored).status == "no_match"
-
-
-def test_random_points_are_not_identified(matcher):
-    generator = np.random.default_rng(23)
-    for count in (4, 8, 15, 24, 30):
-        for _ in range(2):
-            px = generator.uniform(0.0, 1024.0, (count, 2))
-            assert matcher.identify(px).status == "no_match"
-
-
-def test_few_centroids_and_empty_sets_are_no_match(matcher, random_directions):
-    # Stars 60 deg apart have no neighbours, and two stars make sets of one.
-    octahedron = np.concatenate([np.eye(3), -np.eye(3)])
-    pair = np.array([[1.0, 0.0, 0.0], [np.cos(0.05), np.sin(0.05), 0.0]])
-    generator = np.random.default_rng(24)
-    for u in (octahedron, pair, random_directions(1, 1), np.empty((0, 3))):
-        lonely = Matcher(make_database(u), matcher.method)
-        for count in (0, 1, 2, 3, 4, 9):
-            found = lonely.identify(generator.uniform(0.0, 1024.0, (count, 2)))
-            assert found.status == ("too_few_stars" if count < 4 else "no_match")
-    for count in (0, 1, 2, 3):
-        px = generator.uniform(0.0, 1024.0, (count, 2))
-        for batch in METHODS[matcher.method].propose(observed(px), matcher.database):
-            assert batch.stars.shape == batch.centroids.shape
-
-
-def test_centroids_at_nearly_the_same_place_do_no_harm(matcher):
-    px, star = max(own_frames(matcher, 10, Noise(0.3)), key=lambda frame: len(frame[0]))
+@pytest.mark.parametrize("name", TURNING)
+def test_centroids_at_nearly_the_same_place_do_no_harm(sky, name):
+    matcher, some = Matcher(sky, name), frames(sky, 10, Noise(0.3))
+    px, star = max(((one.centroids_px, one.star_index) for one in some), key=lambda f: len(f[0]))
     twin = px + np.spacing(px)
     found = matcher.identify(np.concatenate([px, twin[:3]]))
     assert found.status == "identified"
