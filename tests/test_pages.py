@@ -9,17 +9,29 @@ from pathlib import Path
 
 import pytest
 from fastapi.testclient import TestClient
+from shelved import DATABASE, client_of, shelve
 
-from starcat.service.app import make_app
 from starcat.service.jobs.job_states import Attempt, claim
 from starcat.service.pages.draft import draft_of_form, draft_of_text
 from starcat.service.pages.rendering import DIGEST, FILES
-from starcat.service.settings import Settings
 from starcat.specs.reading import preset, preset_names, read_spec
 
-HOSTILE = '"><script>alert(1)</script><img src=x onerror=alert(1)>'
+PAGE = f"/databases/{DATABASE}"
+LATER = "fedcba9876543210"
 
-BASE = "http://127.0.0.1:8000"
+PAGES = [
+    "/",
+    "/databases",
+    PAGE,
+    f"{PAGE}/coverage",
+    f"{PAGE}/sql?query=FROM+stars+LIMIT+2",
+    f"{PAGE}/compare?other={LATER}",
+    "/identify",
+    "/releases",
+]
+"""Pages of databases."""
+
+HOSTILE = '"><script>alert(1)</script><img src=x onerror=alert(1)>'
 
 SPEC = """\
 name = "small"
@@ -43,14 +55,16 @@ count = 300
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("service")
+def root(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path, artifact_version) -> Path:
+    root = tmp_path_factory.mktemp("pages") / "service"
+    shelve(root, small_artifact)
+    shelve(root, artifact_version("1.1.0"), LATER)
+    return root
 
 
 @pytest.fixture(scope="module")
 def client(root: Path) -> Iterator[TestClient]:
-    settings = Settings(root=root, anonymous="publisher", workers=0)
-    with TestClient(make_app(settings), base_url=BASE) as client:
+    with client_of(root, anonymous="publisher") as client:
         yield client
 
 
@@ -109,7 +123,7 @@ def pages(client: TestClient, job: str) -> dict[str, str]:
     """All pages of this part by address."""
     addresses = ["/new", "/new?preset=sao-12deg-512", f"/new?job={job[6:]}", "/jobs", job]
     addresses += ["/jobs?state=failed", "/jobs?state=done", "/sign-in", "/jobs/nothing"]
-    addresses += ["/api/docs"]
+    addresses += ["/api/docs", *PAGES]
     return {address: client.get(address).text for address in addresses}
 
 
@@ -204,8 +218,7 @@ def test_styles_and_scripts_of_the_pages_are_in_the_package():
 
 
 def test_who_may_not_read_is_led_to_the_sign_in(tmp_path):
-    settings = Settings(root=tmp_path, anonymous="none", workers=0)
-    with TestClient(make_app(settings), base_url=BASE) as client:
+    with client_of(tmp_path, anonymous="none") as client:
         client.headers["Accept"] = "text/html"
         answer = client.get("/jobs", follow_redirects=False)
         assert answer.status_code == 303
@@ -218,8 +231,7 @@ def test_who_may_not_read_is_led_to_the_sign_in(tmp_path):
 
 def test_who_may_only_read_sees_what_a_build_needs(client, root):
     jobs = client.app.state.service.jobs.count()
-    settings = Settings(root=root, anonymous="reader", workers=0)
-    with TestClient(make_app(settings), base_url=BASE) as reader:
+    with client_of(root, anonymous="reader") as reader:
         assert "Sign in to build" in reader.get("/new").text
         sent = {"toml": SPEC, "toml-before": "", "do": "build"}
         answer = reader.post("/new", data=sent, follow_redirects=False)
