@@ -26,7 +26,7 @@ from starcat.matcher.methods.table import METHODS
 from starcat.simulation.simulate import Noise, simulate_frames
 from starcat.storage.digests import file_sha256, json_bytes
 
-FEW = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+FEW = settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 MANY = settings(FEW, max_examples=1000)
 """Two targets of so many cases each."""
 

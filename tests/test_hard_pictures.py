@@ -7,21 +7,14 @@ from pathlib import Path
 import hard_pictures
 import numpy as np
 import pytest
-from hard_pictures import KINDS, MORE_KINDS, verdicts
+from hard_pictures import KINDS, MORE_KINDS, Scene, in_file_steps, scene_light, verdicts
 from scipy.spatial import cKDTree
 
 from starcat.errors import ConfigError
 from starcat.images.background import subtract_background
 from starcat.images.centroiding import find_spots
 from starcat.images.image_file import grey_of_mosaic, without_dark, without_dead_zones, write_image
-from starcat.images.render import (
-    Optics,
-    Scene,
-    in_file_steps,
-    render_image,
-    scene_light,
-    star_electrons,
-)
+from starcat.images.render import Optics, render_image, star_electrons
 from starcat.images.solve_files import IdentifyOptions, LocalInputs, measure
 from starcat.images.spot_width import best_widths
 from starcat.matcher.matcher import Matcher

@@ -17,8 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.calibration.fit import Fit, Seen, fit_camera
-from starcat.calibration.lens import CENTRE, FOCAL, camera_of, cropped, values_of
+from starcat.calibration.fit import (
+    CENTRE,
+    FOCAL,
+    Fit,
+    Seen,
+    camera_of,
+    cropped,
+    fit_camera,
+    values_of,
+)
 from starcat.calibration.models import choose_model, chosen, is_enough, start_of
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import matrix_from_quaternion

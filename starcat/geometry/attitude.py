@@ -86,7 +86,6 @@ def after_turn(q: Sequence[float], turn: Turn) -> Quaternion:
 
 
 def _quaternion_product(one: Sequence[float], other: Sequence[float]) -> Quaternion:
-    """Return the attitude of the second rotation after the first one."""
     (a, b, c, d), (x, y, z, w) = one, other
     return (
         d * x + a * w + b * z - c * y,

@@ -85,7 +85,6 @@ class Camera:
         self._refuse_fold()
 
     def _refuse_fold(self) -> None:
-        """Raise ConfigError unless all of the detector lies inside the fold."""
         if self.distortion.is_none:
             return
         reach_px = float(np.hypot(*(self._corners - self.principal_point_px).T).max())
@@ -123,7 +122,6 @@ class Camera:
         return self.directions_from_pixels(self._corners)
 
     def _widest_rad(self, centroids_px: Pixels) -> float:
-        """Return the largest separation between the directions of pixels."""
         body = self.directions_from_pixels(centroids_px)
         return float(separation(body[:, None], body[None]).max())
 
@@ -238,7 +236,6 @@ def _focal_length_px(
     fov_x_deg: float | None,
     fov_y_deg: float | None,
 ) -> float:
-    """Return the focal length that one of the three, or both angles, stand for."""
     if focal_length_px is not None and fov_x_deg is None and fov_y_deg is None:
         return checked_number("focal_length_px", focal_length_px, 0.0)
     scales = {"focal_length_px": focal_length_px, "fov_x_deg": fov_x_deg, "fov_y_deg": fov_y_deg}

@@ -109,7 +109,6 @@ def _leveled(raw: Grey, mask: Mask) -> Levels:
 
 
 def _in_boxes(raw: Grey, shown: Grey, mask: Mask, least: np.float32, box: int) -> Levels:
-    """Return levels whose background is that of an image, its own or a smoothed one."""
     height, width = raw.shape
     sep = load_sep()
     background = sep.Background(shown, mask=mask, bw=min(box, width), bh=min(box, height))
@@ -142,7 +141,6 @@ def _excess(levels: Levels) -> tuple[float, float]:
 
 
 def _white(sigma: float) -> float:
-    """Return the standard deviation of white noise of 1 after smoothing."""
     return float(1.0 / (np.sqrt(4.0 * np.pi) * sigma))
 
 
@@ -152,7 +150,6 @@ def _smooth_boxes(boxes: NDArray[Any], sigma: float) -> NDArray[np.float32]:
 
 
 def _spread(boxes: NDArray[np.float32], left_out: Mask) -> Array:
-    """Return a standard deviation of each box."""
     return np.asarray(np.ma.masked_array(boxes, left_out).std(axis=(1, 2)).filled(np.inf))
 
 

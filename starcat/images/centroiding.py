@@ -121,7 +121,6 @@ def _measured(
     saturation: float | None,
     gain: float | None,
 ) -> Spots:
-    """Measure place and light of what was found, and put it into order."""
     seen = float(np.sqrt(sigma**2 + PIXEL_VARIANCE))
     centroids = _windowed(levels, found, max(seen, _NARROWEST_WINDOW_PX))
     x, y = (centroids - 0.5).T

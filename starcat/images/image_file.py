@@ -151,7 +151,6 @@ def _shapes_told(shapes: list[tuple[int, ...]]) -> str:
 
 
 def _read_picture(data: bytes) -> tuple[NDArray[Any], bool]:
-    """Return the grey values of a PNG or TIFF file, whose first row is the top."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about tags beside the image, and about its size
         return _grey_of_picture(data), False

@@ -60,7 +60,6 @@ def draw_overlay(frame: FrameAxes, overlay: Overlay) -> Array:
 
 
 def _grid(matrix: Matrix, camera: Camera) -> tuple[tuple[str, Array], ...]:
-    """Return parallels and meridians that cross the frame."""
     step_deg, reach_deg = _step(camera), float(np.degrees(camera.radius_rad))
     _, dec = radec_from_directions(matrix[2])
     lowest, highest = float(dec) - reach_deg, float(dec) + reach_deg
@@ -91,7 +90,6 @@ def _step(camera: Camera) -> float:
 
 
 def _figures(matrix: Matrix, camera: Camera, epoch_jyear: float) -> tuple[Array, ...]:
-    """Return the lines between neighbouring stars of constellations that cross the frame."""
     stars = named_stars()
     places, seen = stars.at(epoch_jyear), []
     for hips in constellation_lines():

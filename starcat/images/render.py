@@ -9,11 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 from scipy.special import erf
 
 from starcat.arrays import Array, Pixels
@@ -138,68 +136,6 @@ def render_image(
     return np.clip(adu, 0, 65_535).astype(np.uint16)
 
 
-@dataclass(frozen=True)
-class Scene:
-    """The sky behind the stars, and what is left of it in a file."""
-
-    # electrons of the gradient in the brightest corner or at the brightest edge; it is a tenth of
-    # that on the opposite side
-    town_light_e: float = 0.0
-    town_light_deg: float = 90.0  # direction in which it becomes brighter: 0 to the right, 90 down
-    moon_px: tuple[float, float] | None = None  # middle of the Moon; it may be outside of the frame
-    moon_radius_px: float = 22.0  # radius of its disk, which fills the well
-    glow_e: float = 0.0  # electrons of its glow at the edge of the disk
-    glow_px: float = 60.0  # distance from the Moon's middle at which the glow is half as bright
-    nebula_e: float = 0.0  # standard deviation of nebulous light, electrons
-    nebula_px: float = 20.0  # size of its structure
-    black_adu: float = 0.0  # step of the detector that is 0 in the file: what is darker is lost
-    adu_per_step: float = 1.0  # steps of the detector in a step of the file
-    bits: int = 16  # 8 or 16: what is brighter than the largest number is lost
-
-    def __post_init__(self) -> None:
-        if self.bits not in (8, 16):
-            raise ValueError(f"bits is {self.bits}; expected 8 or 16")
-        for name in ("moon_radius_px", "glow_px", "nebula_px", "adu_per_step"):
-            if not 0.0 < getattr(self, name) < np.inf:
-                raise ValueError(f"{name} is {getattr(self, name)}; expected a positive number")
-        for name in ("town_light_e", "glow_e", "nebula_e", "black_adu"):
-            if not 0.0 <= getattr(self, name) < np.inf:
-                raise ValueError(f"{name} is {getattr(self, name)}; expected 0 or more")
-
-
-def scene_light(scene: Scene, camera_size: tuple[int, int], full_well_e: float, seed: int) -> Array:
-    """Return the mean number of electrons that a scene adds to the background."""
-    width, height = camera_size
-    y, x = np.mgrid[:height, :width] + 0.5
-    light = np.zeros((height, width))
-    if scene.town_light_e:
-        direction = np.radians(scene.town_light_deg)
-        along = np.cos(direction) * (x - 0.5 * width) + np.sin(direction) * (y - 0.5 * height)
-        part = (along - along.min()) / (along.max() - along.min())
-        light += scene.town_light_e * 10.0 ** (part - 1.0)
-    if scene.moon_px is not None:
-        distance = np.hypot(x - scene.moon_px[0], y - scene.moon_px[1])
-        light += scene.glow_e / (1.0 + (distance / scene.glow_px) ** 2)
-        light[distance < scene.moon_radius_px] += 2.0 * full_well_e
-    if scene.nebula_e:
-        noise = np.random.default_rng(seed).normal(size=(height, width))
-        cloud = gaussian_filter(noise, scene.nebula_px, mode="wrap")
-        light += np.maximum(scene.nebula_e * (cloud / cloud.std() + 1.0), 0.0)
-    return light
-
-
-def in_file_steps(adu: NDArray[Any], scene: Scene) -> NDArray[Any]:
-    """Return an image of a detector as the file of a camera has it.
-
-    Examples
-    --------
-    >>> in_file_steps(np.array([[90.0, 130.0, 9e4]]), Scene(black_adu=100.0, bits=8))
-    array([[  0,  30, 255]], dtype=uint8)
-    """
-    steps = np.rint((adu.astype(np.float64) - scene.black_adu) / scene.adu_per_step)
-    return np.clip(steps, 0, 2**scene.bits - 1).astype(np.uint8 if scene.bits == 8 else np.uint16)
-
-
 def write_simulated(path: Path, frame: Frame, camera: Camera, seed: int) -> None:
     """Write a simulated frame as centroids, or as the image that a camera would take."""
     suffix = path.suffix.lower()
@@ -211,9 +147,9 @@ def write_simulated(path: Path, frame: Frame, camera: Camera, seed: int) -> None
             f"{path}: the name says no kind of frame that starcat writes; end it with one of "
             f"{CENTROIDS_SUFFIX} (centroids), {', '.join(WRITTEN_KINDS)} (images)"
         )
-    eight_bits = Scene(bits=8, black_adu=90.0, adu_per_step=4.0)  # of the default optics
     size = camera.width_px, camera.height_px
     image = render_image(frame.centroids_px, frame.mag, size, Optics(), seed)
     if WRITTEN_KINDS[suffix] == "JPEG":
-        image = in_file_steps(image, eight_bits)
+        # Eight bits from a black point below the sky of the default optics.
+        image = np.clip(np.rint((image.astype(np.float64) - 90.0) / 4.0), 0, 255).astype(np.uint8)
     write_image(path, image)

@@ -218,7 +218,6 @@ def facts(result: MatchResult) -> Content:
 
 
 def _or_none(value: float) -> float | None:
-    """Return a number that JSON has: it has neither NaN nor infinity."""
     return value if math.isfinite(value) else None
 
 
@@ -381,7 +380,6 @@ def _frames_of_stdin() -> Iterator[MeasuredFrame]:
 
 
 def _read_picture(path: Path, options: IdentifyOptions, local: LocalInputs) -> NDArray[Any]:
-    """Read an image and repair it: dark frame, mosaic, mask."""
     from starcat.images.image_file import (
         grey_of_mosaic,
         read_image,
@@ -403,7 +401,6 @@ def _read_picture(path: Path, options: IdentifyOptions, local: LocalInputs) -> N
 def _camera_of_size(
     measured: MeasuredFile, size_px: tuple[int, int] | None, known: Camera
 ) -> Camera:
-    """Return the camera of frames of which nothing is known but their size."""
     width, height = size_px or (known.width_px, known.height_px)
     if measured.image is not None:
         height, width = measured.image.shape

@@ -178,7 +178,6 @@ def _widest(centres: Array, radii: Array) -> tuple[float, Array]:
 
 
 def _farthest(candidates: Array, directions: Directions) -> tuple[float, Array]:
-    """Return the candidate that is farthest from its nearest direction, and how far that is."""
     _, nearest = cKDTree(directions).query(candidates)
     return _widest(candidates, separation(candidates, directions[nearest]))
 

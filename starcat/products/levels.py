@@ -141,7 +141,6 @@ def boresights_of_level(boresights: int, narrowest: FieldSize, field: FieldSize)
 
 
 def _shrink(narrow: FieldSize, wide: FieldSize) -> float:
-    """Return how much smaller one field is than another one, by area."""
     return (narrow.fov_x_deg * narrow.fov_y_deg) / (wide.fov_x_deg * wide.fov_y_deg)
 
 

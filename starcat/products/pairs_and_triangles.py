@@ -175,7 +175,6 @@ def _distinct_packed(
 def _distinct_rows(
     triples: Iterable[NDArray[np.int64]],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the same for numbers of any size."""
     rows = np.concatenate(list(triples))
     rows = rows[np.lexsort(rows.T[::-1])]
     is_first = np.ones(len(rows), dtype=bool)

@@ -77,7 +77,6 @@ def grid_patterns(
 def _tables(
     row: NDArray[np.int64], cell: NDArray[np.int64], rows: int, count: int
 ) -> tuple[Ragged, dict[str, NDArray[Any]]]:
-    """Return the cells of every row, each once, and the rows of every cell."""
     row, cell = np.divmod(sorted_unique(row * count + cell), count)
     order = stable_order(cell, count)
     lookup: dict[str, NDArray[Any]] = {

@@ -147,15 +147,11 @@ class Observer:
         ----------
         time : str or datetime
             UTC, such as ``2026-11-22T10:00:00``; a time zone in it is heeded.
-        position_km : sequence of float, shape (3,), optional
-            Position relative to the origin, km, ICRS axes (of the Earth: GCRS, for which J2000
-            axes will do; not those of a two-line element set). The middle of the Earth by
-            default.
-        velocity_km_s : sequence of float, shape (3,), optional
-            Velocity relative to the origin, km/s, the same axes; that of the Earth by default.
+        position_km, velocity_km_s : sequence of float, shape (3,), optional
+            Relative to the origin, km and km/s, ICRS axes (of the Earth: GCRS, for which J2000
+            axes will do; not those of a two-line element set); those of the Earth by default.
         origin : {"earth", "barycentre"}
-            What both are relative to. Relative to the barycentre of the solar system both have
-            to be given.
+            What both are relative to; relative to the barycentre both have to be given.
 
         Returns
         -------
@@ -165,8 +161,7 @@ class Observer:
         Raises
         ------
         ConfigError
-            If the time is none, before 1900 or after 2099, or position and velocity are not
-            three numbers each, a velocity reaches that of light, or one is missing.
+            If an argument is out of range, such as a time before 1900 or after 2099, or missing.
         """
         moment = _utc(time)
         tt = _terrestrial(moment)

@@ -50,34 +50,25 @@ def identify_in_time(
     Parameters
     ----------
     identify : callable
-        `Matcher.identify`, its camera and options filled in: it is given the centroids and the
-        keyword ``magnitudes``.
-    database : Database
-        The stars that it names.
-    centroids_px : array_like of float64, shape (N, 2)
-        Pixels.
+        `Matcher.identify`, its camera and options filled in.
+    database, observer : Database, Observer
+        The stars that it names; when and from where the frame was taken.
+    centroids_px, magnitudes : array_like of float64, shape (N, 2) and (N,)
+        Pixels, and magnitudes of any zero point.
     camera : Camera
-        The camera that took the frame; where the answer has found another focal length, that one
-        counts.
-    observer : Observer
-        When and from where.
-    magnitudes : array_like of float64, shape (N,), optional
-        Magnitudes of the centroids, of any zero point.
-    tolerance_px : float, default 2
-        Largest distance of a spot from its planet, beside the error of the ephemeris.
-    max_false_match_probability : float, default 1e-9
-        Less certain answers are withheld.
+        The camera that took the frame; a focal length that the answer has found counts instead.
+    tolerance_px, max_false_match_probability : float
+        As of `Matcher`; a spot may be off its planet by the error of the ephemeris too.
 
     Returns
     -------
     MatchResult
         Spots of planets are in ``dropped``, with the planet's name in small letters as the
-        reason, and no star. A frame that is not identified, and whose spots have a brightness,
-        is asked again without one or two of its three brightest spots; such an answer is taken
-        only if a planet is at each of them, and its probability is that of all these questions.
+        reason. A frame that is not identified is asked again without one or two of its three
+        brightest spots; such an answer counts if a planet is at each of them, with the
+        probability of all these questions.
     """
     frame, mag = as_frame(centroids_px, magnitudes)
-    seen = bodies_seen(observer)
     found = identify(frame, magnitudes=mag)
 
     def rows_of(result: MatchResult) -> dict[int, str]:
@@ -87,15 +78,14 @@ def identify_in_time(
         matrix = _apparent_matrix(result, eye, frame, observer)
         star_mag = np.where(result.star_index >= 0, database.mag[result.star_index], np.nan)
         return planets_among(
-            frame, matrix, eye, seen, magnitudes=mag, star_mag=star_mag,
+            frame, matrix, eye, bodies_seen(observer), magnitudes=mag, star_mag=star_mag,
             tolerance_px=tolerance_px, faint_limit_mag=float(database.mag.max()),
         )  # fmt: skip
 
     if found.status == "identified":
         names = rows_of(found)
         return _without(identify, frame, mag, names) if names else found
-    questions = _bright_rows(mag)
-    for left_out in questions:
+    for left_out in (questions := _bright_rows(mag)):
         again = identify(_unset(frame, left_out), magnitudes=mag)
         names = rows_of(again)
         chance = again.false_match_probability * (1 + len(questions))
@@ -151,14 +141,12 @@ def planets_among(
 def _apparent_matrix(
     result: MatchResult, camera: Camera, frame: Array, observer: Observer
 ) -> Array:
-    """Return the attitude by apparent directions, from where the answer puts the spots."""
     body = camera.directions_from_pixels(frame[np.flatnonzero(result.star_index >= 0)])
     icrs = body @ matrix_from_quaternion(result.q_body_from_icrs)
     return solve_wahba_svd(body, observer.apparent(icrs))
 
 
 def _bright_rows(mag: Array | None) -> list[tuple[int, ...]]:
-    """Return the sets of spots that a frame is asked again without."""
     if mag is None or not np.isfinite(mag).any():
         return []
     rows = np.argsort(np.nan_to_num(mag, nan=np.inf), kind="stable")[:BRIGHTEST].tolist()

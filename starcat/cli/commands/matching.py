@@ -240,9 +240,7 @@ def calibrate(
 
     Example: starcat calibrate dist/gaia-12deg-1.0.0 frames.json -o camera.toml --plot left.svg
     """
-    from starcat.calibration.camera_text import write_camera
-    from starcat.calibration.files import calibrate_files
-    from starcat.calibration.residual_plot import draw_residuals
+    from starcat.calibration.files import calibrate_files, draw_residuals, write_camera
     from starcat.cli.terminal.calibrations import print_calibration
     from starcat.cli.terminal.console import progress_bars
     from starcat.images.figure_file import check_kind

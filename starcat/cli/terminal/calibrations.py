@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from starcat.calibration.calibrate import CalibratedFrame, Calibration
-from starcat.calibration.fit import Fit
-from starcat.calibration.lens import AXES, PARAMETERS
+from starcat.calibration.fit import AXES, PARAMETERS, Fit
 from starcat.calibration.models import Trial
 from starcat.cli.terminal.console import print_json, print_table, say
 
