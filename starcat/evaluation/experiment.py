@@ -264,7 +264,7 @@ def catalog_of_artifact(folder: Path) -> Sky:
 
 
 def blend(sky: Sky, limit_rad: float) -> Sky:
-    """Join the points that a camera cannot tell apart."""
+    """Join points closer than a limit, in the order of each group's brightest member."""
     pairs, apart = pairs_within(sky.directions, limit_rad)
     i, j = pairs[apart < limit_rad].T
     count = len(sky)

@@ -258,7 +258,10 @@ def _rounded(count: int) -> str:
 
 
 def table_bytes(table: pa.Table, rows: int | None = None) -> int:
-    """Return about how large the Parquet file of a table will be."""
+    """Return about how large the Parquet file of a table will be; exactly, of a small one.
+
+    ``rows`` are those of the whole product, where the table is a part of it.
+    """
     count = len(table) if rows is None else rows
     if len(table) <= PART_ROWS * PARTS and count == len(table):
         return parquet_bytes(table)

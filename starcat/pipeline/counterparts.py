@@ -43,21 +43,12 @@ from starcat.store.reading import read_catalog
 
 @dataclass(frozen=True)
 class Counterparts:
-    """The counterparts of a build's guide stars.
+    """The counterparts of a build's guide stars."""
 
-    Attributes
-    ----------
-    products : tuple of Product
-        The crossmatch product; none where the spec does not ask for it.
-    sources : tuple of SourceFacts
-        The catalogs they are of, as the manifest has them.
-    notes : tuple of str
-        What a user should know of the inputs.
-    """
-
+    # the crossmatch product; none where the spec does not ask for it
     products: tuple[Product, ...] = ()
-    sources: tuple[SourceFacts, ...] = ()
-    notes: tuple[str, ...] = ()
+    sources: tuple[SourceFacts, ...] = ()  # the catalogs they are of, as the manifest has them
+    notes: tuple[str, ...] = ()  # what a user should know of the inputs
 
 
 def model_from_spec(wanted: Crossmatch) -> MatchModel:

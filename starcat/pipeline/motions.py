@@ -53,21 +53,13 @@ OF_ENTRY = (
 
 @dataclass(frozen=True)
 class JoinedMotions:
-    """What became of the motions of a catalog's stars.
+    """What became of the motions of a catalog's stars."""
 
-    Attributes
-    ----------
-    catalog : Ingested
-        The catalog; its stars have their motions and are at the epoch of the build.
-    table : pyarrow.Table, optional
-        Rows of the schema ``motions`` for all its stars, in their order; None where the spec asks
-        for no motions.
-    sources : tuple of SourceFacts
-        The catalogs that motions were looked for in; ``joined`` counts all stars.
-    """
-
-    catalog: Ingested
+    catalog: Ingested  # the catalog; its stars have their motions and are at the epoch of the build
+    # rows of the schema ``motions`` for all its stars, in their order; None where the spec asks for
+    # no motions
     table: pa.Table | None = None
+    # the catalogs that motions were looked for in; ``joined`` counts all stars
     sources: tuple[SourceFacts, ...] = ()
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array
 from starcat.evaluation.experiment import catalog_of_artifact
-from starcat.evaluation.paper import Paper, Row, Statistic
+from starcat.evaluation.paper import Paper, Statistic
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
 from starcat.matcher.methods.order import is_well_shaped
@@ -49,7 +49,7 @@ def field_centroids(artifact: Path, step_deg: float) -> list[Array]:
 
 
 def passes(centroids_px: Array, triples: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Return which triangles of centroids meet S3's two constraints."""
+    """Return which triangles (rows of centroids, shape (T, 3)) meet S3's two constraints."""
     u, v, w = (centroids_px[triples[:, n]] for n in range(3))
     a, b, c = (np.hypot(*(p - q).T) for p, q in ((v, w), (u, w), (u, v)))
     return is_well_shaped(a, b, c, MIN_SIDE_PX, float(np.radians(MIN_ANGLE_DEG)))
@@ -146,16 +146,11 @@ def _optimised(centroids_px: Array) -> tuple[int, int, int] | None:
     return optimised_triangle(apart, MIN_SIDE_PX, float(np.radians(MIN_ANGLE_DEG)))
 
 
-def _rows(quick: bool) -> list[Row]:
-    return []
-
-
 PAPER = Paper(
     name="S3",
     title="Optimised selection of observation triangles",
     citation="Li et al. 2015, Journal of Astronautics",
     presets=(PRESET,),
-    rows=_rows,
     statistics=statistics,
     deviations=(
         "The paper does not print d_min and theta_min. 10 px and 15 deg reproduce its counts to "

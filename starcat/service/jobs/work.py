@@ -126,7 +126,7 @@ def _ingest(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
     made = order.work / name
     if to == "hats":
         from starcat.store.ingest import ingest_to_store
-        from starcat.store.options import StoreOptions
+        from starcat.store.plan import StoreOptions
 
         options = StoreOptions(
             memory_bytes=order.memory_bytes, workers=order.threads, scheduler=order.scheduler

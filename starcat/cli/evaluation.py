@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starcat.cli.commands.shared import Input, Json, inputs_by_source
+from starcat.cli.console import print_json, print_table, progress_bars, say
+from starcat.cli.options import Input, Json, inputs_by_source
 from starcat.errors import ConfigError
+
+if TYPE_CHECKING:
+    from starcat.evaluation.report.tables import Table
+    from starcat.evaluation.run import Evaluation
 
 app = typer.Typer()
 
@@ -88,8 +94,6 @@ def evaluate(
 
     Example: starcat evaluate dist/gaia-12deg-1.0.0 --noise-px 0,0.5,1 --frames 50
     """
-    from starcat.cli.terminal.console import progress_bars
-    from starcat.cli.terminal.evaluations import print_evaluation
     from starcat.evaluation.run import evaluate_artifact, evaluate_papers
     from starcat.evaluation.sweep import plan_sweep, sweep_values
     from starcat.specs.camera_file import read_camera
@@ -114,3 +118,32 @@ def evaluate(
             )  # fmt: skip
             found = evaluate_artifact(sweep, output, workers=workers, progress=progress)
     print_evaluation(found, as_json=json)
+
+
+def print_evaluation(evaluation: Evaluation, *, as_json: bool) -> None:
+    """Print what was measured."""
+    if as_json:
+        print_json(list(evaluation.contents))
+    else:
+        _print_tables(evaluation.contents)
+    say(f"wrote {evaluation.page}")
+
+
+def _print_tables(contents: Sequence[Mapping[str, Any]]) -> None:
+    from starcat.evaluation.report import tables as made
+
+    for content in contents:
+        failed = made.failure_table(content)
+        tables = [
+            *made.rate_tables(content, made.SHORT),
+            *made.statistic_tables(content, made.verdict),
+        ]
+        for table in (*tables, *([failed] if failed else [])):
+            _print(table, f"{content['name']}: ")
+    if summary := made.summary_table(contents):
+        _print(summary)
+
+
+def _print(table: Table, prefix: str = "") -> None:
+    heads = [head.replace(" guide stars", "\nguide stars") for head in table.heads]
+    print_table(prefix + table.title, heads, table.rows, table.numbers)

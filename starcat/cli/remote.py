@@ -1,4 +1,4 @@
-"""The commands that a service can do instead: building, asking, identifying."""
+"""Commands that a service can run instead: build, sql, identify."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from starcat.cli.console import say
 from starcat.errors import ConfigError, QueryError
 
 if TYPE_CHECKING:
     from starcat.client import Client
-    from starcat.specs.build_spec import BuildSpec
 
 COMMANDS = ("build", "sql", "identify")
 
-NOT_THERE = {
+LOCAL_OPTIONS = {
     "build": ("inputs", "replace", "workers", "max_memory"),
     "sql": ("show_views", "preamble", "memory_limit_gb"),
     "identify": ("dark", "mask", "time", "velocity", "orbit", "wcs", "track"),
 }
-"""Options that mean nothing there, or that a service does not take."""
+"""Options that a service does not take."""
 
-OF_IDENTIFY = (
+REMOTE_IDENTIFY_OPTIONS = (
     *("method", "tolerance_px", "noise_px", "noise_mag", "max_false_match_probability"),
     *("min_share", "max_steps", "time_limit_s", "flip", "psf_sigma_px", "threshold"),
     *("most_spots", "plane", "bayer", "prior_error_deg"),
 )
-"""Options that have the same name and value there."""
+"""Options of identify that a service takes under the same name."""
 
 
-def there(url: str, token: str | None, command: str) -> Client:
+def open_remote(url: str, token: str | None, command: str) -> Client:
     """Return the service that a command line names."""
     if not url.startswith(("http://", "https://")):
         raise ConfigError(
@@ -50,43 +50,7 @@ def there(url: str, token: str | None, command: str) -> Client:
     return Client(url, token)
 
 
-def build_there(context: typer.Context, spec: BuildSpec, output: Path, *, as_json: bool) -> None:
-    """Have a database built by a service, bring it here, and print what it holds."""
-    from starcat.artifact.reader import open_artifact
-    from starcat.cli.terminal.builds import print_artifact, print_rates
-    from starcat.cli.terminal.console import print_json, progress_bars, say
-    from starcat.simulation.selftest import rates_of
-
-    client = _client(context)
-    with progress_bars() as progress:
-        job = client.build(spec.recorded(), progress)
-        database = str(job["result"]["database"])
-        folder, outcome = client.download(database, output, progress)
-    report = client.report(database)
-    for warning in report["warnings"]:
-        say(f"warning: {warning}")
-    artifact = open_artifact(folder)
-    if as_json:
-        kept = ("filters", "coverage", "self_test", "warnings")
-        print_json(
-            {
-                "artifact": str(folder),
-                "report": str(folder / "report" / "index.html"),
-                "outcome": outcome,
-                "database": database,
-                "job": job["id"],
-                **{key: report[key] for key in kept},
-                **{key: artifact.manifest[key] for key in ("sources", "products", "files")},
-            }
-        )
-        return
-    print_artifact(artifact, as_json=False)
-    print_rates(list(map(rates_of, report["self_test"])), as_json=False)
-    say(f"{outcome}: {folder}")
-    say(f"database {database} of {client.url}")
-
-
-def sql_there(
+def sql_remotely(
     context: typer.Context,
     targets: list[str],
     query: str | None,
@@ -98,13 +62,11 @@ def sql_there(
     time_limit_s: float,
 ) -> None:
     """Ask a service a question in SQL, and print or keep the answer."""
-    from starcat.cli.terminal.asking import Wish, format_of_wish
-    from starcat.cli.terminal.console import say
-    from starcat.cli.terminal.queries import print_result
+    from starcat.cli.queries import Wish, format_of_wish, print_result
     from starcat.query.gallery import guessed
     from starcat.query.result import ResultTable
 
-    client = _client(context)
+    client = service_of(context)
     if query is None and named is None:
         raise QueryError("--server needs the query on the line, or --named; there is no prompt")
     if not targets:
@@ -128,12 +90,11 @@ def sql_there(
         sys.stdout.write(path.read_text(encoding="utf-8"))
 
 
-def identify_there(context: typer.Context, database: str, file: Path) -> None:
+def identify_remotely(context: typer.Context, database: str, file: Path) -> None:
     """Have a service identify frames, and print the answers."""
-    from starcat.cli.terminal.console import say
-    from starcat.cli.terminal.matches import print_contents
+    from starcat.cli.matches import print_contents
 
-    client, given = _client(context), context.params
+    client, given = service_of(context), context.params
     picture: Path | None = given["picture"]
     if picture is not None and picture.suffix.lower() not in (".png", ".svg"):
         raise ConfigError(f"{picture}: the picture is PNG or SVG; end its name so", key="picture")
@@ -156,10 +117,9 @@ def identify_there(context: typer.Context, database: str, file: Path) -> None:
 
 
 def _options_of(given: Mapping[str, Any]) -> dict[str, Any]:
-    from starcat.cli.commands.expected import chosen_prior
-    from starcat.cli.commands.shared import share_of_percent, unknown_field
+    from starcat.cli.options import chosen_prior, share_of_percent, unknown_field
 
-    options = {name: given[name] for name in OF_IDENTIFY if given[name] is not None}
+    options = {name: given[name] for name in REMOTE_IDENTIFY_OPTIONS if given[name] is not None}
     prior = chosen_prior(given["prior_q"], given["prior_error_deg"], track=False)
     size_px, fov_deg = unknown_field(given["size"], given["fov"], given["fov_error"])
     camera: Path | None = given["camera"]
@@ -184,9 +144,9 @@ def _of_stdin(folder: Path) -> Path:
     return path
 
 
-def _client(context: typer.Context) -> Client:
+def service_of(context: typer.Context) -> Client:
     """Return the service; refuse options that it does not take."""
-    for name in NOT_THERE[context.info_name or ""]:
+    for name in LOCAL_OPTIONS[context.info_name or ""]:
         source = context.get_parameter_source(name)
         if source is not None and source.name == "COMMANDLINE":
             option = next(one for one in context.command.params if one.name == name).opts[0]

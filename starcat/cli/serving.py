@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from starcat.cli.commands.shared import Json
+from starcat.cli.options import Json
 from starcat.errors import ConfigError, TargetMissing
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def serve(
     from starcat.service.settings import read_settings
 
     def announce(address: str) -> None:
-        from starcat.cli.terminal.console import print_json_line, say
+        from starcat.cli.console import print_json_line, say
 
         if json:
             print_json_line({"address": address, "root": str(root)})
@@ -91,7 +91,7 @@ def create(
         from starcat.service.access import Role
 
         token, text = store.create(name, Role.named(role), expires)
-    from starcat.cli.terminal.console import print_json, say
+    from starcat.cli.console import print_json, say
 
     if json:
         print_json({**token.as_dict(), "token": text})
@@ -125,7 +125,7 @@ def revoke(
 
 
 def _print_tokens(found: Sequence[Token], *, as_json: bool) -> None:
-    from starcat.cli.terminal.console import print_json, print_table
+    from starcat.cli.console import print_json, print_table
 
     rows = [token.as_dict() for token in found]
     if as_json:

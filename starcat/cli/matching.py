@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starcat.cli.commands.expected import PriorAttitude, PriorErrorDeg, Track, chosen_prior
-from starcat.cli.commands.shared import (
+from starcat.cli.options import (
     Dark,
     FailOnNoMatch,
     FieldRange,
@@ -26,12 +25,16 @@ from starcat.cli.commands.shared import (
     NoisePx,
     Orbit,
     Plane,
+    PriorAttitude,
+    PriorErrorDeg,
     PsfSigmaPx,
     Threshold,
     Time,
     TimeLimit,
+    Track,
     Velocity,
     WcsFile,
+    chosen_prior,
     field_range,
     observer_of_options,
     share_of_percent,
@@ -40,7 +43,7 @@ from starcat.cli.commands.shared import (
 )
 
 if TYPE_CHECKING:
-    from starcat.cli.terminal.matches import Tally
+    from starcat.cli.matches import Tally
     from starcat.images.solve_files import FileAnswers
 
 app = typer.Typer()
@@ -81,7 +84,7 @@ def methods(json: Json = False) -> None:
 
     Example: starcat methods
     """
-    from starcat.cli.terminal.matches import print_methods
+    from starcat.cli.matches import print_methods
 
     print_methods(as_json=json)
 
@@ -99,7 +102,7 @@ def simulate(
 
     Example: starcat simulate dist/gaia-12deg-1.0.0 -o frame.csv --seed 7
     """
-    from starcat.cli.terminal.matches import print_simulated
+    from starcat.cli.matches import print_simulated
     from starcat.images.render import write_simulated
     from starcat.matcher.database import open_database
     from starcat.simulation.simulate import Noise, simulate_frames
@@ -154,9 +157,9 @@ def identify(
     Example: starcat identify dist/gaia-12deg-1.0.0 frame.csv --picture frame.png
     """
     if context.obj is not None:
-        from starcat.cli.commands.there import identify_there
+        from starcat.cli.remote import identify_remotely
 
-        identify_there(context, artifact.name, file)
+        identify_remotely(context, artifact.name, file)
         return
     answers = _file_answers(file, artifact, context.params)
     tally = _print_file_answers(answers, picture, wcs, as_json=json, as_lines=ndjson)
@@ -196,8 +199,8 @@ def _print_file_answers(
     answers: FileAnswers, picture: Path | None, wcs: Path | None, *, as_json: bool, as_lines: bool
 ) -> Tally:
     """Print answers with what a user should know of them, and write what is asked for beside."""
-    from starcat.cli.terminal.console import say
-    from starcat.cli.terminal.matches import print_answers
+    from starcat.cli.console import say
+    from starcat.cli.matches import print_answers
     from starcat.images.image_file import expect_room_for_wcs
 
     is_picture = answers.measured.image is not None
@@ -241,8 +244,8 @@ def calibrate(
     Example: starcat calibrate dist/gaia-12deg-1.0.0 frames.json -o camera.toml --plot left.svg
     """
     from starcat.calibration.files import calibrate_files, draw_residuals, write_camera
-    from starcat.cli.terminal.calibrations import print_calibration
-    from starcat.cli.terminal.console import progress_bars
+    from starcat.cli.calibrations import print_calibration
+    from starcat.cli.console import progress_bars
     from starcat.images.figure_file import check_kind
     from starcat.matcher.matcher import Matcher
     from starcat.specs.camera_file import read_camera
@@ -274,8 +277,8 @@ def selftest(
 
     Example: starcat selftest dist/gaia-12deg-1.0.0 --frames 100
     """
-    from starcat.cli.terminal.builds import print_rates
-    from starcat.cli.terminal.console import progress_bars
+    from starcat.cli.builds import print_rates
+    from starcat.cli.console import progress_bars
     from starcat.matcher.matcher import Matcher
     from starcat.simulation.selftest import self_test
 

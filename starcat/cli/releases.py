@@ -1,14 +1,21 @@
-"""The commands about published versions."""
+"""Commands about published versions: publish, pull, releases."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from starcat.cli.commands.shared import Json
+from starcat.cli.console import print_json, print_table, progress_bars, say
+from starcat.cli.options import Json
 from starcat.errors import ConfigError
+
+if TYPE_CHECKING:
+    from starcat.releases.publishing import Published
+    from starcat.releases.pulling import Pulled
+    from starcat.releases.tree import Listed
 
 app = typer.Typer()
 
@@ -25,8 +32,6 @@ def publish(
 
     Example: starcat publish dist/gaia-12deg-1.0.0 registry
     """
-    from starcat.cli.terminal.console import progress_bars
-    from starcat.cli.terminal.published import print_published
     from starcat.releases.publishing import publish_artifact
 
     with progress_bars() as progress:
@@ -62,8 +67,6 @@ def pull(
 
     Example: starcat pull gaia-12deg@latest --registry registry -o onboard
     """
-    from starcat.cli.terminal.console import progress_bars
-    from starcat.cli.terminal.published import print_pulled
     from starcat.releases.project import pull_pinned, pull_wanted
     from starcat.storage.download import DownloadOptions
 
@@ -88,9 +91,73 @@ def releases(
 
     Example: starcat releases registry
     """
-    from starcat.cli.terminal.published import print_releases
     from starcat.releases.registry import open_registry
     from starcat.storage.download import DownloadOptions
 
     opened = open_registry(registry, DownloadOptions(retries))
     print_releases(opened.releases(), as_json=json)
+
+
+DIGEST_LETTERS = 16
+"""Letters of a digest that a table shows; JSON has all."""
+
+
+def print_published(published: Published, *, as_json: bool) -> None:
+    """Print what became of a publication."""
+    release = published.release
+    if as_json:
+        print_json(published.as_dict())
+        return
+    row = (
+        release.name,
+        release.version,
+        release.files,
+        f"{release.bytes:,}",
+        published.new_blobs,
+        f"{published.new_bytes:,}",
+        release.manifest.sha256[:DIGEST_LETTERS],
+    )
+    columns = ("artifact", "version", "files", "bytes", "new files", "new bytes", "manifest")
+    print_table("", columns, [row], numbers=(2, 3, 4, 5))
+    say(f"{published.outcome}: {release.title} in {published.registry}")
+
+
+def print_pulled(pulled: Sequence[Pulled], *, as_json: bool) -> None:
+    """Print what became of pulls."""
+    if as_json:
+        print_json([one.as_dict() for one in pulled])
+        return
+    rows = [
+        (
+            one.release.name,
+            one.release.version,
+            one.release.manifest.sha256[:DIGEST_LETTERS],
+            str(one.folder),
+        )
+        for one in pulled
+    ]
+    print_table("", ("artifact", "version", "manifest", "folder"), rows)
+    for one in pulled:
+        say(f"{one.outcome}: {one.folder}")
+
+
+def print_releases(releases: Sequence[Listed], *, as_json: bool) -> None:
+    """Print what a registry lists."""
+    highest = {release.name: release for release in releases}
+    if as_json:
+        marked = [r.model_dump() | {"is_latest": highest[r.name] is r} for r in releases]
+        print_json(marked)
+        return
+    rows = [
+        (
+            release.name,
+            release.version,
+            "latest" if highest[release.name] is release else "",
+            release.files,
+            f"{release.bytes:,}",
+            release.manifest.sha256[:DIGEST_LETTERS],
+        )
+        for release in releases
+    ]
+    columns = ("artifact", "version", "", "files", "bytes", "manifest")
+    print_table("", columns, rows, numbers=(3, 4))

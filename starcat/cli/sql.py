@@ -1,4 +1,4 @@
-"""The command that asks questions in SQL."""
+"""The command that runs SQL queries."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from starcat.cli.commands.shared import Json
+from starcat.cli.options import Json
 from starcat.errors import QueryError
 from starcat.exchange.formats import FILE_FORMATS
 
@@ -60,22 +60,22 @@ def sql(
     Example: starcat sql dist/gaia-12deg-1.0.0 "SELECT designation, mag FROM cone(37.95, 89.26, 5)"
     """
     if show_list or show_macros:
-        from starcat.cli.terminal.queries import print_gallery, print_macros
+        from starcat.cli.queries import print_gallery, print_macros
 
         (print_gallery if show_list else print_macros)(as_json=json)
         return
     if context.obj is not None:
-        from starcat.cli.commands.there import sql_there
+        from starcat.cli.remote import sql_remotely
 
         targets, query = _split(arguments or [], named)
         wanted = form or ("json" if json else None)
         there = (targets, query, named, dict(_set(values)), wanted, output, rows, time_limit_s)
-        sql_there(context, *there)
+        sql_remotely(context, *there)
         return
     from starcat.query.engine import warm_up
 
     warm_up()  # it starts while the rest is imported
-    from starcat.cli.terminal.asking import Wish, answer, print_preamble, show
+    from starcat.cli.queries import Wish, answer, print_preamble, show
     from starcat.query.session import Limits
 
     limits = Limits(time_limit_s, memory_limit_gb)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from starcat.cli.terminal.console import print_json, print_json_line, print_table
+from starcat.cli.console import print_json, print_json_line, print_table
 from starcat.errors import NotIdentifiedError
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.images.solve_files import FrameAnswer, facts

@@ -1,4 +1,4 @@
-"""The commands that give tables to other tools and take theirs."""
+"""The command that writes tables for other tools and images for flight software."""
 
 from __future__ import annotations
 
@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starcat.cli.commands.shared import Json
+from starcat.cli.console import print_json, print_table, say
+from starcat.cli.options import Json
 from starcat.errors import ConfigError
 from starcat.exchange.formats import EXPORT_FORMATS, ONBOARD_FORMATS
 
 if TYPE_CHECKING:
-    from starcat.exchange.export import NamedTables
+    from starcat.exchange.export import Exported, NamedTables
+    from starcat.exchange.onboard import ExportedImage
+    from starcat.onboard.reading import OnboardImage
 
 app = typer.Typer()
 
@@ -78,7 +81,6 @@ def export(
         _export_image(source, form, output, of_images, replace=replace, as_json=json)
         return
     _refuse(form, of_images if form == "hats" else of_images | of_hats)
-    from starcat.cli.terminal.exports import print_exported
     from starcat.exchange.export import export_tables
     from starcat.exchange.hats import MAX_ROWS
 
@@ -102,7 +104,6 @@ def _export_image(
     replace: bool,
     as_json: bool,
 ) -> None:
-    from starcat.cli.terminal.onboard import print_exported_image
     from starcat.exchange.onboard import export_image
 
     given = {name: value for name, value in options.items() if value is not None}
@@ -131,3 +132,85 @@ def _tables(source: Path | None, peer: str | None) -> NamedTables:
     if peer is not None:
         return peer_tables(peer, source)
     return tables_of(_named(source))
+
+
+def print_exported(exported: Exported, *, as_json: bool) -> None:
+    """Print what was written where; rows left out are told on stderr."""
+    from starcat.exchange.export import COLUMNS_NAME
+
+    for file in exported.files:
+        if file.left_out:
+            say(f"{file.product}: {file.left_out:,} rows without a position are left out")
+    if as_json:
+        print_json(exported.as_dict())
+        return
+    rows = [
+        (file.product, file.name, f"{file.rows:,}", f"{file.bytes:,}") for file in exported.files
+    ]
+    title = f"{exported.source} as {exported.file_format}"
+    print_table(title, ("product", "file", "rows", "bytes"), rows, numbers=(2, 3))
+    beside = f", {COLUMNS_NAME} says what the columns are" if exported.has_columns else ""
+    print_table("", (f"in {exported.folder}{beside}",), [])
+
+
+LIBRARY_STARS = 192
+"""Stars in a field that the onboard library holds unless it is told otherwise."""
+
+
+def print_exported_image(exported: ExportedImage, *, as_json: bool) -> None:
+    """Print what was written, and say what was left out on stderr."""
+    fitted, made = exported.fitted, exported.made
+    noun = _features(fitted.contents.method)
+    if fitted.features < fitted.features_before:
+        say(f"{fitted.features_before - fitted.features:,} {noun} are left out, to fit")
+    if fitted.stars_per_field is not None:
+        say(
+            f"{fitted.stars_before - fitted.stars:,} stars are left out, to fit: those that are "
+            f"not among the {fitted.stars_per_field} brightest of a field"
+        )
+    if made.most_near > LIBRARY_STARS:
+        say(
+            f"a field may have {made.most_near} stars: compile the onboard library with "
+            f"-DSTARCAT_MAX_STARS={made.most_near}, as it holds {LIBRARY_STARS} otherwise"
+        )
+    if as_json:
+        print_json(exported.as_dict())
+        return
+    rows = [
+        ("method, byte order", f"{fitted.contents.method}, {exported.byte_order}-endian"),
+        ("stars", f"{fitted.stars:,} of {fitted.stars_before:,}"),
+        (noun, f"{fitted.features:,} of {fitted.features_before:,}"),
+        ("image", f"{len(made.data):,} bytes"),
+        *(("file", str(path)) for path in exported.files),
+    ]
+    print_table(f"{fitted.contents.name} as {exported.file_format}", ("", ""), rows)
+
+
+def print_image(image: OnboardImage, *, as_json: bool) -> None:
+    """Print what an image holds."""
+    if as_json:
+        print_json(image.as_dict())
+        return
+    from starcat.onboard.layout import DIRECTION_SCALE
+
+    header, arcsec = image.header, 206264.80624709636 / DIRECTION_SCALE
+    rows = [
+        ("format", f"{image.version}, {image.byte_order}-endian"),
+        ("epoch", f"J{header['epoch_jyear']:g}"),
+        ("camera", image.camera.in_words),
+        ("method", image.method),
+        ("stars", f"{header['n_stars']:,}, at most {header['most_near']} near a field"),
+        (_features(image.method), f"{header['n_features']:,}"),
+        ("quantum", f"{arcsec:.2g} arcsec, 0.001 mag"),
+        ("manifest", f"sha256 {image.manifest_sha256}"),
+        ("image", f"{len(image.data):,} bytes"),
+    ]
+    print_table(image.name, ("", ""), rows)
+    sections = [
+        (name, f"{len(part):,}", f"{part.nbytes:,}") for name, part in image.sections.items()
+    ]
+    print_table("", ("section", "rows", "bytes"), sections, numbers=(1, 2))
+
+
+def _features(method: str) -> str:
+    return "triangles" if method == "triangle" else "pairs"

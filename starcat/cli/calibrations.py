@@ -13,7 +13,7 @@ import numpy as np
 from starcat.calibration.calibrate import CalibratedFrame, Calibration
 from starcat.calibration.fit import AXES, PARAMETERS, Fit
 from starcat.calibration.models import Trial
-from starcat.cli.terminal.console import print_json, print_table, say
+from starcat.cli.console import print_json, print_table, say
 
 _SHORT = {
     "focal_length_px": "focal length",
