@@ -108,8 +108,7 @@ def sky_of() -> Callable[..., Database]:
     from starcat.geometry.camera import Camera
     from starcat.matcher.database import Database, ProductArrays
     from starcat.products.boresights import tile_sphere
-    from starcat.products.pairs import find_pairs
-    from starcat.products.triangles import find_triangles
+    from starcat.products.pairs_and_triangles import find_pairs, find_triangles
 
     def make(
         u: NDArray[np.float64], camera: Camera | None = None, boresights: int = 1000

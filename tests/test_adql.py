@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from starcat.errors import QueryError
 from starcat.geometry.sphere import directions_from_radec
 from starcat.query.session import Session, open_session
-from starcat.vo.adql import translate
+from starcat.vo.adql import ask, translate
 from starcat.vo.adql_grammar import parse_adql
-from starcat.vo.answer import ask
 from starcat.vo.tables import Column, Schema, Table, Tables
 from starcat.vo.tap_schema import session_schemas
 

@@ -15,7 +15,7 @@ from starcat.geometry.sphere import (
     separation,
 )
 from starcat.products.boresights import FieldStars, NominalField, stars_in_fields, tile_sphere
-from starcat.products.pairs import find_pairs
+from starcat.products.pairs_and_triangles import find_pairs
 
 # Both sides round their coordinates; nothing else differs.
 ROUNDING_RAD = 1e-15

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from starcat.catalog.fetching.locate import locate
 from starcat.catalog.ingest import ingest
+from starcat.catalog.source_files import locate
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.geometry.attitude import matrix_from_quaternion, random_attitudes
 from starcat.geometry.camera import Camera

@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import os
 import re
-import signal
 import subprocess
 import sys
-import time
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from served import serve
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -67,52 +66,16 @@ frames = 20
 """
 """What the path begins with: fainter stars are not needed, and take time."""
 
-READY_S = 90.0
-
 BUILD_MS = 90_000.0
 """A build of the path takes 5 s on a machine that does nothing else."""
 
 
 @pytest.fixture(scope="module")
-def screenshots(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    named = os.environ.get("STARCAT_SCREENSHOTS")
-    folder = Path(named) if named else tmp_path_factory.mktemp("screenshots")
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
-
-
-@pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """The address of a service that runs, with a folder of its own."""
-    root = tmp_path_factory.mktemp("browser") / "service"
-    root.mkdir()
-    (root / "service.toml").write_text('anonymous = "publisher"\n', encoding="utf-8")
-    log = root.with_name("log")
-    with log.open("wb") as out:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "starcat", "serve", "--root", root, "--port", "0"],
-            stdout=out,
-            stderr=subprocess.STDOUT,
-        )
-        try:
-            yield _address(process, log)
-        finally:
-            process.send_signal(signal.SIGTERM)
-            try:
-                process.wait(20)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-
-
-def _address(process: subprocess.Popen[bytes], log: Path) -> str:
-    until = time.monotonic() + READY_S
-    while time.monotonic() < until and process.poll() is None:
-        found = re.search(r"starcat serves .* at (http://\S+?)/?\s", log.read_text())
-        if found:
-            return found[1]
-        time.sleep(0.1)
-    raise AssertionError(f"the service did not start:\n{log.read_text()[-3000:]}")
+    folder = tmp_path_factory.mktemp("browser")
+    with serve(folder / "service", folder / "log", anonymous="publisher") as served:
+        yield served.address
 
 
 @pytest.fixture(scope="module")
@@ -149,19 +112,23 @@ def no_complaints(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def shoot(page: Page, screenshots: Path) -> Callable[[str], None]:
-    """Take pictures of the page as it is, at every width, light and dark."""
+def shoot(page: Page) -> Callable[[str], None]:
+    """Take pictures of the page as it is, at every width, light and dark, where they are wanted."""
+    folder = os.environ.get("STARCAT_SCREENSHOTS")
 
     def take(name: str) -> None:
-        for theme in ("light", "dark"):
-            page.emulate_media(color_scheme=theme)
+        for theme in ("light", "dark") if folder else ():
             for width in WIDTHS_PX:
-                page.set_viewport_size({"width": width, "height": 900 if width > 500 else 780})
-                page.screenshot(path=screenshots / f"{name}-{width}-{theme}.png")
-        page.emulate_media(color_scheme="light")
-        page.set_viewport_size({"width": 1280, "height": 900})
+                _look(page, theme, width)
+                page.screenshot(path=f"{folder}/{name}-{width}-{theme}.png")
+        _look(page, "light", 1280)
 
     return take
+
+
+def _look(page: Page, theme: str, width: int) -> None:
+    page.emulate_media(color_scheme=theme)
+    page.set_viewport_size({"width": width, "height": 900 if width > 500 else 780})
 
 
 # The path
@@ -241,7 +208,7 @@ def test_a_build_is_watched_until_it_is_done(built, page):
 
 
 @pytest.fixture(scope="module")
-def looked_at(built: str, page: Page, shoot: Callable[[str], None], screenshots: Path) -> str:
+def looked_at(built: str, page: Page, shoot: Callable[[str], None]) -> str:
     """The database after its facts, its coverage and its report were looked at."""
     page.goto("/databases")
     page.get_by_role("link", name="browser 1.0.0").click()
@@ -252,7 +219,7 @@ def looked_at(built: str, page: Page, shoot: Callable[[str], None], screenshots:
     shoot("coverage")
     page.get_by_role("link", name="Build report").click()
     page.wait_for_url("**/report")
-    page.screenshot(path=screenshots / "report.png")
+    shoot("report")
     # A report can do nothing, not even what a driver of browsers would have it do.
     page.complaints = [one for one in page.complaints if "sandboxed" not in one]
     return built
@@ -395,7 +362,7 @@ def addresses(job: str, published: str, identified: str) -> list[str]:
     ]
 
 
-NARROW_AND_WIDE = (("light", 360), ("dark", 1280))
+NARROW_AND_WIDE = (("light", 360), ("dark", 768))
 
 
 @pytest.mark.parametrize(
@@ -404,50 +371,36 @@ NARROW_AND_WIDE = (("light", 360), ("dark", 1280))
         NARROW_AND_WIDE,
         pytest.param((("dark", 360), ("light", 1280)), marks=pytest.mark.slow),
     ],
-    ids=["light and narrow, dark and wide", "dark and narrow, light and wide"],
+    ids=["light and narrow, dark and middling", "dark and narrow, light and wide"],
 )
-def test_axe_finds_no_violation_on_any_page(addresses, page, looks):
+def test_every_page_is_painted_soon_fits_its_window_and_passes_axe(addresses, page, looks):
     axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
     found = []
     for address in addresses:
-        page.goto(address)
+        assert min(_paint_ms(page, address)) < MOST_PAINT_MS, address
         if address.startswith("/new"):
             _settled(page)
         for theme, width in looks:
-            page.emulate_media(color_scheme=theme)
-            page.set_viewport_size({"width": width, "height": 800})
+            _look(page, theme, width)
+            assert page.evaluate("document.documentElement.scrollWidth") <= width, address
             for one in axe.run(page).response["violations"]:
                 nodes = [node["html"][:160] for node in one["nodes"][:3]]
                 found.append((address, theme, width, one["id"], nodes))
-    page.emulate_media(color_scheme="light")
-    page.set_viewport_size({"width": 1280, "height": 900})
+    _look(page, "light", 1280)
     page.complaints = [one for one in page.complaints if not re.search("40[04]", one)]
     assert found == []
 
 
-def test_no_page_is_wider_than_its_window(addresses, page):
-    for width in (360, 768):
-        page.set_viewport_size({"width": width, "height": 800})
-        for address in addresses:
-            page.goto(address)
-            assert page.evaluate("document.documentElement.scrollWidth") <= width, address
-    page.set_viewport_size({"width": 1280, "height": 900})
-    page.complaints = [one for one in page.complaints if not re.search("40[04]", one)]
-
-
-def test_every_page_is_painted_within_a_second(addresses, page):
-    for address in addresses:
-        times_ms = []
-        for _ in range(3):  # the machine may be busy with something else
-            page.goto(address)
-            painted = page.wait_for_function(
-                "() => performance.getEntriesByName('first-contentful-paint')[0]?.startTime"
-            )
-            times_ms.append(painted.json_value())
-            if times_ms[-1] < MOST_PAINT_MS:
-                break
-        assert min(times_ms) < MOST_PAINT_MS, (address, times_ms)
-    page.complaints = [one for one in page.complaints if not re.search("40[04]", one)]
+def _paint_ms(page: Page, address: str) -> Iterator[float]:
+    """Give how long the first paint takes, up to thrice: the machine may be busy."""
+    for _ in range(3):
+        page.goto(address)
+        painted = page.wait_for_function(
+            "() => performance.getEntriesByName('first-contentful-paint')[0]?.startTime"
+        )
+        yield float(painted.json_value())
+        if painted.json_value() < MOST_PAINT_MS:
+            return
 
 
 def test_a_page_is_used_with_the_keyboard_only(built, page):

@@ -10,21 +10,25 @@ import pytest
 
 import starcat as starcat_package
 from starcat.calibration.calibrate import calibrate_frames
-from starcat.calibration.camera_text import calibrated_toml
-from starcat.calibration.files import calibrate_files, starting_camera
-from starcat.calibration.fit import Seen, fit_camera
-from starcat.calibration.lens import (
+from starcat.calibration.files import (
+    calibrate_files,
+    calibrated_toml,
+    draw_residuals,
+    starting_camera,
+)
+from starcat.calibration.fit import (
     CENTRE,
     FOCAL,
     PARAMETERS,
+    Seen,
     camera_of,
+    fit_camera,
     project,
     turn_derivatives,
     value_derivatives,
     values_of,
 )
 from starcat.calibration.models import COMPLETE, choose_model, chosen
-from starcat.calibration.residual_plot import draw_residuals
 from starcat.errors import CalibrationError, ConfigError, OutputError
 from starcat.geometry.attitude import matrix_from_quaternion
 from starcat.geometry.camera import Camera

@@ -16,11 +16,11 @@ from genuine_records import PSC, SAO, SUPPL_1, TYC2, TYC_MAIN
 
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.archives.sao import PRINTED_PM_DEC_ARCSEC_YR, icrs_from_fk5
-from starcat.catalog.ingest import Ingested, ingest
+from starcat.catalog.ingest import Ingested, StarTables, ingest
 from starcat.catalog.proper_motion import Motion, propagate
-from starcat.catalog.quality import Quality
 from starcat.catalog.source import data_source
 from starcat.catalog.stars import directions_of, floats_of
+from starcat.catalog.verdict import Quality
 from starcat.errors import BuildError, ConfigError, ParseError, SourceMissing
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.storage.schema import product_schema
@@ -1042,7 +1042,7 @@ def test_a_file_cut_off_in_its_last_line(read: Callable[..., Ingested], source: 
 def test_a_block_without_a_good_record(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str
 ) -> None:
-    monkeypatch.setattr("starcat.catalog.readers.files.BLOCK_BYTES", 600)
+    monkeypatch.setattr("starcat.catalog.readers.blocks.BLOCK_BYTES", 600)
     path = tmp_path / FILES[source]
     path.write_bytes((GENUINE[source] + b"\n") * 4 + b"bad\n" * 9)
     read = ingest(source, [path])
@@ -1147,10 +1147,13 @@ def test_an_upper_limit_of_the_brightness_is_no_magnitude_within_the_read_limit(
 def test_records_that_get_lost_are_a_fault_of_starcat(
     read: Callable[..., Ingested], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        "starcat.catalog.ingest.join_parts",
-        lambda stars, rejected: (stars[0].slice(1), rejected[0]),
-    )
+    joined = StarTables.joined
+
+    def lose_one(tables: StarTables) -> Any:
+        stars, rejected = joined(tables)
+        return stars.slice(1), rejected
+
+    monkeypatch.setattr(StarTables, "joined", lose_one)
     with pytest.raises(BuildError, match="2 records read, but 1 kept and 0 rejected"):
         read("sao", sao(sao="     1"), sao(sao="     2"))
 
@@ -1169,7 +1172,7 @@ def test_nearest_neighbours_are_those_of_all_that_was_read(read: Callable[..., I
 
 def test_blocks_do_not_matter(catalogs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = ingest("sao", [catalogs / "sao.dat.gz"], neighbours=False)
-    monkeypatch.setattr("starcat.catalog.readers.files.BLOCK_BYTES", 200_001)
+    monkeypatch.setattr("starcat.catalog.readers.blocks.BLOCK_BYTES", 200_001)
     parts = ingest("sao", [catalogs / "sao.dat.gz"], neighbours=False)
     for name in ("star_id", "source_line", "mag", "designation", "double_flag"):
         assert parts.stars[name].equals(whole.stars[name]), name

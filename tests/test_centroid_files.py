@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from starcat.images.identification import measure
+from starcat.images.solve_files import measure
 from starcat.matcher.centroids import MeasuredFrame, read_frames, said_of_columns, upside_down
 
 LIGHT = np.array([100.0, 1.0, 10.0])

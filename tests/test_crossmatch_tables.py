@@ -16,12 +16,12 @@ import pyarrow as pa
 import pytest
 from jsonschema import Draft202012Validator
 
-from starcat.artifact.content import content_sha256
 from starcat.artifact.crossmatch_table import counterpart_problems, matched_stars, moving_stars
 from starcat.artifact.diff import diff_artifacts
 from starcat.artifact.manifest import MANIFEST_VERSION, manifest_digest
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import verify_artifact
+from starcat.artifact.writer import content_sha256
 from starcat.catalog.ingest import ingest
 from starcat.catalog.proper_motion import MAS, Motion, propagate
 from starcat.catalog.selection import select_guide_stars

@@ -18,11 +18,11 @@ from starcat.artifact.manifest import DATABASE_NAME, MANIFEST_NAME
 from starcat.errors import BuildError, ConfigError
 from starcat.pipeline.build import Inputs, build
 from starcat.pipeline.catalog_snapshot import CatalogSnapshot, read_snapshot, reading_keys
+from starcat.pipeline.cost import PART_ROWS, PARTS, table_bytes
 from starcat.pipeline.counts import triple_of_rank
 from starcat.pipeline.estimate import Estimate, choose_stars, estimate, estimate_spec
 from starcat.pipeline.guide_stars import brightest_of_fields, select_stars
 from starcat.pipeline.recipes import tile_guide_stars
-from starcat.pipeline.sizes import PART_ROWS, PARTS, table_bytes
 from starcat.products.boresights import NominalField, stars_in_fields
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import content_of_toml, preset, preset_names, spec_from_dict
@@ -51,7 +51,7 @@ def read(small, small_spec: str) -> CatalogSnapshot:
 
 
 def check(found: Estimate, folder: Path, least_bytes: int = 0) -> None:
-    """Compare an estimate with an artifact: stars to the last one, files within 10 %."""
+    """Compare an estimate with an artifact: stars to the last one, files within 20 %."""
     manifest = json.loads((folder / MANIFEST_NAME).read_bytes())
     [stars, *_] = manifest["sources"]
     assert found.cost.stars == stars["kept"] == manifest["products"]["stars"]["rows"]
@@ -64,7 +64,7 @@ def check(found: Estimate, folder: Path, least_bytes: int = 0) -> None:
         real = (folder / name).stat().st_size
         if name == "report":
             real = report + (folder / MANIFEST_NAME).stat().st_size
-        assert size == pytest.approx(real, rel=0.1, abs=least_bytes), name
+        assert size == pytest.approx(real, rel=0.2, abs=least_bytes), name
     for name, rows in found.cost.rows.items():
         assert rows == pytest.approx(manifest["products"][name]["rows"], rel=0.06), name
 
@@ -101,7 +101,7 @@ def check_small(found: Estimate, folder: Path) -> None:
     assert found.cost.stars == manifest["products"]["stars"]["rows"]
     assert found.rejected == manifest["sources"][0]["rejected"]
     for name, size in small_files.items():
-        assert size == pytest.approx((folder / name).stat().st_size, rel=0.1), name
+        assert size == pytest.approx((folder / name).stat().st_size, rel=0.2), name
 
 
 @pytest.mark.slow

@@ -22,26 +22,22 @@ import pyarrow.parquet as pq
 import pytest
 from astropy.stats import binom_conf_interval
 
-from starcat.cli.terminal.evaluations import print_evaluation
+from starcat.cli.evaluation import print_evaluation
 from starcat.errors import ConfigError, ProductError
+from starcat.evaluation import experiment
 from starcat.evaluation import run as evaluate
-from starcat.evaluation import trial
-from starcat.evaluation.axes import AXES, axis_label
 from starcat.evaluation.campaign import MeasuredRow, Outcome, _measured, is_goal_reached, run_paper
-from starcat.evaluation.earlier import with_earlier
-from starcat.evaluation.judge import FIELDS
+from starcat.evaluation.experiment import Attitudes, Experiment
 from starcat.evaluation.paper import Paper, Row, Statistic
-from starcat.evaluation.papers import table as registry
 from starcat.evaluation.rates import (
     CAUSES,
     MEANINGS,
     RULES,
+    ExperimentRates,
     Share,
-    TrialRates,
     failures_of,
     rates_of,
 )
-from starcat.evaluation.report.columns import LONG, SHORT, milliseconds
 from starcat.evaluation.report.files import (
     RESULTS,
     rates_csv,
@@ -56,10 +52,17 @@ from starcat.evaluation.report.plots import (
     series_of,
     series_order,
 )
-from starcat.evaluation.report.tables import failure_table, rate_tables, summary_table
-from starcat.evaluation.run import Evaluation, evaluate_artifact, evaluate_papers
-from starcat.evaluation.sweep import plan_sweep, sweep_paper, sweep_values
-from starcat.evaluation.trial import Attitudes, Trial
+from starcat.evaluation.report.tables import (
+    LONG,
+    SHORT,
+    failure_table,
+    milliseconds,
+    rate_tables,
+    summary_table,
+)
+from starcat.evaluation.run import Evaluation, evaluate_artifact, evaluate_papers, with_earlier
+from starcat.evaluation.score import FIELDS
+from starcat.evaluation.sweep import PARAMETERS, axis_label, plan_sweep, sweep_paper, sweep_values
 from starcat.geometry.camera import Camera
 from starcat.matcher.methods.table import METHODS, Method
 from starcat.simulation.simulate import Noise
@@ -68,20 +71,22 @@ from starcat.specs.reading import spec_from_dict
 FRAMES = Attitudes("random", 8)
 
 
-def trial_of(name: str, method: str = "triangle", **noise: Any) -> Trial:
-    return Trial(name, method, FRAMES, Noise(**{"limit_mag": 6.0, **noise}))
+def experiment_of(name: str, method: str = "triangle", **noise: Any) -> Experiment:
+    return Experiment(name, method, FRAMES, Noise(**{"limit_mag": 6.0, **noise}))
 
 
 def rows(quick: bool) -> list[Row]:
-    few = trial_of("few", limit_mag=2.6)  # mostly frames with fewer than four stars
+    few = experiment_of("few", limit_mag=2.6)  # mostly frames with fewer than four stars
     table = [
         Row("A table", "few & <far>", "small", few, "attitude", 90.0, 12.3, 99.0, 0.1, "4+"),
-        Row("A table", "few | again", "small", few, "two_stars", 1.5, note="of the same trial"),
-        Row("A table", "all", "small", trial_of("all"), "reference", goal_percent=10.0),
+        Row(
+            "A table", "few | again", "small", few, "two_stars", 1.5, note="of the same experiment"
+        ),
+        Row("A table", "all", "small", experiment_of("all"), "reference", goal_percent=10.0),
     ]
     curve = [
         Row("Position noise", f"{method}, {x:g} px", "small",
-            trial_of(f"noise-{x:g}-{method}", method, noise_px=x), "starcat",
+            experiment_of(f"noise-{x:g}-{method}", method, noise_px=x), "starcat",
             95.0 if x == 1.0 and method == "pairs" else None, x=x)
         for method in ("triangle", "pairs") for x in (1.0, 0.0)
     ]  # fmt: skip
@@ -184,7 +189,7 @@ def random_file(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[list[dict[str, Any]], Path]:
     made = random_records(*request.param)
-    path = tmp_path_factory.mktemp("random") / "trial.parquet"
+    path = tmp_path_factory.mktemp("random") / "experiment.parquet"
     pq.write_table(pa.Table.from_pylist(made), path)
     return made, path
 
@@ -201,7 +206,7 @@ def test_rates_are_what_a_loop_counts(
     rates = rates_of(path, rule, REACH_PX)
     enough = [r for r in made if r["n_guide_stars"] >= 4]
     times = [r["time_ms"] for r in made]
-    expected = TrialRates(
+    expected = ExperimentRates(
         Share(len(enough), len(made)),
         Share(sum(map(BY_HAND[rule], made)), len(made)),
         Share(sum(map(BY_HAND[rule], enough)), len(enough)),
@@ -238,8 +243,8 @@ def test_rows_are_judged_by_their_trials_limit(
     random_file: tuple[list[dict[str, Any]], Path],
 ) -> None:
     made, path = random_file
-    row = Row("g", "l", "small", replace(trial_of("t"), tolerance_px=1.0), "attitude")
-    assert row.trial.attitude_limit_px == pytest.approx(REACH_PX)
+    row = Row("g", "l", "small", replace(experiment_of("t"), tolerance_px=1.0), "attitude")
+    assert row.experiment.attitude_limit_px == pytest.approx(REACH_PX)
     found = _measured(row, path)
     assert found.rates.by_rule.hits == sum(map(right, made))
     assert sum(found.failures.values()) == len(made) - sum(map(right, made))
@@ -251,8 +256,10 @@ def test_rows_are_judged_by_their_trials_limit(
 def test_a_campaign_measures_every_row(outcome: Outcome, records: Path) -> None:
     assert [one.row for one in outcome.rows] == rows(False)
     assert all(one.rates.by_rule.count == 8 for one in outcome.rows)
-    assert {path.stem for path in (records / "S0").iterdir()} == {r.trial.name for r in rows(False)}
-    clean = next(one for one in outcome.rows if one.row.trial.name == "noise-0-triangle")
+    assert {path.stem for path in (records / "S0").iterdir()} == {
+        r.experiment.name for r in rows(False)
+    }
+    clean = next(one for one in outcome.rows if one.row.experiment.name == "noise-0-triangle")
     assert clean.rates.by_rule.percent == 100.0
 
 
@@ -280,13 +287,13 @@ def test_a_stopped_campaign_goes_on_where_it_was(
     lost = tmp_path / "S0" / "all.parquet"
     left = lost.with_name(".all.parquet.0.partial")
     lost.rename(left)  # as if killed just before it was done
-    ran, part = [], trial._run_part
+    ran, part = [], experiment._run_part
 
     def counted(task: Any) -> Any:
         ran.append(task[0].name)
         return part(task)
 
-    monkeypatch.setattr(trial, "_run_part", counted)
+    monkeypatch.setattr(experiment, "_run_part", counted)
     again = run_paper(PAPER, {"small": small_artifact}, tmp_path, workers=1)
     assert ran == ["all"]
     for name in ("all", "few", "noise-1-pairs"):
@@ -313,8 +320,8 @@ def test_processes_give_the_same_records(
 
 
 def test_two_trials_of_one_name_are_refused(small_artifact: Path, tmp_path: Path) -> None:
-    one = Row("g", "a", "small", trial_of("same"), "starcat")
-    two = replace(one, trial=replace(one.trial, seed=2))
+    one = Row("g", "a", "small", experiment_of("same"), "starcat")
+    two = replace(one, experiment=replace(one.experiment, seed=2))
     paper = replace(PAPER, rows=lambda quick: [one, two])
     with pytest.raises(ValueError, match="'same'"):
         run_paper(paper, {"small": small_artifact}, tmp_path, workers=1)
@@ -322,10 +329,10 @@ def test_two_trials_of_one_name_are_refused(small_artifact: Path, tmp_path: Path
 
 def measured(hits: int, hits_enough: int, mean_ms: float, **row: Any) -> MeasuredRow:
     enough = Share(hits_enough, 5)
-    rates = TrialRates(
+    rates = ExperimentRates(
         Share(5, 10), Share(hits, 10), enough, Share(0, 10), Share(0, 5), 0, mean_ms, 1.0, 1.0
     )
-    return MeasuredRow(Row("g", "l", "small", trial_of("t"), "starcat", **row), rates)
+    return MeasuredRow(Row("g", "l", "small", experiment_of("t"), "starcat", **row), rates)
 
 
 @pytest.mark.parametrize(
@@ -361,9 +368,9 @@ def test_goals_of_statistics(is_lower_better: bool | None, value: float, reached
 LENS = Camera(512, 512, fov_x_deg=40.0)
 
 
-@pytest.mark.parametrize("name", AXES)
+@pytest.mark.parametrize("name", PARAMETERS)
 def test_an_axis_reads_what_it_writes(name: str) -> None:
-    axis, base = AXES[name], replace(trial_of("t"), camera=LENS, assumed=LENS)
+    axis, base = PARAMETERS[name], replace(experiment_of("t"), camera=LENS, assumed=LENS)
     values = axis.usual or (5.0, 6.0)
     made = [axis.with_value(base, value) for value in values]
     assert [axis.read(one) for one in made] == pytest.approx(values, abs=1e-12)
@@ -374,10 +381,10 @@ def test_an_axis_reads_what_it_writes(name: str) -> None:
 
 
 def test_axes_keep_each_other_s_values() -> None:
-    one = replace(trial_of("t"), camera=LENS, assumed=LENS)
+    one = replace(experiment_of("t"), camera=LENS, assumed=LENS)
     for name, value in (("k1", -0.05), ("scale", 1.02), ("k1", -0.02), ("noise_mag", 0.5)):
-        one = AXES[name].with_value(one, value)
-    one = AXES["scale"].with_value(one, 1.01)
+        one = PARAMETERS[name].with_value(one, value)
+    one = PARAMETERS["scale"].with_value(one, 1.01)
     assert one.camera is not None
     assert one.camera.distortion.k1 == -0.02
     assert one.camera.focal_length_px == pytest.approx(1.01 * LENS.focal_length_px)
@@ -390,9 +397,9 @@ def test_axes_keep_each_other_s_values() -> None:
      ("scale", 0.0), ("drop_probability", math.nan)],
 )  # fmt: skip
 def test_values_out_of_range_are_refused(name: str, value: float) -> None:
-    base = replace(trial_of("t"), camera=LENS, assumed=LENS)
-    with pytest.raises(ConfigError, match=re.escape(AXES[name].label)):
-        AXES[name].with_value(base, value)
+    base = replace(experiment_of("t"), camera=LENS, assumed=LENS)
+    with pytest.raises(ConfigError, match=re.escape(PARAMETERS[name].label)):
+        PARAMETERS[name].with_value(base, value)
 
 
 def test_a_sweep_varies_one_quantity_at_a_time(
@@ -403,27 +410,29 @@ def test_a_sweep_varies_one_quantity_at_a_time(
     given = {"noise_px": (0.4,), "false_stars": (3.0, 0.0), "scale": (1.0, 1.01)}
     paper = sweep_paper(plan_sweep(small_artifact, given, method="all", camera=LENS, frames=7))
     made = paper.rows(False)
-    methods = {row.trial.method for row in made}
+    methods = {row.experiment.method for row in made}
     assert methods == set(METHODS) - {"other"}
     assert len(made) == 4 * len(methods)
-    assert len({row.trial.name for row in made}) == len(made)
-    assert {row.trial.noise.noise_px for row in made} == {0.4}
-    assert {row.trial.attitudes.count for row in made} == {7}
-    first = [row for row in made if row.trial.method == "triangle"]
+    assert len({row.experiment.name for row in made}) == len(made)
+    assert {row.experiment.noise.noise_px for row in made} == {0.4}
+    assert {row.experiment.attitudes.count for row in made} == {7}
+    first = [row for row in made if row.experiment.method == "triangle"]
     assert [row.x for row in first] == [0.0, 3.0, 1.0, 1.01]
-    assert [row.trial.noise.false_stars for row in first] == [0, 3, 0, 0]
-    assert all(row.trial.assumed == LENS for row in first)
+    assert [row.experiment.noise.false_stars for row in first] == [0, 3, 0, 0]
+    assert all(row.experiment.assumed == LENS for row in first)
 
 
 def test_a_sweep_of_nothing_varies_all_and_of_single_values_none(small_artifact: Path) -> None:
     usual = sweep_paper(plan_sweep(small_artifact, {}, quick=True)).rows(True)
-    labels = [axis.label for axis in AXES.values() if axis.usual]
+    labels = [axis.label for axis in PARAMETERS.values() if axis.usual]
     assert list(dict.fromkeys(row.group for row in usual)) == labels
-    assert {(row.trial.attitudes.count, row.trial.method) for row in usual} == {(100, "triangle")}
+    assert {(row.experiment.attitudes.count, row.experiment.method) for row in usual} == {
+        (100, "triangle")
+    }
     plan = plan_sweep(small_artifact, {"false_stars": (2.0,), "noise_px": (2.0, 2.0)})
     (one,) = sweep_paper(plan).rows(False)
-    assert one.trial.noise == Noise(2.0, false_stars=2, limit_mag=6.0)
-    assert (one.x, one.label, one.trial.tolerance_px) == (None, "triangle", 6.0)
+    assert one.experiment.noise == Noise(2.0, false_stars=2, limit_mag=6.0)
+    assert (one.x, one.label, one.experiment.tolerance_px) == (None, "triangle", 6.0)
 
 
 @pytest.mark.parametrize(("values", "method"), [({"dust": (1.0,)}, None), ({}, "magic")])
@@ -551,7 +560,7 @@ def test_the_page_has_every_row_and_needs_nothing_else(
     assert kind == "data:image/svg+xml;base64"
     assert b64decode(data) == (report / "S0_01_position_noise.svg").read_bytes()
     assert "<title>A &lt;title&gt;</title>" in text
-    assert "few | again: of the same trial" in text
+    assert "few | again: of the same experiment" in text
     assert "<li>one</li><li>two</li>" in text
     assert "✗ no" in page.cells
     titles = re.findall("<h3>(.*?)</h3>", text)
@@ -727,17 +736,17 @@ def test_a_curve_shows_all_methods_the_paper_and_the_ceiling(
 
 
 def test_papers_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "PAPERS", {"S2": PAPER, "S1": replace(PAPER, name="S1")})
-    assert [paper.name for paper in registry.papers_named("ALL")] == ["S1", "S0"]
-    assert registry.papers_named("s2") == [PAPER]
+    monkeypatch.setattr(evaluate, "PAPERS", {"S2": PAPER, "S1": replace(PAPER, name="S1")})
+    assert [paper.name for paper in evaluate.papers_named("ALL")] == ["S1", "S0"]
+    assert evaluate.papers_named("s2") == [PAPER]
     with pytest.raises(ConfigError, match="S1, S2, all"):
-        registry.papers_named("S9")
+        evaluate.papers_named("S9")
 
 
 def test_papers_are_evaluated_end_to_end(
     monkeypatch: pytest.MonkeyPatch, small_artifact: Path, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(registry, "PAPERS", {"S0": PAPER})
+    monkeypatch.setattr(evaluate, "PAPERS", {"S0": PAPER})
     monkeypatch.setattr(evaluate, "prepare_artifacts", lambda *_, **__: {"small": small_artifact})
     done = evaluate_papers("S0", {}, tmp_path, quick=True, workers=1)
     assert done.page == tmp_path / "S0-quick" / "index.html"

@@ -24,9 +24,10 @@ from typing import Any
 import pytest
 
 import starcat
-from starcat.catalog.fetching.arrival import LOCK_NAME, read_lock
-from starcat.catalog.fetching.fetch import FetchReport, cache_folder, fetch_source
+from starcat.catalog.fetch import FetchReport, fetch_source
+from starcat.catalog.integrity import LOCK_NAME, read_lock
 from starcat.catalog.source import DataSource
+from starcat.catalog.source_files import cache_folder
 from starcat.errors import (
     ChecksumMismatch,
     ConfigError,
@@ -425,7 +426,7 @@ def test_killed_download_is_resumed(archive: Archive, tmp_path: Path) -> None:
     url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], stall=stall)
     program = (
         "import sys; from pathlib import Path\n"
-        "from starcat.catalog.fetching.fetch import fetch_source\n"
+        "from starcat.catalog.fetch import fetch_source\n"
         "from starcat.catalog.source import DataSource\n"
         "source = DataSource.model_validate_json(sys.argv[1])\n"
         "fetch_source(source, Path(sys.argv[2]), timeout_s=20)\n"
@@ -628,7 +629,7 @@ def test_harmless_line_ends_and_comments_are_accepted(
 def test_lines_are_numbered_across_blocks(
     archive: Archive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("starcat.catalog.readers.files.BLOCK_BYTES", 1000)
+    monkeypatch.setattr("starcat.catalog.readers.blocks.BLOCK_BYTES", 1000)
     url = archive.serve("/tiny.dat", line_edited(2345, b"\r\n"))
     with pytest.raises(ParseError, match="holds 2999 records"):
         fetch(tiny_source(url), tmp_path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import sys
+from functools import partial
 from pathlib import Path
 
 import pyarrow as pa
@@ -13,15 +14,12 @@ sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 
 from twomass_parts import PARTS, part_bytes
 
-from starcat.catalog import ingest as ingest_module
-from starcat.catalog.blocks import Reading, TablePile
-from starcat.catalog.file_parts import FileReading
 from starcat.catalog.ingest import Ingested, ingest
-from starcat.catalog.readers import files as files_module
-from starcat.catalog.readers.files import InputFile
+from starcat.catalog.parts import FileReading, IngestOptions, Part, merged, parse_block, read_files
+from starcat.catalog.readers import blocks as blocks_module
 from starcat.catalog.source import data_source
+from starcat.catalog.source_files import InputFile
 from starcat.errors import ParseError, SourceError
-from starcat.storage.schema import product_schema
 
 SOURCE = data_source("2mass")
 PSC = SOURCE.files[0]
@@ -46,7 +44,7 @@ def parts(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 @pytest.fixture
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocks of some 30 records."""
-    monkeypatch.setattr(files_module, "BLOCK_BYTES", 10_000)
+    monkeypatch.setattr(blocks_module, "BLOCK_BYTES", 10_000)
 
 
 def same(one: Ingested, other: Ingested) -> None:
@@ -79,15 +77,15 @@ def test_a_file_read_by_itself_has_the_parts_that_ingest_joins(parts: list[Path]
     whole = ingest("2mass", parts[:3], read_limit_mag=14.0, neighbours=False)
     stars, rejected, counted, facts = [], [], 0, []
     for number, path in enumerate(parts[:3]):
-        how = Reading("2mass", "Ks", read_limit_mag=14.0)
-        reading = FileReading(InputFile(path, PSC), number, SOURCE, how)
-        blocks = list(reading)
+        reading = FileReading(InputFile(path, PSC), number, SOURCE)
+        parse = partial(parse_block, options=IngestOptions("2mass", "Ks", read_limit_mag=14.0))
+        blocks = [part for _, parsed in read_files([reading], parse) for part in parsed]
         assert len(blocks) > 5
         stars += [part.stars for part in blocks]
         rejected += [part.rejected for part in blocks]
         counted += sum(part.counted for part in blocks)
         facts.append(reading.facts)
-        assert [problem.split(",")[0] for problem in reading.problems] == [
+        assert [problem.split(",")[0] for problem in reading.named_problems] == [
             f"{path.name} line 101", f"{path.name} line 201"
         ]  # fmt: skip
     assert tuple(facts) == whole.files
@@ -97,15 +95,14 @@ def test_a_file_read_by_itself_has_the_parts_that_ingest_joins(parts: list[Path]
 
 
 def test_facts_of_a_file_that_was_not_read_to_its_end(parts: list[Path]) -> None:
-    reading = FileReading(InputFile(parts[0], PSC), 0, SOURCE, Reading("2mass", "Ks"))
+    reading = FileReading(InputFile(parts[0], PSC), 0, SOURCE)
+    next(reading.blocks())
     with pytest.raises(SourceError, match="not read to its end"):
-        _ = reading.blocks.facts
+        _ = reading.facts
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_progress_of_files_side_by_side_ends_with_all_bytes(
-    parts: list[Path], workers: int
-) -> None:
+def test_progress_of_files_ends_with_all_bytes(parts: list[Path], workers: int) -> None:
     events: list[tuple[str, int, int | None]] = []
     ingest("2mass", parts, neighbours=False, workers=workers, progress=lambda *e: events.append(e))
     size = sum(path.stat().st_size for path in parts)
@@ -134,11 +131,7 @@ def test_the_error_of_the_first_bad_file_is_told(
     assert caught.value.path == copies[2]
 
 
-def test_an_interrupted_reading_of_files_side_by_side_stops(
-    parts: list[Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(ingest_module, "_TELL_EVERY_S", 0.0)
-
+def test_an_interrupted_reading_stops(parts: list[Path]) -> None:
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
@@ -146,20 +139,20 @@ def test_an_interrupted_reading_of_files_side_by_side_stops(
         ingest("2mass", parts, progress=interrupt)
 
 
-def test_a_pile_of_small_tables_is_joined_in_order() -> None:
-    schema = product_schema("rejected").arrow_schema
-    pile = TablePile("rejected")
-    assert [len(table) for table in pile.tables] == [0]
-    tables = []
-    for number in range(2000):
-        columns = [
-            pa.array([number] * 7, field.type) if field.name == "source_line" else
-            pa.array(["x"] * 7) if field.name in ("catalog", "band", "reason") else
-            pa.array([0] * 7, field.type) if field.name == "source_file" else
-            pa.nulls(7, field.type)
-            for field in schema
-        ]  # fmt: skip
-        tables.append(pa.Table.from_arrays(columns, schema=schema))
-        pile.add(tables[-1])
-    assert pa.concat_tables(pile.tables).equals(pa.concat_tables(tables))
-    assert len(pile.tables) < 10
+@pytest.mark.usefixtures("small_blocks")
+@pytest.mark.parametrize("rows", [1, 50, 10_000])
+def test_merged_blocks_hold_the_same_in_the_same_order(parts: list[Path], rows: int) -> None:
+    parse = partial(parse_block, options=IngestOptions("2mass", "Ks", read_limit_mag=14.0))
+    reading = FileReading(InputFile(parts[0], PSC), 0, SOURCE)
+    blocks = [part for _, parsed in read_files([reading], parse) for part in parsed]
+    joined = list(merged(blocks, rows))
+
+    def tables(some: list[Part]) -> list[pa.Table]:
+        each = ([part.stars for part in some], [part.rejected for part in some])
+        return [pa.concat_tables(tables) for tables in each]
+
+    assert len(joined) == len(blocks) if rows == 1 else len(joined) < len(blocks)
+    assert tables(joined) == tables(blocks)
+    for name in ("rows", "counted"):
+        assert sum(getattr(p, name) for p in joined) == sum(getattr(p, name) for p in blocks)
+    assert sum(len(part.problems) for part in joined) == 2

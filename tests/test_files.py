@@ -13,18 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from starcat.catalog.readers import files
-from starcat.catalog.readers.binary import parse_binary
-from starcat.catalog.readers.files import (
-    Block,
-    DigestReader,
-    InputFile,
-    find_files,
-    lacking,
-    map_in_order,
-    read_blocks,
-)
+from starcat.catalog.readers import blocks as blocks_module
+from starcat.catalog.readers.blocks import Block, DigestReader, map_in_order, read_blocks
+from starcat.catalog.readers.fixed_width import parse_binary
 from starcat.catalog.source import Column, DataSource, RecordFile
+from starcat.catalog.source_files import InputFile, SourceFiles, lacking
 from starcat.errors import ParseError, SourceError, SourceMissing
 
 LINES = b"".join(b"%05d\n" % number for number in range(1, 2001))
@@ -81,12 +74,12 @@ def read(path: Path, layout: RecordFile) -> tuple[list[Block], list[DigestReader
 
 
 def names_found(paths: list[Path], source: DataSource = SOURCE) -> list[tuple[str, str]]:
-    return [(file.path.name, file.layout.name) for file in find_files(source, paths)]
+    return [(file.path.name, file.layout.name) for file in SourceFiles.find(source, paths).files]
 
 
 @pytest.fixture
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(files, "BLOCK_BYTES", 100)
+    monkeypatch.setattr(blocks_module, "BLOCK_BYTES", 100)
 
 
 @pytest.mark.parametrize("block_bytes", [1, 7, 100, 1 << 22])
@@ -95,7 +88,7 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_blocks_are_whole_lines_in_order_plain_or_gzipped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes: int, is_gzip: bool, end: bytes
 ) -> None:
-    monkeypatch.setattr(files, "BLOCK_BYTES", block_bytes)
+    monkeypatch.setattr(blocks_module, "BLOCK_BYTES", block_bytes)
     content = LINES[:600].rstrip(b"\n") + end
     path = tmp_path / "tiny.dat"
     path.write_bytes(gzip.compress(content) if is_gzip else content)
@@ -135,7 +128,7 @@ def test_compression_is_recognised_by_content(tmp_path: Path, is_named_gz: bool)
 @pytest.mark.usefixtures("small_blocks")
 def test_truncated_gzip_names_the_file_and_the_last_line(tmp_path: Path) -> None:
     noise = random.Random(1)
-    content = b"".join(b"%05d\n" % noise.randrange(100_000) for _ in range(2000))
+    content = b"".join(b"%05d\n" % noise.randrange(100_000) for _ in range(10_000))
     path = tmp_path / "tiny.dat.gz"
     compressed = gzip.compress(content)
     path.write_bytes(compressed[: len(compressed) // 2])
@@ -145,8 +138,27 @@ def test_truncated_gzip_names_the_file_and_the_last_line(tmp_path: Path) -> None
     assert caught.value.path == path
     assert str(path) in str(caught.value)
     assert caught.value.line == sum(block.data.count(b"\n") for block in seen)
-    assert 500 < caught.value.line < 1500
+    assert 2_500 < caught.value.line < 7_500
     assert ends == []
+
+
+def test_no_cut_and_no_changed_byte_gives_other_lines(tmp_path: Path) -> None:
+    whole = gzip.compress(LINES[:600], mtime=0)
+    path = tmp_path / "tiny.dat.gz"
+    unseen = 0
+    for place in range(10, len(whole)):  # the ten before hold the magic and facts without effect
+        changed = bytearray(whole)
+        changed[place] ^= 1
+        path.write_bytes(whole[:place])
+        with pytest.raises(ParseError, match="the compressed data is cut off"):
+            read(path, text_file())
+        path.write_bytes(bytes(changed))
+        try:
+            assert b"".join(block.data for block in read(path, text_file())[0]) == LINES[:600]
+            unseen += 1
+        except ParseError:
+            continue
+    assert unseen < 3  # a code length of a letter that does not occur
 
 
 def test_gzip_with_a_wrong_checksum(tmp_path: Path) -> None:
@@ -160,7 +172,7 @@ def test_gzip_with_a_wrong_checksum(tmp_path: Path) -> None:
 
 def test_rubbish_behind_a_gzip_member(tmp_path: Path) -> None:
     path = tmp_path / "tiny.dat.gz"
-    path.write_bytes(gzip.compress(LINES) + b"rubbish")
+    path.write_bytes(gzip.compress(LINES) + b"rubbish" * 2)
     with pytest.raises(ParseError, match="damaged"):
         read(path, text_file())
 
@@ -262,14 +274,14 @@ def test_a_missing_part_is_named(tmp_path: Path) -> None:
     (tmp_path / "many.00").write_bytes(b"")
     (tmp_path / "many.02").write_bytes(b"")
     with pytest.raises(SourceMissing, match=r"has 2 of 3 parts of many.\{part\}; missing: 01\."):
-        find_files(SOURCE, [tmp_path])
+        SourceFiles.find(SOURCE, [tmp_path])
 
 
 def test_many_missing_parts_are_not_all_named(tmp_path: Path) -> None:
     source = source_of(text_file(file_names=("t.{part}",), parts=tuple(map(str, range(10, 40)))))
     (tmp_path / "t.10").write_bytes(b"")
     with pytest.raises(SourceMissing, match="missing: 11, 12, 13, 14, 15, 16, 17, 18 …"):
-        find_files(source, [tmp_path])
+        SourceFiles.find(source, [tmp_path])
 
 
 @pytest.mark.parametrize("present", [[], ["extra.dat"], ["other.dat"]])
@@ -277,13 +289,13 @@ def test_a_folder_without_the_file_that_is_needed(tmp_path: Path, present: list[
     for name in present:
         (tmp_path / name).write_bytes(b"")
     with pytest.raises(SourceMissing, match="starcat fetch tiny") as caught:
-        find_files(SOURCE, [tmp_path])
+        SourceFiles.find(SOURCE, [tmp_path])
     assert caught.value.path == tmp_path
 
 
 def test_a_path_that_does_not_exist(tmp_path: Path) -> None:
     with pytest.raises(SourceMissing, match=r"nowhere does not exist.*extra\.dat\[\.gz\]"):
-        find_files(SOURCE, [tmp_path / "nowhere"])
+        SourceFiles.find(SOURCE, [tmp_path / "nowhere"])
 
 
 @pytest.mark.parametrize(

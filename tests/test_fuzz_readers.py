@@ -18,12 +18,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from starcat.catalog.archives.gcvs import COLUMNS as GCVS_COLUMNS
-from starcat.catalog.archives.gcvs import read_gcvs
-from starcat.catalog.blocks import CATALOGS
 from starcat.catalog.ingest import ingest
+from starcat.catalog.parts import CATALOGS
 from starcat.catalog.source import Column, RecordFile, data_source
 from starcat.catalog.stars import directions_of, floats_of
+from starcat.catalog.variability import GCVS_COLUMNS, read_gcvs
 from starcat.errors import StarcatError
 from starcat.storage.schema import product_schema
 
@@ -112,7 +111,7 @@ def layout_of(source_name: str, layout_name: str) -> RecordFile:
 def columns_read(source_name: str, layout: RecordFile) -> list[Column]:
     """The columns that the catalog's module asks for: damage elsewhere is not seen."""
     names: Sequence[str] = (
-        GCVS_COLUMNS if source_name == "gcvs" else CATALOGS[source_name].columns[layout.name]
+        GCVS_COLUMNS if source_name == "gcvs" else CATALOGS[source_name].COLUMNS[layout.name]
     )
     return [layout.column(name) for name in names]
 
@@ -207,7 +206,7 @@ def check_gcvs(path: Path) -> None:
     read = read_gcvs([path])
     kept = len(read.amplitude_mag)
     assert sum(file.rows for file in read.files) == kept + sum(read.rejected.values())
-    assert ((read.hip_number > 0) ^ (read.gaia_id > 0)).all()
+    assert ((read.numbers["hip_number"] > 0) ^ (read.numbers["gaia"] > 0)).all()
     assert not (read.amplitude_mag < 0.0).any()
     assert not np.isinf(read.amplitude_mag).any()
 

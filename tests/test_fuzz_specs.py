@@ -33,9 +33,8 @@ from starcat.products.coverage import tiling_gap
 from starcat.progress import no_progress
 from starcat.resources import resource_folder
 from starcat.specs.build_spec import BuildSpec
-from starcat.specs.keys import spec_sections
+from starcat.specs.keys import spec_sections, spec_toml, toml_value
 from starcat.specs.reading import preset_names, read_spec, spec_from_dict
-from starcat.specs.spec_toml import spec_toml, toml_value
 
 HEADROOM_BYTES = 1 << 30
 """What the use of a spec may allocate, on a sky that needs a few megabytes."""

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 from every_command import every_command
 
-from starcat.cli.commands.shared import chosen_spec
+from starcat.cli.options import chosen_spec
 from starcat.matcher.database import open_database
 from starcat.pipeline.build import build
 from starcat.simulation.simulate import Noise, simulate_frames
@@ -29,7 +29,6 @@ COMMANDS = every_command()
 NETWORK = {"fetch": "downloads an archive from its servers; test_fetch has servers of its own"}
 LASTING = {
     "serve": "runs until it is ended; test_howto_serve runs and ends it",
-    "work": "runs until it is ended, beside a server and a Redis",
 }
 NEEDS = {
     "token list": ("token create",),

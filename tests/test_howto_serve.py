@@ -19,7 +19,7 @@ from urllib.error import URLError
 import pytest
 
 from starcat.service.security.metrics import Metrics
-from starcat.service.service import open_service
+from starcat.service.service import Service
 from starcat.service.settings import Settings, read_settings
 
 PAGE = Path(__file__).parents[1] / "docs" / "howto-serve.md"
@@ -109,11 +109,11 @@ def test_the_table_of_settings_is_that_of_the_program() -> None:
 
 def test_the_table_of_figures_is_that_of_the_program(tmp_path: Path) -> None:
     page = PAGE.read_text()
-    service = open_service(read_settings(tmp_path))
+    service = Service(read_settings(tmp_path))
     for one in Metrics(service).registry.collect():
         name = f"{one.name}_total" if one.type == "counter" else one.name
         assert f"| `{name}` | {one.documentation} |" in page
-    service.records.close()
+    service.close()
 
 
 def test_the_settings_that_the_page_shows_are_read(tmp_path: Path) -> None:

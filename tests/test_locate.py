@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from starcat.catalog.archives.gaia import embedded_sky
-from starcat.catalog.fetching.locate import locate
+from starcat.catalog.source_files import locate
 from starcat.errors import ConfigError, SourceMissing
 
 PLACES = ("given", "beside", "variable", "cache")

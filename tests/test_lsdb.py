@@ -14,7 +14,7 @@ from starcat.specs.product_sections import Crossmatch
 from starcat.storage.parquet import read_parquet
 from starcat.store.ingest import ingest_to_store
 from starcat.store.layout import open_store
-from starcat.store.options import StoreOptions
+from starcat.store.plan import StoreOptions
 
 lsdb = pytest.importorskip("lsdb", reason="LSDB comes with the extra dev")
 

@@ -36,8 +36,7 @@ from starcat.products.match_figures import ARCSEC
 from starcat.specs.product_sections import Crossmatch
 from starcat.storage.parquet import read_parquet, write_parquet, write_parts
 from starcat.storage.schema import product_schema
-from starcat.store.pixels import MAX_ORDER, Pixel, healpix_29
-from starcat.store.region import region_around
+from starcat.store.pixels import MAX_ORDER, Pixel, healpix_29, region_around
 
 pytest.importorskip("cdshealpix")
 

@@ -27,9 +27,9 @@ from starcat.artifact.reader import Artifact, open_artifact
 from starcat.artifact.verify import verify_artifact
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import Ingested, ingest
-from starcat.catalog.quality import Quality
 from starcat.catalog.source import data_source
 from starcat.catalog.stars import floats_of, with_columns
+from starcat.catalog.verdict import Quality
 from starcat.pipeline.build import Built, build
 from starcat.pipeline.motions import JoinedMotions, join_motions, motion_product
 from starcat.pipeline.rebuild import rebuild

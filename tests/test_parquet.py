@@ -13,9 +13,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from starcat.artifact.reader import open_artifact
-from starcat.storage.parquet import read_parquet, write_parquet
+from starcat.storage.parquet import VOTABLE_NAMESPACE, read_parquet, votable_xml, write_parquet
 from starcat.storage.schema import product_schema
-from starcat.storage.votable import VOTABLE_NAMESPACE, votable_xml
 
 
 @pytest.fixture(scope="module")

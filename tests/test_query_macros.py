@@ -17,7 +17,7 @@ from starcat.catalog.photometry import combined_magnitude
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import directions_from_radec
-from starcat.query.macros import macros
+from starcat.query.gallery import macros
 from starcat.query.session import Session, open_session
 
 POLES_AND_SEAMS = [(0.0, 90.0), (123.0, -90.0), (0.0, 0.0), (360.0, 0.0), (359.999999, 41.81),

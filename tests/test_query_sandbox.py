@@ -23,8 +23,7 @@ from hypothesis import strategies as st
 from starcat.errors import ProductError, QueryError, QueryLimitError, SchemaVersionError
 from starcat.query.engine import Engine
 from starcat.query.messages import Views
-from starcat.query.preamble import preamble_of
-from starcat.query.session import Limits, Session, open_session
+from starcat.query.session import Limits, Session, open_session, preamble_of
 from starcat.query.statement import check_statement
 from starcat.query.worker import BESIDE_BYTES
 

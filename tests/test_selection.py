@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from starcat.catalog.ingest import count_by_reason
-from starcat.catalog.quality import Quality
 from starcat.catalog.selection import Selected, select_guide_stars
 from starcat.catalog.stars import directions_of, floats_of, table_from_columns
+from starcat.catalog.verdict import Quality
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, separation
 from starcat.specs.build_spec import Doubles, Selection, Variables
 

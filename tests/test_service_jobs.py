@@ -25,12 +25,15 @@ from starcat.service.access import Principal, Role
 from starcat.service.app import make_app
 from starcat.service.jobs import job_states
 from starcat.service.jobs.job import Job
-from starcat.service.jobs.job_states import MAX_INTERRUPTED, Attempt, claim, interrupt
+from starcat.service.jobs.job_states import (
+    MAX_INTERRUPTED,
+    Attempt,
+    Outcome,
+    begin_next,
+    interrupt,
+)
 from starcat.service.jobs.keys import build_key, file_digests
-from starcat.service.jobs.pool import WorkerPool
-from starcat.service.jobs.queue import JsonMessages
-from starcat.service.jobs.recovery import recover
-from starcat.service.jobs.runner import Slots, lines_of
+from starcat.service.jobs.slots import JobSlots, recover
 from starcat.service.jobs.submission import (
     cancel_job,
     retry_job,
@@ -39,12 +42,13 @@ from starcat.service.jobs.submission import (
     submit_ingest,
 )
 from starcat.service.problems import Problem
+from starcat.service.records import MIGRATIONS
 from starcat.service.server import run_server
-from starcat.service.service import Service, open_service
-from starcat.service.settings import Settings
+from starcat.service.service import Service
+from starcat.service.settings import Settings, read_settings
 from starcat.specs.build_spec import BuildSpec
+from starcat.specs.keys import spec_toml
 from starcat.specs.reading import spec_from_dict
-from starcat.specs.spec_toml import spec_toml
 from starcat.storage.locks import locked
 
 LOCAL = "http://127.0.0.1:8000"
@@ -78,14 +82,13 @@ def opened(tmp_path: Path) -> Iterator[Open]:
     services = []
 
     def make(**options: Any) -> Service:
-        service = open_service(Settings(root=tmp_path / "service", **options))
+        service = Service(Settings(root=tmp_path / "service", **options))
         services.append(service)
         return service
 
     yield make
     for service in services:
-        service.queue.close()
-        service.records.close()
+        service.close()
 
 
 @pytest.fixture
@@ -98,59 +101,59 @@ def states(service: Service, job: Job) -> list[str]:
     return [event.data["state"] for event in events if event.kind == "state"]
 
 
-def messages(service: Service) -> list[str]:
-    """Return the jobs that workers are told of, in order."""
-    return [task.args[0] for task in service.queue.huey.pending()]
-
-
 def begin(service: Service, job: Job) -> Attempt:
-    found = claim(service.records, job.id)
+    found = begin_next(service.records, (job.kind,))
     assert found is not None
+    assert found.id == job.id
     return Attempt(service.records, found)
 
 
 def end(service: Service, job: Job, how: str) -> None:
     attempt = begin(service, job)
     if how == "failed":
-        attempt.fail({"title": "x", "status": 422, "detail": "it went wrong"})
+        attempt.end(Outcome("failed", {"title": "x", "status": 422, "detail": "it went wrong"}))
     elif how == "cancelled":
-        attempt.be_cancelled()
+        attempt.end(Outcome("cancelled"))
     else:
-        attempt.succeed({"database": job.key[:16]})
+        attempt.end(Outcome("done", {"database": job.key[:16]}))
 
 
-def test_a_job_is_begun_once(service, spec):
+def test_each_job_is_begun_once_and_the_first_first(service, spec):
     job = submit_build(service, spec, "anne").job
+    others = [submit_ingest(service, "sao", "anne", read_limit_mag=k).job for k in range(3)]
     begun: list[Job | None] = []
 
     def try_it() -> None:
-        begun.append(claim(service.records, job.id))
+        begun.append(begin_next(service.records, ("build", "ingest")))
 
     threads = [threading.Thread(target=try_it) for _ in range(8)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    [found] = [one for one in begun if one is not None]
-    assert (found.state, found.attempt) == ("running", 1)
+    found = [one for one in begun if one is not None]
+    assert {one.id for one in found} == {one.id for one in (job, *others)}
+    assert {(one.state, one.attempt) for one in found} == {("running", 1)}
+    assert min(found, key=lambda one: one.started_s).id == job.id
+    assert len(found) == 4
     assert states(service, job) == ["queued", "running"]
 
 
 def test_an_attempt_that_is_over_is_not_heard(service, spec):
     job = submit_build(service, spec, "anne").job
     first = begin(service, job)
-    interrupt(service.records, job.id, 1)
+    interrupt(service.records, first.job)
     second = begin(service, job)
-    assert first.wants_end()
-    first.tell_stage("read", 1, 2)
-    first.tell("info", "hello")
-    first.succeed({"database": "0" * 16})
-    first.fail({"detail": "no"})
-    interrupt(service.records, job.id, 1)
+    assert first.cancel_requested()
+    first.report({"stage": "read", "done": 1, "total": 2})
+    first.report({"log": "hello", "level": "info"})
+    for outcome in (Outcome("done", {"database": "0" * 16}), Outcome("failed"), Outcome("queued")):
+        first.end(outcome)
+    interrupt(service.records, first.job)
     assert service.jobs.get(job.id) == second.job
     assert {event.kind for event in service.jobs.events(job.id)} == {"state"}
-    assert not second.wants_end()
-    second.succeed({"database": "0" * 16})
+    assert not second.cancel_requested()
+    second.end(Outcome("done", {"database": "0" * 16}))
     assert service.jobs.get(job.id).state == "done"
 
 
@@ -198,7 +201,7 @@ def test_the_same_request_is_the_same_job(service, spec):
     assert (again.is_new, again.job) == (False, first.job)
     begin(service, first.job)
     assert submit_build(service, spec, "bob").job.id == first.job.id
-    assert messages(service) == [first.job.id]
+    assert service.jobs.count() == 1
 
 
 @pytest.mark.parametrize("how", ["failed", "cancelled", "done"])
@@ -240,7 +243,7 @@ def test_a_full_disk_takes_no_job(opened, spec):
     assert refused.value.status == 507
     service = opened()
     job = submit_build(service, spec, "anne").job
-    Slots(opened(free_gib=1e9)).run_job(job.id)
+    JobSlots(opened(free_gib=1e9)).run_next()
     found = service.jobs.get(job.id)
     assert (found.state, found.error["status"]) == ("failed", 507)
 
@@ -273,12 +276,12 @@ def test_jobs_are_ended_and_tried_again_by_those_who_may(service, spec):
         retry_job(service, job.id, ANNE)
     assert cancel_job(service, job.id, ANNE).state == "cancelled"
     assert cancel_job(service, job.id, CHIEF).state == "cancelled"
-    assert claim(service.records, job.id) is None
+    assert begin_next(service.records, ("build",)) is None
     assert retry_job(service, job.id, CHIEF).state == "queued"
     attempt = begin(service, job)
     assert cancel_job(service, job.id, ANNE).state == "running"
-    assert attempt.wants_end()
-    attempt.be_cancelled()
+    assert attempt.cancel_requested()
+    attempt.end(Outcome("cancelled"))
     other = submit_build(service, spec, "bob").job
     with pytest.raises(Problem, match=f"job {other.id} does the same and is queued"):
         retry_job(service, job.id, ANNE)
@@ -293,10 +296,10 @@ def test_jobs_are_ended_and_tried_again_by_those_who_may(service, spec):
 def test_of_each_stage_the_last_event_is_kept(service, spec):
     attempt = begin(service, submit_build(service, spec, "anne").job)
     for done in range(50):
-        attempt.tell_stage("read", done, 50)
-    attempt.tell("info", "half")
-    attempt.tell_stage("self-test", 0, None)
-    attempt.tell_stage("self-test", 1, None)
+        attempt.report_stage("read", done, 50)
+    attempt.log("info", "half")
+    attempt.report_stage("self-test", 0, None)
+    attempt.report_stage("self-test", 1, None)
     events = service.jobs.events(attempt.job.id)
     told = [(event.number, event.kind, event.data.get("done")) for event in events]
     assert told == [
@@ -312,7 +315,7 @@ def test_a_log_has_an_end(service, spec, monkeypatch):
     monkeypatch.setattr(job_states, "MAX_LOG_LINES", 3)
     attempt = begin(service, submit_build(service, spec, "anne").job)
     for number in range(9):
-        attempt.tell("info", f"line {number}")
+        attempt.log("info", f"line {number}")
     lines = [e.data["text"] for e in service.jobs.events(attempt.job.id) if e.kind == "log"]
     assert lines == ["line 0", "line 1", "line 2", "the log ends here, after 3 lines"]
 
@@ -320,57 +323,60 @@ def test_a_log_has_an_end(service, spec, monkeypatch):
 def test_a_job_that_loses_its_server_waits_again_but_not_for_ever(service, spec):
     job = submit_build(service, spec, "anne").job
     for attempt in range(1, MAX_INTERRUPTED + 1):
-        assert begin(service, job).job.attempt == attempt
-        interrupt(service.records, job.id, attempt)
+        begun = begin(service, job).job
+        assert begun.attempt == attempt
+        interrupt(service.records, begun)
     found = service.jobs.get(job.id)
     assert found.state == "failed"
     assert "the service ended 8 times while this job ran" in found.error["detail"]
     retry_job(service, job.id, ANNE)
-    begin(service, job)
-    interrupt(service.records, job.id, MAX_INTERRUPTED + 1)
+    interrupt(service.records, begin(service, job).job)
     assert service.jobs.get(job.id).state == "queued"
-    begin(service, job)
+    begun = begin(service, job).job
     cancel_job(service, job.id, ANNE)
-    interrupt(service.records, job.id, MAX_INTERRUPTED + 2)
+    interrupt(service.records, begun)
     assert service.jobs.get(job.id).state == "cancelled"
 
 
 def test_a_server_takes_up_what_another_has_left(service, spec):
     ran = submit_build(service, spec, "anne").job
     begin(service, ran)
-    waits = submit_ingest(service, "sao", "anne").job
-    service.queue.huey.flush()  # the messages are lost
     service.paths.job_work(ran.id).mkdir(parents=True)
     (service.paths.job_work(ran.id) / "half").write_text("")
     service.paths.database("0" * 16).mkdir()
     recover(service)
     assert service.jobs.get(ran.id).state == "queued"
-    assert messages(service) == [ran.id, waits.id]
     assert not service.paths.job_work(ran.id).exists()
     assert list(service.paths.databases.iterdir()) == []
 
 
-def test_messages_that_are_lost_are_sent_again(service, spec):
-    job = submit_build(service, spec, "anne").job
-    service.queue.huey.flush()
-    WorkerPool(service)._look()
-    assert messages(service) == [job.id]
-    WorkerPool(service)._look()
-    assert messages(service) == [job.id]
+def test_jobs_of_redis_are_told_where_they_go_now(tmp_path):
+    (tmp_path / "service.toml").write_text('queue_url = "redis://10.0.0.1:6379/0"')
+    with pytest.raises(ConfigError, match=r'write scheduler = "tcp://HOST:8786" instead'):
+        read_settings(tmp_path)
 
 
-def test_a_queue_that_does_not_answer_loses_nothing(opened, spec):
-    service = opened(queue_url="redis://127.0.0.1:1/0")
-    job = submit_build(service, spec, "anne").job
-    assert service.jobs.get(job.id).state == "queued"
-    WorkerPool(service)._look()
-    with pytest.raises(ConfigError, match="expected redis://"):
-        opened(queue_url="nonsense")
-
-
-def test_messages_are_no_code(service):
-    with pytest.raises(ValueError, match="codec"):
-        JsonMessages().deserialize(b"\x80\x04\x95cos\nsystem\n")
+def test_a_service_of_an_earlier_version_opens(tmp_path):
+    old = f"""
+        INSERT INTO jobs (id, kind, key, owner, title, state, request, created_s, heard_s)
+        VALUES ('{1:032x}', 'build', 'k', 'anne', 't', 'queued', '{{}}', 5.0, 6.0);
+        INSERT INTO tap_jobs VALUES ('{2:032x}', 'anne', 'ERROR', '[["QUERY", "SELECT 1"]]',
+            '{{"f": "upload-0.vot"}}', 'mine', 1.0, 2.0, 3.0, 4.0, 9e9, 60.0, 'no column', '');
+        INSERT INTO tap_jobs VALUES ('{3:032x}', 'anne', 'COMPLETED', '[]', '{{}}', '', 1.5, 2.0,
+            3.0, 4.0, 9e9, 60.0, '', 'text/csv');
+    """
+    with sqlite3.connect(tmp_path / "records.sqlite") as connection:
+        connection.executescript(";".join([*MIGRATIONS[:3], "PRAGMA user_version = 3", old]))
+    connection.close()
+    service = Service(Settings(root=tmp_path))
+    assert begin(service, service.jobs.all()[0]).job.id == f"{1:032x}"
+    assert service.jobs.count() == 1
+    csv, failed = service.tap.jobs.jobs("anne")
+    assert (csv.phase, csv.media_type, csv.error) == ("COMPLETED", "text/csv", "")
+    assert (failed.phase, failed.error, failed.run_id) == ("ERROR", "no column", "mine")
+    assert failed.parameters == (("QUERY", "SELECT 1"),)
+    assert (failed.created_s, failed.ended_s, failed.limit_s) == (1.0, 4.0, 60.0)
+    service.close()
 
 
 def test_two_servers_do_not_share_a_root(tmp_path):
@@ -380,19 +386,6 @@ def test_two_servers_do_not_share_a_root(tmp_path):
         pytest.raises(ConfigError, match=r"another server runs with --root .*service"),
     ):
         run_server(settings, print)
-
-
-def test_lines_are_whole_however_they_come(tmp_path):
-    read, write = os.pipe()
-    found = []
-    with open(read, "rb", buffering=0) as pipe:
-        lines = lines_of(pipe, 0.01)
-        os.write(write, b"one\ntw")
-        found += [next(lines), next(lines)]
-        os.write(write, b"o\nthree")
-        os.close(write)
-        found += list(lines)
-    assert [line for line in found if line is not None] == [b"one", b"two"]
 
 
 def settled(service: Service, job_id: str, seconds: float = 50.0) -> Job:
@@ -536,9 +529,9 @@ def long_build(service: Service, spec: BuildSpec) -> Job:
     return submit_build(service, spec_from_dict(content, "long"), "anne").job
 
 
-def run_until(service: Service, slots: Slots, job: Job, then: Callable[[], None]) -> Job:
+def run_until(service: Service, slots: JobSlots, job: Job, then: Callable[[], None]) -> Job:
     """Run a job, and do something as soon as it is under way."""
-    thread = threading.Thread(target=slots.run_job, args=(job.id,))
+    thread = threading.Thread(target=slots.run_next)
     thread.start()
     until_s = time.monotonic() + 40.0
     while not service.jobs.get(job.id).stage and time.monotonic() < until_s:
@@ -555,20 +548,20 @@ def run_until(service: Service, slots: Slots, job: Job, then: Callable[[], None]
 @pytest.mark.slow
 def test_a_job_that_runs_is_cancelled(service, spec):
     job = long_build(service, spec)
-    ended = run_until(service, Slots(service), job, lambda: cancel_job(service, job.id, ANNE))
+    ended = run_until(service, JobSlots(service), job, lambda: cancel_job(service, job.id, ANNE))
     assert (ended.state, ended.error, ended.result) == ("cancelled", None, None)
 
 
 @pytest.mark.slow
 def test_a_job_that_cannot_end_in_time_waits_for_the_next_start(service, spec):
-    slots = Slots(service)
+    slots = JobSlots(service)
 
     def stop() -> None:
         slots.stop_at_s = time.monotonic() + 0.3
 
     job = long_build(service, spec)
     assert run_until(service, slots, job, stop).state == "queued"
-    slots.run_job(job.id)  # it takes no further job
+    assert not slots.run_next()  # it takes no further job
     assert service.jobs.get(job.id).state == "queued"
 
 
@@ -583,7 +576,7 @@ def test_a_job_that_cannot_end_in_time_waits_for_the_next_start(service, spec):
 def test_a_job_has_limits(opened, spec, limits, words):
     service = opened(**limits)
     job = long_build(service, spec)
-    Slots(service).run_job(job.id)
+    JobSlots(service).run_next()
     failed = service.jobs.get(job.id)
     assert failed.state == "failed"
     assert words in failed.error["detail"]
@@ -592,12 +585,12 @@ def test_a_job_has_limits(opened, spec, limits, words):
 
 @pytest.mark.slow
 def test_a_process_that_is_killed_is_told_of(service, spec):
-    slots = Slots(service)
+    slots = JobSlots(service)
     job = long_build(service, spec)
 
     def kill() -> None:
-        for group in slots._groups:
-            os.kill(group, signal.SIGKILL)
+        for child in slots.processes.children:
+            os.kill(child.pid, signal.SIGKILL)
 
     failed = run_until(service, slots, job, kill)
     assert failed.state == "failed"
@@ -608,7 +601,7 @@ def test_a_process_that_is_killed_is_told_of(service, spec):
 def test_a_build_that_fails_says_why(service, spec, archive):
     job = submit_build(service, spec, "anne").job
     (archive / "sao.dat").write_bytes(b"no star\n" * 100)
-    Slots(service).run_job(job.id)
+    JobSlots(service).run_next()
     failed = service.jobs.get(job.id)
     assert (failed.state, failed.error["kind"]) == ("failed", "ParseError")
     assert "sao.dat" in failed.error["detail"]
@@ -619,7 +612,7 @@ def test_a_build_that_fails_says_why(service, spec, archive):
 def test_a_catalog_is_read_either_way(service, archive):
     for to in ("parquet", "hats"):
         job = submit_ingest(service, "sao", "anne", to=to).job
-        Slots(service).run_job(job.id)
+        JobSlots(service).run_next()
         done = service.jobs.get(job.id)
         assert done.state == "done", done.error
         assert done.result["rows"] == 600
@@ -630,12 +623,12 @@ def test_a_catalog_is_read_either_way(service, archive):
 @pytest.mark.slow
 def test_a_database_that_is_there_is_not_built_again(service, spec):
     job = submit_build(service, spec, "anne").job
-    Slots(service).run_job(job.id)
+    JobSlots(service).run_next()
     database = service.library.database(job.key[:16])
     with sqlite3.connect(service.paths.records) as records:  # killed before that was written
         records.execute("UPDATE jobs SET state = 'queued', result = NULL")
     records.close()
     before = database.folder.stat()
-    Slots(service).run_job(job.id)
+    JobSlots(service).run_next()
     assert service.jobs.get(job.id).result == {"database": database.id}
     assert os.path.samestat(database.folder.stat(), before)

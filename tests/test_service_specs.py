@@ -14,16 +14,14 @@ from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
+from shelved import client_of
 
 from starcat.pipeline.catalog_snapshot import CatalogSnapshot, read_snapshot
 from starcat.pipeline.estimate import choose_stars
 from starcat.pipeline.starter import starter_spec
 from starcat.service import catalogs as catalogs_module
-from starcat.service.app import make_app
 from starcat.service.catalogs import Catalogs
-from starcat.service.kept import Kept
 from starcat.service.problems import Problem
-from starcat.service.settings import Settings
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.reading import content_of_toml, preset, preset_names, spec_from_dict
 
@@ -47,8 +45,7 @@ def small(
 
 @pytest.fixture(scope="module")
 def client(small: BuildSpec, tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
-    app = make_app(Settings(root=tmp_path_factory.mktemp("service"), workers=0))
-    with TestClient(app, base_url="http://127.0.0.1:8000") as client:
+    with client_of(tmp_path_factory.mktemp("service")) as client:
         yield client
 
 
@@ -343,16 +340,3 @@ def test_files_that_are_too_large_are_read_to_a_limit_only(small, monkeypatch):
     content["catalog"]["read_limit_mag"] = 6.2
     assert catalogs.estimate(spec_from_dict(content, "small")).cost.stars > 0
     catalogs.close()
-
-
-def test_what_is_kept_in_memory_is_bounded():
-    kept: Kept[str] = Kept(100)
-    for name in "abc":
-        kept.put(name, name.upper(), 40)
-    assert [kept.get(name) for name in "abc"] == [None, "B", "C"]
-    kept.get("b")
-    kept.put("d", "D", 40)
-    assert [kept.get(name) for name in "bcd"] == ["B", None, "D"]
-    kept.put("e", "E", 101)
-    kept.put("d", "DD", 60)
-    assert [kept.get(name) for name in "bde"] == ["B", "DD", None]

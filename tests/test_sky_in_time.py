@@ -29,9 +29,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from starcat.cli.terminal.sky_in_time import print_sky_in_time, sky_as_dict
+from starcat.cli.matches import print_sky_in_time
 from starcat.errors import ConfigError
-from starcat.geometry.aberration import LIGHT_KM_S, aberrated
 from starcat.geometry.attitude import (
     matrix_from_quaternion,
     matrix_from_radec_roll,
@@ -40,15 +39,14 @@ from starcat.geometry.attitude import (
 )
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import radec_from_directions, separation
-from starcat.images.answering import sky_of_answer
-from starcat.images.identification import MeasuredFile, draw, identify_frames
+from starcat.images.picture import draw
+from starcat.images.solve_files import FileAnswers, IdentifyOptions, LocalInputs, MeasuredFile
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
-from starcat.sky.bodies import bodies_seen
+from starcat.sky.bodies import PHASE_CURVES, apparent_magnitude, bodies_seen
 from starcat.sky.in_time import earth_limb_angle_deg, sky_in_time
-from starcat.sky.magnitudes import PHASE_CURVES, apparent_magnitude
-from starcat.sky.observer import Observer, numbers_of
+from starcat.sky.observer import LIGHT_KM_S, Observer, aberrated, numbers_of
 from starcat.sky.spots import identify_in_time, planets_among
 
 Array = NDArray[np.float64]
@@ -375,7 +373,6 @@ def test_frames_that_are_not_identified_have_no_sky(random_sky):
         Matcher(random_sky).identify, random_sky, np.ones((1, 2)), random_sky.camera, observer
     )
     assert sky_in_time(found, random_sky, np.ones((1, 2)), random_sky.camera, observer) is None
-    assert sky_as_dict(None) is None
 
 
 JUPITER = "2026-01-10T09:00:00"
@@ -518,18 +515,16 @@ def test_what_is_printed_is_what_was_found(random_sky, jupiter_frame, capsys):
     )
     sky = sky_in_time(found, random_sky, frame, camera, observer)
     assert sky is not None
-    content = sky_as_dict(sky)
-    assert content is not None
+    content = sky.content()
     assert content["time"] == "2026-01-10T09:00:00Z"
     assert content["q_body_from_icrs"] == list(sky.q_body_from_icrs)
     assert content["earth_limb_angle_deg"] is None
     assert [body["name"] for body in content["bodies"]] == ["Jupiter"]
-    print_sky_in_time(["one", "two"], [sky, None])
+    print_sky_in_time([("one", sky)])
     said = capsys.readouterr().out
     for words in ("With aberration, at 2026-01-10T09:00:00Z", "Jupiter", "one"):
         assert words in said
-    assert "two" not in said
-    print_sky_in_time(["two"], [None])
+    print_sky_in_time([])
     assert capsys.readouterr().out == ""
 
 
@@ -586,8 +581,10 @@ def test_the_picture_of_a_frame_with_jupiter_names_it_once(
     frame, mag, _, _ = jupiter_frame
     camera, observer = random_sky.camera, Observer.at(JUPITER)
     measured = MeasuredFile([MeasuredFrame("one", frame, mag)])
-    results = identify_frames(Matcher(random_sky), measured, camera, observer)
-    sky = sky_of_answer(measured.frames[0], results[0], observer)
+    local = LocalInputs(observer=observer)
+    matcher = Matcher(random_sky)
+    answers = FileAnswers(tmp_path, matcher, measured, camera, IdentifyOptions(), local)
+    [answer] = answers
     written = []
     write = matplotlib.text.Text.__init__
 
@@ -596,10 +593,10 @@ def test_the_picture_of_a_frame_with_jupiter_names_it_once(
         write(self, x, y, text, **options)
 
     monkeypatch.setattr(matplotlib.text.Text, "__init__", listen)
-    draw(tmp_path / "a.png", measured, results[0], random_sky, camera, sky)
+    answers.draw(tmp_path / "a.png", answer)
     assert written.count("Jupiter") == 1
-    assert f"identified: {results[0].n_matched + 1}" in written
+    assert f"identified: {answer.result.n_matched + 1}" in written
     written.clear()
-    draw(tmp_path / "a.png", measured, results[0], random_sky, camera)
+    draw(tmp_path / "a.png", answer.frame, None, answer.result, random_sky, camera)
     assert "Jupiter" not in written
-    assert f"identified: {results[0].n_matched}" in written
+    assert f"identified: {answer.result.n_matched}" in written

@@ -19,10 +19,9 @@ from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.geometry.sphere import separation
-from starcat.images.identification import short_name
+from starcat.images.frame_axes import FrameAxes
 from starcat.images.overlay import Overlay, draw_overlay, overlay_from_attitude
-from starcat.images.picture import draw_identified
-from starcat.images.plate import Plate
+from starcat.images.picture import draw_identified, short_name
 from starcat.sky.in_time import BodyInFrame
 from starcat.sky.names import common_names, constellation_lines, named_stars
 
@@ -237,7 +236,7 @@ def test_names_of_planets_stay_in_the_frame(tmp_path, monkeypatch):
 def test_names_of_the_grid_do_not_cover_each_other():
     overlay = overlay_from_attitude(matrix_from_radec_roll(112.9, 24.2, 20.0), ORION, 2026.0)
     axes = Figure().add_axes((0.0, 0.0, 1.0, 1.0))
-    plate = Plate(axes, 0.6, (1000, 800), np.empty((0, 2)), [], np.empty(0))
+    plate = FrameAxes(axes, 0.6, (1000, 800), np.empty((0, 2)), [], np.empty(0))
     twice = Overlay(overlay.grid + overlay.grid)
     boxes = draw_overlay(plate, twice)
     assert 4 <= len(boxes) <= len(overlay.grid)

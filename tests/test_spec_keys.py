@@ -9,12 +9,28 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from starcat.catalog.ingest import ingest
 from starcat.errors import ConfigError
+from starcat.pipeline import starter
 from starcat.pipeline.starter import ENOUGH_STARS, boresight_count
 from starcat.specs.build_spec import BuildSpec, CameraSpec
-from starcat.specs.keys import REQUIRED, spec_sections
+from starcat.specs.keys import REQUIRED, spec_sections, spec_toml, toml_value
 from starcat.specs.reading import preset, preset_names, read_spec, spec_from_dict
-from starcat.specs.spec_toml import spec_toml, toml_value
+
+
+@pytest.fixture(scope="module", autouse=True)
+def sky_read_once():
+    """The embedded sky, which every first spec begins with."""
+    read = {}
+
+    def once(source, paths, **options):
+        if source not in read:
+            read[source] = ingest(source, paths)
+        return read[source]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(starter, "ingest", once)
+        yield
 
 
 def all_keys():

@@ -23,7 +23,7 @@ import pytest
 from astropy.table import Table
 
 from starcat.artifact.reader import open_artifact
-from starcat.cli.terminal.prompt import prompt, words
+from starcat.cli.queries import prompt, words
 from starcat.errors import ProductError, QueryError, SchemaVersionError, SourceError
 from starcat.query.gallery import gallery, guessed, named_query
 from starcat.query.names import identifier
@@ -79,7 +79,13 @@ def test_columns_are_described_with_their_units(session, small_artifact):
 def test_units_of_an_answer_are_those_of_the_columns_and_of_the_names(session):
     text = "SELECT ra_deg, mag, mag - 1 AS other_mag, 1.5 AS x_mas_yr, 3 AS plain FROM stars"
     with session.ask(text) as answer:
-        assert [facts.unit for facts in answer.facts] == ["deg", "mag", "mag", "mas/yr", ""]
+        assert [column.unit for column in answer.table(1).columns] == [
+            "deg",
+            "mag",
+            "mag",
+            "mas/yr",
+            "",
+        ]
         assert answer.batches().schema.field("mag").metadata[b"unit"] == b"mag"
 
 

@@ -14,8 +14,8 @@ from starcat.exchange.hats import write_hats
 from starcat.storage.digests import file_sha256
 from starcat.store.ingest import ingest_to_store
 from starcat.store.layout import open_store
-from starcat.store.options import StoreOptions
 from starcat.store.pixels import HEALPIX_COLUMN, healpix_29
+from starcat.store.plan import StoreOptions
 from starcat.store.reading import read_catalog
 
 

@@ -18,8 +18,8 @@ from twomass_parts import write_part
 from starcat.errors import BuildError, ConfigError, OutputError, ParseError, SourceError
 from starcat.store import split as splitting
 from starcat.store.ingest import ingest_to_store
-from starcat.store.ledger import Work
-from starcat.store.options import StoreOptions
+from starcat.store.ledger import ResumePlan
+from starcat.store.plan import StoreOptions
 
 ROWS = 4_000
 SMALL = {"max_partition_rows": 3_000}
@@ -71,7 +71,7 @@ def test_a_damaged_part_is_named_and_what_is_done_is_kept(damaged, whole, tmp_pa
     with pytest.raises(ParseError, match=rf"{copies[1].name}: .*cut off"):
         make(copies, store, workers=1)
     assert not store.exists()
-    work = Work.of(store)
+    work = ResumePlan.of(store)
     assert work.done("file-00000") is not None
     assert work.done("file-00001") is None
     copies[1].write_bytes(content)
@@ -109,13 +109,13 @@ def test_what_is_done_is_not_done_again_and_what_was_changed_is(
         return reading(file, *rest)
 
     monkeypatch.setattr(splitting, "FileReading", spy)
-    assert Work.of(store).done("file-00000") is not None
-    next((Work.of(store) / "runs").glob("file-00000*.arrow")).write_bytes(b"no longer")
+    assert ResumePlan.of(store).done("file-00000") is not None
+    next((ResumePlan.of(store) / "runs").glob("file-00000*.arrow")).write_bytes(b"no longer")
     make(copies, store, resume=True)
     assert set(opened) >= {path.name for path in copies[:2]}
     assert bytes_of(store) == whole
     opened.clear()
-    work = Work.of(tmp_path / "again")
+    work = ResumePlan.of(tmp_path / "again")
     with monkeypatch.context() as patch:
         patch.setattr("starcat.store.ingest.make_manifest", _fail)
         with pytest.raises(BuildError):

@@ -25,11 +25,12 @@ from starcat.errors import QueryError
 from starcat.exchange.formats import response_format
 from starcat.query.session import open_session
 from starcat.service.app import make_app
-from starcat.service.records import Records
+from starcat.service.jobs.job import QUERY
+from starcat.service.jobs.job_states import begin_next
+from starcat.service.jobs.slots import ENDED_WITH_SERVER
+from starcat.service.service import Service
 from starcat.service.settings import Settings
 from starcat.service.vo.tap_spool import ClientGone, Spool
-from starcat.service.vo.tap_store import ENDED_WITH_SERVER, TapJobs
-from starcat.vo.documents import ServiceLimits
 from starcat.vo.parameters import Question
 
 LOCAL = "http://127.0.0.1:8000"
@@ -564,14 +565,15 @@ def test_jobs_outlive_the_server(tmp_path, small_artifact, bright):
     root = tmp_path / "service"
     shelve(root, small_artifact)
     settings = Settings(root=root)
-    with TestClient(make_app(settings), base_url=LOCAL) as client:
-        records = Records(root / "records.sqlite")
-        jobs = TapJobs(records, client.app.state.service.paths, ServiceLimits(60, 3600, 10, 10))
-        made = [jobs.create("anonymous", [("QUERY", BRIGHT)]).job_id for _ in range(3)]
-        for job_id in made[:2]:
-            jobs.queue(job_id)
-        jobs.begin(made[0])
-        records.close()
+    service = Service(settings)
+    jobs = service.tap.jobs
+    made = [jobs.create("anonymous").job_id for _ in range(3)]
+    for job_id in made:
+        jobs.set_parameters(job_id, [("QUERY", BRIGHT)], {})
+    for job_id in made[:2]:
+        jobs.run(job_id)
+    begin_next(service.records, (QUERY,))
+    service.close()
     with TestClient(make_app(settings), base_url=LOCAL) as client:
         addresses = [f"{LOCAL}/tap/async/{job_id}" for job_id in made]
         assert error_of(client.get(f"{addresses[0]}/error")) == ENDED_WITH_SERVER

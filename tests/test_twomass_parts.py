@@ -13,8 +13,8 @@ sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 from twomass_parts import FAINTEST_KS_MAG, KINDS, PARTS, part_bytes, write_parts
 
 from starcat.catalog.ingest import ingest
-from starcat.catalog.quality import Quality
 from starcat.catalog.stars import floats_of
+from starcat.catalog.verdict import Quality
 from starcat.geometry.sphere import directions_from_radec, separation
 
 ROWS = 92 * 300

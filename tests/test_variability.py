@@ -11,11 +11,10 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from starcat.catalog.archives.gcvs import Gcvs, read_gcvs
 from starcat.catalog.ingest import ingest
 from starcat.catalog.source import data_source
 from starcat.catalog.stars import floats_of, table_from_columns
-from starcat.catalog.variability import AmplitudeTable, join_amplitudes, read_amplitudes
+from starcat.catalog.variability import AmplitudeTable, join_amplitudes, read_amplitudes, read_gcvs
 from starcat.errors import ParseError
 
 
@@ -172,10 +171,10 @@ def test_a_star_that_gaia_lacks_joins_by_its_hipparcos_number() -> None:
 
 
 @pytest.fixture
-def gcvs(tmp_path: Path) -> Callable[..., Gcvs]:
+def gcvs(tmp_path: Path) -> Callable[..., AmplitudeTable]:
     """Read GCVS records: number, type, maximum, flag, minimum."""
 
-    def run(*records: str) -> Gcvs:
+    def run(*records: str) -> AmplitudeTable:
         lines = []
         for record in records:
             number, kind, top, flag, low = record.split()
@@ -207,42 +206,44 @@ def gcvs(tmp_path: Path) -> Callable[..., Gcvs]:
     ],
 )
 def test_amplitudes_of_gcvs(
-    gcvs: Callable[..., Gcvs], record: str, amplitude: float | None
+    gcvs: Callable[..., AmplitudeTable], record: str, amplitude: float | None
 ) -> None:
     found = gcvs(record).amplitude_mag
     expected = np.nan if amplitude is None else amplitude
     np.testing.assert_allclose(found, [expected], rtol=0, atol=1e-12)
 
 
-def test_numbers_of_gcvs(gcvs: Callable[..., Gcvs]) -> None:
+def test_numbers_of_gcvs(gcvs: Callable[..., AmplitudeTable]) -> None:
     found = gcvs("118218 M 1 0 2", "4313918654563864193 - 1 0 2")
-    assert found.hip_number.tolist() == [118218, 0]
-    assert found.gaia_id.tolist() == [0, 4313918654563864193]
-    assert found.var_type.tolist() == ["M", None]
+    assert found.numbers["hip_number"].tolist() == [118218, 0]
+    assert found.numbers["gaia"].tolist() == [0, 4313918654563864193]
+    assert found.flag.tolist() == ["M", None]
     assert found.files[0].rows == 2
     assert found.rejected == {}
 
 
 @pytest.mark.parametrize("ref", ["none", "0", "\u00b2\u00b3", "9" * 19, "\u0661", "-5", "1_0"])
-def test_a_record_of_gcvs_without_a_number_is_rejected(gcvs: Callable[..., Gcvs], ref: str) -> None:
+def test_a_record_of_gcvs_without_a_number_is_rejected(
+    gcvs: Callable[..., AmplitudeTable], ref: str
+) -> None:
     found = gcvs("118218 M 1 0 2", f"{ref} SR 1 0 2")
-    assert found.hip_number.tolist() == [118218]
+    assert found.numbers["hip_number"].tolist() == [118218]
     assert found.rejected == {"no_identity": 1}
     assert found.files[0].rows == 2
 
 
 @pytest.mark.parametrize("mag", ["nan", "inf", "1e308", "\u0665", "1_0"])
 def test_a_magnitude_of_gcvs_that_is_none_gives_no_amplitude(
-    gcvs: Callable[..., Gcvs], mag: str
+    gcvs: Callable[..., AmplitudeTable], mag: str
 ) -> None:
     found = gcvs(f"118218 M 8.0 0 {mag}")
     assert np.isnan(found.amplitude_mag).all()
 
 
-def test_a_malformed_record_of_gcvs(gcvs: Callable[..., Gcvs]) -> None:
+def test_a_malformed_record_of_gcvs(gcvs: Callable[..., AmplitudeTable]) -> None:
     found = gcvs("1 M 1 0 2", "2 M 1 x 2", "3 M 1 0 2")
     assert found.rejected == {"malformed_record": 1}
-    assert found.hip_number.tolist() == [1, 3]
+    assert found.numbers["hip_number"].tolist() == [1, 3]
     assert found.files[0].rows == 3
 
 

@@ -16,15 +16,15 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from starcat.artifact.content import content_sha256
-from starcat.artifact.database import INDICES
 from starcat.artifact.manifest import DATABASE_NAME, MANIFEST_NAME, manifest_digest
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import Finding, check_artifact, verify_artifact
+from starcat.artifact.writer import content_sha256
 from starcat.errors import ProductError
 from starcat.resources import resource_folder
 from starcat.storage.digests import file_sha256, json_bytes
 from starcat.storage.parquet import read_parquet, write_parquet
+from starcat.storage.product_table import PRODUCTS, indices_of
 
 SCHEMAS = resource_folder("schemas")
 
@@ -112,8 +112,8 @@ def test_every_index_that_is_written_is_named(small_artifact: Path) -> None:
             for column in artifact.schema(name).columns:
                 parts = ("_offsets", "_values") if column.is_list else ("",)
                 columns |= {f"{column.name}{part}" for part in parts}
-            assert set(file[name]) - columns == set(INDICES.get(name, ()))
-    assert set(INDICES) <= {path.stem.partition("-")[0] for path in SCHEMAS.glob("*.json")}
+            assert set(file[name]) - columns == set(indices_of(name))
+    assert set(PRODUCTS) <= {path.stem.partition("-")[0] for path in SCHEMAS.glob("*.json")}
 
 
 # Whole and damaged files --------------------------------------------------------------------
@@ -152,9 +152,13 @@ def test_200_flipped_bytes_are_all_found(copy: Path, files: Sequence[str]) -> No
     assert verify_artifact(copy).findings == ()
 
 
-@pytest.mark.parametrize("share", [pytest.param(0.0, marks=pytest.mark.slow), 0.5])
+SOME = (MANIFEST_NAME, DATABASE_NAME, "stars.parquet", "report/index.html")
+"""One file of each kind."""
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
 def test_every_truncated_file_is_found(share: float, copy: Path, files: Sequence[str]) -> None:
-    for name in files:
+    for name in SOME:
         whole = (copy / name).read_bytes()
         os.truncate(copy / name, int(share * len(whole)))
         found = verify_artifact(copy).findings
@@ -162,16 +166,27 @@ def test_every_truncated_file_is_found(share: float, copy: Path, files: Sequence
         assert (name, product_of(name)) in {(f.file, f.product) for f in found}
         assert {f.file for f in found} == {name}
     assert verify_artifact(copy).findings == ()
+    listed = [name for name in files if name != MANIFEST_NAME]
+    for name in listed:
+        os.truncate(copy / name, int(share * (copy / name).stat().st_size))
+    found = verify_artifact(copy).findings
+    assert {(f.file, f.product) for f in found} == {(name, product_of(name)) for name in listed}
 
 
 def test_every_missing_file_is_found(copy: Path, files: Sequence[str]) -> None:
-    for name in files:
+    for name in SOME:
         whole = (copy / name).read_bytes()
         (copy / name).unlink()
         (finding,) = verify_artifact(copy).findings
         (copy / name).write_bytes(whole)
         assert (finding.file, finding.product) == (name, product_of(name))
         assert finding.problem.startswith("missing")
+    listed = [name for name in files if name != MANIFEST_NAME]
+    for name in listed:
+        (copy / name).unlink()
+    found = verify_artifact(copy).findings
+    assert sorted(f.file for f in found) == listed
+    assert all(f.problem.startswith("missing") for f in found)
 
 
 def test_a_damaged_database_is_one_finding_and_is_not_opened(copy: Path) -> None:

@@ -15,7 +15,7 @@ from starcat.resources import PathLike
 if TYPE_CHECKING:  # a program that only matches has none of the libraries behind these
     from starcat.artifact.verify import Verification
     from starcat.matcher.matcher import Matcher
-    from starcat.query.answer import Answer
+    from starcat.query.result import Answer
     from starcat.query.session import Limits
     from starcat.report.coverage_report import CoverageReport
 
@@ -174,7 +174,7 @@ class Connection:
         QueryLimitError
             If it takes more time or memory than it may.
         """
-        from starcat.query.answer import Answer
+        from starcat.query.result import Answer
 
         with self._session.ask(text, values) as answer:
             return Answer(answer.batches().read_all())

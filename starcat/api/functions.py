@@ -112,7 +112,7 @@ def ingest(
     ConfigError, SourceError
         If the source is unknown, or its files are missing or damaged.
     """
-    from starcat.catalog.fetching.locate import locate
+    from starcat.catalog.source_files import locate
     from starcat.progress import no_progress
     from starcat.store.reading import read_catalog as read
 

@@ -10,7 +10,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,7 @@ from starcat.errors import ArtifactMissing, ProductError, SchemaVersionError
 from starcat.version import __version__
 
 if TYPE_CHECKING:  # reading a manifest needs none of these
-    from starcat.catalog.file_parts import FileFacts
+    from starcat.catalog.source_files import FileFacts
     from starcat.storage.schema import ProductSchema
 
 MANIFEST_NAME = "manifest.json"
@@ -81,19 +81,8 @@ class SourceFacts:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the facts as the manifest holds them."""
-        facts: dict[str, Any] = {
-            "source": self.source,
-            "role": self.role,
-            "files": [vars(file) for file in self.files],
-            "rows_read": self.rows_read,
-            "kept": self.kept,
-            "rejected": self.rejected,
-        }
-        if self.joined is not None:
-            facts["joined"] = self.joined
-        if self.moved_arcsec is not None:
-            facts["moved_arcsec"] = self.moved_arcsec
-        return facts
+        facts = {name: value for name, value in asdict(self).items() if value is not None}
+        return {**facts, "files": list(facts["files"])}
 
 
 @dataclass(frozen=True)

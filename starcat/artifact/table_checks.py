@@ -14,9 +14,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from starcat.artifact.content import content_sha256
 from starcat.artifact.crossmatch_table import counterpart_problems
 from starcat.artifact.motion_table import motion_problems
+from starcat.artifact.writer import content_sha256
 from starcat.errors import SchemaError
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.storage.schema import ProductSchema

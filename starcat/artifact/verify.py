@@ -184,7 +184,6 @@ def _check_files(artifact: Artifact, log: _Log) -> set[str]:
 
 
 def _product_of(name: str) -> str:
-    """Return the product that a file holds."""
     path = Path(name)
     if path.name == DATABASE_NAME:
         return "database"

@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starcat.arrays import Array
-from starcat.calibration.fit import Fit, fit_camera
-from starcat.calibration.lens import AXES, PARAMETERS, camera_of, values_of
+from starcat.calibration.fit import AXES, PARAMETERS, Fit, camera_of, fit_camera, values_of
 from starcat.calibration.models import COMPLETE, Trial, choose_model, chosen, is_enough, start_of
 from starcat.calibration.rounds import Identified, first_answer, identify_part, settled
 from starcat.errors import CalibrationError
@@ -157,7 +156,6 @@ def calibrate_frames(
 def _finished(
     matcher: Matcher, frames: Sequence[MeasuredFrame], identified: Identified, fit: Fit
 ) -> Calibration:
-    """Return the calibration that compares all models, once the stars are known."""
     size_px = identified.camera.width_px, identified.camera.height_px
     seen = identified.seen(frames, matcher)
     trials, terms = [], fit.free
@@ -222,5 +220,5 @@ def _too_few(
 
 
 def _why(frame: MeasuredFrame, result: MatchResult) -> str:
-    words = result.refusal.words if result.refusal else result.status.replace("_", " ")
+    words = result.refusal.message if result.refusal else result.status.replace("_", " ")
     return f"{len(frame.centroids_px)} centroids: {words}"

@@ -16,8 +16,20 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
 from starcat.arrays import Array
-from starcat.calibration.fit import BEND, Fit, Seen, fit_camera, reduced_derivatives, turned_to
-from starcat.calibration.lens import CENTRE, FOCAL, PARAMETERS, RADIAL, TANGENTIAL, camera_of
+from starcat.calibration.fit import (
+    BEND,
+    CENTRE,
+    FOCAL,
+    PARAMETERS,
+    RADIAL,
+    TANGENTIAL,
+    Fit,
+    Seen,
+    camera_of,
+    fit_camera,
+    reduced_derivatives,
+    turned_to,
+)
 from starcat.errors import ConfigError
 
 FOLDS = 5

@@ -17,16 +17,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.calibration.fit import Fit, Seen, fit_camera
-from starcat.calibration.lens import CENTRE, FOCAL, camera_of, cropped, values_of
+from starcat.calibration.fit import (
+    CENTRE,
+    FOCAL,
+    Fit,
+    Seen,
+    camera_of,
+    cropped,
+    fit_camera,
+    values_of,
+)
 from starcat.calibration.models import choose_model, chosen, is_enough, start_of
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import matrix_from_quaternion
 from starcat.geometry.camera import Camera
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.chance import MIN_STARS
-from starcat.matcher.matcher import NOISE_DEVIATIONS, Matcher
+from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
+from starcat.matcher.settings import NOISE_DEVIATIONS
 from starcat.progress import Progress
 
 WIDE_PX = 6.0
@@ -73,22 +82,13 @@ ROUND_MODELS = (
 
 @dataclass(frozen=True)
 class Identified:
-    """What the matcher says about the frames.
+    """What the matcher says about the frames."""
 
-    Attributes
-    ----------
-    results : tuple of MatchResult
-        One a frame, about the centroids as they were given; those outside of the part of the
-        frame that was asked about have no star.
-    camera : Camera
-        That they were identified with.
-    tolerance_px : float
-        Within which.
-    """
-
+    # one a frame, about the centroids as they were given; those outside of the part of the frame
+    # that was asked about have no star
     results: tuple[MatchResult, ...]
-    camera: Camera
-    tolerance_px: float
+    camera: Camera  # that they were identified with
+    tolerance_px: float  # within which
 
     @property
     def found(self) -> list[int]:
@@ -227,7 +227,7 @@ def _focal_lengths(shortest: float, longest: float, step: float) -> list[float]:
 
 def _of_all(result: MatchResult, rows: NDArray[np.int64], count: int) -> MatchResult:
     """Return the answer about some centroids as one about all of them."""
-    ids, index = np.full(count, -1, dtype=np.int64), np.full(count, -1, dtype=np.int32)
-    ids[rows], index[rows] = result.star_ids, result.star_index
+    index = np.full(count, -1, dtype=np.int32)
+    index[rows] = result.star_index
     dropped = tuple((int(rows[row]), reason) for row, reason in result.dropped)
-    return replace(result, star_ids=ids, star_index=index, dropped=dropped)
+    return replace(result, star_index=index, dropped=dropped)

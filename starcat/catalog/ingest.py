@@ -7,63 +7,49 @@ or in the rejected table, with one reason.
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterator, Sequence
-from concurrent.futures import CancelledError, ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from threading import Event
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from starcat.catalog.blocks import CATALOGS, Reading, TablePile, join_parts
-from starcat.catalog.file_parts import NAMED_PROBLEMS, BytesRead, FileFacts, FileReading
-from starcat.catalog.nearest import add_nearest_neighbours
+from starcat.catalog.parts import (
+    CATALOGS,
+    NAMED_PROBLEMS,
+    FileReading,
+    IngestOptions,
+    merged,
+    parse_block,
+    read_files,
+)
 from starcat.catalog.photometry import blend_weights
-from starcat.catalog.readers.files import InputFile, find_files
-from starcat.catalog.repeats import check_contents, check_names
 from starcat.catalog.source import DataSource, data_source
-from starcat.catalog.stars import floats_of
-from starcat.catalog.verdict import Reason
-from starcat.errors import BuildError, ConfigError, SourceMissing
+from starcat.catalog.source_files import FileFacts, SourceFiles
+from starcat.catalog.stars import add_nearest_neighbours, floats_of, sort_rows, split_by_verdict
+from starcat.catalog.verdict import Reason, Verdicts, rejected_path
+from starcat.errors import BuildError, ConfigError
 from starcat.progress import Progress, no_progress
+from starcat.storage.parquet import write_table
 from starcat.storage.schema import product_schema
+
+_PART_ROWS = 8192
 
 
 @dataclass(frozen=True)
 class Ingested:
-    """A catalog as a star table.
-
-    Attributes
-    ----------
-    source : str
-        Name of the data source.
-    band : str
-        Band of ``mag``.
-    stars : pyarrow.Table
-        Records with a position, by star_id; schema ``stars``.
-    rejected : pyarrow.Table
-        All other records but those beyond the read limit; schema ``rejected``.
-    files : tuple of FileFacts
-        What was read, in order.
-    problems : tuple of str
-        The first malformed records, each with file, line and bytes.
-    notes : tuple of str
-        What a user should know of the inputs: optional files that are missing.
-    beyond_read_limit : int
-        Records fainter than the read limit, which are in neither table.
-    """
+    """A catalog as a star table."""
 
     source: str
-    band: str
-    stars: pa.Table
-    rejected: pa.Table
-    files: tuple[FileFacts, ...]
-    problems: tuple[str, ...]
-    notes: tuple[str, ...] = ()
-    beyond_read_limit: int = 0
+    band: str  # of `mag`
+    stars: pa.Table  # records with a position, by star_id; schema `stars`
+    rejected: pa.Table  # all others but those beyond the read limit; schema `rejected`
+    files: tuple[FileFacts, ...]  # what was read, in order
+    problems: tuple[str, ...]  # the first malformed records, each with file, line and bytes
+    notes: tuple[str, ...] = ()  # what a user should know of the inputs
+    beyond_read_limit: int = 0  # records that are in neither table
 
     def __repr__(self) -> str:
         """Return source and counts in one line."""
@@ -83,8 +69,48 @@ class Ingested:
         return count_by_reason(self.rejected, self.beyond_read_limit)
 
 
+@dataclass
+class StarTables:
+    """The tables of a catalog while it is read, part by part."""
+
+    stars: list[pa.Table] = field(default_factory=list)
+    rejected: list[pa.Table] = field(default_factory=list)
+    counted: int = 0  # records beyond the read limit
+
+    def add(self, stars: pa.Table, rejected: pa.Table | None = None, counted: int = 0) -> None:
+        """Take a part."""
+        self.stars += [stars] if len(stars) else []
+        self.rejected += [rejected] if rejected is not None and len(rejected) else []
+        self.counted += counted
+
+    def joined(self) -> tuple[pa.Table, pa.Table]:
+        """Return stars and rejected records, sorted.
+
+        Of the records of a star the one that was read first is kept.
+        """
+        # Chunks stay as they are: joining them would hold the whole catalog in memory twice.
+        stars = sort_rows(_concatenated("stars", self.stars), _KEYS)
+        number = stars["star_id"].to_numpy()
+        repeated = np.concatenate([[False], number[1:] == number[:-1]])[: len(number)]
+        if repeated.any():
+            verdicts = Verdicts(len(stars))
+            verdicts.reject(repeated, Reason.duplicate_record)
+            stars, again = split_by_verdict(stars, verdicts)
+            stars = stars.combine_chunks()
+            self.rejected.append(again)
+        rejected = _concatenated("rejected", self.rejected).combine_chunks()
+        return stars, sort_rows(rejected, _KEYS)
+
+
+_KEYS = ("star_id", "source_file", "source_line")
+
+
+def _concatenated(product: str, tables: Sequence[pa.Table]) -> pa.Table:
+    return pa.concat_tables(tables or [product_schema(product).arrow_schema.empty_table()])
+
+
 def count_by_reason(rejected: pa.Table, beyond_read_limit: int = 0) -> dict[str, int]:
-    """Return how many rows of a rejected table each reason has."""
+    """Return how many rows of a rejected table each reason has, in the order of the reasons."""
     counted = {
         entry["values"]: entry["counts"]
         for entry in pc.value_counts(rejected["reason"]).to_pylist()
@@ -105,49 +131,75 @@ def ingest(
     workers: int = 2,
     progress: Progress = no_progress,
 ) -> Ingested:
-    """Read a star catalog into a star table."""
-    source = star_catalog(source_name)
-    how = Reading(source_name, check_band(source, band), epoch_jyear, read_limit_mag)
-    files = given_files(source, paths)
-    gathered: list[_Gathered] = []
-    for each in _read_files(files, source, how, workers, progress):
-        gathered.append(each)
-        check_contents(files[: len(gathered)], [one.facts for one in gathered], source)
-    stars, rejected = join_parts(
-        [table for each in gathered for table in each.stars],
-        [table for each in gathered for table in each.rejected],
-    )
-    stars = add_nearest_neighbours(stars, workers) if neighbours else stars
+    """Read a star catalog into a star table.
+
+    Without a band it is the source's first, without an epoch every star stays at its own. Records
+    fainter than the read limit are counted and never held; they are nobody's neighbour. Workers
+    are threads; the result is the same for any number.
+
+    Raises
+    ------
+    ConfigError
+        If the source is not a star catalog or has no such band.
+    SourceError
+        If a file is missing, damaged, given twice, or not of this archive.
+    """
+    options = ingest_options(source_name, band, epoch_jyear, read_limit_mag)
+    files = SourceFiles.find(data_source(source_name), paths)
+    readings = [FileReading(file, n, files.source) for n, file in enumerate(files.files)]
+    tables, facts = StarTables(), []
+    problems: list[str] = []
+    parse = partial(parse_block, options=options)
+    for reading, parts in read_files(readings, parse, workers, progress):
+        for part in merged(parts, _PART_ROWS):
+            tables.add(part.stars, part.rejected, part.counted)
+        facts.append(reading.facts)
+        problems += reading.named_problems
+        files.check_contents(facts)
+    stars, rejected = tables.joined()
+    read = ingested(options, stars, rejected, tables.counted, facts, problems, files.notes)
+    return replace(read, stars=add_nearest_neighbours(read.stars, workers)) if neighbours else read
+
+
+def ingested(
+    options: IngestOptions,
+    stars: pa.Table,
+    rejected: pa.Table,
+    counted: int,
+    files: Sequence[FileFacts],
+    problems: Sequence[str],
+    notes: Sequence[str],
+) -> Ingested:
+    """Return a catalog that has been read, after checking that no record is missing."""
     product_schema("stars").check(stars)
     product_schema("rejected").check(rejected)
-    notes = (*missing_files(source, files), *unmoved_stars(source_name, stars, epoch_jyear))
     read = Ingested(
-        source_name,
-        how.band,
+        options.source_name,
+        options.band,
         stars,
         rejected,
-        tuple(each.facts for each in gathered),
-        tuple(problem for each in gathered for problem in each.problems)[:NAMED_PROBLEMS],
-        notes,
-        sum(each.counted for each in gathered),
+        tuple(files),
+        tuple(problems)[:NAMED_PROBLEMS],
+        (*notes, *unmoved_stars(options.source_name, stars, options.epoch_jyear)),
+        counted,
     )
-    check_balance(read)
+    left_out = sum(read.rejected_by_reason.values())
+    if read.rows_read != len(stars) + left_out:
+        raise BuildError(
+            f"{read.source}: {read.rows_read} records read, but {len(stars)} kept and "
+            f"{left_out} rejected by reason; expected as many. This is a fault of starcat: report "
+            "it with the command and the files"
+        )
     return read
 
 
-def check_balance(read: Ingested) -> None:
-    """Check that every record read is kept or rejected."""
-    rejected = sum(read.rejected_by_reason.values())
-    if read.rows_read != len(read.stars) + rejected:
-        raise BuildError(
-            f"{read.source}: {read.rows_read} records read, but {len(read.stars)} kept and "
-            f"{rejected} rejected by reason; expected as many. This is a fault of starcat: report "
-            "it with the command and the files"
-        )
-
-
-def star_catalog(source_name: str) -> DataSource:
-    """Return a data source that is a star catalog."""
+def ingest_options(
+    source_name: str,
+    band: str | None,
+    epoch_jyear: float | None = None,
+    read_limit_mag: float | None = None,
+) -> IngestOptions:
+    """Return the options to read a source with, after checking that it has stars and the band."""
     source = data_source(source_name)
     if source_name not in CATALOGS:
         raise ConfigError(
@@ -155,16 +207,22 @@ def star_catalog(source_name: str) -> DataSource:
             key="source",
             value=source_name,
         )
-    return source
+    return IngestOptions(source_name, check_band(source, band), epoch_jyear, read_limit_mag)
 
 
-def given_files(source: DataSource, paths: Sequence[Path]) -> list[InputFile]:
-    """Return the files of a source."""
-    files = find_files(source, paths)
-    if not files:
-        raise SourceMissing(f"{source.name}: no input files given", source=source.name)
-    check_names(files, source)
-    return files
+def check_band(source: DataSource, band: str | None) -> str:
+    """Return the band to use, the source's first by default, after checking that it has it."""
+    if band is None:
+        return source.bands[0]
+    if source.name == "2mass":
+        blend_weights(band)
+    elif band not in source.bands:
+        raise ConfigError(
+            f"{source.name} has no band {band!r}; it has {', '.join(source.bands)}",
+            key="band",
+            value=band,
+        )
+    return band
 
 
 def unmoved_stars(source_name: str, stars: pa.Table, epoch_jyear: float | None) -> tuple[str, ...]:
@@ -180,86 +238,11 @@ def unmoved_stars(source_name: str, stars: pa.Table, epoch_jyear: float | None) 
     )
 
 
-def missing_files(source: DataSource, files: Sequence[InputFile]) -> tuple[str, ...]:
-    """Return a note for each optional file of a source that is not among the inputs."""
-    given = {file.layout.name for file in files}
-    return tuple(
-        f"{source.name}: {layout.file_names[0]} is not among the inputs ({layout.description})"
-        for layout in source.files
-        if layout.optional and layout.name not in given
-    )
-
-
-@dataclass(frozen=True)
-class _Gathered:
-    """What one file has given."""
-
-    facts: FileFacts
-    stars: list[pa.Table]
-    rejected: list[pa.Table]
-    counted: int
-    problems: tuple[str, ...]
-
-
-def _gather(reading: FileReading, stop: Event | None = None) -> _Gathered:
-    """Read a file; give up between two blocks when asked to stop."""
-    stars, rejected, counted = TablePile("stars"), TablePile("rejected"), 0
-    for part in reading:
-        stars.add(part.stars)
-        rejected.add(part.rejected)
-        counted += part.counted
-        if stop is not None and stop.is_set():
-            raise CancelledError
-    return _Gathered(reading.facts, stars.tables, rejected.tables, counted, reading.problems)
-
-
-def _read_files(
-    files: Sequence[InputFile],
-    source: DataSource,
-    how: Reading,
-    workers: int,
-    progress: Progress,
-) -> Iterator[_Gathered]:
-    """Read all files, in order: side by side where each is small beside all of them."""
-    read = BytesRead(files, source.name, progress)
-    sizes = [file.path.stat().st_size for file in files]
-    if workers < 2 or max(sizes) * workers > sum(sizes):
-        for n, file in enumerate(files):
-            tell = read.teller(n)
-            yield _gather(FileReading(file, n, source, how, workers=workers, on_bytes=tell))
-        return
-    stop = Event()
-    with ThreadPoolExecutor(workers) as pool:
-        readings = (
-            FileReading(file, n, source, how, on_bytes=partial(read.note, n))
-            for n, file in enumerate(files)
-        )
-        pending = deque(pool.submit(_gather, reading, stop) for reading in readings)
-        try:
-            while pending:
-                while not wait([pending[0]], timeout=_TELL_EVERY_S).done:
-                    read.tell()
-                read.tell()
-                yield pending.popleft().result()
-        finally:
-            stop.set()
-            for future in pending:
-                future.cancel()
-
-
-_TELL_EVERY_S = 0.1
-
-
-def check_band(source: DataSource, band: str | None) -> str:
-    """Return the band to use, after checking that the source has it."""
-    if band is None:
-        return source.bands[0]
-    if source.name == "2mass":
-        blend_weights(band)
-    elif band not in source.bands:
-        raise ConfigError(
-            f"{source.name} has no band {band!r}; it has {', '.join(source.bands)}",
-            key="band",
-            value=band,
-        )
-    return band
+def write_star_tables(read: Ingested, output: Path) -> None:
+    """Write a star table, and its rejected rows beside it where there are any."""
+    write_table(read.stars, output)
+    beside = rejected_path(output)
+    if len(read.rejected):
+        write_table(read.rejected, beside)
+    else:
+        beside.unlink(missing_ok=True)

@@ -19,20 +19,12 @@ _TERM = re.compile(r"(?:(\d+(?:\.\d+)?|\.\d+)\*)?(J|H|Ks)")
 
 @dataclass(frozen=True)
 class JohnsonV:
-    """Johnson V of Tycho stars.
+    """Johnson V of Tycho stars."""
 
-    Attributes
-    ----------
-    mag : ndarray of float64, shape (N,)
-        V; NaN where neither magnitude is known.
-    is_estimated : ndarray of bool, shape (N,)
-        VT or BT is missing, so no colour correction was possible.
-    is_out_of_range : ndarray of bool, shape (N,)
-        The colour lies outside the formula's range; it was held at the range's end.
-    """
-
-    mag: Array
+    mag: Array  # shape (N,): V; NaN where neither magnitude is known
+    # shape (N,): VT or BT is missing, so no colour correction was possible
     is_estimated: NDArray[np.bool_]
+    # shape (N,): the colour lies outside the formula's range; it was held at the range's end
     is_out_of_range: NDArray[np.bool_]
 
 

@@ -20,18 +20,12 @@ MAS = np.pi / (180.0 * 3600.0 * 1000.0)  # rad in a milliarcsecond
 
 @dataclass(frozen=True)
 class Motion:
-    """Positions and proper motions at one epoch, all of shape (N,).
+    """Positions and proper motions at one epoch, all of shape (N,)."""
 
-    Attributes
-    ----------
-    ra_deg, dec_deg : ndarray of float64
-        Degrees, ICRS.
-    pm_ra_cosdec_mas_yr, pm_dec_mas_yr : ndarray of float64
-        Milliarcseconds a year; NaN where unknown.
-    """
-
+    # ra_deg, dec_deg: degrees, ICRS
     ra_deg: Array
     dec_deg: Array
+    # pm_ra_cosdec_mas_yr, pm_dec_mas_yr: milliarcseconds a year; NaN where unknown
     pm_ra_cosdec_mas_yr: Array
     pm_dec_mas_yr: Array
 

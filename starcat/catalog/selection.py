@@ -16,11 +16,15 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from starcat.arrays import Array, Mask
-from starcat.catalog.blocks import reject_rows
 from starcat.catalog.photometry import combined_magnitude
-from starcat.catalog.quality import Quality
-from starcat.catalog.stars import directions_of, floats_of, sort_rows, with_columns
-from starcat.catalog.verdict import Reason, Verdicts
+from starcat.catalog.stars import (
+    directions_of,
+    floats_of,
+    sort_rows,
+    split_by_verdict,
+    with_columns,
+)
+from starcat.catalog.verdict import Quality, Reason, Verdicts
 from starcat.errors import BuildError
 from starcat.geometry.proximity import pairs_within
 from starcat.geometry.sphere import radec_from_directions
@@ -33,37 +37,19 @@ MOST_PAIRS = 10_000_000
 
 @dataclass(frozen=True)
 class Step:
-    """The stars that are left after one filter.
+    """The stars that are left after one filter."""
 
-    Attributes
-    ----------
-    name : str
-        What was filtered.
-    directions : ndarray of float64, shape (N, 3)
-        Directions of the stars that are left.
-    """
-
-    name: str
-    directions: Array
+    name: str  # what was filtered
+    directions: Array  # ICRS, shape (N, 3)
 
 
 @dataclass(frozen=True)
 class Selected:
-    """Guide stars, and every other star with its reason.
+    """Guide stars, and every other star with its reason."""
 
-    Attributes
-    ----------
-    guide_stars : pyarrow.Table
-        Table of the stars schema, by star_id.
-    rejected : pyarrow.Table
-        Table of the rejected schema, by star_id.
-    steps : tuple of Step
-        What was left after each filter, in order.
-    """
-
-    guide_stars: pa.Table
-    rejected: pa.Table
-    steps: tuple[Step, ...]
+    guide_stars: pa.Table  # of the stars schema, by star_id
+    rejected: pa.Table  # of the rejected schema, by star_id
+    steps: tuple[Step, ...]  # what was left after each filter, in order
 
 
 def select_guide_stars(stars: pa.Table, selection: Selection) -> Selected:
@@ -95,12 +81,8 @@ def select_guide_stars(stars: pa.Table, selection: Selection) -> Selected:
             beyond_brightest(stars, verdicts.is_kept, selection.max_stars), Reason.beyond_count
         )
         note("count")
-    kept = pa.array(verdicts.is_kept)
-    return Selected(
-        stars.filter(kept).combine_chunks(),
-        reject_rows(stars.filter(pa.array(~verdicts.is_kept)), verdicts.reasons),
-        tuple(steps),
-    )
+    kept, rejected = split_by_verdict(stars, verdicts)
+    return Selected(kept.combine_chunks(), rejected, tuple(steps))
 
 
 def _companion_pairs(stars: pa.Table, selection: Selection) -> tuple[NDArray[np.int64], Array]:
@@ -127,7 +109,10 @@ def _check_pairs(stars: int, separation_deg: float) -> None:
 
 
 def has_companion(stars: pa.Table, selection: Selection) -> Mask:
-    """Return which stars have a companion that the sensor cannot tell apart."""
+    """Return which stars have a companion that the sensor cannot tell apart.
+
+    It lies within ``min_separation_deg`` and is not fainter by more than ``max_delta_mag``.
+    """
     pairs, mag = _companion_pairs(stars, selection)
     most = selection.doubles.max_delta_mag
     found = np.zeros(len(stars), dtype=bool)
@@ -139,7 +124,11 @@ def has_companion(stars: pa.Table, selection: Selection) -> Mask:
 
 
 def merge_doubles(stars: pa.Table, selection: Selection, verdicts: Verdicts) -> pa.Table:
-    """Merge groups of close stars into one star each, at their photocentre."""
+    """Merge groups of close stars into one star each, at their photocentre.
+
+    The rows stay; the brightest of each group, a chain of pairs as `has_companion` finds them,
+    has the combined magnitude and direction, the others are rejected.
+    """
     pairs, mag = _companion_pairs(stars, selection)
     if selection.doubles.max_delta_mag is not None:
         delta = np.abs(mag[pairs[:, 0]] - mag[pairs[:, 1]])
@@ -190,7 +179,11 @@ def _with_photocentres(
 
 
 def is_unresolved_double(stars: pa.Table, doubles: Doubles) -> Mask:
-    """Return which stars an archive's flags say to leave out as doubles."""
+    """Return which stars an archive's flags say to leave out as doubles.
+
+    With ``unresolved``: flagged, with a separation below the limit or not stated, and a stated
+    magnitude difference within ``max_delta_mag``.
+    """
     flagged = np.array(stars["is_flagged_double"])
     if doubles.flags == "ignore" or doubles.action == "keep":
         return np.zeros(len(stars), dtype=bool)
@@ -226,16 +219,13 @@ def beyond_brightest(stars: pa.Table, kept: Mask, count: int) -> Mask:
 
 
 def reject_dense(selected: Selected, kept: NDArray[np.integer]) -> Selected:
-    """Thin the guide stars to those that a tiling asks for."""
-    stars = selected.guide_stars
-    verdicts = Verdicts(len(stars))
-    wanted = np.zeros(len(stars), dtype=bool)
-    wanted[kept] = True
-    verdicts.reject(~wanted, Reason.density)
-    dense = reject_rows(stars.filter(pa.array(~wanted)), verdicts.reasons)
+    """Thin the guide stars to those that a tiling asks for, by row."""
+    verdicts = Verdicts(len(selected.guide_stars))
+    verdicts.reject(~np.isin(np.arange(len(selected.guide_stars)), kept), Reason.density)
+    stars, dense = split_by_verdict(selected.guide_stars, verdicts)
     rejected = pa.concat_tables([selected.rejected, dense]).combine_chunks()
     return Selected(
-        stars.filter(pa.array(wanted)).combine_chunks(),
+        stars.combine_chunks(),
         sort_rows(rejected, product_schema("rejected").order),
-        (*selected.steps, Step("density", directions_of(stars)[wanted])),
+        (*selected.steps, Step("density", directions_of(stars))),
     )

@@ -19,31 +19,10 @@ from starcat.errors import ConfigError, suggest
 from starcat.failures import validation_message
 from starcat.resources import resource_folder
 
-UNITS = frozenset(
-    [
-        "deg",
-        "rad",
-        "h",
-        "min",
-        "s",
-        "arcmin",
-        "arcsec",
-        "mas",
-        "cas",
-        "darcsec",
-        "mag",
-        "mmag",
-        "yr",
-        "d",
-        "mas/yr",
-        "arcsec/yr",
-        "s/yr",
-        "cas/yr",
-        "pix",
-        "ct",
-        "km/s",
-    ]
-)
+UNITS = frozenset((
+    "deg", "rad", "h", "min", "s", "arcmin", "arcsec", "mas", "cas", "darcsec", "mag", "mmag",
+    "yr", "d", "mas/yr", "arcsec/yr", "s/yr", "cas/yr", "pix", "ct", "km/s",
+))  # fmt: skip
 """Units that a column may name; ``cas`` is 10 mas, ``darcsec`` is 0.1 arcsec."""
 
 RANGES = {
@@ -68,37 +47,15 @@ class _Model(BaseModel):
 
 
 class Column(_Model):
-    """One column of a record.
+    """One column of a record."""
 
-    Attributes
-    ----------
-    name : str
-        The archive's own label, in snake_case.
-    bytes : tuple of int, optional
-        First and last byte in the record, 1-based inclusive (fixed width and binary).
-    format : str
-        As the archive's ReadMe prints it (``I6``, ``F9.6``, ``A3``); a little-endian numpy
-        code such as ``<f8`` for binary records.
-    unit : str, optional
-        One of ``UNITS``.
-    null : tuple of str
-        Texts that mean "no value", beside a blank field.
-    required : bool
-        A record whose field is blank is malformed.
-    limits : tuple of float, optional
-        Least and greatest number that the field can hold, both included; a record with another
-        is malformed. `range` says what holds where this is not given.
-    description : str
-        Meaning, in a few words.
-    """
-
-    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
-    bytes: tuple[int, int] | None = None
-    format: str
-    unit: str | None = None
-    null: tuple[str, ...] = ()
-    required: bool = False
-    limits: tuple[float, float] | None = None
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")  # the archive's own label, in snake_case
+    bytes: tuple[int, int] | None = None  # first and last in the record, 1-based inclusive
+    format: str  # as the archive's ReadMe prints it (I6, F9.6, A3); in packed records such as <f8
+    unit: str | None = None  # one of `UNITS`
+    null: tuple[str, ...] = ()  # texts that mean "no value", beside a blank field
+    required: bool = False  # a record whose field is blank is malformed
+    limits: tuple[float, float] | None = None  # a record with a number outside is malformed
     description: str = ""
 
     @model_validator(mode="after")
@@ -146,60 +103,25 @@ class Column(_Model):
 
 
 class RecordFile(_Model):
-    """One file of a source, or one file in several parts, and its record layout.
+    """One file of a source, or one file in several parts, and its record layout."""
 
-    Attributes
-    ----------
-    name : str
-        Layout name; the quirk module branches on it.
-    file_names : tuple of str
-        Accepted names without ``.gz``, most usual first; ``{part}`` stands for a part.
-    parts : tuple of str
-        Values of ``{part}`` in order; empty for a single file.
-    optional : bool
-        The source is usable without this file.
-    description : str
-        What is in the file, where a source has several.
-    layout : {"fixed_width", "delimited", "binary"}
-        Which reader.
-    record_bytes : int, optional
-        Length of a record without its line end (fixed width, binary).
-    header_bytes : int
-        Bytes before the first record (binary).
-    magic : str
-        Text that a binary file begins with.
-    delimiter : str
-        Between fields of a delimited record.
-    comment : str
-        Lines that begin with it are not records.
-    literals : dict of str to str
-        Byte position (1-based) to the character that every record has there.
-    rows : int, optional
-        Records in the whole archive file.
-    sha256 : str, optional
-        Digest of the file as published, where it is known.
-    urls : tuple of str
-        Addresses, the preferred first; ``{part}`` stands for a part.
-    columns : tuple of Column
-        The record, in order.
-    """
-
-    name: str
+    name: str  # of the layout, which the archive's module branches on
+    # Accepted names without .gz, most usual first; {part} stands for a part, here and in urls.
     file_names: tuple[str, ...] = Field(min_length=1)
-    parts: tuple[str, ...] = ()
-    optional: bool = False
-    description: str = ""
+    parts: tuple[str, ...] = ()  # in order; empty for a single file
+    optional: bool = False  # the source is usable without this file
+    description: str = ""  # what is in the file, where a source has several
     layout: Literal["fixed_width", "delimited", "binary"]
-    record_bytes: int | None = None
-    header_bytes: int = 0
-    magic: str = ""
+    record_bytes: int | None = None  # without the line end (fixed width, binary)
+    header_bytes: int = 0  # before the first record (binary)
+    magic: str = ""  # text that a binary file begins with
     delimiter: str = "|"
-    comment: str = ""
-    literals: dict[str, str] = {}
-    rows: int | None = None
-    sha256: str | None = None
-    urls: tuple[str, ...] = ()
-    columns: tuple[Column, ...] = Field(min_length=1)
+    comment: str = ""  # lines that begin with it are not records
+    literals: dict[str, str] = {}  # 1-based byte to the character that every record has there
+    rows: int | None = None  # records in the whole archive file
+    sha256: str | None = None  # of the file as published, where it is known
+    urls: tuple[str, ...] = ()  # the preferred first
+    columns: tuple[Column, ...] = Field(min_length=1)  # the record, in order
 
     @model_validator(mode="after")
     def _check(self) -> RecordFile:
@@ -228,41 +150,20 @@ class RecordFile(_Model):
 
 
 class DataSource(_Model):
-    """An archive as ``data_sources/<name>.toml`` describes it.
+    """An archive as ``data_sources/<name>.toml`` describes it."""
 
-    Attributes
-    ----------
-    name : str
-        How commands call it.
-    title, identifier, citation, licence, reference : str
-        What it is, where it is catalogued, how to cite it, under which terms it comes and
-        which document the layout was taken from.
-    kind : {"stars", "variability"}
-        A star catalog, or a table joined to one.
-    frame : {"ICRS", "FK5", "none"}
-        Axes of the positions.
-    epoch_jyear : float, optional
-        Julian year of the positions, where all records share it.
-    bands : tuple of str
-        Magnitude bands that can be asked for, the default first.
-    urls_retrieved : str
-        When and how the addresses were last tried.
-    files : tuple of RecordFile
-        The files, in reading order.
-    """
-
-    name: str
+    name: str  # in commands
     title: str
-    identifier: str
+    identifier: str  # where it is catalogued
     citation: str
     licence: str
-    reference: str = ""
-    kind: Literal["stars", "variability"] = "stars"
-    frame: Literal["ICRS", "FK5", "none"]
-    epoch_jyear: float | None = None
-    bands: tuple[str, ...] = ()
-    urls_retrieved: str
-    files: tuple[RecordFile, ...] = Field(min_length=1)
+    reference: str = ""  # the document that the layout was taken from
+    kind: Literal["stars", "variability"] = "stars"  # a catalog, or a table joined to one
+    frame: Literal["ICRS", "FK5", "none"]  # axes of the positions
+    epoch_jyear: float | None = None  # of the positions, where all records share it
+    bands: tuple[str, ...] = ()  # of the magnitudes, the default first
+    urls_retrieved: str  # when and how the addresses were last tried
+    files: tuple[RecordFile, ...] = Field(min_length=1)  # in reading order
 
     @property
     def rows(self) -> int | None:

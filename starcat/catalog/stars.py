@@ -1,13 +1,12 @@
 """The star table: one row a catalog record, columns as ``schemas/stars-*.json`` says.
 
 A catalog module fills in the columns that its archive has; this module adds the rest, moves
-positions to the epoch of the build and joins blocks into one table sorted by star.
+positions to the epoch of the build and parts the rejected records from the stars.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -16,44 +15,24 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from starcat.catalog.proper_motion import Motion, propagate_directions
-from starcat.catalog.quality import Quality
-from starcat.catalog.verdict import Verdicts
+from starcat.catalog.verdict import Quality, Verdicts
+from starcat.geometry.proximity import nearest_neighbours
 from starcat.geometry.sphere import directions_from_radec
 from starcat.storage.schema import product_schema
 
 Values: TypeAlias = NDArray[Any] | pa.Array | str | float | int | bool
+"""An array of shape (N,) or one value for all; NaN means null."""
+
+Columns: TypeAlias = dict[str, Values]
+"""Star-table columns of some records; one that the archive does not have is left out."""
 
 
-@dataclass(frozen=True)
-class StarBlock:
-    """What a catalog module makes of a block of records.
+def move_to_epoch(columns: Mapping[str, Values], epoch_jyear: float | None) -> Columns:
+    """Return the columns with positions at an epoch, and their directions.
 
-    Attributes
-    ----------
-    columns : dict of str to Values
-        Star-table columns, arrays of shape (N,) or one value for all; NaN means null. A column
-        that the archive does not have is left out.
-    verdicts : Verdicts
-        Records that are not stars to keep, with the reason.
+    A star without proper motion stays where and when its archive has it, and its quality flags
+    say so; where the epoch is None, every star stays.
     """
-
-    columns: dict[str, Values]
-    verdicts: Verdicts
-
-    def where(self, chosen: NDArray[np.bool_]) -> StarBlock:
-        """Return some of the records."""
-        columns = {name: _values_where(values, chosen) for name, values in self.columns.items()}
-        return StarBlock(columns, self.verdicts.where(chosen))
-
-
-def _values_where(values: Values, chosen: NDArray[np.bool_]) -> Values:
-    if isinstance(values, pa.Array | pa.ChunkedArray):
-        return values.filter(pa.array(chosen))
-    return values[chosen] if isinstance(values, np.ndarray) else values
-
-
-def move_to_epoch(columns: Mapping[str, Values], epoch_jyear: float | None) -> dict[str, Values]:
-    """Return the columns with positions at an epoch, and their directions."""
     ra = np.asarray(columns["ra_deg"], dtype=np.float64)
     dec = np.asarray(columns["dec_deg"], dtype=np.float64)
     blank = np.full(len(ra), np.nan)
@@ -83,7 +62,7 @@ def move_to_epoch(columns: Mapping[str, Values], epoch_jyear: float | None) -> d
 
 
 def table_from_columns(product: str, columns: Mapping[str, Values], count: int) -> pa.Table:
-    """Return columns as a table of a product's schema."""
+    """Return columns as a table of a product's schema, null where none was given."""
     schema = product_schema(product).arrow_schema
     unknown = set(columns) - set(schema.names)
     if unknown:
@@ -121,6 +100,36 @@ def _as_array(value: Values, kind: pa.DataType, count: int) -> pa.Array:
     return pa.array(array).cast(kind)
 
 
+def reject_rows(stars: pa.Table, reasons: pa.Array) -> pa.Table:
+    """Return rows of a star table as rows of a rejected table, each with its reason."""
+    schema = product_schema("rejected").arrow_schema
+    verdict = {"reason": reasons, "detail": pa.nulls(len(stars), pa.string())}
+    columns = [verdict[name] if name in verdict else stars[name] for name in schema.names]
+    return pa.Table.from_arrays(columns, schema=schema)
+
+
+def split_by_verdict(stars: pa.Table, verdicts: Verdicts) -> tuple[pa.Table, pa.Table]:
+    """Return the rows of a star table that are kept, and the others as a rejected table."""
+    is_kept = verdicts.is_kept
+    if is_kept.all():
+        return stars, product_schema("rejected").arrow_schema.empty_table()
+    rejected = reject_rows(stars.filter(pa.array(~is_kept)), verdicts.reasons)
+    return stars.filter(pa.array(is_kept)), rejected
+
+
+def add_nearest_neighbours(stars: pa.Table, workers: int = 2) -> pa.Table:
+    """Return a star table with the columns of the nearest neighbour filled in."""
+    if len(stars) < 2:
+        return stars
+    angle, index = nearest_neighbours(directions_of(stars), workers)
+    mag = floats_of(stars, "mag")
+    columns: Columns = {
+        "nearest_separation_arcsec": np.degrees(angle) * 3600.0,
+        "nearest_delta_mag": mag[index] - mag,
+    }
+    return with_columns(stars, columns)
+
+
 def text_column(values: NDArray[Any]) -> pa.Array:
     """Return fixed-width bytes as trimmed text, null where blank."""
     try:
@@ -132,7 +141,10 @@ def text_column(values: NDArray[Any]) -> pa.Array:
 
 
 def join_flags(parts: Mapping[str, tuple[NDArray[np.bool_], NDArray[Any] | None]]) -> pa.Array:
-    """Return the archive's codes as one text a star, such as ``Rem=1;m_HD=2``."""
+    """Return the archive's codes as one text a star, such as ``Rem=1;m_HD=2``; null without any.
+
+    Each label comes with where its code applies and the text of the code (None: the label alone).
+    """
     is_flagged = np.logical_or.reduce([where for where, _ in parts.values()])
     rows = np.flatnonzero(is_flagged)
     joined = pa.nulls(len(rows), pa.string())
@@ -160,12 +172,12 @@ def numbered(prefix: str, number: NDArray[np.int64]) -> pa.Array:
 
 
 def directions_of(stars: pa.Table) -> NDArray[np.float64]:
-    """Return the directions of a star table."""
+    """Return the ICRS directions of a star table, contiguous, shape (N, 3)."""
     return np.stack([stars[name].to_numpy() for name in ("x", "y", "z")], axis=-1)
 
 
 def floats_of(stars: pa.Table, name: str) -> NDArray[np.float64]:
-    """Return a numeric column with NaN for null."""
+    """Return a copy of a numeric column with NaN for null."""
     column = stars[name]
     if column.null_count:
         column = pc.fill_null(column.cast(pa.float64()), float("nan"))

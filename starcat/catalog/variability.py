@@ -1,7 +1,13 @@
-"""Amplitudes of variable stars, joined to a star table from another source."""
+"""Amplitudes of variable stars, from another source than the star table that they are joined to.
+
+The General Catalogue of Variable Stars names a star by one number: up to six digits are a
+Hipparcos number, more are a Gaia DR3 source id. Its magnitude flag 1 says that the "minimum" is
+an amplitude itself.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,42 +18,35 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.catalog.archives.gcvs import read_gcvs
-from starcat.catalog.file_parts import FileFacts
 from starcat.catalog.ingest import ingest
+from starcat.catalog.parts import FileReading, read_files
+from starcat.catalog.readers.blocks import Block
+from starcat.catalog.readers.delimited import parse_delimited
+from starcat.catalog.readers.records import Records, number_from_text
+from starcat.catalog.source import RANGES, data_source
+from starcat.catalog.source_files import FileFacts, SourceFiles
 from starcat.catalog.stars import floats_of, with_columns
+from starcat.catalog.verdict import Reason
 from starcat.progress import Progress, no_progress
+
+GCVS_COLUMNS = ("star_ref", "var_type", "mag_max", "mag_flag", "mag_min")
+
+_DIGITS = re.compile(r"[0-9]{1,19}")
+_LARGEST_HIP = 999_999
 
 
 @dataclass(frozen=True)
 class AmplitudeTable:
-    """Amplitudes by the numbers under which stars are known.
-
-    Attributes
-    ----------
-    source : str
-        Data source of the amplitudes.
-    files : tuple of FileFacts
-        What was read.
-    kept : int
-        Records that could be used.
-    rejected : dict of str to int
-        The others, by reason.
-    amplitude_mag : ndarray of float64, shape (M,)
-        NaN where unknown.
-    flag : ndarray of object, shape (M,)
-        The source's code for the variability, None where it has none.
-    numbers : dict of str to ndarray of float64 or int64, shape (M,)
-        Keys by name: ``hip_number``, ``hd_number``, ``tyc`` or ``gaia``; 0 where unknown.
-    """
+    """Amplitudes by the numbers under which stars are known, arrays of shape (M,)."""
 
     source: str
     files: tuple[FileFacts, ...]
-    kept: int
-    rejected: dict[str, int]
-    amplitude_mag: Array
-    flag: NDArray[np.object_]
+    kept: int  # records that could be used
+    rejected: dict[str, int]  # the others, by reason
+    amplitude_mag: Array  # NaN where unknown; in GCVS a lower bound where the minimum is a limit
+    flag: NDArray[np.object_]  # the source's code for the variability, None where it has none
     numbers: dict[str, NDArray[np.int64]]
+    """Keys by name, ``hip_number``, ``hd_number``, ``tyc`` or ``gaia``; 0 where unknown."""
 
 
 def read_amplitudes(
@@ -55,11 +54,7 @@ def read_amplitudes(
 ) -> AmplitudeTable:
     """Read the amplitudes of a source."""
     if source_name == "gcvs":
-        gcvs = read_gcvs(paths, progress)
-        return AmplitudeTable(
-            "gcvs", gcvs.files, len(gcvs.amplitude_mag), gcvs.rejected, gcvs.amplitude_mag,
-            gcvs.var_type, {"hip_number": gcvs.hip_number, "gaia": gcvs.gaia_id},
-        )  # fmt: skip
+        return read_gcvs(paths, progress)
     read = ingest(source_name, paths, neighbours=False, progress=progress)
     # A star without a position can still be known to vary.
     usable = read.rejected.filter(pc.is_valid(read.rejected["star_id"]))
@@ -80,6 +75,70 @@ def read_amplitudes(
         np.array(stars["variable_flag"].to_pylist(), dtype=object),
         numbers,
     )
+
+
+def read_gcvs(paths: Sequence[Path], progress: Progress = no_progress) -> AmplitudeTable:
+    """Read the General Catalogue of Variable Stars."""
+    files = SourceFiles.find(data_source("gcvs"), paths)
+    readings = [FileReading(file, n, files.source) for n, file in enumerate(files.files)]
+
+    def parse(block: Block, _: int) -> Records:
+        return parse_delimited(block.data, block.file.layout, GCVS_COLUMNS, block.first_line)
+
+    parts = [
+        part for _, parsed in read_files(readings, parse, progress=progress) for part in parsed
+    ]
+    facts = tuple(reading.facts for reading in readings)
+    files.check_contents(facts)
+
+    def text(name: str) -> list[str]:
+        return [value.decode("latin-1").strip() for part in parts for value in part[name].tolist()]
+
+    number = np.array([_star_number(ref) for ref in text("star_ref")], dtype=np.int64)
+    known = number > 0
+    brightest, faintest = (_magnitudes(text(name)) for name in ("mag_max", "mag_min"))
+    flag = np.concatenate([np.asarray(part["mag_flag"], dtype=np.float64) for part in parts])
+    # A few records contradict themselves: an "amplitude" fainter than the maximum is a
+    # magnitude after all, and a minimum brighter than the maximum says nothing.
+    is_amplitude = (flag == 1) & ~(faintest > brightest)
+    amplitude = np.where(is_amplitude, faintest, faintest - brightest)
+    amplitude[amplitude < 0.0] = np.nan
+    is_hip = number <= _LARGEST_HIP
+    rejected = {
+        Reason.malformed_record.name: sum(reading.malformed for reading in readings),
+        Reason.no_identity.name: int(np.count_nonzero(~known)),
+    }
+    return AmplitudeTable(
+        "gcvs",
+        facts,
+        int(np.count_nonzero(known)),
+        {reason: count for reason, count in rejected.items() if count},
+        amplitude[known],
+        np.array([kind or None for kind in text("var_type")], dtype=object)[known],
+        {
+            "hip_number": np.where(is_hip, number, 0)[known],
+            "gaia": np.where(is_hip, 0, number)[known],
+        },
+    )
+
+
+def _star_number(text: str) -> int:
+    """Return the number that names a star; 0 where the text is none."""
+    number = int(text) if _DIGITS.fullmatch(text) else 0
+    return number if number < 2**63 else 0
+
+
+def _magnitudes(texts: list[str]) -> Array:
+    """Return magnitudes, NaN where there is none; a limit sign stands before its number."""
+    values = np.full(len(texts), np.nan)
+    for i, text in enumerate(texts):
+        try:
+            values[i] = number_from_text(text.lstrip("<>(").encode("latin-1"))
+        except ValueError:
+            continue
+    least, greatest = RANGES["mag"]
+    values[(values < least) | (values > greatest)] = np.nan
+    return values
 
 
 def join_amplitudes(stars: pa.Table, table: AmplitudeTable) -> tuple[pa.Table, int]:

@@ -1,15 +1,18 @@
-"""Verdicts: every record is kept, or leaves with exactly one reason.
+"""Verdicts on records, kept or rejected with exactly one reason; and the bits of their quality.
 
 The reasons stand in the order in which they are tried; the first that applies is the verdict.
 """
 
 from __future__ import annotations
 
-from enum import Enum
+from enum import Enum, IntFlag
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
+
+from starcat.arrays import Mask
 
 
 class Reason(Enum):
@@ -48,19 +51,13 @@ class Verdicts:
     def __init__(self, count: int) -> None:
         self._code = np.zeros(count, dtype=np.int8)
 
-    def reject(self, where: NDArray[np.bool_], reason: Reason) -> None:
+    def reject(self, where: Mask, reason: Reason) -> None:
         """Reject records that no earlier reason applied to."""
         self._code[where & (self._code == 0)] = _CODES[reason]
 
-    def where(self, chosen: NDArray[np.bool_]) -> Verdicts:
-        """Return the verdicts on some of the records."""
-        verdicts = Verdicts(0)
-        verdicts._code = self._code[chosen]
-        return verdicts
-
     @property
-    def is_kept(self) -> NDArray[np.bool_]:
-        """Whether each record is kept: no reason has applied to it, shape (N,)."""
+    def is_kept(self) -> Mask:
+        """Whether each record is kept: no reason has applied to it."""
         return np.asarray(self._code == 0)
 
     @property
@@ -68,7 +65,31 @@ class Verdicts:
         """Names of the reasons of the rejected records, in order."""
         return _NAMES.take(pa.array(self._code[self._code != 0]))
 
-    def count_by_reason(self) -> dict[str, int]:
-        """Return how many records each reason has taken."""
-        counts = np.bincount(self._code, minlength=len(_NAMES))
-        return {r.name: int(counts[_CODES[r]]) for r in Reason if counts[_CODES[r]]}
+
+class Quality(IntFlag):
+    """The bits of ``quality_flags``: what to know of a star's position and magnitude."""
+
+    ESTIMATED_MAGNITUDE = 1
+    COLOUR_OUT_OF_RANGE = 2
+    SATURATED = 4
+    NO_PROPER_MOTION = 8
+    PHOTOCENTRE = 16
+    BLENDED = 32
+    POOR_PHOTOMETRY = 64
+    DUBIOUS_POSITION = 128
+    CONTAMINATED = 256
+    MERGED = 512
+    PERHAPS_NOT_A_STAR = 1024
+
+
+def quality_flags(count: int, bits: dict[Quality, Mask]) -> NDArray[np.int32]:
+    """Return the sum of the bits that apply to each star."""
+    flags = np.zeros(count, dtype=np.int32)
+    for bit, where in bits.items():
+        flags |= np.where(where, np.int32(bit), np.int32(0))
+    return flags
+
+
+def rejected_path(output: Path) -> Path:
+    """Return the file of the rejected rows that belong to a star table."""
+    return output.with_name(f"{output.stem}.rejected{output.suffix}")

@@ -1,6 +1,6 @@
-"""Running all trials of a paper, and what came of them.
+"""Running all experiments of a paper, and what came of them.
 
-Trials run side by side, one process each; a trial that is finished is never run again, so a
+Experiments run side by side, one process each. One that is finished is never run again, so a
 campaign that was stopped goes on where it was.
 """
 
@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import Any
 
 from starcat.errors import StarcatError
-from starcat.evaluation.axes import axis_label
+from starcat.evaluation.experiment import Experiment, frame_count, run_experiment
 from starcat.evaluation.paper import Paper, Row, Statistic
-from starcat.evaluation.rates import Share, TrialRates, failures_of, rates_of
-from starcat.evaluation.trial import Trial, frame_count, run_trial
+from starcat.evaluation.rates import ExperimentRates, Share, failures_of, rates_of
+from starcat.evaluation.sweep import axis_label
 from starcat.progress import Progress, no_progress
 
 
@@ -32,7 +32,7 @@ class MeasuredRow:
     """A row of a paper and what was measured."""
 
     row: Row  # the paper's
-    rates: TrialRates  # rates of the row's trial
+    rates: ExperimentRates  # rates of the row's experiment
     # frames without success by the row's rule, by cause
     failures: dict[str, int] = field(default_factory=dict)
 
@@ -53,7 +53,8 @@ class MeasuredRow:
             for name, value in vars(self.rates).items()
         }
         return {
-            **_plain(asdict(self.row)),
+            # results.json has called an experiment a trial since its first version
+            **{"trial" if k == "experiment" else k: v for k, v in _plain(asdict(self.row)).items()},
             **rates,
             "frames": self.rates.by_rule.count,
             "failures": self.failures,
@@ -68,7 +69,7 @@ class Outcome:
     paper: Paper  # what it prints
     is_quick: bool  # whether fewer frames were tried than the paper's
     rows: tuple[MeasuredRow, ...]  # the measured rows, in the paper's order
-    statistics: tuple[Statistic, ...]  # numbers that need no trial
+    statistics: tuple[Statistic, ...]  # numbers that need no experiment
 
     def as_dict(self) -> dict[str, Any]:
         """Return the outcome as plain values."""
@@ -112,50 +113,52 @@ def run_paper(
     workers: int = 2,
     progress: Progress = no_progress,
 ) -> Outcome:
-    """Run all trials of a paper, but those whose records are there."""
+    """Run all experiments of a paper, but those whose records are there."""
     rows = paper.rows(quick)
     tasks = _tasks(rows, artifacts)
     place = folder / (f"{paper.name}-quick" if quick else paper.name)
-    total = sum(frame_count(trial) for trial, _ in tasks)
+    total = sum(frame_count(experiment) for experiment, _ in tasks)
     done = 0
     progress(paper.name, done, total)
     with _running(tasks, place, workers) as finished:
-        for trial in finished:
-            done += frame_count(trial)
+        for experiment in finished:
+            done += frame_count(experiment)
             progress(paper.name, done, total)
-    measured = tuple(_measured(row, place / f"{row.trial.name}.parquet") for row in rows)
+    measured = tuple(_measured(row, place / f"{row.experiment.name}.parquet") for row in rows)
     return Outcome(paper, quick, measured, tuple(paper.statistics(dict(artifacts), quick)))
 
 
-def _tasks(rows: list[Row], artifacts: Mapping[str, Path]) -> list[tuple[Trial, Path]]:
-    """Return each trial once: rows may share one. The longest go first."""
-    tasks: dict[str, tuple[Trial, Path]] = {}
+def _tasks(rows: list[Row], artifacts: Mapping[str, Path]) -> list[tuple[Experiment, Path]]:
+    """Return each experiment once: rows may share one. The longest go first."""
+    tasks: dict[str, tuple[Experiment, Path]] = {}
     for row in rows:
-        task = row.trial, artifacts[row.preset]
-        if tasks.setdefault(row.trial.name, task) != task:
-            raise ValueError(f"two different trials are named {row.trial.name!r}")
+        task = row.experiment, artifacts[row.preset]
+        if tasks.setdefault(row.experiment.name, task) != task:
+            raise ValueError(f"two different experiments are named {row.experiment.name!r}")
     return sorted(tasks.values(), key=lambda task: -frame_count(task[0]))
 
 
 def _measured(row: Row, records: Path) -> MeasuredRow:
-    rates = rates_of(records, row.rule, row.trial.attitude_limit_px)
-    return MeasuredRow(row, rates, failures_of(records, row.rule, row.trial.attitude_limit_px))
+    rates = rates_of(records, row.rule, row.experiment.attitude_limit_px)
+    return MeasuredRow(row, rates, failures_of(records, row.rule, row.experiment.attitude_limit_px))
 
 
 @contextmanager
 def _running(
-    tasks: list[tuple[Trial, Path]], folder: Path, workers: int
-) -> Iterator[Iterator[Trial]]:
-    """Yield the trials as they end; leaving the block early drops those that have not ended."""
+    tasks: list[tuple[Experiment, Path]], folder: Path, workers: int
+) -> Iterator[Iterator[Experiment]]:
+    """Yield the experiments as they end; leaving the block early drops the others."""
     if workers == 1:
-        yield (_run(trial, artifact, folder) for trial, artifact in tasks)
+        yield (_run(experiment, artifact, folder) for experiment, artifact in tasks)
         return
     # Processes are spawned: a forked one inherits locks that the threads of libraries hold, and
     # waits for them without end.
     context, others = multiprocessing.get_context("spawn"), multiprocessing.active_children()
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with_parent)
     try:
-        futures = [pool.submit(_run, trial, artifact, folder) for trial, artifact in tasks]
+        futures = [
+            pool.submit(_run, experiment, artifact, folder) for experiment, artifact in tasks
+        ]
         yield (future.result() for future in as_completed(futures))
     except BrokenProcessPool as error:
         raise StarcatError(
@@ -171,9 +174,9 @@ def _running(
         pool.shutdown(cancel_futures=True)
 
 
-def _run(trial: Trial, artifact: Path, folder: Path) -> Trial:
-    run_trial(trial, artifact, folder, workers=1)
-    return trial
+def _run(experiment: Experiment, artifact: Path, folder: Path) -> Experiment:
+    run_experiment(experiment, artifact, folder, workers=1)
+    return experiment
 
 
 def _end_with_parent() -> None:
@@ -190,8 +193,8 @@ def _end_with_parent() -> None:
 
 
 def _axis(rows: list[Row]) -> str:
-    points = [(row.trial, row.x) for row in rows if row.x is not None]
-    return axis_label([trial for trial, _ in points], [x for _, x in points])
+    points = [(row.experiment, row.x) for row in rows if row.x is not None]
+    return axis_label([experiment for experiment, _ in points], [x for _, x in points])
 
 
 def _plain(value: Any) -> Any:

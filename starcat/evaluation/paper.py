@@ -1,4 +1,4 @@
-"""What a paper printed, and the trial that measures the same: the rows of the evaluation."""
+"""What a paper printed, and the experiment that measures the same: the rows of the evaluation."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from starcat.evaluation.trial import Trial
+from starcat.evaluation.experiment import Experiment
 from starcat.matcher.database import open_database
 
 
@@ -18,7 +18,7 @@ class Row:
     group: str  # title of the table or curve
     label: str  # name of the line
     preset: str  # the artifact that is used, by its preset
-    trial: Trial  # the frames and the method
+    experiment: Experiment  # the frames and the method
     rule: str  # what the paper counts as a success: a key of `RULES`
     published_percent: float | None = None  # what the paper prints
     published_ms: float | None = None
@@ -32,7 +32,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Statistic:
-    """A number that needs no trial, such as a count of triangles or bytes."""
+    """A number that needs no experiment, such as a count of triangles or bytes."""
 
     group: str  # title of the table, and name of the line
     label: str
@@ -54,10 +54,10 @@ class Paper:
     title: str  # what it is about; who, where, when
     citation: str
     presets: tuple[str, ...]  # artifacts that it needs
-    # function that returns the rows; for a quick run (True) with fewer frames
-    rows: Callable[[bool], list[Row]]
-    # function that returns the other numbers, from the artifacts' folders by preset
-    statistics: Callable[[dict[str, Path], bool], list[Statistic]]
+    # for a quick run (True) with fewer frames
+    rows: Callable[[bool], list[Row]] = lambda quick: []
+    # from the artifacts' folders by preset
+    statistics: Callable[[dict[str, Path], bool], list[Statistic]] = lambda artifacts, quick: []
     deviations: tuple[str, ...] = ()  # what the paper leaves unsaid, and what is done instead
 
 

@@ -1,4 +1,4 @@
-"""Rates, intervals and times of trials, and why frames failed, by SQL over their records."""
+"""Rates, intervals and times of experiments, and why frames failed, by SQL over their records."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 
 import duckdb
 
-from starcat.matcher.searching import CERTAIN
-from starcat.simulation.interval import wilson_interval
+from starcat.matcher.settings import CERTAIN
+from starcat.simulation.selftest import wilson_interval
 
 _ACCEPTED = f"status = 'identified' AND false_match_probability <= {CERTAIN!r}"
 _HOLDS = "coalesce(attitude_error_px <= $reach_px, false)"
@@ -91,8 +91,8 @@ class Share:
 
 
 @dataclass(frozen=True)
-class TrialRates:
-    """How a trial went."""
+class ExperimentRates:
+    """How an experiment went."""
 
     ceiling: Share  # frames with at least four guide stars
     # successes by the paper's rule, of all frames and of those with four guide stars
@@ -107,12 +107,12 @@ class TrialRates:
     p95_ms: float
 
 
-def rates_of(records: Path, rule: str, reach_px: float) -> TrialRates:
-    """Return the rates of a trial."""
+def rates_of(records: Path, rule: str, reach_px: float) -> ExperimentRates:
+    """Return the rates of an experiment."""
     query = _RATES.format(rule=RULES[rule], own=RULES["starcat"], accepted=_ACCEPTED, holds=_HOLDS)
     (row,) = _rows(query, records, reach_px)
     count, enough, hits, hits_enough, own, own_enough, wrong, mean, median, p95 = row
-    return TrialRates(
+    return ExperimentRates(
         Share(enough, count),
         Share(hits, count),
         Share(hits_enough, enough),
@@ -126,7 +126,7 @@ def rates_of(records: Path, rule: str, reach_px: float) -> TrialRates:
 
 
 def failures_of(records: Path, rule: str, reach_px: float) -> dict[str, int]:
-    """Count the frames of a trial that failed, by cause."""
+    """Count the frames of an experiment that failed, by cause."""
     cases = " ".join(f"WHEN {condition} THEN '{cause}'" for cause, condition in CAUSES.items())
     query = _FAILURES.format(cases=cases, rule=RULES[rule])
     return dict.fromkeys(CAUSES, 0) | dict(_rows(query, records, reach_px))

@@ -25,23 +25,11 @@ PROPERTIES_NAME = "hats.properties"
 
 @dataclass(frozen=True)
 class HatsCatalog:
-    """What a HATS catalog holds.
-
-    Attributes
-    ----------
-    rows : int
-        Stars written.
-    left_out : int
-        Rows without a position, which have no place on the sky.
-    order : int
-        Highest HEALPix order of the partitions' pixels.
-    partitions : int
-        Number of files.
-    """
+    """What a HATS catalog holds."""
 
     rows: int
-    left_out: int
-    order: int
+    left_out: int  # rows without a position, which have no place on the sky
+    order: int  # highest HEALPix order of the partitions' pixels
     partitions: int
 
 

@@ -10,8 +10,12 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from starcat.exchange.columns import Label, is_list, plain_batch, plain_schema
-from starcat.storage.parquet import ROW_GROUP_ROWS
-from starcat.storage.votable import ARROW_DATATYPES, astropy_metadata, votable_metadata
+from starcat.storage.parquet import (
+    ARROW_DATATYPES,
+    ROW_GROUP_ROWS,
+    astropy_metadata,
+    votable_metadata,
+)
 
 
 def write_parquet_stream(batches: pa.RecordBatchReader, path: Path, label: Label) -> int:

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest
-from starcat.catalog.quality import Quality
 from starcat.catalog.stars import numbered, sort_rows, table_from_columns
+from starcat.catalog.verdict import Quality
 from starcat.errors import ConfigError, SourceError, SourceMissing, reason
 from starcat.exchange.export import NamedTables, in_memory
 from starcat.geometry.sphere import directions_from_radec

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Directions, Matrix
 
 Quaternion = tuple[float, float, float, float]
 
@@ -20,18 +20,7 @@ Turn = tuple[float, float, float]
 
 
 def matrix_from_quaternion(q: Array) -> Array:
-    """Return the rotation matrix of a quaternion.
-
-    Parameters
-    ----------
-    q : ndarray of float64, shape (4,)
-        ``q_body_from_icrs``, scalar last; normalised here.
-
-    Returns
-    -------
-    ndarray of float64, shape (3, 3)
-        ``body = matrix @ icrs``.
-    """
+    """Return the rotation matrix of a quaternion, which is normalised here."""
     x, y, z, w = q.tolist()
     length = math.hypot(x, y, z, w)
     x, y, z, w = x / length, y / length, z / length, w / length
@@ -44,21 +33,9 @@ def matrix_from_quaternion(q: Array) -> Array:
     )
 
 
-def quaternion_from_matrix(matrix: Array) -> Array:
+def quaternion_from_matrix(matrix: Matrix) -> Array:
     """Return the quaternion of a rotation matrix, with ``w >= 0``.
 
-    Parameters
-    ----------
-    matrix : ndarray of float64, shape (3, 3)
-        ``body = matrix @ icrs``, a proper rotation.
-
-    Returns
-    -------
-    ndarray of float64, shape (4,)
-        ``q_body_from_icrs``, unit, scalar last.
-
-    Notes
-    -----
     The largest of the four components is found first, so that no division is by a small
     number (Shepperd 1978).
     """
@@ -82,19 +59,8 @@ def quaternion_from_matrix(matrix: Array) -> Array:
 def turn_between(q_from: Sequence[float], q_to: Sequence[float]) -> Turn:
     """Return the rotation of the camera that leads from one attitude to another.
 
-    Parameters
-    ----------
-    q_from, q_to : sequence of four float
-        Attitudes, unit.
+    Axis times angle, radians about the axes of the camera frame, at most pi long.
 
-    Returns
-    -------
-    tuple of three float
-        Radians about the axes of the camera frame (x right, y down, z along the boresight): axis
-        times angle, at most pi long.
-
-    Examples
-    --------
     >>> x, y, z = turn_between((0.0, 0.0, 0.0, 1.0), (0.0, 0.0, math.sin(0.1), math.cos(0.1)))
     >>> x, y, round(z, 9)
     (0.0, 0.0, 0.2)
@@ -109,20 +75,6 @@ def turn_between(q_from: Sequence[float], q_to: Sequence[float]) -> Turn:
 def after_turn(q: Sequence[float], turn: Turn) -> Quaternion:
     """Return the attitude that a rotation of the camera leads to.
 
-    Parameters
-    ----------
-    q : sequence of four float
-        Attitude, unit.
-    turn : tuple of three float
-        As `turn_between` has it.
-
-    Returns
-    -------
-    tuple of four float
-        Attitude, unit.
-
-    Examples
-    --------
     >>> there = after_turn((0.5, 0.5, 0.5, 0.5), (0.1, -0.2, 0.3))
     >>> [round(part, 9) for part in turn_between((0.5, 0.5, 0.5, 0.5), there)]
     [0.1, -0.2, 0.3]
@@ -134,7 +86,6 @@ def after_turn(q: Sequence[float], turn: Turn) -> Quaternion:
 
 
 def _quaternion_product(one: Sequence[float], other: Sequence[float]) -> Quaternion:
-    """Return the attitude of the second rotation after the first one."""
     (a, b, c, d), (x, y, z, w) = one, other
     return (
         d * x + a * w + b * z - c * y,
@@ -147,21 +98,9 @@ def _quaternion_product(one: Sequence[float], other: Sequence[float]) -> Quatern
 def matrix_from_radec_roll(ra_deg: float, dec_deg: float, roll_deg: float) -> Array:
     """Return the attitude matrix of a boresight and a roll.
 
-    Parameters
-    ----------
-    ra_deg, dec_deg : float
-        Boresight, degrees, ICRS.
-    roll_deg : float
-        Degrees. At 0 the image's up is north; positive turns the camera so that north moves
-        from up towards the image's left (counter-clockwise as seen in the image).
+    Row 2 is the boresight. At roll 0 the image's up is north; positive turns the camera so that
+    north moves from up towards the image's left (counter-clockwise as seen in the image).
 
-    Returns
-    -------
-    ndarray of float64, shape (3, 3)
-        ``body = matrix @ icrs``; row 2 is the boresight.
-
-    Notes
-    -----
     Looking out at the sky with north up, east is to the left, so the image's right (x) is
     west and its down (y) is south.
     """
@@ -175,19 +114,8 @@ def matrix_from_radec_roll(ra_deg: float, dec_deg: float, roll_deg: float) -> Ar
     return np.array([right, down, boresight])
 
 
-def radec_roll_from_matrix(matrix: Array) -> tuple[float, float, float]:
-    """Return boresight and roll of an attitude matrix.
-
-    Parameters
-    ----------
-    matrix : ndarray of float64, shape (3, 3)
-        ``body = matrix @ icrs``.
-
-    Returns
-    -------
-    ra_deg, dec_deg, roll_deg : float
-        Degrees; right ascension and roll in [0, 360).
-    """
+def radec_roll_from_matrix(matrix: Matrix) -> tuple[float, float, float]:
+    """Return right ascension and declination of the boresight, and roll: degrees, 0 to 360."""
     right, _, (x, y, z) = matrix.tolist()
     level = math.hypot(x, y)
     if level == 0.0:
@@ -202,184 +130,26 @@ def radec_roll_from_matrix(matrix: Array) -> tuple[float, float, float]:
     return ra_deg, math.degrees(math.atan2(z, level)), roll_deg
 
 
-def solve_wahba_svd(body: Array, icrs: Array, weights: Array | None = None) -> Array:
+def solve_wahba_svd(body: Directions, icrs: Directions, weights: Array | None = None) -> Array:
     """Return the rotation that best turns reference directions into observed ones.
 
-    Parameters
-    ----------
-    body, icrs : ndarray of float64, shape (N, 3) or (K, N, 3)
-        Observed directions in the camera frame and their stars' ICRS directions, N >= 2; K
-        problems at once.
-    weights : ndarray of float64, shape (N,), optional
-        Non-negative; 1 each by default.
+    Observed directions in the camera frame and their stars' ICRS directions, shape (N, 3) or,
+    for K problems at once, (K, N, 3), N >= 2; weights of shape (N,) are not negative. The
+    result is the proper rotation with ``body = matrix @ icrs`` in the least-squares sense.
 
-    Returns
-    -------
-    ndarray of float64, shape (3, 3) or (K, 3, 3)
-        ``body = matrix @ icrs`` in the least-squares sense; always a proper rotation.
-
-    References
-    ----------
     Markley 1988, "Attitude determination using vector observations and the SVD".
     """
     weighted = body if weights is None else body * weights[:, None]
     u, _, vt = np.linalg.svd(np.swapaxes(weighted, -1, -2) @ icrs)
     matrix = u @ vt
-    if matrix.ndim == 2:
-        if determinant(matrix) < 0.0:
-            u[:, 2] *= -1.0
-            matrix = u @ vt
-        return np.asarray(matrix)
     mirrored = np.linalg.det(matrix) < 0.0
-    u[mirrored, :, 2] *= -1.0
+    if not mirrored.any():
+        return np.asarray(matrix)
+    u[..., 2] *= np.where(mirrored, -1.0, 1.0)[..., None]
     return np.asarray(u @ vt)
 
 
-NEAR_RAD = 0.05
-"""Largest turn that `solve_wahba_near` makes in one step; a larger one is left to the SVD."""
-
-CONVERGED_RAD = 1e-6
-"""Turn after which there is no further one: the error that is left is of the order of its square.
-"""
-
-
-def solve_wahba_near(body: Array, icrs: Array, matrix: Array) -> Array:
-    """Return the rotation that best turns reference directions into observed ones.
-
-    Parameters
-    ----------
-    body, icrs : ndarray of float64, shape (N, 3)
-        Observed directions in the camera frame and their stars' ICRS directions, N >= 2.
-    matrix : ndarray of float64, shape (3, 3)
-        A rotation near that one.
-
-    Returns
-    -------
-    ndarray of float64, shape (3, 3)
-        As `solve_wahba_svd`, to rounding.
-
-    Notes
-    -----
-    Steps of Newton's method on Wahba's loss, in plain numbers. With ``B = sum(body predicted^T)``
-    the gradient by a small turn of the predicted directions is the vector of its antisymmetric
-    part, and ``tr(B) I - (B + B^T) / 2`` the second derivative. Where a turn is not small, the
-    SVD answers.
-
-    Examples
-    --------
-    >>> icrs = np.array([[0.1, 0.0, 0.995], [0.0, 0.1, 0.995], [-0.1, -0.1, 0.99]])
-    >>> turned = matrix_from_quaternion(np.array([0.001, 0.002, -0.003, 1.0]))
-    >>> found = solve_wahba_near(icrs @ turned.T, icrs, np.eye(3))
-    >>> bool(np.abs(found - turned).max() < 1e-12)
-    True
-    """
-    (a, b, c), (d, e, f), (g, h, i) = (body.T @ icrs @ matrix.T).tolist()
-    whole = (0.0, 0.0, 0.0, 1.0)
-    for _ in range(4):
-        # The symmetric matrix of the second derivative: p, q, r; s, t; u above its diagonal.
-        p, q, r = e + i, -0.5 * (b + d), -0.5 * (c + g)
-        s, t, u = a + i, -0.5 * (f + h), a + e
-        k, m, n = s * u - t * t, r * t - q * u, q * t - r * s
-        size = p * k + q * m + r * n
-        if not size > 0.0:
-            break
-        v, w = p * u - r * r, q * r - p * t
-        tx, ty, tz = h - f, c - g, d - b
-        x, y, z = (
-            0.5 * (k * tx + m * ty + n * tz) / size,
-            0.5 * (m * tx + v * ty + w * tz) / size,
-            0.5 * (n * tx + w * ty + (p * s - q * q) * tz) / size,
-        )
-        half = math.hypot(x, y, z)
-        if not half < 0.5 * NEAR_RAD:
-            break
-        whole = _quaternion_product(whole, (-x, -y, -z, 1.0))
-        if half < 0.5 * CONVERGED_RAD:
-            return np.asarray(matrix_from_quaternion(np.array(whole)) @ matrix)
-        # B is of the observed directions by those that are predicted after the turn, which is
-        # v + scale ((x, y, z) x (v + (x, y, z) x v)) for a direction v.
-        scale = 2.0 / (1.0 + x * x + y * y + z * z)
-        a, b, c = _turned_by(x, y, z, scale, a, b, c)
-        d, e, f = _turned_by(x, y, z, scale, d, e, f)
-        g, h, i = _turned_by(x, y, z, scale, g, h, i)
-    return solve_wahba_svd(body, icrs)
-
-
-def _turned_by(
-    x: float, y: float, z: float, scale: float, a: float, b: float, c: float
-) -> tuple[float, float, float]:
-    d, e, f = a + y * c - z * b, b + z * a - x * c, c + x * b - y * a
-    return a + scale * (y * f - z * e), b + scale * (z * d - x * f), c + scale * (x * e - y * d)
-
-
-def determinant(matrix: Array) -> float:
-    """Return the determinant of one 3 x 3 matrix.
-
-    Parameters
-    ----------
-    matrix : ndarray of float64, shape (3, 3)
-        Any.
-
-    Returns
-    -------
-    float
-        In plain numbers: a tenth of the time that the general routine takes to start.
-
-    Examples
-    --------
-    >>> determinant(np.diag([1.0, 2.0, 3.0]))
-    6.0
-    """
-    (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
-    return float(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
-
-
-def inverse(matrix: Array) -> Array:
-    """Return the inverse of one symmetric 3 x 3 matrix.
-
-    Parameters
-    ----------
-    matrix : ndarray of float64, shape (3, 3)
-        Symmetric.
-
-    Returns
-    -------
-    ndarray of float64, shape (3, 3)
-        In plain numbers, as `determinant`.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If the determinant is 0.
-
-    Examples
-    --------
-    >>> inverse(np.diag([1.0, 2.0, 4.0])).diagonal().tolist()
-    [1.0, 0.5, 0.25]
-    """
-    (a, b, c), (_, d, e), (_, _, f) = matrix.tolist()
-    p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
-    size = a * p + b * q + c * r
-    if size == 0.0:
-        raise np.linalg.LinAlgError("the matrix has no inverse")
-    s, t, u = a * f - c * c, b * c - a * e, a * d - b * b
-    return np.asarray(np.array([[p, q, r], [q, s, t], [r, t, u]]) / size)
-
-
 def random_attitudes(count: int, generator: np.random.Generator) -> Array:
-    """Return attitudes uniform over all rotations.
-
-    Parameters
-    ----------
-    count : int
-        How many.
-    generator : numpy.random.Generator
-        Source of randomness, seeded by the caller.
-
-    Returns
-    -------
-    ndarray of float64, shape (count, 3, 3)
-        Matrices, ``body = matrix @ icrs``.
-    """
+    """Return attitudes uniform over all rotations, shape (count, 3, 3)."""
     q = generator.normal(size=(count, 4))
     return np.array([matrix_from_quaternion(row) for row in q]).reshape(count, 3, 3)

@@ -13,9 +13,8 @@ from functools import cached_property
 from numbers import Integral
 
 import numpy as np
-from numpy.typing import NDArray
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Directions, Mask, Pixels
 from starcat.errors import ConfigError
 from starcat.geometry.distortion import NO_DISTORTION, Distortion, checked_number
 from starcat.geometry.sphere import separation
@@ -86,7 +85,6 @@ class Camera:
         self._refuse_fold()
 
     def _refuse_fold(self) -> None:
-        """Raise ConfigError unless all of the detector lies inside the fold."""
         if self.distortion.is_none:
             return
         reach_px = float(np.hypot(*(self._corners - self.principal_point_px).T).max())
@@ -123,29 +121,12 @@ class Camera:
         """Directions of the four corners in the camera frame, shape (4, 3)."""
         return self.directions_from_pixels(self._corners)
 
-    def _widest_rad(self, centroids_px: Array) -> float:
-        """Return the largest separation between the directions of pixels."""
+    def _widest_rad(self, centroids_px: Pixels) -> float:
         body = self.directions_from_pixels(centroids_px)
         return float(separation(body[:, None], body[None]).max())
 
     def with_focal_length(self, focal_length_px: float) -> Camera:
-        """Return the same camera with another focal length.
-
-        Parameters
-        ----------
-        focal_length_px : float
-            Pixels.
-
-        Returns
-        -------
-        Camera
-            The coefficients of the distortion are kept.
-
-        Raises
-        ------
-        ConfigError
-            If the distortion then folds the image back on the detector.
-        """
+        """Return the same camera with another focal length; ConfigError if the image then folds."""
         return Camera(
             self.width_px,
             self.height_px,
@@ -190,19 +171,11 @@ class Camera:
         x, y, z = self.directions_from_pixels(self._corners).T
         return float(np.arctan2(np.hypot(x, y), z).max())
 
-    def pixels_from_directions(self, body: Array) -> Array:
-        """Project directions in the camera frame.
+    def pixels_from_directions(self, body: Directions) -> Array:
+        """Project directions in the camera frame, of any length, onto the detector.
 
-        Parameters
-        ----------
-        body : ndarray of float64, shape (N, 3)
-            Directions in the camera frame, of any length.
-
-        Returns
-        -------
-        ndarray of float64, shape (N, 2)
-            Pixels (x right, y down); NaN where a direction lies behind the camera, or so far
-            off the axis that the distortion folds its image back.
+        NaN where a direction lies behind the camera, or so far off the axis that the distortion
+        folds its image back.
         """
         z = np.where(body[:, 2:] > 0.0, body[:, 2:], np.nan)
         if self.distortion.is_none:
@@ -213,19 +186,11 @@ class Camera:
         pixels += self._axis_px
         return np.asarray(pixels)
 
-    def directions_from_pixels(self, centroids_px: Array) -> Array:
+    def directions_from_pixels(self, centroids_px: Pixels) -> Array:
         """Return the directions that centroids point at.
 
-        Parameters
-        ----------
-        centroids_px : ndarray of float64, shape (N, 2)
-            Pixels (x right, y down, origin at the outer corner of the top-left pixel).
-
-        Returns
-        -------
-        ndarray of float64, shape (N, 3)
-            Unit vectors in the camera frame; NaN where no direction inside the fold has that
-            image, which happens off the detector only.
+        Unit vectors in the camera frame; NaN where no direction inside the fold has that image,
+        which happens off the detector only.
         """
         body = np.empty((len(centroids_px), 3))
         np.subtract(centroids_px, self._axis_px, out=body[:, :2])
@@ -237,18 +202,10 @@ class Camera:
         body /= np.sqrt(np.einsum("ij,ij->i", body, body))[:, None]
         return body
 
-    def contains(self, centroids_px: Array) -> NDArray[np.bool_]:
+    def contains(self, centroids_px: Pixels) -> Mask:
         """Return which pixels lie on the detector.
 
-        Parameters
-        ----------
-        centroids_px : ndarray of float64, shape (N, 2)
-            Pixels; NaN lies outside.
-
-        Returns
-        -------
-        ndarray of bool, shape (N,)
-            Closed at the left and top edge, open at the right and bottom.
+        Closed at the left and top edge, open at the right and bottom; NaN lies outside.
         """
         inside = (centroids_px >= 0.0) & (centroids_px < 2.0 * self.middle_px)
         return np.asarray(inside[:, 0] & inside[:, 1])
@@ -279,7 +236,6 @@ def _focal_length_px(
     fov_x_deg: float | None,
     fov_y_deg: float | None,
 ) -> float:
-    """Return the focal length that one of the three, or both angles, stand for."""
     if focal_length_px is not None and fov_x_deg is None and fov_y_deg is None:
         return checked_number("focal_length_px", focal_length_px, 0.0)
     scales = {"focal_length_px": focal_length_px, "fov_x_deg": fov_x_deg, "fov_y_deg": fov_y_deg}

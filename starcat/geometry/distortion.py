@@ -32,27 +32,7 @@ have no inverse."""
 
 
 def checked_number(name: str, value: object, low: float = -np.inf, high: float = np.inf) -> float:
-    """Return a value that has to be a finite number.
-
-    Parameters
-    ----------
-    name : str
-        What the value is called in the message.
-    value : object
-        To check; a bool is not a number.
-    low, high : float, optional
-        Ends of the open interval that it has to lie in.
-
-    Returns
-    -------
-    float
-        The value.
-
-    Raises
-    ------
-    ValueError
-        If it is anything else; says what was found and what was expected.
-    """
+    """Return a value that has to be a finite number in an open interval; a bool is none."""
     if isinstance(value, Real) and not isinstance(value, bool):
         with suppress(OverflowError):  # a whole number may be too large for a float
             number = float(value)
@@ -67,13 +47,6 @@ def checked_number(name: str, value: object, low: float = -np.inf, high: float =
 @dataclass(frozen=True)
 class Distortion:
     """Radial and tangential distortion of a lens (Brown-Conrady), as in OpenCV.
-
-    Attributes
-    ----------
-    k1, k2, k3 : float
-        Radial coefficients; ``k1 < 0`` is barrel distortion, ``k1 > 0`` pincushion.
-    p1, p2 : float
-        Tangential coefficients, of a lens whose elements are not centred.
 
     Raises
     ------
@@ -93,9 +66,11 @@ class Distortion:
     Conrady 1919, "Decentred lens-systems"; Brown 1966, "Decentering distortion of lenses".
     """
 
+    # k1, k2, k3: radial coefficients; ``k1 < 0`` is barrel distortion, ``k1 > 0`` pincushion
     k1: float = 0.0
     k2: float = 0.0
     k3: float = 0.0
+    # p1, p2: tangential coefficients, of a lens whose elements are not centred
     p1: float = 0.0
     p2: float = 0.0
 
@@ -115,8 +90,6 @@ class Distortion:
     def fold_radius(self) -> float:
         """Distance from the axis, as x/z, below which no two directions share an image.
 
-        Notes
-        -----
         The model is the gradient of a function. As far as its Hessian is positive, on a disc,
         the function is strictly convex and no two points share a gradient. The Hessian's
         eigenvalues are the radial polynomial P and d(r P)/dr, less 6 r hypot(p1, p2) at the
@@ -150,18 +123,7 @@ class Distortion:
         return 1.0 + s * (self.k1 + s * (self.k2 + s * self.k3))
 
     def distorted(self, z: Points) -> Points:
-        """Return where the lens puts directions.
-
-        Parameters
-        ----------
-        z : ndarray of complex128, shape (N,)
-            Directions, x/z + i y/z.
-
-        Returns
-        -------
-        ndarray of complex128, shape (N,)
-            Images x + i y, focal lengths; NaN from the fold outwards.
-        """
+        """Return where the lens puts directions x/z + i y/z; NaN from the fold outwards."""
         size = np.abs(z)
         size = np.where(size < self.fold_radius, size, np.nan)
         s = size * size
@@ -172,20 +134,8 @@ class Distortion:
         return np.asarray(z * factor + s * complex(self.p2, self.p1))
 
     def undistorted(self, image: Points) -> Points:
-        """Return which directions the lens puts at images: the inverse of `distorted`.
+        """Return which directions the lens puts at images; NaN where there is none.
 
-        Parameters
-        ----------
-        image : ndarray of complex128, shape (N,)
-            Images x + i y, focal lengths.
-
-        Returns
-        -------
-        ndarray of complex128, shape (N,)
-            Directions, x/z + i y/z; NaN where there is none inside the fold.
-
-        Notes
-        -----
         Newton's method in the plane, started from a table of the radial part. At a distance
         d short of the fold, images that differ by a rounding are 1e-16/d apart in direction.
         """

@@ -13,43 +13,29 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array
+
 
 @dataclass(frozen=True)
 class KVector:
     """A K-vector over a sorted array of values.
 
-    Attributes
-    ----------
-    values : ndarray of float64, shape (n,)
-        Sorted, finite, ascending; duplicates are welcome.
-    counts : ndarray of int32, shape (n,)
-        ``counts[i]`` is the number of values on or below ``intercept + slope * i``.
-    intercept, slope : float
-        The line, in the unit of the values; ``slope`` is 0 where n < 2.
-
-    References
-    ----------
     Mortari and Neta 2000, "K-vector range searching techniques".
     """
 
-    values: NDArray[np.float64]
+    values: Array  # shape (n,): sorted, finite, ascending; duplicates are welcome
+    # shape (n,): ``counts[i]`` is the number of values on or below ``intercept + slope * i``
     counts: NDArray[np.int32]
+    # intercept, slope: the line, in the unit of the values; ``slope`` is 0 where n < 2
     intercept: float
     slope: float
 
     def range(self, low: float, high: float) -> slice:
         """Return a slice that holds every value in ``[low, high]``, and few others.
 
-        Parameters
-        ----------
-        low, high : float
-            Closed interval, in the unit of the values. May be empty, inverted or out of
-            bounds; NaN finds nothing.
-
-        Returns
-        -------
-        slice
-            A superset: at most the values of one step of the line more at either end.
+        The interval is closed, in the unit of the values; it may be empty, inverted or out of
+        bounds, and NaN finds nothing. At most the values of one step of the line are too many
+        at either end.
         """
         n = len(self.values)
         if n == 0 or not low <= high or high < self.values[0] or low > self.values[-1]:
@@ -69,19 +55,7 @@ class KVector:
         return slice(start, stop)
 
     def exact(self, low: float, high: float) -> slice:
-        """Return the slice of exactly the values in ``[low, high]``.
-
-        Parameters
-        ----------
-        low, high : float
-            Closed interval, in the unit of the values. May be empty, inverted or out of
-            bounds; NaN finds nothing.
-
-        Returns
-        -------
-        slice
-            Rows with ``low <= value <= high``; empty where there are none.
-        """
+        """Return the slice of exactly the values in ``[low, high]``."""
         found = self.range(low, high)
         part = self.values[found]
         start = found.start + int(np.searchsorted(part, low, side="left"))
@@ -89,26 +63,11 @@ class KVector:
         return slice(start, max(start, stop))
 
 
-def build_kvector(values: NDArray[np.float64]) -> KVector:
-    """Build the K-vector of a sorted array.
+def build_kvector(values: Array) -> KVector:
+    """Build the K-vector of ascending, finite values; ValueError where they are not.
 
-    Parameters
-    ----------
-    values : ndarray of float64, shape (n,)
-        Ascending and finite.
+    It refers to the values, it does not copy them.
 
-    Returns
-    -------
-    KVector
-        The index; it refers to ``values``, it does not copy them.
-
-    Raises
-    ------
-    ValueError
-        If the array is not one-dimensional, not sorted, not finite, or too long for int32.
-
-    Examples
-    --------
     >>> index = build_kvector(np.array([0.1, 0.2, 0.2, 0.7]))
     >>> index.exact(0.15, 0.2)
     slice(1, 3, None)

@@ -24,23 +24,9 @@ def bin_of(
 ) -> Whole:
     """Return the bins of successive angles and separations in the look-up table.
 
-    Parameters
-    ----------
-    angle_rad, separation_rad : array_like of float64, shape (M,)
-        Radians, 0 or more.
-    angle_bin_rad, separation_bin_rad : float
-        Widths of the bins, radians.
-    n_angle_bins, n_separation_bins : int
-        Their numbers.
+    ``angle bin * n_separation_bins + separation bin``. A bin includes its lower end and not its
+    upper one, but for the last, which includes all that lies above.
 
-    Returns
-    -------
-    ndarray of int64, shape (M,)
-        ``angle bin * n_separation_bins + separation bin``. A bin includes its lower end and
-        not its upper one, but for the last, which includes all that lies above.
-
-    Examples
-    --------
     >>> bin_of([0.0, 1.0, 9.0], [0.3, 0.1, 0.9], 1.0, 0.2, 3, 2)
     array([1, 2, 5])
     """
@@ -53,25 +39,12 @@ def bin_of(
 def cell_of(x: ArrayLike, y: ArrayLike, radius_rad: float, cells_per_side: int) -> Whole:
     """Return the numbers of the cells of a square grid about a star.
 
-    Parameters
-    ----------
-    x, y : array_like of float64, same shape
-        Gnomonic coordinates about the star in units of the focal length, x towards the
-        alignment star and y counter-clockwise of it on the sky as seen.
-    radius_rad : float
-        The grid spans ``-tan(radius)`` to ``tan(radius)`` on both axes.
-    cells_per_side : int
-        Number of rows, and of columns.
+    Gnomonic coordinates about the star in focal lengths, x towards the alignment star and y
+    counter-clockwise of it on the sky as seen; the grid spans ``-tan(radius)`` to
+    ``tan(radius)``. The number is ``row * cells_per_side + column``, rows along y, both upwards
+    from 0. A cell includes its lower edges and not its upper ones; what lies outside goes to
+    the edge.
 
-    Returns
-    -------
-    ndarray of int64, same shape
-        ``row * cells_per_side + column``, rows along y and columns along x, both upwards from
-        0. A cell includes its lower edges and not its upper ones, but for the last of a row or
-        column; what lies outside the grid goes to its edge.
-
-    Examples
-    --------
     >>> cell_of([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], np.pi / 4.0, 2)
     array([0, 3, 3])
     """
@@ -88,23 +61,9 @@ def cell_of(x: ArrayLike, y: ArrayLike, radius_rad: float, cells_per_side: int) 
 def ring_of(separation_rad: ArrayLike, radius_rad: float, rings: int) -> Whole:
     """Return the rings that separations fall in.
 
-    Parameters
-    ----------
-    separation_rad : array_like of float64, shape (M,)
-        Radians, 0 or more.
-    radius_rad : float
-        Outer end of the last ring, radians.
-    rings : int
-        Number of rings.
+    From 0, the innermost. A ring includes its inner end and not its outer one, but for the
+    last, which includes all that lies beyond.
 
-    Returns
-    -------
-    ndarray of int64, shape (M,)
-        From 0, the innermost. A ring includes its inner end and not its outer one, but for the
-        last, which includes all that lies beyond.
-
-    Examples
-    --------
     >>> ring_of([0.0, 0.5, 0.99, 1.0], 1.0, 2)
     array([0, 1, 1, 1])
     """
@@ -115,20 +74,8 @@ def ring_of(separation_rad: ArrayLike, radius_rad: float, rings: int) -> Whole:
 def sector_of(turn_rad: ArrayLike, sectors: int) -> Whole:
     """Return the sectors that angles from the nearest neighbour fall in.
 
-    Parameters
-    ----------
-    turn_rad : array_like of float64, shape (M,)
-        Position angle less that of the nearest neighbour, radians.
-    sectors : int
-        Number of sectors.
+    Position angle less that of the nearest neighbour; sector 0 begins there, counter-clockwise.
 
-    Returns
-    -------
-    ndarray of int64, shape (M,)
-        From 0, which begins at the nearest neighbour, counter-clockwise.
-
-    Examples
-    --------
     >>> sector_of(np.radians([0.0, 95.0, -5.0]), 4)
     array([0, 1, 3])
     """
@@ -139,21 +86,9 @@ def sector_of(turn_rad: ArrayLike, sectors: int) -> Whole:
 def cyclic_shifts(pattern: Whole | int, sectors: int) -> Whole:
     """Return all cyclic shifts of bit patterns.
 
-    Parameters
-    ----------
-    pattern : ndarray of int64, shape (N,), or int
-        Bit s stands for sector s.
-    sectors : int
-        Length of the cycle in bits.
+    Bit s stands for sector s; the first axis of the result are the shifts. The smallest is what
+    the product ``radial`` keeps: patterns that are turned into each other have the same.
 
-    Returns
-    -------
-    ndarray of int64, shape (sectors, N) or (sectors,)
-        The smallest of them is what the product ``radial`` keeps: patterns that are turned into
-        each other have the same.
-
-    Examples
-    --------
     >>> cyclic_shifts(0b0011, 4).tolist()
     [3, 9, 12, 6]
     """
@@ -163,25 +98,11 @@ def cyclic_shifts(pattern: Whole | int, sectors: int) -> Whole:
 
 
 def triangle_area(a: Array, b: Array, c: Array) -> Array:
-    """Return the area of plane triangles from their sides.
+    """Return the area of plane triangles from their sides in any order; 0 where they do not close.
 
-    Parameters
-    ----------
-    a, b, c : ndarray of float64, shape (M,)
-        Sides, any unit, in any order.
-
-    Returns
-    -------
-    ndarray of float64, shape (M,)
-        The unit squared; 0 where the sides do not close.
-
-    References
-    ----------
     Heron's formula in the order of operations of Kahan 2014, which keeps its digits for
     needle-like triangles.
 
-    Examples
-    --------
     >>> triangle_area(np.array([3.0]), np.array([5.0]), np.array([4.0]))
     array([6.])
     """

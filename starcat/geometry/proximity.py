@@ -6,27 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from starcat.arrays import Array, Directions
 from starcat.geometry.sphere import chord_from_separation, separation
 
 
-def nearest_neighbours(
-    directions: NDArray[np.float64], workers: int = 2
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def nearest_neighbours(directions: Directions, workers: int = 2) -> tuple[Array, NDArray[np.int64]]:
     """Return each star's nearest other star.
 
-    Parameters
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        ICRS unit vectors, N >= 2.
-    workers : int, default 2
-        Threads; the result is the same for any number.
-
-    Returns
-    -------
-    separation_rad : ndarray of float64, shape (N,)
-        Great-circle separation.
-    index : ndarray of int64, shape (N,)
-        Row of the neighbour; of several at the same separation the first.
+    Separations in radians and rows; of several at the same separation the first. N >= 2.
     """
     rows = np.arange(len(directions))
     chord, index = nearest_chords(directions, directions, rows, rows, workers)
@@ -34,33 +21,17 @@ def nearest_neighbours(
 
 
 def nearest_chords(
-    points: NDArray[np.float64],
-    stars: NDArray[np.float64],
+    points: Directions,
+    stars: Directions,
     itself: NDArray[np.int64],
     rank: NDArray[np.int64],
     workers: int = 1,
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+) -> tuple[Array, NDArray[np.int64]]:
     """Return the nearest star of each point that is not the point itself.
 
-    Parameters
-    ----------
-    points : ndarray of float64, shape (M, 3)
-        ICRS unit vectors.
-    stars : ndarray of float64, shape (N, 3)
-        Where the neighbours are looked for.
-    itself : ndarray of int64, shape (M,)
-        Row of ``stars`` that is the point; -1 where none is.
-    rank : ndarray of int64, shape (N,)
-        Of several stars at the same distance, that of the lowest rank is taken.
-    workers : int, default 1
-        Threads.
-
-    Returns
-    -------
-    chord : ndarray of float64, shape (M,)
-        Length of the chord between the two; infinite where there is no other star.
-    index : ndarray of int64, shape (M,)
-        Row of ``stars``; their number where there is none.
+    ``itself`` is the row of ``stars`` that is the point, -1 where none is. Of several stars at
+    the same distance that of the lowest rank is taken. Chords are infinite, and rows the number
+    of stars, where there is no other star.
     """
     # A plain split by midpoints builds far faster and searches no slower on a sky of stars.
     tree = cKDTree(stars, leafsize=16, balanced_tree=False)
@@ -86,19 +57,8 @@ def nearest_chords(
     return best, index
 
 
-def separation_from_chord(chord: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the separation of directions whose tips are a chord apart.
-
-    Parameters
-    ----------
-    chord : ndarray of float64, shape (N,)
-        0 to 2.
-
-    Returns
-    -------
-    ndarray of float64, shape (N,)
-        Radians.
-    """
+def separation_from_chord(chord: Array) -> Array:
+    """Return the separation of directions whose tips are a chord apart."""
     # Chord |u - v| and |u + v| are the legs of a right triangle over the diameter.
     # The chord of antipodes may be rounded above the diameter.
     other = np.sqrt(np.maximum(2.0 - chord, 0.0) * (2.0 + chord))
@@ -106,23 +66,12 @@ def separation_from_chord(chord: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def pairs_within(
-    directions: NDArray[np.float64], max_separation_rad: float
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    directions: Directions, max_separation_rad: float
+) -> tuple[NDArray[np.int64], Array]:
     """Return all pairs of stars within a separation.
 
-    Parameters
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        ICRS unit vectors.
-    max_separation_rad : float
-        Largest separation, radians, itself included.
-
-    Returns
-    -------
-    pairs : ndarray of int64, shape (M, 2)
-        Rows i < j, in order of (i, j).
-    separation_rad : ndarray of float64, shape (M,)
-        Their separations.
+    Rows i < j, shape (M, 2), in order of (i, j), and separations, radians; the largest is
+    included.
     """
     if len(directions) < 2:
         return np.empty((0, 2), dtype=np.int64), np.empty(0)

@@ -1,4 +1,4 @@
-"""Geometry on the celestial sphere: directions, separations, tangent plane, spiral points.
+"""Geometry on the celestial sphere: directions, separations, tangent plane, spiral points, caps.
 
 Directions are unit vectors, float64, one row a star, in whatever frame the caller uses
 (ICRS throughout starcat). Angles are radians inside and degrees only where a name says so.
@@ -7,27 +7,18 @@ Nothing here reads files or knows of catalogs.
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import ArrayLike
+import math
+from dataclasses import dataclass
 
-from starcat.arrays import Array
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from starcat.arrays import Array, Directions
 
 
 def directions_from_radec(ra_deg: ArrayLike, dec_deg: ArrayLike) -> Array:
     """Return unit vectors from right ascension and declination.
 
-    Parameters
-    ----------
-    ra_deg, dec_deg : array_like of float64, shape (N,)
-        Degrees, any common frame.
-
-    Returns
-    -------
-    ndarray of float64, shape (N, 3)
-        Unit vectors in the same frame.
-
-    Examples
-    --------
     >>> directions_from_radec([0.0], [90.0]).round(12)
     array([[0., 0., 1.]])
     """
@@ -42,20 +33,10 @@ def directions_from_radec(ra_deg: ArrayLike, dec_deg: ArrayLike) -> Array:
 
 
 def radec_from_directions(u: ArrayLike) -> tuple[Array, Array]:
-    """Return right ascension in [0, 360) and declination from directions.
+    """Return right ascension in [0, 360) and declination, degrees, of vectors of any length but 0.
 
-    Parameters
-    ----------
-    u : array_like of float64, shape (N, 3)
-        Directions; any length but zero.
+    The declination is exact at the poles (no arcsine).
 
-    Returns
-    -------
-    ra_deg, dec_deg : ndarray of float64, shape (N,)
-        Degrees. The declination is exact at the poles (no arcsine).
-
-    Examples
-    --------
     >>> radec_from_directions([[0.0, -1.0, 0.0]])
     (array([270.]), array([0.]))
     """
@@ -69,25 +50,11 @@ def radec_from_directions(u: ArrayLike) -> tuple[Array, Array]:
 
 
 def separation(u: ArrayLike, v: ArrayLike) -> Array:
-    """Return the great-circle separation of directions, exact at all angles.
+    """Return the great-circle separation of directions, radians, exact at all angles.
 
-    Parameters
-    ----------
-    u, v : array_like of float64, shape (N, 3) or (3,)
-        Unit vectors.
-
-    Returns
-    -------
-    ndarray of float64, shape (N,)
-        Radians, 0 to pi.
-
-    Notes
-    -----
     ``2 atan2(|u - v|, |u + v|)``: an arc cosine of the dot product returns NaN when rounding
     takes the product above 1, and loses half of the digits at small angles.
 
-    Examples
-    --------
     >>> float(separation([1.0, 0.0, 0.0], [0.0, 1.0, 0.0])) * 2 / np.pi
     1.0
     """
@@ -97,20 +64,8 @@ def separation(u: ArrayLike, v: ArrayLike) -> Array:
 
 
 def chord_from_separation(separation_rad: float) -> float:
-    """Return the chord of the unit sphere that spans a separation.
+    """Return the chord of the unit sphere that spans a separation: 0 to 2.
 
-    Parameters
-    ----------
-    separation_rad : float
-        Radians, 0 to pi.
-
-    Returns
-    -------
-    float
-        Chord length, 0 to 2: the radius that a k-d tree of directions is searched with.
-
-    Examples
-    --------
     >>> chord_from_separation(np.pi)
     2.0
     """
@@ -118,17 +73,9 @@ def chord_from_separation(separation_rad: float) -> float:
 
 
 def tangent_axes(ra_deg: ArrayLike, dec_deg: ArrayLike) -> tuple[Array, Array]:
-    """Return the east and north unit vectors at positions, also at the poles.
+    """Return the east and north unit vectors at positions.
 
-    Parameters
-    ----------
-    ra_deg, dec_deg : array_like of float64, shape (N,)
-        Degrees. At a pole the right ascension says which way east is.
-
-    Returns
-    -------
-    east, north : ndarray of float64, shape (N, 3)
-        Unit vectors along increasing right ascension and declination.
+    At a pole the right ascension says which way east is.
     """
     ra = np.radians(np.asarray(ra_deg, dtype=np.float64))
     dec = np.radians(np.asarray(dec_deg, dtype=np.float64))
@@ -140,31 +87,12 @@ def tangent_axes(ra_deg: ArrayLike, dec_deg: ArrayLike) -> tuple[Array, Array]:
 
 
 def saff_kuijlaars(count: int) -> Array:
-    """Return the generalised spiral points of Saff and Kuijlaars.
+    """Return the generalised spiral points of Saff and Kuijlaars, from south to north.
 
-    Parameters
-    ----------
-    count : int
-        Number of points, at least 1.
-
-    Returns
-    -------
-    ndarray of float64, shape (count, 3)
-        Directions in spiral order, from the south pole to the north pole.
-
-    Raises
-    ------
-    ValueError
-        If ``count`` is below 1.
-
-    References
-    ----------
     Saff and Kuijlaars, The Mathematical Intelligencer 19 (1997) 5:
     ``h_k = -1 + 2 (k - 1)/(N - 1)``, ``phi_k = phi_(k-1) + 3.6/sqrt(N (1 - h_k^2))``,
     ``phi_1 = phi_N = 0``.
 
-    Examples
-    --------
     >>> saff_kuijlaars(3)[[0, 2], 2]
     array([-1.,  1.])
     """
@@ -183,3 +111,41 @@ def saff_kuijlaars(count: int) -> Array:
 
 def _length(v: Array) -> Array:
     return np.asarray(np.sqrt(np.einsum("...i,...i->...", v, v)))
+
+
+_ROUNDING = 1e-12
+"""By so much a zone is wider than its cap: more than the sines are off by."""
+
+
+@dataclass(frozen=True)
+class Zones:
+    """Directions in order of declination."""
+
+    # shape (N, 3): unit vectors, southernmost first, so that a zone is read from one place
+    directions: Directions
+    order: NDArray[np.int64]  # shape (N,): rows that they had when they were given
+    height: Array  # shape (N,): their third components
+
+    def near(self, axis: Array, radius_rad: float) -> NDArray[np.int64]:
+        """Return which directions lie within a cap, its edge included: rows, ascending.
+
+        >>> zones_of(np.eye(3)).near(np.array([0.0, 0.6, 0.8]), 1.0)
+        array([1, 2])
+        """
+        declination = math.asin(max(-1.0, min(1.0, float(axis[2]))))
+        south = math.sin(max(-0.5 * math.pi, declination - radius_rad)) - _ROUNDING
+        north = math.sin(min(0.5 * math.pi, declination + radius_rad)) + _ROUNDING
+        first, last = np.searchsorted(self.height, [south, north])
+        # A product of matrices would wake threads, which takes longer than the product; and the
+        # chord keeps its digits where the cosine of a small angle does not.
+        offset = self.directions[first:last] - axis
+        chord = 2.0 * math.sin(0.5 * radius_rad)
+        inside = np.einsum("ij,ij->i", offset, offset) <= chord * chord
+        return np.sort(self.order[first:last][inside])
+
+
+def zones_of(directions: Directions) -> Zones:
+    """Return directions in order of declination."""
+    order = np.argsort(directions[:, 2], kind="stable")
+    ordered = directions[order]
+    return Zones(ordered, order, np.ascontiguousarray(ordered[:, 2]))

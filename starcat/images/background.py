@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter
 from scipy.special import erf, ndtri
 
+from starcat.arrays import Array, Mask
 from starcat.errors import ConfigError
 from starcat.version import install_command
 
@@ -43,34 +44,19 @@ _HOT_PART = 0.25
 
 @dataclass(frozen=True)
 class Levels:
-    """An image and its background.
+    """An image and its background."""
 
-    Attributes
-    ----------
-    raw : ndarray of float32, shape (height, width)
-        Grey values; 0 where they are left out.
-    above : ndarray of float32, shape (height, width)
-        The same above the background.
-    noise : ndarray of float32, shape (height, width)
-        Standard deviation of the background, grey values.
-    mask : ndarray of bool, shape (height, width)
-        Pixels left out, because their values are not finite.
-    is_rough : bool
-        Whether the noise of filtered pixels is larger than that of white noise: coarse digits,
-        a clipped background, JPEG, clouds.
-    is_flat : bool
-        Whether there is next to no noise: what compression left of it are steps.
-    box_px : int
-        Side of the boxes in which the background was found.
-    """
-
-    raw: Grey
-    above: Grey
-    noise: Grey
-    mask: NDArray[np.bool_]
+    raw: Grey  # shape (height, width): grey values; 0 where they are left out
+    above: Grey  # shape (height, width): the same above the background
+    noise: Grey  # shape (height, width): standard deviation of the background, grey values
+    # shape (height, width): pixels left out, because their values are not finite
+    mask: Mask
+    # whether the noise of filtered pixels is larger than that of white noise: coarse digits, a
+    # clipped background, JPEG, clouds
     is_rough: bool = False
+    # whether there is next to no noise: what compression left of it are steps
     is_flat: bool = False
-    box_px: int = _BOX_PX
+    box_px: int = _BOX_PX  # side of the boxes in which the background was found
 
 
 def load_sep() -> Any:
@@ -101,7 +87,7 @@ def subtract_background(image: ArrayLike) -> Levels:
     return _leveled(raw, mask)
 
 
-def _leveled(raw: Grey, mask: NDArray[np.bool_]) -> Levels:
+def _leveled(raw: Grey, mask: Mask) -> Levels:
     """Return levels with boxes as large as the structure of the background allows."""
     least = _least_noise(raw[~mask])
     levels = _in_boxes(raw, raw, mask, least, _BOX_PX)
@@ -122,10 +108,7 @@ def _leveled(raw: Grey, mask: NDArray[np.bool_]) -> Levels:
     return replace(levels, is_rough=True)
 
 
-def _in_boxes(
-    raw: Grey, shown: Grey, mask: NDArray[np.bool_], least: np.float32, box: int
-) -> Levels:
-    """Return levels whose background is that of an image, its own or a smoothed one."""
+def _in_boxes(raw: Grey, shown: Grey, mask: Mask, least: np.float32, box: int) -> Levels:
     height, width = raw.shape
     sep = load_sep()
     background = sep.Background(shown, mask=mask, bw=min(box, width), bh=min(box, height))
@@ -158,7 +141,6 @@ def _excess(levels: Levels) -> tuple[float, float]:
 
 
 def _white(sigma: float) -> float:
-    """Return the standard deviation of white noise of 1 after smoothing."""
     return float(1.0 / (np.sqrt(4.0 * np.pi) * sigma))
 
 
@@ -167,8 +149,7 @@ def _smooth_boxes(boxes: NDArray[Any], sigma: float) -> NDArray[np.float32]:
     return np.asarray(smooth, dtype=np.float32)
 
 
-def _spread(boxes: NDArray[np.float32], left_out: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return a standard deviation of each box."""
+def _spread(boxes: NDArray[np.float32], left_out: Mask) -> Array:
     return np.asarray(np.ma.masked_array(boxes, left_out).std(axis=(1, 2)).filled(np.inf))
 
 

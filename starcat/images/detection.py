@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
+from starcat.arrays import Array, Mask
 from starcat.errors import ConfigError
 from starcat.images.background import Levels, load_sep
 
@@ -24,13 +25,16 @@ _MOST_PARTS = 4096
 """Parts that sep may divide an object into: a Moon with its glow has thousands."""
 _RAISE, _TRIES = 1.5, 4
 """The threshold is raised by this factor, so many times, where the room does not do."""
+_FEWEST, _MOST = 5, 30
+_LONG = 2.5
+"""Length over width from which a spot is long, by standard deviations along its axes."""
+_ALIGNED = 0.9
+"""Length of the mean of unit vectors with twice the angle: 1 if all are parallel."""
 
 
 def detect(levels: Levels, sigma: float, threshold: float) -> NDArray[Any]:
     """Return what stands out after smoothing with a star's shape.
 
-    Notes
-    -----
     Where noise is white, its part that is left by the filter is known. Where it is not
     (`Levels.is_rough`: coarse digits, a clipped background, JPEG, clouds), the noise is measured
     in the filtered image.
@@ -38,7 +42,7 @@ def detect(levels: Levels, sigma: float, threshold: float) -> NDArray[Any]:
     reach = np.arange(-int(np.ceil(2.5 * sigma)), int(np.ceil(2.5 * sigma)) + 1)
     profile = np.exp(-0.5 * (reach / sigma) ** 2)
     profile /= profile.sum()
-    kernel: NDArray[np.float64] | None = np.outer(profile, profile)
+    kernel: Array | None = np.outer(profile, profile)
     image, noise, least = levels.above, levels.noise, threshold * float((profile**2).sum())
     if levels.is_rough:
         image, noise = _filtered(levels, profile)
@@ -60,8 +64,8 @@ def _extract(
     image: NDArray[np.float32],
     least: float,
     noise: NDArray[np.float32],
-    mask: NDArray[np.bool_],
-    kernel: NDArray[np.float64] | None,
+    mask: Mask,
+    kernel: Array | None,
 ) -> NDArray[Any]:
     """Call sep.
 
@@ -84,9 +88,7 @@ def _extract(
         sep.set_sub_object_limit(before[1])
 
 
-def _filtered(
-    levels: Levels, profile: NDArray[np.float64]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _filtered(levels: Levels, profile: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the filtered image above its own background, and its own noise."""
     image = convolve1d(levels.above, profile, axis=0, mode="nearest")
     image = convolve1d(image, profile, axis=1, mode="nearest")
@@ -95,3 +97,18 @@ def _filtered(
     known = levels.noise * np.float32((profile**2).sum())
     noise = np.maximum(background.rms(dtype=np.float32), known)
     return image - background.back(dtype=np.float32), noise
+
+
+def trail_px(found: NDArray[Any]) -> float | None:
+    """Return the length of trails."""
+    bright = found[np.argsort(-found["flux"], kind="stable")[:_MOST]]
+    if len(bright) < _FEWEST:
+        return None
+    long, wide = bright["a"].astype(np.float64), bright["b"].astype(np.float64)
+    is_long = long > _LONG * np.maximum(wide, 0.3)
+    if is_long.mean() <= 0.5:
+        return None
+    if abs(np.exp(2j * bright["theta"][is_long].astype(np.float64)).mean()) < _ALIGNED:
+        return None
+    # The variance of a bar along itself is a twelfth of its length squared.
+    return float(np.median(np.sqrt(12.0 * (long**2 - wide**2)[is_long])))

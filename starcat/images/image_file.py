@@ -1,5 +1,8 @@
 """Image files: FITS, PNG, TIFF and JPEG to and from one array of grey values, row 0 at the top.
 
+A dark frame, dead pixels and a mosaic of colours are taken out of such an array, and copies of
+files are written that say where in the sky each pixel is.
+
 What kind a file is, its first bytes say, not its name. Colour becomes luminance, also that of
 FITS files with three planes. Pillow reads what it keeps all bits of; colour of 16 bits is read
 by imagecodecs, which the extra ``images`` brings. Stacks of other numbers of planes are refused,
@@ -11,18 +14,25 @@ from __future__ import annotations
 import gzip
 import io
 import logging
+import re
 import warnings
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import convolve1d
 
+from starcat.arrays import Array
 from starcat.errors import ConfigError, OutputError, reason
+from starcat.matcher.result import MatchResult
 from starcat.version import install_command
 
-Grey = NDArray[np.float32] | NDArray[np.float64]
+if TYPE_CHECKING:
+    from astropy.io.fits import Header
+
+Grey = NDArray[np.float32] | Array
 
 _log = logging.getLogger(__name__)
 
@@ -43,14 +53,21 @@ WRITTEN_KINDS = {
 _LUMINANCE = np.array([0.299, 0.587, 0.114])
 """Weights of red, green and blue: ITU-R BT.601."""
 
+_BINOMIAL = np.array([0.25, 0.5, 0.25])
+
+_WCS_SUFFIXES = (".fits", ".fit", ".fts")
+_OF_A_WCS = re.compile(
+    r"(WCSAXES|WCSNAME|C(TYPE|UNIT|RVAL|RPIX|DELT|ROTA)\d|(PC|CD)\d_\d|P[VS]\d_\d+|LONPOLE|LATPOLE"
+    r"|RADE(SYS|CSYS)|EQUINOX|MJDREF[IF]?|[AB]P?_(ORDER|DMAX|\d_\d))"
+)
+"""Keywords that a world coordinate system of a header is made of."""
+
 
 def read_image(
     path: Path, *, flip: bool | None = None, hdu: int | None = None, plane: int | None = None
 ) -> Grey:
     """Read the grey values of an image.
 
-    Notes
-    -----
     The FITS standard does not say which row is the top one. Programs that write arrays put the
     top row first, which is what is assumed here; viewers show the first row at the bottom. A
     frame that is read upside down is a mirror image, and no mirror image is ever identified.
@@ -134,7 +151,6 @@ def _shapes_told(shapes: list[tuple[int, ...]]) -> str:
 
 
 def _read_picture(data: bytes) -> tuple[NDArray[Any], bool]:
-    """Return the grey values of a PNG or TIFF file, whose first row is the top."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about tags beside the image, and about its size
         return _grey_of_picture(data), False
@@ -213,7 +229,108 @@ def write_image(path: Path, image: NDArray[Any], *, quality: int = 95) -> None:
             raise ValueError(f"image of {image.dtype}; {kind} takes {' and '.join(taken)}")
         options = {"quality": quality} if kind == "JPEG" else {}
         Image.fromarray(np.ascontiguousarray(image)).save(buffer, format=kind, **options)
+    _write_bytes(path, buffer)
+
+
+def _write_bytes(path: Path, buffer: io.BytesIO) -> None:
     try:
         path.write_bytes(buffer.getvalue())
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({reason(error)})", path=path) from error
+
+
+def without_dark(image: NDArray[Any], dark: NDArray[Any]) -> NDArray[Any]:
+    """Return an image without the dark current of its pixels."""
+    _check_size(image, dark, "dark frame")
+    return np.asarray(np.asarray(image, dtype=np.float64) - dark)
+
+
+def without_dead_zones(image: NDArray[Any], mask: NDArray[Any]) -> NDArray[Any]:
+    """Return an image in which dead pixels have no value."""
+    _check_size(image, mask, "mask")
+    is_dead = np.asarray(mask) != 0
+    if is_dead.all():
+        raise ConfigError("the mask leaves no pixel; expected zeros where stars are looked for")
+    return np.asarray(np.where(is_dead, np.nan, image), dtype=np.float64)
+
+
+def grey_of_mosaic(image: NDArray[Any]) -> NDArray[Any]:
+    """Return the light of a mosaic of colour filters, at the mosaic's own resolution."""
+    grey = np.asarray(image, dtype=np.float64)
+    for axis in (0, 1):
+        grey = convolve1d(grey, _BINOMIAL, axis=axis, mode="mirror")
+    return np.asarray(grey)
+
+
+def _check_size(image: NDArray[Any], other: NDArray[Any], what: str) -> None:
+    if image.shape != other.shape:
+        (height, width), (tall, wide) = image.shape, other.shape
+        raise ConfigError(
+            f"the {what} has {wide} x {tall} px, the image {width} x {height}; expected the same"
+        )
+
+
+def expect_room_for_wcs(path: Path, source: Path, *, is_picture: bool) -> None:
+    """Check, before anything is done, that a WCS can be written."""
+    if path.suffix.lower() not in _WCS_SUFFIXES:
+        raise ConfigError(f"--wcs {path}: a FITS file has a name that ends with .fits")
+    if not is_picture:
+        raise ConfigError(
+            f"--wcs {path}: {source} holds centroids, and a WCS is written into a copy of a "
+            "picture; give the picture, or use MatchResult.wcs() in Python"
+        )
+
+
+def write_wcs(
+    path: Path,
+    source: Path,
+    image: NDArray[Any],
+    result: MatchResult,
+    *,
+    flip: bool | None = None,
+) -> None:
+    """Write a FITS copy of a picture with the world coordinates of its answer."""
+    from astropy.utils.exceptions import AstropyWarning
+
+    data = source.read_bytes()
+    data = gzip.decompress(data) if data.startswith(b"\x1f\x8b") else data
+    buffer = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AstropyWarning)  # about headers, as cameras write them
+        if data.startswith(b"SIMPLE  ="):
+            _copy_fits(data, result, flip, buffer)
+        else:
+            _new_fits(image, result, buffer)
+    _write_bytes(path, buffer)
+
+
+def _copy_fits(data: bytes, result: MatchResult, flip: bool | None, buffer: io.BytesIO) -> None:
+    from astropy.io import fits
+
+    # Values stay as they are stored, whatever the scale of the file.
+    with fits.open(io.BytesIO(data), memmap=False, do_not_scale_image_data=True) as parts:
+        part = next(
+            part for part in parts if part.is_image and len(part.shape) >= 2 and min(part.shape) > 0
+        )
+        order = str(part.header.get("ROWORDER", "")).strip().upper()
+        bottom_up = order == "BOTTOM-UP" if flip is None else flip
+        for key in [key for key in part.header if _OF_A_WCS.fullmatch(key)]:
+            del part.header[key]
+        _add_wcs(part.header, result, bottom_up)
+        parts.writeto(buffer, output_verify="silentfix+ignore")
+
+
+def _new_fits(image: NDArray[Any], result: MatchResult, buffer: io.BytesIO) -> None:
+    from astropy.io import fits
+
+    part = fits.PrimaryHDU(np.ascontiguousarray(image))
+    part.header["ROWORDER"] = ("TOP-DOWN", "the first row is the top one")
+    _add_wcs(part.header, result, bottom_up=False)
+    part.writeto(buffer)
+
+
+def _add_wcs(header: Header, result: MatchResult, bottom_up: bool) -> None:
+    """Add the keywords of a WCS; SIP is beyond what the standard has, and is written too."""
+    for card in result.wcs(bottom_up=bottom_up).to_header(relax=True).cards:
+        if not card.keyword.startswith("MJDREF"):  # which would be the time of no observation
+            header.append(card, end=True)

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Matrix, Pixels
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, separation
-from starcat.images.plate import LABEL_PT, LETTER_PT, SKY, Plate
+from starcat.images.frame_axes import LABEL_PT, LETTER_PT, SKY, FrameAxes
 from starcat.sky.names import constellation_lines, named_stars
 
 if TYPE_CHECKING:
@@ -31,45 +31,35 @@ _INTERVALS = 5
 
 @dataclass(frozen=True)
 class Overlay:
-    """Lines and planets in pixels.
+    """Lines and planets in pixels."""
 
-    Attributes
-    ----------
-    grid : tuple of (str, ndarray of float64, shape (P, 2))
-        What a line of the grid is called, and its points; NaN where there is no image.
-    figures : tuple of ndarray of float64, shape (P, 2)
-        Lines of constellations.
-    bodies : tuple of BodyInFrame
-        Planets, the Sun and the Moon.
-    """
-
+    # shape (P, 2): what a line of the grid is called, and its points; NaN where there is no image
     grid: tuple[tuple[str, Array], ...] = ()
-    figures: tuple[Array, ...] = ()
-    bodies: tuple[BodyInFrame, ...] = ()
+    figures: tuple[Array, ...] = ()  # shape (P, 2): lines of constellations
+    bodies: tuple[BodyInFrame, ...] = ()  # planets, the Sun and the Moon
 
 
 def overlay_from_attitude(
-    matrix: Array, camera: Camera, epoch_jyear: float, bodies: tuple[BodyInFrame, ...] = ()
+    matrix: Matrix, camera: Camera, epoch_jyear: float, bodies: tuple[BodyInFrame, ...] = ()
 ) -> Overlay:
     """Return what lies behind the stars of a frame."""
     return Overlay(_grid(matrix, camera), _figures(matrix, camera, epoch_jyear), bodies)
 
 
-def draw_overlay(plate: Plate, overlay: Overlay) -> Array:
+def draw_overlay(frame: FrameAxes, overlay: Overlay) -> Array:
     """Draw lines and planets."""
     taken: list[list[float]] = []
     for name, points in overlay.grid:
-        plate.axes.plot(*points.T, color=GRID, lw=0.6, alpha=0.75, zorder=0.5)
-        taken += _write_at_edge(plate, name, points, taken)
+        frame.axes.plot(*points.T, color=GRID, lw=0.6, alpha=0.75, zorder=0.5)
+        taken += _write_at_edge(frame, name, points, taken)
     for points in overlay.figures:
-        plate.axes.plot(*points.T, color=LINES, lw=1.1, alpha=0.75, zorder=0.6)
+        frame.axes.plot(*points.T, color=LINES, lw=1.1, alpha=0.75, zorder=0.6)
     for body in overlay.bodies:
-        taken.append(_draw_body(plate, body))
+        taken.append(_draw_body(frame, body))
     return np.array(taken).reshape(-1, 4)
 
 
-def _grid(matrix: Array, camera: Camera) -> tuple[tuple[str, Array], ...]:
-    """Return parallels and meridians that cross the frame."""
+def _grid(matrix: Matrix, camera: Camera) -> tuple[tuple[str, Array], ...]:
     step_deg, reach_deg = _step(camera), float(np.degrees(camera.radius_rad))
     _, dec = radec_from_directions(matrix[2])
     lowest, highest = float(dec) - reach_deg, float(dec) + reach_deg
@@ -99,8 +89,7 @@ def _step(camera: Camera) -> float:
     return max((step for step in _STEPS_DEG if step <= most), default=_STEPS_DEG[0])
 
 
-def _figures(matrix: Array, camera: Camera, epoch_jyear: float) -> tuple[Array, ...]:
-    """Return the lines between neighbouring stars of constellations that cross the frame."""
+def _figures(matrix: Matrix, camera: Camera, epoch_jyear: float) -> tuple[Array, ...]:
     stars = named_stars()
     places, seen = stars.at(epoch_jyear), []
     for hips in constellation_lines():
@@ -121,7 +110,7 @@ def _great_circle(start: Array, end: Array) -> Array:
     return np.asarray(chord / np.sqrt(np.einsum("ij,ij->i", chord, chord))[:, None])
 
 
-def _on_detector(points: Array, camera: Camera) -> Array:
+def _on_detector(points: Pixels, camera: Camera) -> Array:
     """Return the points on the detector with those next to them, NaN for the others between."""
     inside = camera.contains(points)
     near = inside.copy()
@@ -134,17 +123,17 @@ def _on_detector(points: Array, camera: Camera) -> Array:
 
 
 def _write_at_edge(
-    plate: Plate, name: str, points: Array, taken: list[list[float]]
+    frame: FrameAxes, name: str, points: Pixels, taken: list[list[float]]
 ) -> list[list[float]]:
     """Write the name of a line of the grid at the edge of the frame, unless another is there."""
-    size = np.array(plate.size, dtype=np.float64)
+    size = np.array(frame.size, dtype=np.float64)
     to_edge = np.minimum(points, size - points).min(axis=1)
     inside = np.flatnonzero(to_edge >= 0.0)
     if not len(inside):
         return []
-    x, y = points[inside[np.argmin(to_edge[inside])]] * plate.scale
+    x, y = points[inside[np.argmin(to_edge[inside])]] * frame.scale
     half_width, half_height = 0.5 * LETTER_PT * len(name) + 2.0, 0.6 * LABEL_PT
-    width, height = plate.frame
+    width, height = frame.size_pt
     x = float(np.clip(x, half_width, width - half_width))
     y = float(np.clip(y, half_height, height - half_height))
     box = [x - half_width, y - half_height, x + half_width, y + half_height]
@@ -153,25 +142,25 @@ def _write_at_edge(
         for left, top, right, bottom in taken
     ):
         return []
-    plate.axes.text(
-        x / plate.scale, y / plate.scale, name, color="#7fb2cf", size=0.8 * LABEL_PT,
+    frame.axes.text(
+        x / frame.scale, y / frame.scale, name, color="#7fb2cf", size=0.8 * LABEL_PT,
         ha="center", va="center", zorder=2.5, parse_math=False,
     )  # fmt: skip
     return [box]
 
 
-def _draw_body(plate: Plate, body: BodyInFrame) -> list[float]:
+def _draw_body(frame: FrameAxes, body: BodyInFrame) -> list[float]:
     """Draw a planet as a square around its place, with its name; return the name's box."""
     from matplotlib.patheffects import withStroke
 
-    x, y, name = body.x_px * plate.scale, body.y_px * plate.scale, body.name
+    x, y, name = body.x_px * frame.scale, body.y_px * frame.scale, body.name
     width = LETTER_PT * len(name)
-    plate.axes.scatter([body.x_px], [body.y_px], 160.0, marker="s", facecolor="none",
+    frame.axes.scatter([body.x_px], [body.y_px], 160.0, marker="s", facecolor="none",
                        edgecolor=PLANET, lw=1.3, zorder=3.0)  # fmt: skip
-    side = 1.0 if x + 11.0 + width < plate.frame[0] else -1.0
+    side = 1.0 if x + 11.0 + width < frame.size_pt[0] else -1.0
     middle = x + side * (11.0 + 0.5 * width)
-    plate.axes.text(
-        middle / plate.scale, body.y_px, name, color=PLANET, size=1.1 * LABEL_PT, ha="center",
+    frame.axes.text(
+        middle / frame.scale, body.y_px, name, color=PLANET, size=1.1 * LABEL_PT, ha="center",
         va="center", zorder=3.0, parse_math=False,
         path_effects=[withStroke(linewidth=2.0, foreground=SKY)],
     )  # fmt: skip

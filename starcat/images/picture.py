@@ -1,54 +1,122 @@
 """A picture of one frame: the image or its spots, which of them are which stars, where north is.
 
-Drawn with matplotlib's own defaults and font, never the user's settings: the same input gives
-the same bytes. Nothing is identified here.
+The same input gives the same bytes. Nothing is identified here.
 """
 
 from __future__ import annotations
 
-import io
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Array
-from starcat.errors import ConfigError, OutputError, reason
-from starcat.geometry.attitude import radec_roll_from_matrix
-from starcat.images.overlay import Overlay, draw_overlay
-from starcat.images.plate import (
+from starcat.arrays import Array, Matrix, Pixels
+from starcat.geometry.attitude import matrix_from_quaternion, radec_roll_from_matrix
+from starcat.geometry.camera import Camera
+from starcat.images.figure_file import check_kind, own_style, write_figure
+from starcat.images.frame_axes import (
     SKY,
-    Plate,
+    FrameAxes,
     draw_compass,
     draw_marks,
     draw_names,
     draw_sky,
     mark_radii,
 )
+from starcat.images.overlay import Overlay, draw_overlay, overlay_from_attitude
+from starcat.matcher.centroids import MeasuredFrame
+from starcat.matcher.database import Database
+from starcat.matcher.result import MatchResult
+from starcat.sky.names import common_names
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from starcat.sky.in_time import SkyInTime
 
-_STYLE: dict[Any, Any] = {
-    "font.family": "DejaVu Sans",  # comes with matplotlib
-    "font.size": 9.0,
-    "svg.hashsalt": "starcat",
-}
-_DPI = 100
 _LONG_SIDE_IN = 9.0
 _LEFT_IN, _BOTTOM_IN, _RIGHT_IN, _TOP_IN = 0.6, 0.85, 0.3, 0.8
+
+
+def draw(
+    path: Path,
+    frame: MeasuredFrame,
+    image: NDArray[Any] | None,
+    result: MatchResult,
+    database: Database,
+    camera: Camera,
+    sky: SkyInTime | None = None,
+) -> None:
+    """Draw a frame with its stars circled and named."""
+    title, below = f"{frame.name}: {result.status.replace('_', ' ')}", database.name
+    compass = overlay = None
+    if result.status == "identified":
+        title = (
+            f"{frame.name}: RA {result.boresight_ra_deg:.4f}, "
+            f"Dec {result.boresight_dec_deg:+.4f}, roll {result.roll_deg:.3f} deg"
+        )
+        below = (
+            f"{result.n_matched} of {len(result.star_index)} spots are stars of {database.name}, "
+            f"residual {result.residual_arcsec:.1f} arcsec"
+        )
+        matrix = matrix_from_quaternion(result.q_body_from_icrs)
+        compass = compass_from_matrix(matrix)
+        bodies = () if sky is None else sky.bodies
+        overlay = overlay_from_attitude(matrix, camera, database.epoch_jyear, bodies)
+    draw_identified(
+        path,
+        image,
+        (camera.width_px, camera.height_px),
+        frame.centroids_px,
+        _labels(result, database, sky),
+        title,
+        mag=frame.mag,
+        below=below,
+        compass=compass,
+        overlay=overlay,
+    )
+
+
+def _labels(result: MatchResult, database: Database, sky: SkyInTime | None) -> list[str | None]:
+    """Return the names that stars are known by; the catalog's own where there is no other.
+
+    The spot of a planet has an empty name: it is identified, and named beside its place.
+    """
+    rows = np.flatnonzero(result.star_index >= 0)
+    stars = result.star_index[rows]
+    own = [name.decode() for name in database.designation[stars].tolist()]
+    known = common_names(own, database.directions[stars], database.mag[stars], database.epoch_jyear)
+    labels: list[str | None] = [None] * len(result.star_index)
+    for row, name, other in zip(rows.tolist(), known, own, strict=True):
+        labels[row] = name or short_name(other)
+    for body in () if sky is None else sky.bodies:
+        if body.row is not None:
+            labels[body.row] = ""
+    return labels
+
+
+def short_name(designation: str) -> str:
+    """Return a designation that fits beside a star.
+
+    Examples
+    --------
+    >>> short_name("Gaia DR3 3221269181884277504"), short_name("SAO 308")
+    ('Gaia …84277504', 'SAO 308')
+    """
+    words = designation.split() or [""]
+    if len(words[-1]) <= 12:
+        return designation
+    return f"{words[0]} …{words[-1][-8:]}"
 
 
 def draw_identified(
     path: Path,
     image: NDArray[Any] | None,
     camera_size: tuple[int, int],
-    centroids_px: Array,
+    centroids_px: Pixels,
     names: Sequence[str | None],
     title: str,
     *,
@@ -58,22 +126,23 @@ def draw_identified(
     overlay: Overlay | None = None,
 ) -> None:
     """Draw which spots of a frame are which stars."""
-    if path.suffix.lower() not in (".png", ".svg"):
-        raise ConfigError(f"{path}: a picture is .png or .svg")
+    check_kind(path, "picture")
     _check(image, camera_size, centroids_px, names, mag)
-    with _own_style():
+    with own_style():
         figure, axes, scale = _canvas(camera_size, title, below)
-        plate = Plate(axes, scale, camera_size, centroids_px, names, mark_radii(len(names), mag))
-        draw_sky(plate, image)
-        written = draw_overlay(plate, overlay or Overlay())
-        draw_marks(plate)
-        taken = draw_compass(plate, compass)
-        left_out = draw_names(plate, np.vstack([taken, written]))
+        frame = FrameAxes(
+            axes, scale, camera_size, centroids_px, names, mark_radii(len(names), mag)
+        )
+        draw_sky(frame, image)
+        written = draw_overlay(frame, overlay or Overlay())
+        draw_marks(frame)
+        taken = draw_compass(frame, compass)
+        left_out = draw_names(frame, np.vstack([taken, written]))
         _draw_legend(figure, names, left_out)
-        _write(figure, path)
+        write_figure(figure, path)
 
 
-def compass_from_matrix(matrix: Array) -> tuple[Array, Array]:
+def compass_from_matrix(matrix: Matrix) -> tuple[Array, Array]:
     """Return where north and east are in the middle of a frame.
 
     Examples
@@ -91,7 +160,7 @@ def compass_from_matrix(matrix: Array) -> tuple[Array, Array]:
 def _check(
     image: NDArray[Any] | None,
     camera_size: tuple[int, int],
-    centroids_px: Array,
+    centroids_px: Pixels,
     names: Sequence[str | None],
     mag: Array | None,
 ) -> None:
@@ -103,17 +172,6 @@ def _check(
         )
     if image is not None and image.shape != camera_size[::-1]:
         raise ValueError(f"image of shape {image.shape} from a camera of {camera_size} px")
-
-
-@contextmanager
-def _own_style() -> Iterator[None]:
-    """Draw with matplotlib's defaults and the style above, then put everything back."""
-    import matplotlib
-
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()
-        matplotlib.rcParams.update(_STYLE)
-        yield
 
 
 def _canvas(camera_size: tuple[int, int], title: str, below: str) -> tuple[Figure, Axes, float]:
@@ -157,20 +215,3 @@ def _draw_legend(figure: Figure, names: Sequence[str | None], left_out: int) -> 
         note = f"{left_out} more names have no room" if left_out > 1 else "1 name has no room"
         right = 1.0 - _RIGHT_IN / figure.get_figwidth()
         figure.text(right, 0.16 / figure.get_figheight(), note, color="#777", ha="right", size=8)
-
-
-def _write(figure: Figure, path: Path) -> None:
-    """Write the file, without a date or a version in it."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-
-    buffer = io.BytesIO()
-    if path.suffix.lower() == ".png":
-        FigureCanvasAgg(figure).print_figure(buffer, dpi=_DPI, metadata={"Software": None})
-    else:
-        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        FigureCanvasSVG(figure).print_figure(buffer, metadata=nothing)
-    try:
-        path.write_bytes(buffer.getvalue())
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({reason(error)})", path=path) from error

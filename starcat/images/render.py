@@ -8,12 +8,21 @@ whose spot changes over the field.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Pixels
+from starcat.errors import ConfigError
+from starcat.geometry.camera import Camera
+from starcat.images.image_file import WRITTEN_KINDS, write_image
+from starcat.matcher.centroids import write_centroids
+from starcat.simulation.simulate import Frame
+
+CENTROIDS_SUFFIX = ".csv"
+"""Suffix of the file that a simulated frame's centroids are written to."""
 
 _REACH_SIGMA = 6.0
 """A star is drawn this far to each side: 4e-9 of its light falls outside."""
@@ -27,40 +36,22 @@ _MOST_ELECTRONS = 1e15
 class Optics:
     """A lens and a detector, for one exposure.
 
-    Attributes
-    ----------
-    psf_sigma_px : float
-        Standard deviation of the Gaussian spot, pixels.
-    zero_point_e : float
-        Electrons of a star of magnitude 0. The default is 19,100 electrons per second and mm2
-        [1]_ through an aperture of 20 mm in 0.1 s.
-    background_e : float
-        Electrons of sky and dark current in a pixel.
-    read_noise_e : float
-        Standard deviation of the read-out, electrons.
-    gain_e_per_adu : float
-        Electrons of one step of the file.
-    bias_adu : float
-        Steps added to every pixel, so that noise does not fall below zero.
-    full_well_e : float
-        Electrons that a pixel can hold; what is above is lost.
-    hot_pixels : int
-        Pixels with a high dark current, at places that the seed gives.
-
     References
     ----------
     .. [1] Liebe 2002, "Accuracy performance of star trackers - a tutorial", IEEE Transactions
        on Aerospace and Electronic Systems 38 (2), 587-599.
     """
 
-    psf_sigma_px: float = 1.0
+    psf_sigma_px: float = 1.0  # standard deviation of the Gaussian spot, pixels
+    # electrons of a star of magnitude 0. The default is 19,100 electrons per second and mm2
+    # through an aperture of 20 mm in 0.1 s.
     zero_point_e: float = 600_000.0
-    background_e: float = 20.0
-    read_noise_e: float = 8.0
-    gain_e_per_adu: float = 1.0
-    bias_adu: float = 100.0
-    full_well_e: float = 50_000.0
-    hot_pixels: int = 0
+    background_e: float = 20.0  # electrons of sky and dark current in a pixel
+    read_noise_e: float = 8.0  # standard deviation of the read-out, electrons
+    gain_e_per_adu: float = 1.0  # electrons of one step of the file
+    bias_adu: float = 100.0  # steps added to every pixel, so that noise does not fall below zero
+    full_well_e: float = 50_000.0  # electrons that a pixel can hold; what is above is lost
+    hot_pixels: int = 0  # pixels with a high dark current, at places that the seed gives
 
     def __post_init__(self) -> None:
         for name in ("psf_sigma_px", "gain_e_per_adu", "full_well_e"):
@@ -72,7 +63,7 @@ class Optics:
 
 
 def star_electrons(
-    centroids_px: Array, mag: Array, camera_size: tuple[int, int], optics: Optics
+    centroids_px: Pixels, mag: Array, camera_size: tuple[int, int], optics: Optics
 ) -> Array:
     """Return the mean number of electrons that stars release, without background or noise."""
     width, height = camera_size
@@ -94,7 +85,7 @@ def star_electrons(
     return image
 
 
-def _check(centroids_px: Array, mag: Array, camera_size: tuple[int, int]) -> None:
+def _check(centroids_px: Pixels, mag: Array, camera_size: tuple[int, int]) -> None:
     if centroids_px.ndim != 2 or centroids_px.shape[1] != 2 or mag.shape != centroids_px.shape[:1]:
         raise ValueError(
             f"centroids_px of shape {centroids_px.shape} and mag of shape {mag.shape}; "
@@ -115,7 +106,7 @@ def _profiles(centre: Array, sigma: float) -> tuple[Array, NDArray[np.int64]]:
 
 
 def render_image(
-    centroids_px: Array,
+    centroids_px: Pixels,
     mag: Array,
     camera_size: tuple[int, int],
     optics: Optics,
@@ -124,13 +115,9 @@ def render_image(
 ) -> NDArray[np.uint16]:
     """Return the image of stars as a detector would record it.
 
-    Notes
-    -----
     Electrons of stars, background and hot pixels are Poisson variates; the full well cuts
     them; the read-out adds Gaussian noise and rounds to whole ADU.
 
-    Examples
-    --------
     >>> import numpy as np
     >>> image = render_image(np.array([[10.5, 20.5]]), np.array([3.0]), (64, 48), Optics(), 1)
     >>> image.shape, np.unravel_index(image.argmax(), image.shape) == (20, 10)
@@ -147,3 +134,22 @@ def render_image(
     electrons += generator.normal(scale=optics.read_noise_e, size=mean.shape)
     adu = np.rint(electrons / optics.gain_e_per_adu + optics.bias_adu)
     return np.clip(adu, 0, 65_535).astype(np.uint16)
+
+
+def write_simulated(path: Path, frame: Frame, camera: Camera, seed: int) -> None:
+    """Write a simulated frame as centroids, or as the image that a camera would take."""
+    suffix = path.suffix.lower()
+    if suffix == CENTROIDS_SUFFIX:
+        write_centroids(frame.centroids_px, path, frame.mag)
+        return
+    if suffix not in WRITTEN_KINDS:
+        raise ConfigError(
+            f"{path}: the name says no kind of frame that starcat writes; end it with one of "
+            f"{CENTROIDS_SUFFIX} (centroids), {', '.join(WRITTEN_KINDS)} (images)"
+        )
+    size = camera.width_px, camera.height_px
+    image = render_image(frame.centroids_px, frame.mag, size, Optics(), seed)
+    if WRITTEN_KINDS[suffix] == "JPEG":
+        # Eight bits from a black point below the sky of the default optics.
+        image = np.clip(np.rint((image.astype(np.float64) - 90.0) / 4.0), 0, 255).astype(np.uint8)
+    write_image(path, image)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Mask
 from starcat.images.background import Levels
 
 SIGMA_RANGE_PX = (0.3, 5.0)
@@ -48,7 +48,7 @@ def best_widths(levels: Levels, places: Array) -> tuple[Array, Array]:
     return _between(np.log(widths), scores, best), scores.max(axis=0) / levels.noise[y, x]
 
 
-def is_sharp(levels: Levels, places: Array, sigma: float) -> NDArray[np.bool_]:
+def is_sharp(levels: Levels, places: Array, sigma: float) -> Mask:
     """Return which spots are too narrow for the light of a star, beyond their noise."""
     if not len(places):
         return np.zeros(0, dtype=np.bool_)

@@ -18,9 +18,9 @@ import pyarrow as pa
 
 from starcat.artifact.verify import check_artifact
 from starcat.artifact.writer import Product, write_manifest, write_products
-from starcat.catalog.fetching.locate import locate
 from starcat.catalog.ingest import Ingested
 from starcat.catalog.selection import Selected
+from starcat.catalog.source_files import locate
 from starcat.catalog.stars import directions_of, sort_rows
 from starcat.catalog.variability import AmplitudeTable, join_amplitudes, read_amplitudes
 from starcat.errors import BuildError, ConfigError
@@ -41,11 +41,13 @@ from starcat.pipeline.recipes import (
 from starcat.pipeline.report_data import (
     BuildResults,
     FilterCoverage,
-    build_facts,
+    coverage_report,
     filter_coverages,
+    report_content,
     source_facts,
 )
 from starcat.products.boresights import FieldStars
+from starcat.products.coverage import field_coverage
 from starcat.progress import Progress, no_progress
 from starcat.report.coverage_report import CoverageReport, holes_warning
 from starcat.report.report import write_report
@@ -103,9 +105,14 @@ def build(
     """Build an artifact."""
     final = output / f"{spec.name}-{spec.version}"
     clock = Stopwatch()
+
+    def check_cost(cost: Cost) -> None:
+        if announce is not None:
+            announce(cost)
+        check_memory(cost, spec, max_memory_bytes)
+
     with whole_folder(final) as partial:
-        plan = _Plan(spec, inputs, workers, announce, max_memory_bytes)
-        made = _make(partial, plan, clock, progress)
+        made = _make(partial, spec, inputs, workers, check_cost, clock, progress)
         progress("verify", 0, None)
         check_artifact(partial)
         try:
@@ -118,20 +125,16 @@ def build(
     return changed(made, folder=final, outcome=outcome, times_s=clock.times_s)
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """What was asked for."""
-
-    spec: BuildSpec
-    inputs: Inputs
-    workers: int
-    announce: Callable[[Cost], None] | None
-    max_memory_bytes: int | None
-
-
-def _make(partial: Path, plan: _Plan, clock: Stopwatch, progress: Progress) -> Built:
+def _make(
+    partial: Path,
+    spec: BuildSpec,
+    inputs: Inputs,
+    workers: int,
+    check_cost: Callable[[Cost], None],
+    clock: Stopwatch,
+    progress: Progress,
+) -> Built:
     """Go through all stages up to the manifest, in a folder that has no name yet."""
-    spec, inputs, workers = plan.spec, plan.inputs, plan.workers
     catalog, amplitudes = read_sources(spec, inputs, workers, progress)
     motions = join_motions(catalog, spec, inputs, workers, progress)
     catalog = motions.catalog
@@ -139,10 +142,7 @@ def _make(partial: Path, plan: _Plan, clock: Stopwatch, progress: Progress) -> B
     clock.lap("read")
     selected, fields = select_stars(stars, spec)
     moved = motion_product(motions, selected.guide_stars)
-    cost = estimate_cost(catalog, selected, fields, spec, moved)
-    if plan.announce is not None:
-        plan.announce(cost)
-    check_memory(cost, spec, plan.max_memory_bytes)
+    check_cost(estimate_cost(catalog, selected, fields, spec, moved))
     clock.lap("select")
     products = make_products(spec, catalog, selected, fields, progress)
     products += moved
@@ -220,13 +220,15 @@ def join_all(
 
 def report_build(folder: Path, results: BuildResults) -> CoverageReport:
     """Write the report of a build."""
-    facts = build_facts(folder, results)
+    spec = results.spec
+    counted = field_coverage(results.fields, spec.boresights.brightest)
+    coverage = coverage_report(counted, spec)
+    content = report_content(folder, results, coverage)
     (folder / "report").mkdir()
-    write_report(folder / "report", facts)
-    warning = holes_warning(facts.coverage.gap)
-    if warning is not None:
-        _logger.warning("%s: %s", facts.title, warning)
-    return facts.coverage
+    write_report(folder / "report", content, coverage)
+    for warning in content["warnings"]:
+        _logger.warning("%s-%s: %s", spec.name, spec.version, warning)
+    return coverage
 
 
 def make_products(

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from starcat.catalog.stars import floats_of
 from starcat.pipeline.build import Inputs, join_all, read_sources
+from starcat.pipeline.cost import table_bytes
 from starcat.pipeline.motions import join_motions
-from starcat.pipeline.sizes import table_bytes
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import BuildSpec
 

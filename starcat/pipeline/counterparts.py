@@ -24,9 +24,9 @@ from starcat.artifact.crossmatch_table import (
 )
 from starcat.artifact.manifest import SourceFacts
 from starcat.artifact.writer import Product
-from starcat.catalog.fetching.locate import locate
 from starcat.catalog.ingest import Ingested
 from starcat.catalog.selection import Selected
+from starcat.catalog.source_files import locate
 from starcat.catalog.stars import sort_rows
 from starcat.catalog.verdict import Reason
 from starcat.errors import ParseError, SchemaError, SourceMissing, reason
@@ -43,21 +43,12 @@ from starcat.store.reading import read_catalog
 
 @dataclass(frozen=True)
 class Counterparts:
-    """The counterparts of a build's guide stars.
+    """The counterparts of a build's guide stars."""
 
-    Attributes
-    ----------
-    products : tuple of Product
-        The crossmatch product; none where the spec does not ask for it.
-    sources : tuple of SourceFacts
-        The catalogs they are of, as the manifest has them.
-    notes : tuple of str
-        What a user should know of the inputs.
-    """
-
+    # the crossmatch product; none where the spec does not ask for it
     products: tuple[Product, ...] = ()
-    sources: tuple[SourceFacts, ...] = ()
-    notes: tuple[str, ...] = ()
+    sources: tuple[SourceFacts, ...] = ()  # the catalogs they are of, as the manifest has them
+    notes: tuple[str, ...] = ()  # what a user should know of the inputs
 
 
 def model_from_spec(wanted: Crossmatch) -> MatchModel:

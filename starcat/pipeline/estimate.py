@@ -14,16 +14,15 @@ import numpy as np
 import pyarrow as pa
 
 from starcat.artifact.writer import Product
-from starcat.catalog.blocks import reject_rows
 from starcat.catalog.ingest import count_by_reason
 from starcat.catalog.selection import Selected
-from starcat.catalog.stars import floats_of, sort_rows
+from starcat.catalog.stars import floats_of, reject_rows, sort_rows
 from starcat.catalog.verdict import Reason
 from starcat.errors import BuildError
 from starcat.geometry.sphere import saff_kuijlaars
 from starcat.pipeline.build import Inputs
 from starcat.pipeline.catalog_snapshot import SAMPLE_ROWS, CatalogSnapshot, read_snapshot
-from starcat.pipeline.cost import Cost, EstimateInputs, base_memory, check_memory, whole_cost
+from starcat.pipeline.cost import Cost, base_memory, check_memory, table_bytes, whole_cost
 from starcat.pipeline.guide_stars import (
     MIN_GUIDE_STARS,
     MOST_FIELD_STARS,
@@ -33,7 +32,6 @@ from starcat.pipeline.guide_stars import (
 )
 from starcat.pipeline.motions import motions_of
 from starcat.pipeline.recipes import field_size, tile_guide_stars
-from starcat.pipeline.sizes import table_bytes
 from starcat.products.boresights import FieldStars
 from starcat.products.coverage import (
     CoverageSummary,
@@ -70,7 +68,7 @@ class Choice:
 
 
 def choose_stars(read: CatalogSnapshot, spec: BuildSpec) -> Choice:
-    """Choose the guide stars of a spec, as its build does."""
+    """Choose the guide stars of a spec, as its build does; a field may have too few of them."""
     order, mag = read.by_brightness
     bright = np.sort(order[: np.searchsorted(mag, _faintest(spec.selection), side="right")])
     stars = read.stars.take(pa.array(bright)).combine_chunks()
@@ -157,15 +155,14 @@ def estimate(
 ) -> Estimate:
     """Estimate what a spec will give."""
     guide_stars, fields = choice.selected.guide_stars, choice.fields
-    made = EstimateInputs(
+    cost = whole_cost(
         guide_stars,
         fields,
         spec,
         _rejected_bytes(read, choice, spec),
-        _motion_product(read, guide_stars),
         base_memory(read.held_bytes),
+        _motion_product(read, guide_stars),
     )
-    cost = whole_cost(made)
     refusals = []
     for check in (
         partial(check_fields, fields, spec),

@@ -30,8 +30,7 @@ from starcat.products.crossmatch import MovingStars, Pairs, candidate_pairs, jud
 from starcat.products.match_figures import is_sure
 from starcat.products.match_probability import ROUNDS
 from starcat.storage.atomic import whole_file
-from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, Pixels, border_order
-from starcat.store.region import region_around
+from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, Pixels, border_order, region_around
 
 MOST_RINGS = 2 * ROUNDS + 8
 """Messages of a cluster go no farther than two pairs in a round: with so many rings a piece has

@@ -11,9 +11,9 @@ import pyarrow as pa
 
 from starcat.artifact.crossmatch_table import moving_stars
 from starcat.pipeline.star_rows import opened, rows_of_partition
-from starcat.products.census import Census
 from starcat.products.crossmatch import MovingStars
 from starcat.products.match_figures import Figures, MatchModel
+from starcat.products.star_counts import Census
 from starcat.store.pixels import Pixel, border_order
 
 PLACED = (
@@ -33,23 +33,12 @@ PIECE_LOAD = 1 << 19
 
 @dataclass(frozen=True)
 class Extent:
-    """What is known of a catalog, or a part of it, before any pair is looked for.
+    """What is known of a catalog, or a part of it, before any pair is looked for."""
 
-    Attributes
-    ----------
-    census : Census
-        Counts of its stars.
-    speed_rad_yr : float
-        The largest proper motion, radians a year.
-    has_still : bool
-        Whether any star has none.
-    first_jyear, last_jyear : float
-        Epochs of its positions.
-    """
-
-    census: Census
-    speed_rad_yr: float
-    has_still: bool
+    census: Census  # counts of its stars
+    speed_rad_yr: float  # the largest proper motion, radians a year
+    has_still: bool  # whether any star has none
+    # first_jyear, last_jyear: epochs of its positions
     first_jyear: float
     last_jyear: float
 
@@ -83,29 +72,17 @@ class Extent:
 
 @dataclass(frozen=True)
 class Job:
-    """What all tasks of a cross-identification need.
+    """What all tasks of a cross-identification need."""
 
-    Attributes
-    ----------
-    a, b, scratch : Path
-        The two stores, and the folder for what is not finished.
-    radius_rad : float
-        Largest separation of a candidate.
-    model : MatchModel
-        What the odds assume.
-    hop_rad : float
-        How far a candidate's position may be from that of its star, each at its own epoch.
-    figures : Figures, optional
-        What is known of both catalogs, once it is.
-    """
-
+    # a, b, scratch: the two stores, and the folder for what is not finished
     a: Path
     b: Path
     scratch: Path
-    radius_rad: float
-    model: MatchModel
+    radius_rad: float  # largest separation of a candidate
+    model: MatchModel  # what the odds assume
+    # how far a candidate's position may be from that of its star, each at its own epoch
     hop_rad: float = 0.0
-    figures: Figures | None = None
+    figures: Figures | None = None  # what is known of both catalogs, once it is
 
 
 @dataclass(frozen=True)

@@ -16,38 +16,23 @@ from starcat.products.match_figures import ARCSEC
 
 @dataclass(frozen=True)
 class Summary:
-    """What a cross-identification of two catalogs found.
+    """What a cross-identification of two catalogs found."""
 
-    Attributes
-    ----------
-    stars, counterparts : int
-        Rows of the two.
-    radius_arcsec : float
-        Largest separation of a candidate.
-    matched, unmatched : int
-        Stars with a counterpart, be it ambiguous, and all others.
-    verdicts : dict of str to int
-        Stars by the verdict on their likeliest candidate.
-    no_candidate : int
-        Stars with none within the radius.
-    mutual : int
-        Stars that are their likeliest candidate's likeliest star.
-    median_separation_arcsec, median_delta_mag : float or None
-        Over the matched stars; None where there is none.
-    position_error_arcsec, expected_delta_mag, completeness : float
-        The figures behind the odds, given or measured.
-    """
-
+    # stars, counterparts: rows of the two
     stars: int
     counterparts: int
-    radius_arcsec: float
+    radius_arcsec: float  # largest separation of a candidate
+    # matched, unmatched: stars with a counterpart, be it ambiguous, and all others
     matched: int
     unmatched: int
-    verdicts: dict[str, int]
-    no_candidate: int
-    mutual: int
+    verdicts: dict[str, int]  # stars by the verdict on their likeliest candidate
+    no_candidate: int  # stars with none within the radius
+    mutual: int  # stars that are their likeliest candidate's likeliest star
+    # median_separation_arcsec, median_delta_mag: over the matched stars; None where there is none
     median_separation_arcsec: float | None
     median_delta_mag: float | None
+    # position_error_arcsec, expected_delta_mag, completeness: the figures behind the odds, given or
+    # measured
     position_error_arcsec: float
     expected_delta_mag: float
     completeness: float
@@ -59,27 +44,13 @@ class Summary:
 
 @dataclass(frozen=True)
 class Tally:
-    """What was found of some stars.
+    """What was found of some stars."""
 
-    Attributes
-    ----------
-    rows : int
-        Candidates of all of them.
-    matched : int
-        Stars with a counterpart, be it ambiguous.
-    with_candidates : int
-        Stars with any candidate.
-    mutual : int
-        Stars that are their likeliest candidate's likeliest star.
-    verdicts : dict of str to int
-        Stars by the verdict on their likeliest candidate.
-    """
-
-    rows: int
-    matched: int
-    with_candidates: int
-    mutual: int
-    verdicts: dict[str, int]
+    rows: int  # candidates of all of them
+    matched: int  # stars with a counterpart, be it ambiguous
+    with_candidates: int  # stars with any candidate
+    mutual: int  # stars that are their likeliest candidate's likeliest star
+    verdicts: dict[str, int]  # stars by the verdict on their likeliest candidate
 
     @classmethod
     def of_none(cls) -> Tally:

@@ -21,12 +21,17 @@ from starcat.arrays import Array
 from starcat.artifact.manifest import SourceFacts
 from starcat.artifact.motion_table import JOINED, NO_CANDIDATE, NO_MOTION, OWN_MOTION
 from starcat.artifact.writer import Product
-from starcat.catalog.fetching.locate import locate
 from starcat.catalog.ingest import Ingested, unmoved_stars
-from starcat.catalog.nearest import add_nearest_neighbours
 from starcat.catalog.proper_motion import Motion, propagate
-from starcat.catalog.quality import Quality
-from starcat.catalog.stars import directions_of, floats_of, move_to_epoch, with_columns
+from starcat.catalog.source_files import locate
+from starcat.catalog.stars import (
+    add_nearest_neighbours,
+    directions_of,
+    floats_of,
+    move_to_epoch,
+    with_columns,
+)
+from starcat.catalog.verdict import Quality
 from starcat.geometry.sphere import separation
 from starcat.pipeline.counterparts import match_tables
 from starcat.progress import Progress, no_progress
@@ -48,21 +53,13 @@ OF_ENTRY = (
 
 @dataclass(frozen=True)
 class JoinedMotions:
-    """What became of the motions of a catalog's stars.
+    """What became of the motions of a catalog's stars."""
 
-    Attributes
-    ----------
-    catalog : Ingested
-        The catalog; its stars have their motions and are at the epoch of the build.
-    table : pyarrow.Table, optional
-        Rows of the schema ``motions`` for all its stars, in their order; None where the spec asks
-        for no motions.
-    sources : tuple of SourceFacts
-        The catalogs that motions were looked for in; ``joined`` counts all stars.
-    """
-
-    catalog: Ingested
+    catalog: Ingested  # the catalog; its stars have their motions and are at the epoch of the build
+    # rows of the schema ``motions`` for all its stars, in their order; None where the spec asks for
+    # no motions
     table: pa.Table | None = None
+    # the catalogs that motions were looked for in; ``joined`` counts all stars
     sources: tuple[SourceFacts, ...] = ()
 
 

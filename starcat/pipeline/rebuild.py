@@ -10,9 +10,8 @@ from typing import Any
 from starcat.artifact.diff import Change, changes_between
 from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
 from starcat.artifact.reader import Artifact, open_artifact
-from starcat.catalog.fetching.locate import locate
-from starcat.catalog.readers.files import find_files
 from starcat.catalog.source import data_source
+from starcat.catalog.source_files import SourceFiles, locate
 from starcat.errors import ChecksumMismatch
 from starcat.pipeline.build import Inputs, build, check_inputs
 from starcat.progress import Progress, no_progress
@@ -70,7 +69,7 @@ def _same_inputs(old: Artifact, given: Inputs, progress: Progress) -> Inputs:
     for facts in old.manifest["sources"]:
         name = facts["source"]
         found[name] = locate(name, given)
-        paths = [file.path for file in find_files(data_source(name), found[name])]
+        paths = [file.path for file in SourceFiles.find(data_source(name), found[name]).files]
         expected = [(file["name"], file["sha256"]) for file in facts["files"]]
         if len(paths) != len(expected):
             raise ChecksumMismatch(

@@ -8,26 +8,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from starcat.arrays import Array
 from starcat.artifact.writer import Product
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.geometry.sphere import radec_from_directions
 from starcat.products.boresights import FieldSize, FieldStars, NominalField, tile_sphere
-from starcat.products.grid import grid_patterns
-from starcat.products.hausdorff_angular import angular_reference_sets
-from starcat.products.hausdorff_l2 import planar_reference_sets
 from starcat.products.index import Index, Ragged
 from starcat.products.levels import find_levels, level_fields
-from starcat.products.neighbours import find_neighbours
-from starcat.products.pairs import find_pairs
-from starcat.products.radial import radial_patterns
-from starcat.products.triangles import find_triangles
+from starcat.products.neighbours import (
+    angular_reference_sets,
+    find_neighbours,
+    planar_reference_sets,
+)
+from starcat.products.pairs_and_triangles import find_pairs, find_triangles
+from starcat.products.star_patterns import grid_patterns, radial_patterns
 from starcat.specs.build_spec import BuildSpec
 from starcat.storage.schema import ProductSchema, product_schema
 
@@ -150,11 +150,17 @@ def table_from_result(result: Any, schema: ProductSchema) -> pa.Table:
 def boresight_product(fields: FieldStars, brightest: int) -> Product:
     """Return the boresights as a product."""
     ra_deg, dec_deg = radec_from_directions(fields.boresights)
-    u = np.ascontiguousarray(fields.boresights.T)
     rows = np.arange(len(ra_deg), dtype=np.int32)
-    count = fields.count.astype(np.int32)
-    result = _Boresights(
-        rows, ra_deg, dec_deg, u[0], u[1], u[2], count, Ragged(*fields.brightest(brightest))
+    x, y, z = np.ascontiguousarray(fields.boresights.T)
+    result = SimpleNamespace(
+        boresight=rows,
+        ra_deg=ra_deg,
+        dec_deg=dec_deg,
+        x=x,
+        y=y,
+        z=z,
+        star_count=fields.count.astype(np.int32),
+        brightest=Ragged(*fields.brightest(brightest)),
     )
     return Product("boresights", table_from_result(result, product_schema("boresights")), Index())
 
@@ -172,15 +178,3 @@ def level_product(guide_stars: pa.Table, spec: BuildSpec) -> Product:
         brightest=spec.boresights.brightest,
     )
     return Product("levels", table_from_result(result, product_schema("levels")), result.index)
-
-
-@dataclass(frozen=True)
-class _Boresights:
-    boresight: NDArray[np.int32]
-    ra_deg: Array
-    dec_deg: Array
-    x: Array
-    y: Array
-    z: Array
-    star_count: NDArray[np.int32]
-    brightest: Ragged

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +26,9 @@ from starcat.catalog.verdict import Reason
 from starcat.pipeline.guide_stars import MIN_GUIDE_STARS
 from starcat.pipeline.recipes import field_size
 from starcat.products.boresights import FieldStars, tile_sphere
-from starcat.products.coverage import Coverage, coverage_from_counts, field_coverage
-from starcat.report.coverage_report import CoverageReport, report_coverage
-from starcat.report.report import BuildFacts
+from starcat.products.coverage import Coverage, coverage_from_counts
+from starcat.report.coverage_report import CoverageReport, holes_warning, report_coverage
+from starcat.report.report import count_magnitudes
 from starcat.simulation.selftest import Rates
 from starcat.specs.build_spec import BuildSpec
 
@@ -44,7 +45,6 @@ class FilterCoverage:
 
 
 def _counts(step: Step, spec: BuildSpec) -> NDArray[np.int64]:
-    """Return the stars in each field of the tiling."""
     return tile_sphere(
         spec.boresights.count,
         step.directions,
@@ -132,28 +132,31 @@ class BuildResults:
     rates: Sequence[Rates]  # rates of the self-test
 
 
-def build_facts(folder: Path, results: BuildResults) -> BuildFacts:
-    """Return what the report of a build is made of."""
+def report_content(folder: Path, results: BuildResults, coverage: CoverageReport) -> dict[str, Any]:
+    """Return the report of a build as JSON holds it; its files are in the folder."""
     spec, tables = results.spec, {product.name: product.table for product in results.products}
+    recorded, warning = spec.recorded(), holes_warning(coverage.gap)
     products = {name: facts.as_dict() for name, facts in results.facts.items()}
     for facts in products.values():
         facts["bytes"] = (folder / facts["parquet"]).stat().st_size
     sources = [source.as_dict() for source in results.sources]
     found = {name for source in sources for name in source["rejected"]}
-    return BuildFacts(
-        spec=spec.recorded(),
-        sources=sources,
-        reasons={reason.name: reason.value for reason in Reason if reason.name in found},
-        products=products,
-        database_bytes=(folder / DATABASE_NAME).stat().st_size,
-        filters=[asdict(step) for step in results.filters],
-        coverage=coverage_report(field_coverage(results.fields, spec.boresights.brightest), spec),
-        self_test=[rates.as_dict() for rates in results.rates],
-        software=software_versions(),
-        band=str(tables["stars"]["band"][0]),
-        guide_star_mag=floats_of(tables["stars"], "mag"),
-        rejected_mag=floats_of(tables["rejected"], "mag"),
-    )
+    mags = (floats_of(tables[name], "mag") for name in ("stars", "rejected"))
+    return {
+        **{name: recorded[name] for name in ("name", "version", "description", "epoch_jyear")},
+        "frame": "ICRS",
+        "warnings": [warning] if warning else [],
+        "sources": sources,
+        "reasons": {reason.name: reason.value for reason in Reason if reason.name in found},
+        "products": products,
+        "database_bytes": (folder / DATABASE_NAME).stat().st_size,
+        "filters": [asdict(step) for step in results.filters],
+        "coverage": coverage.as_dict(),
+        "magnitudes": {"band": str(tables["stars"]["band"][0]), **count_magnitudes(*mags)},
+        "self_test": [rates.as_dict() for rates in results.rates],
+        "spec": recorded,
+        "software": software_versions(),
+    }
 
 
 def artifact_coverage(artifact: Artifact) -> CoverageReport:

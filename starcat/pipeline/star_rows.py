@@ -30,8 +30,15 @@ from starcat.store.layout import (
     write_properties,
 )
 from starcat.store.metadata import write_pixel_list, write_slices
-from starcat.store.pixels import HEALPIX_COLUMN, MAX_ORDER, Pixel, Pixels, healpix_29, runs_of
-from starcat.store.region import Region
+from starcat.store.pixels import (
+    HEALPIX_COLUMN,
+    MAX_ORDER,
+    Pixel,
+    Pixels,
+    Region,
+    healpix_29,
+    runs_of,
+)
 
 _ALIKE = {
     "string": (

@@ -17,22 +17,21 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from starcat.catalog.fetching.locate import locate
 from starcat.catalog.ingest import ingest
 from starcat.catalog.selection import reject_dense, select_guide_stars
+from starcat.catalog.source_files import locate
 from starcat.catalog.stars import directions_of, floats_of
 from starcat.errors import BuildError, OutputError
 from starcat.geometry.camera import Camera
-from starcat.pipeline.cost import Cost, EstimateInputs, base_memory, product_cost, whole_cost
+from starcat.pipeline.cost import Cost, base_memory, product_cost, table_bytes, whole_cost
 from starcat.pipeline.guide_stars import brightest_of_fields, check_tiling
 from starcat.pipeline.recipes import RECIPES, ProductInputs, field_size, tile_guide_stars
-from starcat.pipeline.sizes import table_bytes
 from starcat.products.boresights import tile_sphere
 from starcat.products.coverage import Spread, field_coverage, summarise_coverage
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import BuildSpec, CameraSpec
+from starcat.specs.keys import spec_toml
 from starcat.specs.reading import spec_from_dict
-from starcat.specs.spec_toml import spec_toml
 from starcat.storage.atomic import whole_file
 
 SOURCE, BAND = "gaia", "G"
@@ -142,7 +141,6 @@ def starter_spec(
 
 
 def _is_quick(mag: NDArray[np.float64], limit: float, spec: BuildSpec, most: int) -> bool:
-    """Return whether what a limit leaves is counted in a moment."""
     if spec.boresights.count > MOST_BORESIGHTS:
         return False
     try:
@@ -234,7 +232,7 @@ def _affordable(sky: pa.Table, spec: BuildSpec) -> tuple[BuildSpec, LimitRow, Co
         spec = BuildSpec.model_validate(content)
         cost = product_cost(ProductInputs(directions, fields, spec), base)
     rejected = table_bytes(selected.rejected)
-    cost = whole_cost(EstimateInputs(guide_stars, fields, spec, rejected, base_bytes=base))
+    cost = whole_cost(guide_stars, fields, spec, rejected, base)
     stars = summarise_coverage(field_coverage(fields, BRIGHTEST)).stars
     return spec, LimitRow(spec.selection.faint_limit_mag, len(guide_stars), stars), cost
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Directions, Mask
 from starcat.geometry.sphere import (
     chord_from_separation,
     radec_from_directions,
@@ -33,34 +33,21 @@ class FieldSize(Protocol):
 
 @dataclass(frozen=True)
 class NominalField:
-    """A field of view that is stated, not that of a detector.
+    """A field of view that is stated, not that of a detector."""
 
-    Attributes
-    ----------
-    fov_x_deg, fov_y_deg : float
-        Full angles across width and height, degrees.
-    """
-
+    # fov_x_deg, fov_y_deg: full angles across width and height, degrees
     fov_x_deg: float
     fov_y_deg: float
 
 
 @dataclass(frozen=True)
 class FieldStars:
-    """The stars in each of a number of fields.
+    """The stars in each of a number of fields."""
 
-    Attributes
-    ----------
-    boresights : ndarray of float64, shape (F, 3)
-        ICRS directions.
-    offsets : ndarray of int64, shape (F + 1,)
-        The stars of field f are ``star_index[offsets[f]:offsets[f + 1]]``.
-    star_index : ndarray of int32, shape (M,)
-        Rows of the star table, brightest first within a field.
-    """
-
-    boresights: Array
+    boresights: Directions  # shape (F, 3): ICRS directions
+    # shape (F + 1,): the stars of field f are ``star_index[offsets[f]:offsets[f + 1]]``
     offsets: NDArray[np.int64]
+    # shape (M,): rows of the star table, brightest first within a field
     star_index: NDArray[np.int32]
 
     @property
@@ -74,52 +61,24 @@ class FieldStars:
         return int(self.boresights.nbytes + self.offsets.nbytes + self.star_index.nbytes)
 
     def brightest(self, most: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-        """Return the brightest stars of each field.
-
-        Parameters
-        ----------
-        most : int
-            How many at the most.
-
-        Returns
-        -------
-        offsets : ndarray of int64, shape (F + 1,)
-            As for all stars.
-        star_index : ndarray of int32, shape (K,)
-            The brightest, in order.
-        """
+        """Return offsets and rows of the brightest stars of each field, at most so many."""
         rank = np.arange(len(self.star_index)) - np.repeat(self.offsets[:-1], self.count)
         offsets = np.concatenate([[0], np.cumsum(np.minimum(self.count, most))])
         return offsets, self.star_index[rank < most]
 
 
 def stars_in_fields(
-    boresights: Array,
-    directions: Array,
+    boresights: Directions,
+    directions: Directions,
     mag: Array,
     size: FieldSize,
     field: Literal["rectangular", "circular"] = "rectangular",
 ) -> FieldStars:
     """Find the stars in the field of each boresight.
 
-    Parameters
-    ----------
-    boresights : ndarray of float64, shape (F, 3)
-        ICRS directions.
-    directions : ndarray of float64, shape (N, 3)
-        ICRS directions of the stars.
-    mag : ndarray of float64, shape (N,)
-        Their magnitudes; equal ones go by row.
-    size : FieldSize
-        How large the field is: a camera or a stated field.
-    field : {"rectangular", "circular"}
-        The frame at roll 0 (rows along right ascension), or the circle whose radius
-        is half of the narrower side. Edges belong to the field.
-
-    Returns
-    -------
-    FieldStars
-        Stars by field, brightest first.
+    A rectangular field is the frame at roll 0 (rows along right ascension), a circular one has
+    the radius of half of the narrower side. Edges belong to the field; equal magnitudes go by
+    row.
     """
     half_x, half_y = np.radians(0.5 * size.fov_x_deg), np.radians(0.5 * size.fov_y_deg)
     radius = reach_rad(size, field)
@@ -147,28 +106,15 @@ def stars_in_fields(
 
 
 def reach_rad(size: FieldSize, field: Literal["rectangular", "circular"]) -> float:
-    """Return how far from its boresight a field reaches.
-
-    Parameters
-    ----------
-    size : FieldSize
-        How large the field is.
-    field : {"rectangular", "circular"}
-        As for `stars_in_fields`.
-
-    Returns
-    -------
-    float
-        Radians: to a corner of the frame, or the radius of the circle.
-    """
+    """Return how far from its boresight a field reaches: its corner, or the edge of the circle."""
     half_x, half_y = np.radians(0.5 * size.fov_x_deg), np.radians(0.5 * size.fov_y_deg)
     corner = np.arctan(np.hypot(np.tan(half_x), np.tan(half_y)))
     return float(min(half_x, half_y) if field == "circular" else corner)
 
 
 def _in_frame(
-    boresights: Array, tile: NDArray[np.int64], u: Array, half_x: float, half_y: float
-) -> NDArray[np.bool_]:
+    boresights: Directions, tile: NDArray[np.int64], u: Array, half_x: float, half_y: float
+) -> Mask:
     """Return which directions project into the frame of their tile at roll 0."""
     east, north = tangent_axes(*radec_from_directions(boresights))
     along = np.einsum("ij,ij->i", u, boresights[tile])
@@ -179,29 +125,10 @@ def _in_frame(
 
 def tile_sphere(
     count: int,
-    directions: Array,
+    directions: Directions,
     mag: Array,
     size: FieldSize,
     field: Literal["rectangular", "circular"] = "rectangular",
 ) -> FieldStars:
-    """Tile the sphere with Saff-Kuijlaars boresights and find the stars in each field.
-
-    Parameters
-    ----------
-    count : int
-        Number of boresights.
-    directions : ndarray of float64, shape (N, 3)
-        ICRS directions of the stars.
-    mag : ndarray of float64, shape (N,)
-        Their magnitudes.
-    size : FieldSize
-        How large the field is.
-    field : {"rectangular", "circular"}
-        As for `stars_in_fields`.
-
-    Returns
-    -------
-    FieldStars
-        In spiral order.
-    """
+    """Tile the sphere with Saff-Kuijlaars boresights and find the stars in each field."""
     return stars_in_fields(saff_kuijlaars(count), directions, mag, size, field)

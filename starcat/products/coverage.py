@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Directions
 from starcat.geometry.sphere import radec_from_directions, separation
 from starcat.products.boresights import FieldStars
 
@@ -21,93 +21,53 @@ Counts = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Coverage:
-    """What the field of each boresight holds.
+    """What the field of each boresight holds."""
 
-    Attributes
-    ----------
-    boresights : ndarray of float64, shape (F, 3)
-        ICRS directions.
-    stars : ndarray of int64, shape (F,)
-        Guide stars in the field.
-    pairs : ndarray of int64, shape (F,)
-        Pairs of them.
-    triangles : ndarray of int64, shape (F,)
-        Triangles of the brightest of them.
-    """
-
-    boresights: Array
-    stars: Counts
-    pairs: Counts
-    triangles: Counts
+    boresights: Directions  # shape (F, 3): ICRS directions
+    stars: Counts  # shape (F,): guide stars in the field
+    pairs: Counts  # shape (F,): pairs of them
+    triangles: Counts  # shape (F,): triangles of the brightest of them
 
 
 @dataclass(frozen=True)
 class Spread:
-    """How one count is spread over the fields.
+    """How one count is spread over the fields."""
 
-    Attributes
-    ----------
-    minimum, one_percent, median, maximum : int
-        Values that occur; at least 1 % and 50 % of the fields have no more than
-        ``one_percent`` and ``median``.
-    mean : float
-        The numbers over all fields.
-    """
-
+    # minimum, one_percent, median, maximum: values that occur; at least 1 % and 50 % of the fields
+    # have no more than ``one_percent`` and ``median``
     minimum: int
     one_percent: int
     median: int
     maximum: int
-    mean: float
+    mean: float  # the numbers over all fields
 
 
 @dataclass(frozen=True)
 class CoverageSummary:
-    """The coverage of the sphere in a few numbers.
+    """The coverage of the sphere in a few numbers."""
 
-    Attributes
-    ----------
-    fields : int
-        Number of boresights.
-    stars, pairs, triangles : Spread
-        The numbers of a field.
-    worst_boresight : int
-        The field with the fewest stars; the first along the spiral where several have.
-    worst_ra_deg, worst_dec_deg : float
-        Its direction, degrees, ICRS.
-    histogram : ndarray of int64, shape (maximum + 1,)
-        ``histogram[n]`` fields hold n stars.
-    """
-
-    fields: int
+    fields: int  # number of boresights
+    # stars, pairs, triangles: the numbers of a field
     stars: Spread
     pairs: Spread
     triangles: Spread
+    # the field with the fewest stars; the first along the spiral where several have
     worst_boresight: int
+    # worst_ra_deg, worst_dec_deg: its direction, degrees, ICRS
     worst_ra_deg: float
     worst_dec_deg: float
-    histogram: Counts
+    histogram: Counts  # shape (maximum + 1,): ``histogram[n]`` fields hold n stars
 
 
 @dataclass(frozen=True)
 class TilingGap:
-    """The direction that is farthest from all boresights.
+    """The direction that is farthest from all boresights."""
 
-    Attributes
-    ----------
-    boresights : int
-        How many there are.
-    tile_radius_rad : float
-        Radius of the largest circle inside the field: seen whatever the roll.
-    covering_radius_rad : float
-        Every direction has a boresight within it, and this one none nearer.
-    ra_deg, dec_deg : float
-        The direction, degrees, ICRS.
-    """
-
-    boresights: int
-    tile_radius_rad: float
+    boresights: int  # how many there are
+    tile_radius_rad: float  # radius of the largest circle inside the field: seen whatever the roll
+    # every direction has a boresight within it, and this one none nearer
     covering_radius_rad: float
+    # ra_deg, dec_deg: the direction, degrees, ICRS
     ra_deg: float
     dec_deg: float
 
@@ -124,42 +84,15 @@ class TilingGap:
 
 
 def field_coverage(fields: FieldStars, brightest: int) -> Coverage:
-    """Count stars, pairs and triangles of each field.
-
-    Parameters
-    ----------
-    fields : FieldStars
-        The tiling.
-    brightest : int
-        How many stars of a field make triangles.
-
-    Returns
-    -------
-    Coverage
-        By boresight.
-    """
+    """Count stars, pairs and triangles (of the brightest stars) of each field."""
     return coverage_from_counts(fields.boresights, fields.count, brightest)
 
 
-def coverage_from_counts(boresights: Array, stars: Counts, brightest: int) -> Coverage:
+def coverage_from_counts(boresights: Directions, stars: Counts, brightest: int) -> Coverage:
     """Return the coverage of fields whose stars are counted.
 
-    Parameters
-    ----------
-    boresights : ndarray of float64, shape (F, 3)
-        ICRS directions.
-    stars : ndarray of int64, shape (F,)
-        Stars in the field of each.
-    brightest : int
-        How many stars of a field make triangles.
+    n stars make n (n - 1) / 2 pairs; the m brightest make m (m - 1) (m - 2) / 6 triangles.
 
-    Returns
-    -------
-    Coverage
-        n stars make n (n - 1) / 2 pairs; the m brightest make m (m - 1) (m - 2) / 6 triangles.
-
-    Examples
-    --------
     >>> made = coverage_from_counts(np.eye(3), np.array([0, 4, 30]), 6)
     >>> made.pairs, made.triangles
     (array([  0,   6, 435]), array([ 0,  4, 20]))
@@ -171,18 +104,7 @@ def coverage_from_counts(boresights: Array, stars: Counts, brightest: int) -> Co
 
 
 def summarise_coverage(coverage: Coverage) -> CoverageSummary:
-    """Return the coverage of the sphere in a few numbers.
-
-    Parameters
-    ----------
-    coverage : Coverage
-        What at least one field holds.
-
-    Returns
-    -------
-    CoverageSummary
-        Least, 1 %, median and most, the worst field and the histogram of stars.
-    """
+    """Return the coverage of the sphere, of one field at least, in a few numbers."""
     worst = int(np.argmin(coverage.stars))
     ra_deg, dec_deg = radec_from_directions(coverage.boresights[worst])
     return CoverageSummary(
@@ -204,23 +126,11 @@ def _spread(counts: Counts) -> Spread:
     )
 
 
-def tiling_gap(boresights: Array, tile_radius_rad: float) -> TilingGap:
+def tiling_gap(boresights: Directions, tile_radius_rad: float) -> TilingGap:
     """Compare the gaps between boresights with what a field covers at any roll.
 
-    Parameters
-    ----------
-    boresights : ndarray of float64, shape (F, 3)
-        Unit vectors.
-    tile_radius_rad : float
-        Radians: of the largest circle inside a field, half of its narrower angle.
+    The radius is that of the largest circle inside a field, half of its narrower angle.
 
-    Returns
-    -------
-    TilingGap
-        The direction farthest from all boresights.
-
-    Examples
-    --------
     >>> from starcat.geometry.sphere import saff_kuijlaars
     >>> tiling_gap(saff_kuijlaars(10_000), np.radians(6.0)).has_holes
     False
@@ -232,31 +142,17 @@ def tiling_gap(boresights: Array, tile_radius_rad: float) -> TilingGap:
     )
 
 
-def covering_radius(directions: Array) -> tuple[float, Array]:
+def covering_radius(directions: Directions) -> tuple[float, Array]:
     """Return how far a direction can be from the nearest of some directions.
 
-    Parameters
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        Unit vectors.
+    Radians, and the unit vector that is so far away; of several the first by x, y and z.
 
-    Returns
-    -------
-    radius_rad : float
-        Radians, 0 to pi.
-    direction : ndarray of float64, shape (3,)
-        The unit vector that is so far away; of several the first by x, y and z.
-
-    Notes
-    -----
     The facets of the convex hull are the spherical Delaunay triangles, and the normal of a
     facet is the centre of its circumcircle, which holds no other direction. Where the farthest
     of these centres is less than 90 deg away, it is the farthest direction of all. Otherwise all
     directions lie in one half of the sphere, and the farthest one may also be opposite to the
     middle of an edge of the hull.
 
-    Examples
-    --------
     >>> octahedron = np.concatenate([np.eye(3), -np.eye(3)])
     >>> round(float(np.degrees(covering_radius(octahedron)[0])), 3)
     54.736
@@ -281,8 +177,7 @@ def _widest(centres: Array, radii: Array) -> tuple[float, Array]:
     return float(radii[widest]), np.asarray(centres[widest])
 
 
-def _farthest(candidates: Array, directions: Array) -> tuple[float, Array]:
-    """Return the candidate that is farthest from its nearest direction, and how far that is."""
+def _farthest(candidates: Array, directions: Directions) -> tuple[float, Array]:
     _, nearest = cKDTree(directions).query(candidates)
     return _widest(candidates, separation(candidates, directions[nearest]))
 
@@ -295,7 +190,7 @@ def _opposite_to_middle(u: Array, v: Array) -> Array:
     return np.asarray(-middle[is_arc] / length[is_arc, None])
 
 
-def _opposite_to_circle(directions: Array) -> Array:
+def _opposite_to_circle(directions: Directions) -> Array:
     """Return where the farthest direction from those of one circle can be.
 
     That is at a pole of the circle, or opposite to the middle of the directions at the ends of

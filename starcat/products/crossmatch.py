@@ -17,10 +17,10 @@ from scipy.spatial import cKDTree
 
 from starcat.arrays import Array, Mask
 from starcat.geometry.sphere import chord_from_separation, separation
-from starcat.products.census import Census
 from starcat.products.match_figures import Figures, MatchModel, figures_of, measure
 from starcat.products.match_odds import Odds, match_odds
 from starcat.products.match_probability import runs
+from starcat.products.star_counts import Census
 
 Rows = NDArray[np.int64]
 
@@ -35,29 +35,15 @@ CHUNK = 1 << 17
 
 @dataclass(frozen=True)
 class MovingStars:
-    """Stars of one catalog, each at its own epoch.
+    """Stars of one catalog, each at its own epoch."""
 
-    Attributes
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        ICRS unit vectors at ``epoch_jyear``.
-    velocities : ndarray of float64, shape (N, 3)
-        Proper motions as vectors along the sky, radians a year; 0 where unknown.
-    has_motion : ndarray of bool, shape (N,)
-        Whether the proper motion is known.
-    epoch_jyear : ndarray of float64, shape (N,)
-        Julian years.
-    mag : ndarray of float64, shape (N,)
-        Magnitudes; NaN where unknown.
-    error_rad : ndarray of float64, shape (N,), optional
-        Standard deviations of the positions, each axis, radians.
-    """
-
-    directions: Array
+    directions: Array  # shape (N, 3): ICRS unit vectors at ``epoch_jyear``
+    # shape (N, 3): proper motions as vectors along the sky, radians a year; 0 where unknown
     velocities: Array
-    has_motion: Mask
-    epoch_jyear: Array
-    mag: Array
+    has_motion: Mask  # shape (N,): whether the proper motion is known
+    epoch_jyear: Array  # shape (N,): Julian years
+    mag: Array  # shape (N,): magnitudes; NaN where unknown
+    # shape (N,): standard deviations of the positions, each axis, radians
     error_rad: Array | None = None
 
     def at(self, rows: Rows, epoch_jyear: Array | float) -> Array:
@@ -83,25 +69,14 @@ class MovingStars:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Stars and candidate counterparts within a radius; arrays of shape (M,).
+    """Stars and candidate counterparts within a radius; arrays of shape (M,)."""
 
-    Attributes
-    ----------
-    star, counterpart : ndarray of int64
-        Rows of the two sets.
-    separation_rad : ndarray of float64
-        Radians, at ``epoch_jyear``.
-    epoch_jyear : ndarray of float64
-        Julian year at which the two were compared.
-    unmoved_years : ndarray of float64
-        Years between their positions where neither could be moved, else 0.
-    """
-
+    # star, counterpart: rows of the two sets
     star: Rows
     counterpart: Rows
-    separation_rad: Array
-    epoch_jyear: Array
-    unmoved_years: Array
+    separation_rad: Array  # radians, at ``epoch_jyear``
+    epoch_jyear: Array  # Julian year at which the two were compared
+    unmoved_years: Array  # years between their positions where neither could be moved, else 0
 
     def take(self, rows: Rows | Mask) -> Pairs:
         """Return some of the pairs.
@@ -127,40 +102,25 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Matches:
-    """Every candidate of every star, by star and rank; arrays of shape (M,).
+    """Every candidate of every star, by star and rank; arrays of shape (M,)."""
 
-    Attributes
-    ----------
-    star, counterpart : ndarray of int64
-        Rows of the two sets.
-    rank, star_rank : ndarray of int64
-        Rank of the candidate among those of its star, and of the star among those of its candidate;
-        1 is the likeliest.
-    n_candidates, n_stars : ndarray of int64
-        Candidates of the star, and stars that the candidate is one of, within the radius.
-    separation_rad : ndarray of float64
-        Radians, at ``epoch_jyear``.
-    delta_mag : ndarray of float64
-        Magnitude of the candidate minus that of the star; NaN where either is unknown.
-    epoch_jyear : ndarray of float64
-        Julian year at which the two were compared.
-    odds : Odds
-        How likely each pair is, and the model behind it.
-    verdict : ndarray of int64
-        Index into `VERDICTS`.
-    """
-
+    # star, counterpart: rows of the two sets
     star: Rows
     counterpart: Rows
+    # rank, star_rank: rank of the candidate among those of its star, and of the star among those of
+    # its candidate; 1 is the likeliest
     rank: Rows
     star_rank: Rows
+    # n_candidates, n_stars: candidates of the star, and stars that the candidate is one of, within
+    # the radius
     n_candidates: Rows
     n_stars: Rows
-    separation_rad: Array
+    separation_rad: Array  # radians, at ``epoch_jyear``
+    # magnitude of the candidate minus that of the star; NaN where either is unknown
     delta_mag: Array
-    epoch_jyear: Array
-    odds: Odds
-    verdict: Rows
+    epoch_jyear: Array  # Julian year at which the two were compared
+    odds: Odds  # how likely each pair is, and the model behind it
+    verdict: Rows  # index into `VERDICTS`
 
     def count(self, verdict: str) -> int:
         """Return how many stars have a best candidate with a verdict.

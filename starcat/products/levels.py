@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Directions
 from starcat.products.boresights import FieldSize, FieldStars, NominalField, tile_sphere
 from starcat.products.index import Index, Ragged
-from starcat.products.triangles import distinct_triangles
+from starcat.products.pairs_and_triangles import distinct_triangles
 
 Rows = NDArray[np.int32]
 
@@ -27,30 +27,18 @@ FEWEST_BORESIGHTS = 1000
 
 @dataclass(frozen=True)
 class Levels:
-    """Stars and triangles of each level, the narrowest first.
+    """Stars and triangles of each level, the narrowest first."""
 
-    Attributes
-    ----------
-    level : ndarray of int32, shape (L,)
-        1 to L; level 0 is the camera's own field.
-    fov_x_deg, fov_y_deg : ndarray of float64, shape (L,)
-        Full angles of a level's fields.
-    stars : Ragged
-        Rows of the star table, ascending.
-    i, j, k : Ragged
-        Triangles: rows of the star table, i < j < k, in order.
-    index : Index
-        Nothing.
-    """
-
-    level: Rows
+    level: Rows  # shape (L,): 1 to L; level 0 is the camera's own field
+    # fov_x_deg, fov_y_deg: shape (L,): full angles of a level's fields
     fov_x_deg: Array
     fov_y_deg: Array
-    stars: Ragged
+    stars: Ragged  # rows of the star table, ascending
+    # i, j, k: triangles: rows of the star table, i < j < k, in order
     i: Ragged
     j: Ragged
     k: Ragged
-    index: Index
+    index: Index  # nothing
 
 
 def level_fields(
@@ -58,29 +46,14 @@ def level_fields(
 ) -> tuple[NominalField, ...]:
     """Return the fields of the levels.
 
-    Parameters
-    ----------
-    narrowest : FieldSize
-        The camera: its field is level 0, and all others have its proportions.
-    widest_fov_x_deg : float
-        Full angle across the width of the widest frames, degrees.
-    max_ratio : float
-        Largest ratio of the focal lengths of neighbouring levels, above 1.
+    The narrowest first, without level 0, the camera's own field, whose proportions all have.
+    The focal lengths of neighbours have the same ratio, ``max_ratio`` at most, and the widest
+    frames are wider than the last level's by that ratio too.
 
-    Returns
-    -------
-    tuple of NominalField
-        The narrowest first, without level 0. Their focal lengths have the same ratio, and the
-        widest frames are wider than the last one's by that ratio too.
-
-    Notes
-    -----
     A level serves frames that are as wide as its fields, or wider, up to those of the next level.
     Such a frame holds fields of the level whole, so that their triangles are in it. In a frame
     that is narrower than these by a sixth there may be no triangle at all.
 
-    Examples
-    --------
     >>> fields = level_fields(NominalField(10.0, 7.5), 30.0, 1.5)
     >>> [round(field.fov_x_deg, 2) for field in fields]
     [14.48, 20.91]
@@ -102,7 +75,7 @@ def level_fields(
 
 
 def find_levels(
-    directions: Array,
+    directions: Directions,
     mag: Array,
     narrowest: FieldSize,
     fields: Sequence[FieldSize],
@@ -113,29 +86,9 @@ def find_levels(
 ) -> Levels:
     """Find the stars and the triangles of each level.
 
-    Parameters
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        ICRS directions of the stars.
-    mag : ndarray of float64, shape (N,)
-        Their magnitudes.
-    narrowest : FieldSize
-        Field of the camera, to which the number of boresights belongs.
-    fields : sequence of FieldSize
-        Field of each level, the narrowest first, as `level_fields` has them.
-    boresights : int
-        Points that tile the sphere for the camera's field; levels have fewer, as their fields
-        are larger, but `FEWEST_BORESIGHTS` at the least.
-    stars_per_field : int
-        A star is kept that is among the brightest so many of some field of the level.
-    brightest : int
-        Stars of a field that make its triangles.
-
-    Returns
-    -------
-    Levels
-        Each level is thinned from the one before, so that its stars are among those of all
-        narrower ones.
+    ``boresights`` tile the sphere for the camera's field, fewer for a level. A star is kept
+    that is among the brightest ``stars_per_field`` of some field; the ``brightest`` of a field
+    make its triangles. Each level is thinned from the one before.
     """
     stars, triangles = [], []
     for level in thin_levels(directions, mag, narrowest, fields, boresights, stars_per_field):
@@ -157,43 +110,22 @@ def find_levels(
 
 @dataclass(frozen=True)
 class Level:
-    """The stars of a level.
+    """The stars of a level."""
 
-    Attributes
-    ----------
-    before : ndarray of int32, shape (M,)
-        Rows of the star table that the level is chosen from.
-    tiled : FieldStars
-        These in the fields of the level; its star numbers are places in ``before``.
-    rows : ndarray of int32, shape (K,)
-        Rows of the star table that are left, ascending.
-    """
-
-    before: Rows
-    tiled: FieldStars
-    rows: Rows
+    before: Rows  # shape (M,): rows of the star table that the level is chosen from
+    tiled: FieldStars  # these in the fields of the level; its star numbers are places in ``before``
+    rows: Rows  # shape (K,): rows of the star table that are left, ascending
 
 
 def thin_levels(
-    directions: Array,
+    directions: Directions,
     mag: Array,
     narrowest: FieldSize,
     fields: Sequence[FieldSize],
     boresights: int,
     stars_per_field: int,
 ) -> Iterator[Level]:
-    """Thin stars to those of each level.
-
-    Parameters
-    ----------
-    directions, mag, narrowest, fields, boresights, stars_per_field
-        As for `find_levels`.
-
-    Yields
-    ------
-    Level
-        The narrowest first, each from the stars of the one before.
-    """
+    """Thin stars to those of each level, the narrowest first, each from those of the one before."""
     rows = np.arange(len(directions), dtype=np.int32)
     for field in fields:
         count = boresights_of_level(boresights, narrowest, field)
@@ -204,25 +136,11 @@ def thin_levels(
 
 
 def boresights_of_level(boresights: int, narrowest: FieldSize, field: FieldSize) -> int:
-    """Return how many boresights tile the sphere for a level.
-
-    Parameters
-    ----------
-    boresights : int
-        Points for the camera's own field.
-    narrowest, field : FieldSize
-        That field, and the level's.
-
-    Returns
-    -------
-    int
-        `FEWEST_BORESIGHTS` at the least.
-    """
+    """Return how many boresights tile the sphere for a level: the wider its field, the fewer."""
     return max(FEWEST_BORESIGHTS, round(boresights * _shrink(narrowest, field)))
 
 
 def _shrink(narrow: FieldSize, wide: FieldSize) -> float:
-    """Return how much smaller one field is than another one, by area."""
     return (narrow.fov_x_deg * narrow.fov_y_deg) / (wide.fov_x_deg * wide.fov_y_deg)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
-from starcat.products.census import Census, MagnitudeCounts, PositionsAndMagnitudes
+from starcat.products.star_counts import Census, MagnitudeCounts, PositionsAndMagnitudes
 
 Rows = NDArray[np.int64]
 
@@ -50,57 +50,38 @@ class CandidatePairs(Protocol):
 
 @dataclass(frozen=True)
 class MatchModel:
-    """How far a star may be from its own counterpart, and what the verdicts ask for.
+    """How far a star may be from its own counterpart, and what the verdicts ask for."""
 
-    Attributes
-    ----------
-    position_error_rad : float, optional
-        Standard deviation of the difference of two positions of a star, each axis, where the
-        catalogs state none; measured if not given.
-    unknown_motion_rad_yr : float
-        Standard deviation of the proper motion of stars that have none in either catalog.
-    outlier_share : float
-        Share of the stars that are off by more than errors explain, up to the radius: double
-        stars of which the catalogs measured different parts, wrong proper motions.
-    expected_delta_mag : float, optional
-        Magnitude of the counterpart minus that of the star, on average; measured if not given.
-    colour_spread_mag : float
-        Standard deviation of that difference: colours, variability, poor magnitudes.
-    completeness : float, optional
-        Share of the stars that have a counterpart at all; measured if not given.
-    ambiguous_odds : float
-        Two candidates whose odds differ by this factor or less cannot be told apart.
-    min_probability : float
-        A star whose candidates together are less probable has but doubtful ones.
-    """
-
+    # standard deviation of the difference of two positions of a star, each axis, where the catalogs
+    # state none; measured if not given
     position_error_rad: float | None = None
+    # standard deviation of the proper motion of stars that have none in either catalog
     unknown_motion_rad_yr: float = 0.02 * ARCSEC
+    # share of the stars that are off by more than errors explain, up to the radius: double stars of
+    # which the catalogs measured different parts, wrong proper motions
     outlier_share: float = 0.02
+    # magnitude of the counterpart minus that of the star, on average; measured if not given
     expected_delta_mag: float | None = None
+    # standard deviation of that difference: colours, variability, poor magnitudes
     colour_spread_mag: float = 1.0
+    # share of the stars that have a counterpart at all; measured if not given
     completeness: float | None = None
+    # two candidates whose odds differ by this factor or less cannot be told apart
     ambiguous_odds: float = 10.0
+    # a star whose candidates together are less probable has but doubtful ones
     min_probability: float = 0.5
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What all candidate pairs of two catalogs say of them.
+    """What all candidate pairs of two catalogs say of them."""
 
-    Attributes
-    ----------
-    with_candidates : int
-        Stars that have any.
-    sure, sure_with_mag : int
-        Pairs whose star and candidate have no other, and those with both magnitudes.
-    median_separation_rad, median_delta_mag : float
-        Over these; NaN where there is none.
-    """
-
-    with_candidates: int
+    with_candidates: int  # stars that have any
+    # sure, sure_with_mag: pairs whose star and candidate have no other, and those with both
+    # magnitudes
     sure: int
     sure_with_mag: int
+    # median_separation_rad, median_delta_mag: over these; NaN where there is none
     median_separation_rad: float
     median_delta_mag: float
 
@@ -156,29 +137,18 @@ def measure(
 
 @dataclass(frozen=True)
 class Figures:
-    """What all pairs of two catalogs have in common.
+    """What all pairs of two catalogs have in common."""
 
-    Attributes
-    ----------
-    position_error_rad : float
-        Standard deviation of the difference of two positions of a star, each axis, unless the
-        catalogs state their errors themselves.
-    delta_mag : float
-        Magnitude of the counterpart minus that of the star, on average.
-    completeness, shared : float
-        Share of the stars that have a counterpart, and of the counterparts that have a star.
-    density : ndarray of float64, shape (TILES,)
-        Counterparts per steradian around each tile of the sky.
-    magnitudes : MagnitudeCounts
-        Of the counterparts.
-    """
-
+    # standard deviation of the difference of two positions of a star, each axis, unless the
+    # catalogs state their errors themselves
     position_error_rad: float
-    delta_mag: float
+    delta_mag: float  # magnitude of the counterpart minus that of the star, on average
+    # completeness, shared: share of the stars that have a counterpart, and of the counterparts that
+    # have a star
     completeness: float
     shared: float
-    density: Array
-    magnitudes: MagnitudeCounts
+    density: Array  # shape (TILES,): counterparts per steradian around each tile of the sky
+    magnitudes: MagnitudeCounts  # of the counterparts
 
 
 def figures_of(

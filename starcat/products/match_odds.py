@@ -12,35 +12,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.products.census import PositionsAndMagnitudes, tiles_of
 from starcat.products.match_figures import CandidatePairs, Figures, MatchModel
 from starcat.products.match_probability import pair_probabilities
+from starcat.products.star_counts import PositionsAndMagnitudes, tiles_of
 
 Rows = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Odds:
-    """The odds of pairs, arrays of shape (M,), and the figures behind them.
+    """The odds of pairs, arrays of shape (M,), and the figures behind them."""
 
-    Attributes
-    ----------
-    log_ratio : ndarray of float64
-        Natural logarithm of the likelihood ratio.
-    probability : ndarray of float64
-        That this candidate is the star.
-    any_probability : ndarray of float64
-        That any candidate of the star is.
-    error_rad : ndarray of float64
-        Standard deviation of the difference of the two positions, each axis.
-    position_error_rad, delta_mag, completeness : float
-        As given or measured; NaN for an error that the catalogs state themselves.
-    """
-
-    log_ratio: Array
-    probability: Array
-    any_probability: Array
-    error_rad: Array
+    log_ratio: Array  # natural logarithm of the likelihood ratio
+    probability: Array  # that this candidate is the star
+    any_probability: Array  # that any candidate of the star is
+    error_rad: Array  # standard deviation of the difference of the two positions, each axis
+    # position_error_rad, delta_mag, completeness: as given or measured; NaN for an error that the
+    # catalogs state themselves
     position_error_rad: float
     delta_mag: float
     completeness: float

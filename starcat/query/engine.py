@@ -35,26 +35,16 @@ from starcat.query.messages import (
     Views,
 )
 
-OPENING_S = 60.0
-"""How long a process may take until it has opened the targets, seconds."""
-
+OPENING_S = 60.0  # how long a process may take until it has opened the targets, seconds
 _PROGRAM = "import sys; sys.path[:] = sys.argv[1:]; from starcat.query.worker import serve; serve()"
 
 
 @dataclass
 class Allowance:
-    """The time that a query may take.
-
-    Attributes
-    ----------
-    total_s : float
-        Seconds in all.
-    left_s : float
-        Seconds that are left of them. Only waiting for the answer counts.
-    """
+    """The time that a query may take."""
 
     total_s: float
-    left_s: float
+    left_s: float  # of them; only waiting for the answer counts
 
 
 _waiting: list[subprocess.Popen[bytes]] = []

@@ -1,7 +1,11 @@
-"""Queries that people ask often, by name: one SQL file each.
+"""Named queries and macros: one SQL file each, with its help in the comments above.
 
-The comments above a query say what it finds, how many targets it needs where that is not one
+The comments above a named query say what it finds, how many targets it needs where that is not one
 (``-- Targets: 2``), and its values with their defaults (``-- count = 10: how many``).
+
+The file of a macro holds ``CREATE MACRO`` of the name of the file, after those of helpers whose
+names begin with ``_``. A table macro is made once for every schema; ``{places}`` in its text is the
+schema of its target's views with places (`starcat.query.spatial_macros`).
 """
 
 from __future__ import annotations
@@ -15,8 +19,9 @@ from pathlib import Path
 
 from starcat.errors import QueryError, suggest
 
-FOLDER = Path(__file__).parent / "sql" / "gallery"
+FOLDER = Path(__file__).parent / "sql"
 
+FIRST = ("cosd", "sind", "separation")  # macros that others use, in the order to make them
 _VALUE = re.compile(r"-- (\w+) = (.+?): (.+)")
 _TARGETS = re.compile(r"-- Targets: (\d+)")
 
@@ -29,44 +34,20 @@ Literal = int | float | str
 
 @dataclass(frozen=True)
 class Value:
-    """A value that a named query can be given.
+    """A value that a named query can be given."""
 
-    Attributes
-    ----------
-    name : str
-        ``$name`` in the query.
-    default : int, float or str
-        The value where none is given; one that is given has the same type.
-    help : str
-        What it means.
-    """
-
-    name: str
-    default: Literal
+    name: str  # $name in the query
+    default: Literal  # one that is given has the same type
     help: str
 
 
 @dataclass(frozen=True)
 class NamedQuery:
-    """A query of the gallery.
-
-    Attributes
-    ----------
-    name : str
-        The name of its file without the suffix.
-    help : str
-        What it finds.
-    targets : int
-        The number of targets that it is about.
-    values : tuple of Value
-        The values that it can be given.
-    text : str
-        SQL.
-    """
+    """A query of the gallery."""
 
     name: str
     help: str
-    targets: int
+    targets: int  # how many it is about
     values: tuple[Value, ...]
     text: str
 
@@ -113,7 +94,7 @@ def gallery() -> dict[str, NamedQuery]:
     >>> gallery()["densest-fields"].values[0].default
     10
     """
-    return {path.stem: _read(path) for path in sorted(FOLDER.glob("*.sql"))}
+    return {path.stem: _named_query(path) for path in sorted((FOLDER / "gallery").glob("*.sql"))}
 
 
 def named_query(name: str) -> NamedQuery:
@@ -125,16 +106,65 @@ def named_query(name: str) -> NamedQuery:
     return known[name]
 
 
-def _read(path: Path) -> NamedQuery:
-    lines = path.read_text(encoding="utf-8").splitlines()
+def _named_query(path: Path) -> NamedQuery:
+    comments, text = _parts(path)
     told, values, targets = [], [], 1
-    start = next(k for k, line in enumerate(lines) if not line.startswith("--"))
-    for line in lines[:start]:
+    for line in comments:
         if value := _VALUE.fullmatch(line):
             values.append(Value(value[1], json.loads(value[2].replace("'", '"')), value[3]))
         elif count := _TARGETS.fullmatch(line):
             targets = int(count[1])
         else:
             told.append(line.removeprefix("-- "))
-    text = "\n".join(lines[start:])
     return NamedQuery(path.stem, " ".join(told), targets, tuple(values), text)
+
+
+@dataclass(frozen=True)
+class Macro:
+    """A macro of SQL."""
+
+    name: str
+    arguments: str
+    help: str
+    example: str  # a query that shows it and runs on any artifact
+    text: str  # the SQL that makes it, with {places} where that schema has to be named
+
+    @property
+    def is_table(self) -> bool:
+        """Whether it stands after FROM."""
+        return "AS TABLE" in self.text
+
+    def statement(self, schema: str, places: str) -> str:
+        """Return the SQL that makes a table macro."""
+        made = self.text.replace("{places}", places)
+        return made.replace("CREATE MACRO ", f"CREATE MACRO {schema}.")
+
+
+@cache
+def macros() -> tuple[Macro, ...]:
+    """Return all macros, in an order in which they can be made.
+
+    Examples
+    --------
+    >>> [macro.name for macro in macros() if macro.is_table]
+    ['box', 'cone', 'field']
+    """
+    names = sorted(path.stem for path in (FOLDER / "macros").glob("*.sql"))
+    return tuple(_macro(name) for name in (*FIRST, *(n for n in names if n not in FIRST)))
+
+
+def _macro(name: str) -> Macro:
+    comments, text = _parts(FOLDER / "macros" / f"{name}.sql")
+    words = " ".join(line.removeprefix("-- ") for line in comments)
+    told, _, example = words.partition(" Example: ")
+    found = re.search(rf"CREATE MACRO {name}\((.*?)\) AS", text, re.DOTALL)
+    if found is None:
+        raise ValueError(f"{name}.sql makes no macro of that name")
+    return Macro(name, found[1], told, example, text)
+
+
+def _parts(path: Path) -> tuple[list[str], str]:
+    """Return the lines of the comments above, and the SQL."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    start = next(k for k, line in enumerate(lines) if not line.startswith("--"))
+    return lines[:start], "\n".join(lines[start:])

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array, Directions, Mask
 from starcat.geometry.sphere import separation
 from starcat.store.pixels import Pixel
 
@@ -26,32 +27,20 @@ _RING_OF_FACE = np.array([2, 2, 2, 2, 3, 3, 3, 3, 4, 4, 4, 4])
 _EIGHTH_OF_FACE = np.array([1, 3, 5, 7, 0, 2, 4, 6, 1, 3, 5, 7])
 _CORNERS = ((0.0, 0.0), (0.0, 1.0), (1.0, 0.0), (1.0, 1.0))
 
-Floats = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class Extents:
-    """Circles and boxes that hold pixels; arrays of float64, of shape (N,) where no other is said.
+    """Circles and boxes that hold N pixels; shape (N,) where no other is said."""
 
-    Attributes
-    ----------
-    centre : ndarray of float64, shape (N, 3)
-        Directions of the centres of the circles.
-    reach_deg : ndarray of float64
-        Radius of the circle, degrees.
-    ra_from_deg, ra_to_deg : ndarray of float64
-        Sides of the box, degrees; the first is from 0 to 360, the second is larger, also than 360
-        where the box goes through 0.
-    dec_from_deg, dec_to_deg : ndarray of float64
-        Lower and upper side of the box, degrees.
-    """
-
-    centre: Floats
-    reach_deg: Floats
-    ra_from_deg: Floats
-    ra_to_deg: Floats
-    dec_from_deg: Floats
-    dec_to_deg: Floats
+    centre: Directions  # of the circles
+    reach_deg: Array  # radius of the circle
+    # Sides of the box; the first is from 0 to 360, the second is larger, also than 360 where the
+    # box goes through 0.
+    ra_from_deg: Array
+    ra_to_deg: Array
+    # Lower and upper side of the box.
+    dec_from_deg: Array
+    dec_to_deg: Array
 
 
 def extents(pixels: Sequence[Pixel]) -> Extents:
@@ -78,7 +67,7 @@ def extents(pixels: Sequence[Pixel]) -> Extents:
 
 def _place(
     order: NDArray[np.int64], number: NDArray[np.int64], x: float, y: float
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+) -> tuple[Array, Array, Mask]:
     """Return directions and right ascensions of a point of each pixel, and which are a pole.
 
     The point is given by its parts of the way along the two sides that meet in the south.
@@ -108,6 +97,6 @@ def _every_second_bit(number: NDArray[np.int64], order: NDArray[np.int64]) -> ND
     return found
 
 
-def _turned(angle_deg: Floats) -> Floats:
+def _turned(angle_deg: Array) -> Array:
     """Return angles between -180 and 180 degrees."""
     return np.mod(angle_deg + 180.0, 360.0) - 180.0

@@ -17,52 +17,32 @@ from typing import Any
 
 from starcat.errors import ProductError, QueryError
 from starcat.progress import Progress, no_progress
-from starcat.query.columns import column_facts, facts_by_name
 from starcat.query.engine import Allowance, Engine, WorkerEnded
-from starcat.query.macros import macros
+from starcat.query.gallery import macros
 from starcat.query.messages import Statement, Views
-from starcat.query.names import quoted
-from starcat.query.preamble import preamble, schemas_of
-from starcat.query.running_query import RunningQuery
+from starcat.query.names import quoted, short_names
+from starcat.query.result import Facts, RunningQuery, column_facts, facts_by_name
+from starcat.query.spatial_macros import place_macros, place_statements, places_schema, reading
 from starcat.query.targets import Target, View, open_targets
 
-MAX_COLUMNS = 100_000
-"""How many columns a DESCRIBE tells of at most."""
-
+PREAMBLE_GB = 1.0  # memory for looking into the footers of Parquet files
+MAX_COLUMNS = 100_000  # how many columns a DESCRIBE tells of at most
 MAX_CHECKED = 200
 """Queries that are remembered as checked; those that were asked longest ago are forgotten."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a query may take.
+    """What a query may take."""
 
-    Attributes
-    ----------
-    time_s : float
-        Seconds until it is stopped.
-    memory_gb : float
-        Gigabytes of memory; a query that needs more uses the disk.
-    disk_gb : float
-        Gigabytes of disk, in a folder that is removed afterwards.
-    """
-
-    time_s: float = 60.0
-    memory_gb: float = 2.0
-    disk_gb: float = 20.0
+    time_s: float = 60.0  # seconds until it is stopped
+    memory_gb: float = 2.0  # gigabytes of memory; a query that needs more uses the disk
+    disk_gb: float = 20.0  # gigabytes of disk, in a folder that is removed afterwards
 
 
 @dataclass(frozen=True)
 class Session:
-    """Views of targets, and the queries about them.
-
-    Attributes
-    ----------
-    targets : tuple of Target
-        The targets whose tables the views show.
-    limits : Limits
-        What each query may take.
-    """
+    """Views of targets, and the queries about them."""
 
     targets: tuple[Target, ...]
     limits: Limits
@@ -160,6 +140,61 @@ def open_session(
             engine.close()
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+
+
+def schemas_of(targets: Sequence[Target]) -> dict[str, Target]:
+    """Return targets by their schemas.
+
+    A target alone is ``main`` and its own name; several are ``a``, ``b`` ... and their names.
+    """
+    short = ["main"] if len(targets) == 1 else short_names(len(targets))
+    named = {target.name: target for target in targets}
+    return {**dict(zip(short, targets, strict=True)), **named}
+
+
+def preamble(targets: Sequence[Target]) -> str:
+    """Return the SQL that makes the views and the macros of some targets."""
+    tables = [macro for macro in macros() if macro.is_table]
+    lines = [macro.text + ";" for macro in macros() if not macro.is_table]
+    lines.append(place_macros())
+    for target in targets:
+        lines += place_statements(target)
+    for schema, target in schemas_of(targets).items():
+        lines.append(f"CREATE SCHEMA IF NOT EXISTS {schema};")
+        for view in target.views:
+            lines += _view_statements(f"{schema}.{view.name}", view)
+        lines += [macro.statement(schema, places_schema(target)) + ";" for macro in tables]
+    return "\n".join(lines)
+
+
+def preamble_of(given: Sequence[str]) -> str:
+    """Return the preamble of artifacts and Parquet files by name, for any DuckDB."""
+    with tempfile.TemporaryDirectory(prefix="starcat-sql-") as folder:
+        engine = Engine(Path(folder), PREAMBLE_GB, PREAMBLE_GB)
+        try:
+            targets = open_targets(given, Path(folder), engine)
+        finally:
+            engine.close()
+        for target in targets:
+            if any(Path(folder) in p.parents for view in target.views for p in view.paths):
+                raise QueryError(
+                    f"{target.name}: an archive file has no tables that another DuckDB could "
+                    "read; write them with 'starcat ingest' and give the Parquet file"
+                )
+        return preamble(targets)
+
+
+def _view_statements(name: str, view: View) -> list[str]:
+    made = [f"CREATE VIEW {name} AS {reading(view)};"]
+    if view.schema is None:
+        return made
+    facts = {c.name: str(Facts(c.unit, c.description)) for c in view.schema.columns}
+    made.append(f"COMMENT ON VIEW {name} IS {quoted(view.schema.description)};")
+    return made + [
+        f"COMMENT ON COLUMN {name}.{c} IS {quoted(told)};"
+        for c, told in facts.items()
+        if c in view.columns
+    ]
 
 
 def _make_views(engine: Engine, targets: Sequence[Target]) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
-from starcat.catalog.star_files import rejected_path
+from starcat.catalog.verdict import rejected_path
 from starcat.errors import ProductError, QueryError, TargetMissing
 from starcat.progress import Progress, no_progress
 from starcat.query.engine import Engine
@@ -25,29 +25,16 @@ POSITION = ("ra_deg", "dec_deg")
 
 @dataclass(frozen=True)
 class View:
-    """A table as a query sees it.
+    """A table as a query sees it."""
 
-    Attributes
-    ----------
-    name : str
-        The name of the product, or of the file where starcat did not write it.
-    paths : tuple of Path
-        Its Parquet files: one, or many of a store.
-    columns : tuple of str
-        Names of its columns.
-    schema : ProductSchema, optional
-        The schema of the product, with units and meanings of its columns.
-    position : tuple of str, optional
-        Columns with right ascension and declination, where they have other names than in starcat.
-    pixels : tuple of Pixel
-        For each file the part of the sky that its rows are in; empty where that is not known.
-    """
-
-    name: str
-    paths: tuple[Path, ...]
+    name: str  # the name of the product, or of the file where starcat did not write it
+    paths: tuple[Path, ...]  # its Parquet files: one, or many of a store
     columns: tuple[str, ...]
+    # The schema of the product, with units and meanings of its columns.
     schema: ProductSchema | None = None
+    # Columns with right ascension and declination, where they have other names than in starcat.
     position: tuple[str, str] | None = None
+    # For each file the part of the sky that its rows are in; empty where that is not known.
     pixels: tuple[Pixel, ...] = ()
 
     @cached_property
@@ -58,20 +45,10 @@ class View:
 
 @dataclass(frozen=True)
 class Target:
-    """Something that a query is about.
+    """Something that a query is about."""
 
-    Attributes
-    ----------
-    name : str
-        The schema of its views: the name of the artifact, the source or the file.
-    version : str
-        The version of an artifact; empty for anything else.
-    views : tuple of View
-        A view for each table.
-    """
-
-    name: str
-    version: str
+    name: str  # the schema of its views: the name of the artifact, the source or the file
+    version: str  # the version of an artifact; empty for anything else
     views: tuple[View, ...]
 
 
@@ -240,8 +217,8 @@ def _product_view(name: str, path: Path, schema: ProductSchema) -> View:
 
 def _source_of(text: str, path: Path) -> tuple[str | None, list[Path]]:
     """Return the source that a text names, and the files it names of it."""
-    from starcat.catalog.readers.files import source_of_file
     from starcat.catalog.source import data_source, source_names
+    from starcat.catalog.source_files import source_of_file
 
     name, separator, given = text.partition("=")
     if separator and not path.exists():
@@ -253,8 +230,8 @@ def _source_of(text: str, path: Path) -> tuple[str | None, list[Path]]:
 
 def _archive(source: str, inputs: list[Path], scratch: Path, progress: Progress) -> Target:
     """Read an archive's files into Parquet files that a query can see."""
-    from starcat.catalog.fetching.locate import locate
     from starcat.catalog.ingest import ingest
+    from starcat.catalog.source_files import locate
     from starcat.storage.parquet import write_parquet
 
     read = ingest(source, locate(source, {source: inputs}), progress=progress)

@@ -115,7 +115,6 @@ def _text(cell: Any) -> str:
 
 
 def _class(cell: Any, kind: str) -> str:
-    """Return the attribute of a cell: that of its column, or of a digest."""
     is_digest = isinstance(cell, str) and len(cell) == 64 and cell.isalnum()
     return ' class="digest"' if is_digest else kind
 

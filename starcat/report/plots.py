@@ -6,15 +6,14 @@ uses matplotlib's own defaults and font, never the user's settings.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from io import StringIO
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from starcat.arrays import Array
+from starcat.images.figure_file import figure_bytes, own_style, write_figure
 from starcat.products.coverage import Coverage, CoverageSummary
 from starcat.report.sky_map import (
     HALF_HEIGHT,
@@ -29,12 +28,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 STYLE: dict[Any, Any] = {
-    "font.family": "DejaVu Sans",  # comes with matplotlib
-    "font.size": 9.0,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.axisbelow": True,
-    "svg.hashsalt": "starcat",
     "path.simplify": True,
 }
 _DPI = 100
@@ -58,17 +54,6 @@ _RASTER_WIDTH = 720
 _COLOURS = 24
 
 
-@contextmanager
-def own_style() -> Iterator[None]:
-    """Draw with matplotlib's defaults and the style above, then put everything back."""
-    import matplotlib
-
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()
-        matplotlib.rcParams.update(STYLE)
-        yield
-
-
 def draw_map(title: str, coverage: Coverage, summary: CoverageSummary) -> Figure:
     """Draw the number of stars in each field over the whole sky."""
     from matplotlib.figure import Figure
@@ -77,7 +62,7 @@ def draw_map(title: str, coverage: Coverage, summary: CoverageSummary) -> Figure
     raster = nearest_raster(coverage.boresights, coverage.stars, _RASTER_WIDTH)
     least = summary.stars.minimum
     most = max(int(np.quantile(coverage.stars, 0.995, method="inverted_cdf")), least + 1)
-    with own_style():
+    with own_style(STYLE):
         figure = Figure(figsize=(8.4, 5.2))
         headline(figure, f"{title}: guide stars in the field", _map_legend(summary))
         axes = figure.add_axes((0.05, 0.17, 0.92, 0.7))
@@ -152,7 +137,6 @@ def _cut(x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def _chart(title: str, below: str) -> tuple[Figure, Axes]:
-    """Return an empty chart with a headline and horizontal lines."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.2, 4.0))
@@ -172,7 +156,7 @@ def draw_histogram(title: str, summary: CoverageSummary) -> Figure:
         "1 %": summary.stars.one_percent,
         "median": summary.stars.median,
     }
-    with own_style():
+    with own_style(STYLE):
         figure, axes = _chart(f"{title}: guide stars per field", f"{summary.fields:,} fields")
         left = np.arange(len(fields)) * width - 0.5
         axes.bar(left, fields, width * 0.92, align="edge", color=_BLUE)
@@ -195,7 +179,7 @@ def draw_magnitudes(title: str, band: str, counts: Mapping[str, Any]) -> Figure:
     left, right = np.asarray(counts["from_mag"]), np.asarray(counts["to_mag"])
     kept = np.asarray(counts["guide_stars"])
     read = kept + np.asarray(counts["rejected"])
-    with own_style():
+    with own_style(STYLE):
         below = f"{kept.sum():,} guide stars of {read.sum():,} records with a magnitude"
         figure, axes = _chart(f"{title}: guide stars by magnitude", below)
         width = right - left
@@ -218,15 +202,8 @@ def _whole_ticks() -> Any:
 
 def save_plot(figure: Figure, folder: Path, name: str) -> None:
     """Write a drawing as PNG, and as SVG that turns dark where the reader's system is."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-
-    drawn = StringIO()
-    with own_style():
-        FigureCanvasAgg(figure).print_figure(
-            folder / f"{name}.png", dpi=_DPI, metadata={"Software": None}
-        )
-        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        FigureCanvasSVG(figure).print_figure(drawn, metadata=nothing)
-    text = drawn.getvalue().replace("</style>", f"{_DARK}</style>", 1)
+    with own_style(STYLE):
+        write_figure(figure, folder / f"{name}.png", _DPI)
+        drawn = figure_bytes(figure, ".svg").decode()
+    text = drawn.replace("</style>", f"{_DARK}</style>", 1)
     (folder / f"{name}.svg").write_text(text, encoding="utf-8")

@@ -5,47 +5,23 @@ All of it is plain data of the stages before; the files hold neither clock nor h
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from starcat.arrays import Array
-from starcat.report.coverage_report import CoverageReport, holes_warning, write_coverage
+from starcat.report.coverage_report import CoverageReport, write_coverage
 from starcat.report.page import report_page
 from starcat.report.plots import MAG_BIN, draw_magnitudes, save_plot
 from starcat.storage.digests import json_bytes
 
 
-@dataclass(frozen=True)
-class BuildFacts:
-    """What a report is made of."""
-
-    spec: Mapping[str, Any]  # the whole build spec
-    sources: Sequence[Mapping[str, Any]]  # the sources, as the manifest has them
-    reasons: Mapping[str, str]  # what each reason means
-    # the products as the manifest has them, by name, with ``bytes``
-    products: Mapping[str, Mapping[str, Any]]
-    database_bytes: int  # size of the matcher's file
-    # what each filter left in the fields of the tiling, in order
-    filters: Sequence[Mapping[str, Any]]
-    coverage: CoverageReport  # coverage by the guide stars
-    self_test: Sequence[Mapping[str, Any]]
-    software: Mapping[str, str]
-    band: str  # band of the magnitudes
-    guide_star_mag: Array  # shape (N,) and (M,): magnitudes; NaN where there is none
-    rejected_mag: Array
-
-    @property
-    def title(self) -> str:
-        """Name and version of the database."""
-        return f"{self.spec['name']}-{self.spec['version']}"
-
-
 def count_magnitudes(guide_star_mag: Array, rejected_mag: Array) -> dict[str, list[Any]]:
-    """Count guide stars and rejected stars by magnitude.
+    """Count guide stars and rejected stars by magnitude; NaN is left out.
+
+    Bins are half a magnitude wide, none between is left out, and ``to_mag`` belongs to its bin.
 
     Examples
     --------
@@ -69,40 +45,12 @@ def count_magnitudes(guide_star_mag: Array, rejected_mag: Array) -> dict[str, li
     }
 
 
-def report_content(facts: BuildFacts) -> dict[str, Any]:
-    """Return the report as JSON holds it."""
-    coverage = facts.coverage.as_dict()
-    warning = holes_warning(facts.coverage.gap)
-    return {
-        "name": facts.spec["name"],
-        "version": facts.spec["version"],
-        "description": facts.spec["description"],
-        "frame": "ICRS",
-        "epoch_jyear": facts.spec["epoch_jyear"],
-        "warnings": [warning] if warning else [],
-        "sources": [dict(source) for source in facts.sources],
-        "reasons": dict(facts.reasons),
-        "products": {name: dict(product) for name, product in facts.products.items()},
-        "database_bytes": facts.database_bytes,
-        "filters": [dict(step) for step in facts.filters],
-        "coverage": coverage,
-        "magnitudes": {
-            "band": facts.band,
-            **count_magnitudes(facts.guide_star_mag, facts.rejected_mag),
-        },
-        "self_test": [dict(rates) for rates in facts.self_test],
-        "spec": dict(facts.spec),
-        "software": dict(facts.software),
-    }
-
-
-def write_report(folder: Path, facts: BuildFacts) -> None:
-    """Write all files of a report."""
-    content = report_content(facts)
-    write_coverage(folder, facts.title, facts.coverage)
-    counts = content["magnitudes"]
+def write_report(folder: Path, content: Mapping[str, Any], coverage: CoverageReport) -> None:
+    """Write all files of a report; ``content`` is that of report.json."""
+    title, counts = f"{content['name']}-{content['version']}", content["magnitudes"]
+    write_coverage(folder, title, coverage)
     (folder / "stars_by_magnitude.csv").write_bytes(_magnitude_csv(counts))
-    save_plot(draw_magnitudes(facts.title, facts.band, counts), folder, "stars_by_magnitude")
+    save_plot(draw_magnitudes(title, counts["band"], counts), folder, "stars_by_magnitude")
     (folder / "self_test.json").write_bytes(json_bytes(content["self_test"]))
     (folder / "report.json").write_bytes(json_bytes(content))
     plots = {

@@ -16,29 +16,22 @@ from starcat.service.api import (
     databases,
     identify,
     jobs,
-    registry,
     releases,
     specs,
     sql,
-    work,
 )
-from starcat.service.jobs.pool import WorkerPool
+from starcat.service.jobs.slots import JobSlots
 from starcat.service.pages.rendering import add_missing_page
 from starcat.service.problems import REFUSALS, add_problem_handlers
-from starcat.service.security import health, signing
-from starcat.service.security.auth import Who
-from starcat.service.security.bodies import Bodies
-from starcat.service.security.headers import SafeHeaders
-from starcat.service.security.identities import Identities
-from starcat.service.security.logs import Defects, RequestLog
-from starcat.service.security.metrics import Counted, Metrics
-from starcat.service.security.origin import Origin
-from starcat.service.security.request_id import RequestId
-from starcat.service.security.request_limits import Shape
-from starcat.service.security.retention import keep_removing
-from starcat.service.service import Service, open_service
+from starcat.service.removal import keep_removing
+from starcat.service.security import metrics, signing
+from starcat.service.security.auth import Authentication, Identities
+from starcat.service.security.middleware import Defects, Refusals, RequestContext, SafeHeaders
+from starcat.service.security.origin import Origins
+from starcat.service.security.request_limits import BodyLimits, check_shape
+from starcat.service.service import Service
 from starcat.service.settings import Settings
-from starcat.service.vo import cone_search, tap, tap_jobs
+from starcat.service.vo import cone_search, tap, tap_async
 from starcat.version import __version__
 
 API = "/api/v1"
@@ -51,17 +44,16 @@ RESOURCES: tuple[APIRouter, ...] = (
     releases.router,
     identify.router,
     sql.router,
-    work.router,
 )
 """Routers of the REST interface, under `API`."""
 
 OTHERS: tuple[APIRouter, ...] = (
-    registry.router,
-    health.router,
+    releases.registry_router,
+    metrics.router,
     signing.router,
     cone_search.router,
     tap.router,
-    tap_jobs.router,
+    tap_async.router,
     *pages.ROUTERS,
 )
 """Routers of everything else: pages, the registry, TAP, cone searches, health."""
@@ -69,8 +61,9 @@ OTHERS: tuple[APIRouter, ...] = (
 
 def make_app(settings: Settings) -> FastAPI:
     """Make the application."""
-    service = open_service(settings)
-    metrics, identities = Metrics(service), Identities(service)
+    service = Service(settings)
+    figures, identities = metrics.Metrics(service), Identities(service.records, settings)
+    checks = (check_shape, Origins(settings).check, Authentication(settings, identities).check)
     app = FastAPI(
         title="starcat",
         version=__version__,
@@ -80,19 +73,14 @@ def make_app(settings: Settings) -> FastAPI:
         docs_url=None,
         redoc_url=None,
         middleware=[  # what a request passes, from the outside to the inside
-            Middleware(RequestId),
-            Middleware(RequestLog),
-            Middleware(Counted, metrics=metrics),
+            Middleware(RequestContext, metrics=figures),
             Middleware(SafeHeaders, settings=settings),
-            Middleware(Shape),
-            Middleware(Origin, settings=settings),
-            Middleware(Who, settings=settings, identities=identities),
-            Middleware(Bodies, settings=settings),
+            Middleware(Refusals, checks=checks, limits=BodyLimits(settings)),
             Middleware(Defects),
         ],
     )
-    app.state.service, app.state.metrics, app.state.identities = service, metrics, identities
-    app.state.workers = WorkerPool(service)
+    app.state.service, app.state.metrics, app.state.identities = service, figures, identities
+    app.state.slots = JobSlots(service)
     add_problem_handlers(app)
     add_missing_page(app)
     for router in RESOURCES:
@@ -105,9 +93,8 @@ def make_app(settings: Settings) -> FastAPI:
 @asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     service: Service = app.state.service
-    pool: WorkerPool = app.state.workers
-    await to_thread.run_sync(pool.start)
-    service.tap.runner.start()
+    slots: JobSlots = app.state.slots
+    await to_thread.run_sync(slots.start)
     removing = asyncio.create_task(keep_removing(service))
     try:
         yield
@@ -116,10 +103,5 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         removing.cancel()
         with suppress(asyncio.CancelledError):
             await removing
-        await to_thread.run_sync(pool.stop)
-        service.queue.close()
-        service.tap.close()
-        service.catalogs.close()
-        service.query_pool.close()
-        service.sandbox.close()
-        service.records.close()
+        await to_thread.run_sync(slots.stop)
+        service.close()

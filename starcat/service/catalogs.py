@@ -16,9 +16,9 @@ from typing import Any, TypeVar
 
 from cachetools import LRUCache
 
-from starcat.catalog.blocks import CATALOGS
-from starcat.catalog.fetching.locate import locate
+from starcat.catalog.parts import CATALOGS
 from starcat.catalog.source import DataSource, data_source
+from starcat.catalog.source_files import locate
 from starcat.errors import SourceMissing
 from starcat.pipeline.catalog_snapshot import CatalogSnapshot, read_snapshot, reading_keys
 from starcat.pipeline.estimate import Choice, Estimate, choose_stars, estimate
@@ -34,7 +34,7 @@ from starcat.version import __version__
 T = TypeVar("T")
 
 WAIT_S = 25.0
-"""Seconds that a request waits for a catalog to be read, or for its turn."""
+"""Seconds that a request waits for a catalog to be read, or for a free slot."""
 
 RETRY_S = 5
 """Seconds after which to ask again."""
@@ -66,21 +66,11 @@ class CatalogRead:
 
 @dataclass(frozen=True)
 class Offered:
-    """A catalog that a spec may name.
+    """A catalog that a spec may name."""
 
-    Attributes
-    ----------
-    source : DataSource
-        What it is.
-    is_here : bool
-        Whether its files are.
-    read : tuple of CatalogRead
-        What is known of it where it was read.
-    """
-
-    source: DataSource
-    is_here: bool
-    read: tuple[CatalogRead, ...]
+    source: DataSource  # what it is
+    is_here: bool  # whether its files are
+    read: tuple[CatalogRead, ...]  # what is known of it where it was read
 
 
 class Catalogs:
@@ -97,7 +87,7 @@ class Catalogs:
         self._estimates: LRUCache[Any, Estimate] = LRUCache(
             ESTIMATE_BYTES, lambda found: found.fields.nbytes
         )
-        self._turns = threading.Semaphore(AT_ONCE)
+        self._slots = threading.Semaphore(AT_ONCE)
         self._lock = threading.RLock()
         self._underway: dict[str, Future[CatalogSnapshot]] = {}
         # One at a time: a catalog takes memory.
@@ -120,7 +110,7 @@ class Catalogs:
         found = self._cached(self._estimates, whole)
         if found is None:
             read = self.read(spec, key)
-            with self._turn():
+            with self._slot():
                 choice = self._choice(read, key, spec)
                 found = estimate(read, choice, spec, self._max_memory_bytes)
             self._cache(self._estimates, whole, found)
@@ -136,7 +126,7 @@ class Catalogs:
         """Return a first spec for a camera, from the embedded sky."""
         # The default preset reads what a first spec is made from.
         sky = self.read(preset(preset_names()[0])).stars
-        with self._turn():
+        with self._slot():
             return starter_spec(
                 name,
                 camera,
@@ -166,10 +156,10 @@ class Catalogs:
         except TimeoutError:
             if future.done():
                 raise
-            what = (
-                f"{', '.join(_sources_read(spec))}: being read, which takes longer than you waited"
-            )
-            raise _busy(what, RETRY_S) from None
+            names = ", ".join(_sources_read(spec))
+            raise _busy(
+                f"{names}: being read, which takes longer than a request waits", RETRY_S
+            ) from None
 
     def close(self) -> None:
         """Begin no more reading; what is underway is not waited for."""
@@ -204,13 +194,13 @@ class Catalogs:
         return found
 
     @contextmanager
-    def _turn(self) -> Iterator[None]:
-        if not self._turns.acquire(timeout=self._wait_s):
+    def _slot(self) -> Iterator[None]:
+        if not self._slots.acquire(timeout=self._wait_s):
             raise _busy("too many estimates are being made", 1)
         try:
             yield
         finally:
-            self._turns.release()
+            self._slots.release()
 
     @staticmethod
     def _key(spec: BuildSpec) -> str:

@@ -10,10 +10,12 @@ from typing import Any
 
 from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
 from starcat.errors import ProductError, TargetMissing
+from starcat.geometry.camera import Camera
 from starcat.releases.tree import Blob, files_of
 from starcat.service.paths import DATABASE_ID, ServicePaths
 from starcat.service.problems import Problem
-from starcat.specs.version import version_numbers
+from starcat.specs.build_spec import CameraSpec
+from starcat.specs.section import version_numbers
 from starcat.storage.digests import file_sha256
 
 CATALOG = re.compile(r"(?P<source>[a-z0-9_]{1,64})-[0-9a-f]{16}(\.parquet)?", re.ASCII)
@@ -42,6 +44,38 @@ class Database:
     def title(self) -> str:
         """Name and version, as the folder has them."""
         return f"{self.name}-{self.version}"
+
+    @property
+    def spec(self) -> dict[str, Any]:
+        """The spec, with all defaults."""
+        return dict(self.manifest["spec"])
+
+    @property
+    def description(self) -> str:
+        """What the spec says of it."""
+        return str(self.spec.get("description") or "")
+
+    @property
+    def catalog(self) -> str:
+        """Name of the star catalog, with the band."""
+        catalog = self.spec["catalog"]
+        band = catalog.get("band")
+        return f"{catalog['source']}{f' ({band})' if band else ''}"
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The camera that it is for."""
+        return CameraSpec.model_validate(self.spec["camera"]).camera()
+
+    @property
+    def products(self) -> dict[str, int]:
+        """Rows of each product."""
+        return {name: int(facts["rows"]) for name, facts in self.manifest["products"].items()}
+
+    @property
+    def bytes(self) -> int:
+        """Size of all files together, without the manifest."""
+        return sum(int(facts["bytes"]) for facts in self.manifest["files"].values())
 
     @cached_property
     def manifest_blob(self) -> Blob:

@@ -31,11 +31,6 @@ class ServicePaths:
         return self.root / "records.sqlite"
 
     @property
-    def queue(self) -> Path:
-        """The SQLite file of the queue, where no Redis is used."""
-        return self.root / "queue.sqlite"
-
-    @property
     def lock(self) -> Path:
         """What the one server of this root holds while it runs."""
         return self.root / "server.lock"

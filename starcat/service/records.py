@@ -98,6 +98,35 @@ MIGRATIONS: tuple[str, ...] = (
     );
     CREATE INDEX tap_jobs_by_owner ON tap_jobs (owner, created_s);
     """,
+    """
+    ALTER TABLE jobs RENAME COLUMN wants_end TO cancel_requested;
+    ALTER TABLE jobs DROP COLUMN heard_s;
+    ALTER TABLE jobs ADD COLUMN queued_s REAL;
+    ALTER TABLE jobs ADD COLUMN destroyed_s REAL;
+    UPDATE jobs SET queued_s = created_s;
+    DROP INDEX jobs_by_state;
+    CREATE INDEX jobs_by_state ON jobs (state, queued_s);
+    INSERT INTO jobs (
+        id, kind, key, owner, title, state, request, created_s, queued_s, started_s, ended_s,
+        destroyed_s, error, result
+    )
+    SELECT
+        id, 'query', '', owner, '',
+        CASE phase
+            WHEN 'QUEUED' THEN 'queued' WHEN 'EXECUTING' THEN 'running'
+            WHEN 'COMPLETED' THEN 'done' WHEN 'ERROR' THEN 'failed'
+            WHEN 'ABORTED' THEN 'cancelled' ELSE 'pending'
+        END,
+        json_object(
+            'parameters', json(parameters), 'files', json(files), 'run_id', run_id,
+            'limit_s', limit_s
+        ),
+        created_s, queued_s, started_s, ended_s, destroyed_s,
+        CASE WHEN error != '' THEN json_object('detail', error) END,
+        CASE WHEN media_type != '' THEN json_object('media_type', media_type) END
+    FROM tap_jobs;
+    DROP TABLE tap_jobs
+    """,
 )
 """Statements that bring the file from each version to the next; one that is out never changes."""
 

@@ -15,7 +15,7 @@ from fastapi import FastAPI
 from starcat.errors import ConfigError, OutputError, reason
 from starcat.service.access import Role
 from starcat.service.app import make_app
-from starcat.service.jobs.pool import WorkerPool
+from starcat.service.jobs.slots import JobSlots
 from starcat.service.paths import ServicePaths
 from starcat.service.security.header_timeout import HeaderTimeout
 from starcat.service.security.logs import log_settings
@@ -97,7 +97,7 @@ class _Server(uvicorn.Server):
     def __init__(self, config: uvicorn.Config, app: FastAPI, announce: Announce) -> None:
         super().__init__(config)
         self._service: Service = app.state.service
-        self._workers: WorkerPool = app.state.workers
+        self._slots: JobSlots = app.state.slots
         self._announce = announce
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -109,7 +109,7 @@ class _Server(uvicorn.Server):
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Stop: streams of events end at once, requests and jobs within the time that they have."""
         self._service.stopping.set()
-        self._workers.begin_stop()
+        self._slots.begin_stop()
         await super().shutdown(sockets)
 
 

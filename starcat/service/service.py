@@ -3,88 +3,90 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from typing import Annotated
 
 from fastapi import Depends, Request
 
 from starcat.service.catalogs import Catalogs
 from starcat.service.jobs.job import JobStore
-from starcat.service.jobs.queue import JobQueue, open_queue
 from starcat.service.library import Library
 from starcat.service.paths import ServicePaths
 from starcat.service.query_pool import QueryPool
 from starcat.service.records import Records
 from starcat.service.sandbox.sandbox import Sandbox
 from starcat.service.settings import Settings
-from starcat.service.vo.tap_service import Tap
+from starcat.service.vo.tap_jobs import QueryJobs
+from starcat.service.vo.tap_queries import TapQueries
+from starcat.service.vo.tap_tables import TapTables
+from starcat.vo.documents import ServiceLimits
 
 GIB = 2**30
 
 
-@dataclass(frozen=True)
+DAY_S = 86_400
+
+
+class Tap:
+    """The parts of TAP: what is granted, what there is to be asked, and what answers."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        paths: ServicePaths,
+        records: Records,
+        library: Library,
+        query_pool: QueryPool,
+        sandbox: Sandbox,
+        wake_slots: Callable[[], None],
+    ) -> None:
+        self.limits = ServiceLimits(
+            run_s=int(settings.job_time_s),
+            keep_s=int(settings.keep_results_days * DAY_S),
+            rows=settings.max_rows,
+            upload_bytes=int(settings.upload_mib * 2**20),
+        )
+        self.tables = TapTables(paths, library, query_pool)
+        self.queries = TapQueries(paths, self.tables, query_pool, sandbox, settings.max_rows)
+        self.jobs = QueryJobs(records, paths, self.limits, self.queries, wake_slots)
+
+
 class Service:
-    """What a running service is made of.
+    """A running service: its folders and records, and what works with them."""
 
-    Attributes
-    ----------
-    settings : Settings
-        What the operator set.
-    paths : ServicePaths
-        What lies where.
-    records : Records
-        What is remembered.
-    library : Library
-        The databases there are.
-    jobs : JobStore
-        The jobs there are.
-    query_pool : QueryPool
-        Open query sessions.
-    queue : JobQueue
-        What waits for workers.
-    sandbox : Sandbox
-        Processes that read uploads and make files.
-    tap : Tap
-        What TAP needs.
-    catalogs : Catalogs
-        The catalogs there are, and estimates from them.
-    stopping : threading.Event
-        Set when the service stops.
-    """
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.paths = ServicePaths(settings.root)
+        self.paths.make()
+        self.records = Records(self.paths.records)
+        self.library = Library(self.paths)
+        self.jobs = JobStore(self.records)
+        self.job_queued = threading.Condition()  # notified when a job waits
+        self.query_pool = QueryPool(settings)
+        self.sandbox = Sandbox(settings, self.paths.scratch)
+        self.tap = Tap(
+            settings,
+            self.paths,
+            self.records,
+            self.library,
+            self.query_pool,
+            self.sandbox,
+            self.wake_slots,
+        )
+        self.catalogs = Catalogs(round(settings.job_memory_gib * GIB))
+        self.stopping = threading.Event()
 
-    settings: Settings
-    paths: ServicePaths
-    records: Records
-    library: Library
-    jobs: JobStore
-    query_pool: QueryPool
-    sandbox: Sandbox
-    tap: Tap
-    queue: JobQueue
-    catalogs: Catalogs
-    stopping: threading.Event = field(default_factory=threading.Event)
+    def wake_slots(self) -> None:
+        """Have an idle slot look for jobs now."""
+        with self.job_queued:
+            self.job_queued.notify_all()
 
-
-def open_service(settings: Settings) -> Service:
-    """Open a service: its folders and its records."""
-    paths = ServicePaths(settings.root)
-    paths.make()
-    records = Records(paths.records)
-    library, query_pool = Library(paths), QueryPool(settings)
-    most = round(settings.job_memory_gib * GIB)
-    sandbox = Sandbox(settings, paths.scratch)
-    return Service(
-        settings=settings,
-        paths=paths,
-        records=records,
-        library=library,
-        jobs=JobStore(records),
-        query_pool=query_pool,
-        sandbox=sandbox,
-        tap=Tap(settings, paths, records, library, query_pool, sandbox),
-        queue=open_queue(settings, paths),
-        catalogs=Catalogs(most),
-    )
+    def close(self) -> None:
+        """Close sessions, processes and records."""
+        self.catalogs.close()
+        self.query_pool.close()
+        self.sandbox.close()
+        self.records.close()
 
 
 def service_of(request: Request) -> Service:

@@ -18,10 +18,7 @@ RoleName = Literal["none", "reader", "builder", "publisher"]
 
 
 class Settings(BaseModel):
-    """Everything that an operator may set.
-
-    Attributes are described where they are defined, for the page of documentation.
-    """
+    """Everything that an operator may set; docs/howto-serve.md prints the descriptions."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -39,12 +36,11 @@ class Settings(BaseModel):
         description="What somebody without a token may do; by default read on a loopback address "
         "without a public_url, nothing on any other.",
     )
-    workers: int = Field(1, ge=0, le=64, description="Jobs that run at the same time here.")
-    queue_url: str | None = Field(
-        None, description="redis://HOST:PORT/N, for workers on several machines; else a file."
+    workers: int = Field(
+        1, ge=0, le=64, description="Jobs that run at the same time, here or on the cluster."
     )
     scheduler: str | None = Field(
-        None, description="tcp://HOST:PORT of a Dask cluster for ingests."
+        None, description="tcp://HOST:PORT of a Dask cluster that does the jobs; else this machine."
     )
     job_time_s: float = Field(3600.0, gt=0, description="Seconds that a job may take.")
     job_memory_gib: float = Field(4.0, gt=0, description="Memory that a job may take, GiB.")
@@ -54,7 +50,7 @@ class Settings(BaseModel):
     query_time_s: float = Field(60.0, gt=0, description="Seconds that a query may take.")
     query_memory_gib: float = Field(1.0, gt=0, description="Memory that a query may take, GiB.")
     worker_silence_s: float = Field(
-        60.0, gt=0, description="Seconds until a worker on another machine that is silent is lost."
+        60.0, gt=0, description="Seconds until a worker of the cluster that is silent is lost."
     )
     queries: int = Field(2, ge=1, le=64, description="Queries that run at the same time.")
     max_rows: int = Field(10_000_000, ge=1, description="Rows of an answer at most.")
@@ -106,6 +102,13 @@ def read_settings(root: Path, **options: object) -> Settings:
         except (OSError, ValueError) as error:
             raise ConfigError(f"{path}: not a readable TOML file: {error}") from error
     content |= {name: value for name, value in options.items() if value is not None}
+    if "queue_url" in content:
+        raise ConfigError(
+            f"{path}: queue_url: jobs of other machines no longer go through Redis; start a Dask "
+            'cluster there, and write scheduler = "tcp://HOST:8786" instead',
+            key="queue_url",
+            value=content["queue_url"],
+        )
     try:
         return Settings.model_validate({**content, "root": root.resolve()})
     except ValidationError as error:

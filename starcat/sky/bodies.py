@@ -1,21 +1,23 @@
 """The Sun, the Moon and the planets: where an observer sees them, and how bright they are.
 
 By ERFA's ``epv00``, ``moon98`` and ``plan94``, which are what astropy calls its built-in
-ephemeris. Nothing is read and nothing is downloaded.
+ephemeris. Nothing is read and nothing is downloaded. Magnitudes of planets are after Mallama and
+Hilton 2018, "Computing apparent planetary magnitudes for The Astronomical Almanac", Astronomy and
+Computing 25, 10, V band; without the rotation of Mars (0.06 mag). The Sun and the Moon are after
+Allen's Astrophysical Quantities (4th ed., 2000, sections 14.2 and 12.9).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
 import erfa
 import numpy as np
 
-from starcat.arrays import Array
-from starcat.geometry.aberration import AU_KM, LIGHT_KM_S, aberrated
-from starcat.sky.magnitudes import apparent_magnitude
-from starcat.sky.observer import DAY_S, Observer
+from starcat.arrays import Array, Directions
+from starcat.sky.observer import AU_KM, DAY_S, LIGHT_KM_S, Observer, aberrated
 
 RADII_KM = {
     "Sun": 695_700.0,
@@ -55,30 +57,18 @@ _AU_DAY = LIGHT_KM_S * DAY_S / AU_KM
 
 @dataclass(frozen=True)
 class Bodies:
-    """The bodies of the solar system, as they are seen at a time.
+    """The bodies of the solar system, as they are seen at a time."""
 
-    Attributes
-    ----------
-    names : tuple of str, length B
-        ``Sun``, ``Moon``, the planets; ``Earth`` where the observer's position is known.
-    directions : ndarray of float64, shape (B, 3)
-        Apparent directions of their middles, ICRS axes: light time and aberration are in them.
-    distance_au : ndarray of float64, shape (B,)
-        From the observer.
-    radius_rad : ndarray of float64, shape (B,)
-        Half of what they subtend.
-    mag : ndarray of float64, shape (B,)
-        Magnitudes, V.
-    error_rad : ndarray of float64, shape (B,)
-        Largest error of the directions, that of an unknown position within 7,000 km of the
-        middle of the Earth included.
-    """
-
+    # ``Sun``, ``Moon``, the planets; ``Earth`` where the observer's position is known
     names: tuple[str, ...]
-    directions: Array
-    distance_au: Array
-    radius_rad: Array
-    mag: Array
+    # shape (B, 3): apparent directions of their middles, ICRS axes: light time and aberration are
+    # in them
+    directions: Directions
+    distance_au: Array  # shape (B,): from the observer
+    radius_rad: Array  # shape (B,): half of what they subtend
+    mag: Array  # shape (B,): magnitudes, V
+    # shape (B,): largest error of the directions, that of an unknown position within 7,000 km of
+    # the middle of the Earth included
     error_rad: Array
 
     def row(self, name: str) -> int:
@@ -146,3 +136,104 @@ def _ephemeris_error_rad(name: str, from_sun_au: Array, from_observer_au: Array)
         return 0.0
     error_au = np.radians(_PLANETS[name][1] / 3600.0) * np.sqrt(from_sun_au @ from_sun_au)
     return float(error_au / np.sqrt(from_observer_au @ from_observer_au))
+
+
+SUN_MAG, MOON_MAG = -26.75, -12.74
+"""V of the Sun from 1 au, and of the full Moon from its mean distance, with the Sun 1 au away."""
+
+MOON_DISTANCE_AU = 384_400.0 / 149_597_870.7
+
+_SATURN_POLE = np.array([0.08547883, 0.07323576, 0.99364475])
+"""ICRS unit vector (IAU: RA 40.589, Dec 83.537 deg)."""
+
+_URANUS_POLE = np.array([-0.21199958, -0.94155916, -0.26176809])
+"""ICRS unit vector (IAU: RA 257.311, Dec -15.175 deg)."""
+
+
+def apparent_magnitude(name: str, from_sun_au: Array, from_observer_au: Array) -> float:
+    """Return how bright a body of the solar system is."""
+    distance = float(np.sqrt(from_observer_au @ from_observer_au))
+    if name == "Sun":
+        return SUN_MAG + 5.0 * float(np.log10(distance))
+    solar = float(np.sqrt(from_sun_au @ from_sun_au))
+    phase_deg = _angle_deg(from_sun_au, from_observer_au)
+    if name == "Moon":
+        part = 0.026 * phase_deg + 4e-9 * phase_deg**4
+        return MOON_MAG + part + 5.0 * float(np.log10(solar * distance / MOON_DISTANCE_AU))
+    if name == "Saturn":
+        own = _saturn(phase_deg, *_latitudes(_SATURN_POLE, from_sun_au, from_observer_au))
+    elif name == "Uranus":
+        sun, observer = _latitudes(_URANUS_POLE, from_sun_au, from_observer_au)
+        own = _uranus(phase_deg, 0.5 * (abs(sun) + abs(observer)))
+    else:
+        own = PHASE_CURVES[name](phase_deg)
+    return own + 5.0 * float(np.log10(solar * distance))
+
+
+def _angle_deg(u: Array, v: Array) -> float:
+    cross = np.cross(u, v)
+    return float(np.degrees(np.arctan2(np.sqrt(cross @ cross), u @ v)))
+
+
+def _latitudes(pole: Array, from_sun_au: Array, from_observer_au: Array) -> tuple[float, float]:
+    """Return the planet's latitudes under the Sun and under the observer, degrees."""
+    return _angle_deg(pole, from_sun_au) - 90.0, _angle_deg(pole, from_observer_au) - 90.0
+
+
+def _mercury(a: float) -> float:
+    terms = (-0.613, 6.3280e-2, -1.6336e-3, 3.3644e-5, -3.4265e-7, 1.6893e-9, -3.0334e-12)
+    return _polynomial(a, *terms)
+
+
+def _venus(a: float) -> float:
+    if a < 163.7:
+        return _polynomial(a, -4.384, -1.044e-3, 3.687e-4, -2.814e-6, 8.938e-9)
+    return _polynomial(a, 236.05828, -2.81914, 8.39034e-3)
+
+
+def _earth(a: float) -> float:
+    return _polynomial(a, -3.99, -1.060e-3, 2.054e-4)
+
+
+def _mars(a: float) -> float:
+    if a <= 50.0:
+        return _polynomial(a, -1.601, 2.267e-2, -1.302e-4)
+    return _polynomial(a, -0.367, -2.573e-2, 3.445e-4)
+
+
+def _jupiter(a: float) -> float:
+    if a <= 12.0:
+        return _polynomial(a, -9.395, -3.7e-4, 6.16e-4)
+    light = _polynomial(a / 180.0, 1.0, -1.507, -0.363, -0.062, 2.809, -1.876)
+    return -9.428 - 2.5 * float(np.log10(light))
+
+
+def _saturn(a: float, sun_deg: float, observer_deg: float) -> float:
+    """Globe and rings; the rings show their dark side where the latitudes have two signs."""
+    tilt = float(np.sqrt(max(sun_deg * observer_deg, 0.0)))
+    sine, a = float(np.sin(np.radians(tilt))), min(a, 6.5)
+    return -8.914 - 1.825 * sine + 0.026 * a - 0.378 * sine * float(np.exp(-2.25 * a))
+
+
+def _uranus(a: float, latitude_deg: float) -> float:
+    beyond = _polynomial(a, 0.0, 6.587e-3, 1.045e-4) if a > 3.1 else 0.0
+    return -7.110 - 0.00084 * latitude_deg + beyond
+
+
+def _neptune(a: float) -> float:
+    return -7.00 + (_polynomial(a, 0.0, 7.944e-3, 9.617e-5) if a > 1.9 else 0.0)
+
+
+def _polynomial(x: float, *terms: float) -> float:
+    return float(np.polynomial.polynomial.polyval(x, terms))
+
+
+PHASE_CURVES: Mapping[str, Callable[[float], float]] = {
+    "Mercury": _mercury,
+    "Venus": _venus,
+    "Earth": _earth,
+    "Mars": _mars,
+    "Jupiter": _jupiter,
+    "Neptune": _neptune,
+}
+"""Magnitude at 1 au from the Sun and from the observer, by the phase angle in degrees."""

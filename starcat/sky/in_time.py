@@ -9,13 +9,13 @@ attitude is fitted to them again.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starcat.arrays import Array
-from starcat.geometry.aberration import AU_KM
+from starcat.arrays import Array, Matrix
 from starcat.geometry.attitude import (
     matrix_from_quaternion,
     quaternion_from_matrix,
@@ -28,7 +28,7 @@ from starcat.matcher.database import Database
 from starcat.matcher.observation import as_frame
 from starcat.matcher.result import MatchResult
 from starcat.sky.bodies import RADII_KM, Bodies, bodies_seen
-from starcat.sky.observer import Observer
+from starcat.sky.observer import AU_KM, Observer
 
 
 @dataclass(frozen=True)
@@ -98,6 +98,10 @@ class SkyInTime:
     moon_angle_deg: float
     earth_limb_angle_deg: float | None
 
+    def content(self) -> dict[str, Any]:
+        """Return it as JSON has it, under the key ``in_time`` of an answer."""
+        return {**asdict(self), "q_body_from_icrs": self.q_body_from_icrs.tolist()}
+
 
 def sky_in_time(
     result: MatchResult,
@@ -133,7 +137,7 @@ def sky_in_time(
     """
     if result.status != "identified":
         return None
-    frame, _ = as_frame(centroids_px)
+    frame = as_frame(centroids_px, camera).centroids_px
     rows = np.flatnonzero(result.star_index >= 0)
     stars = result.star_index[rows]
     parallax = None if parallax_mas is None else parallax_mas[stars]
@@ -161,19 +165,9 @@ def sky_in_time(
 
 
 def earth_limb_angle_deg(boresight: Array, observer: Observer) -> float | None:
-    """Return the angle from a boresight to the limb of the Earth.
+    """Return the angle from a boresight (apparent, ICRS axes) to the limb of the Earth.
 
-    Parameters
-    ----------
-    boresight : ndarray of float64, shape (3,)
-        Apparent direction, ICRS axes.
-    observer : Observer
-        With a position.
-
-    Returns
-    -------
-    float or None
-        Degrees, negative where the Earth is in the boresight; None without a position.
+    Degrees, negative where the Earth is in the boresight; None without a position.
     """
     if not observer.is_placed:
         return None
@@ -197,7 +191,7 @@ def _angle_arcsec(rotation: Array) -> float:
 
 
 def _in_frame(
-    seen: Bodies, matrix: Array, camera: Camera, angle_deg: Array, rows: dict[str, int]
+    seen: Bodies, matrix: Matrix, camera: Camera, angle_deg: Array, rows: dict[str, int]
 ) -> tuple[BodyInFrame, ...]:
     places = camera.pixels_from_directions(seen.directions @ matrix.T)
     inside = camera.contains(places)

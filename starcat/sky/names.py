@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Directions
 from starcat.geometry.sphere import (
     chord_from_separation,
     directions_from_radec,
@@ -35,26 +35,13 @@ _MAS = np.radians(1.0 / 3_600_000.0)
 
 @dataclass(frozen=True)
 class NamedStars:
-    """The stars that have names.
+    """The stars that have names."""
 
-    Attributes
-    ----------
-    hip : ndarray of int64, shape (N,)
-        Hipparcos numbers, ascending.
-    directions : ndarray of float64, shape (N, 3)
-        ICRS unit vectors at J2000.0.
-    motion_rad_yr : ndarray of float64, shape (N, 3)
-        Proper motions in the tangent plane, radians a year.
-    mag : ndarray of float64, shape (N,)
-        V.
-    labels : tuple of str, length N
-        Proper name, else Bayer letter and constellation, else ``HIP`` and number.
-    """
-
-    hip: NDArray[np.int64]
-    directions: Array
-    motion_rad_yr: Array
-    mag: Array
+    hip: NDArray[np.int64]  # shape (N,): Hipparcos numbers, ascending
+    directions: Directions  # shape (N, 3): ICRS unit vectors at J2000.0
+    motion_rad_yr: Array  # shape (N, 3): proper motions in the tangent plane, radians a year
+    mag: Array  # shape (N,): V
+    # proper name, else Bayer letter and constellation, else ``HIP`` and number
     labels: tuple[str, ...]
 
     @cached_property
@@ -103,7 +90,7 @@ def constellation_lines() -> tuple[tuple[int, ...], ...]:
 
 
 def common_names(
-    designations: Sequence[str], directions: Array, mag: Array, epoch_jyear: float
+    designations: Sequence[str], directions: Directions, mag: Array, epoch_jyear: float
 ) -> list[str | None]:
     """Return the names that people know stars by."""
     known = named_stars()

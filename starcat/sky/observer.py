@@ -1,8 +1,13 @@
-"""The observer: when and where he looks, and how fast he moves.
+"""The observer: when and where he looks and how fast he moves, and where he sees stars.
 
 The Earth and the Sun are by ERFA's ``epv00``, which astropy calls its built-in ephemeris: the
 velocity of the Earth is good to 5 mm/s, 4 microarcseconds of aberration. Nothing is downloaded:
 leap seconds are those of the installed ERFA.
+
+A catalog says where a star is seen from the middle of the solar system, at rest. An observer
+elsewhere sees it shifted by parallax (at most 0.8 arcsec), bent by the Sun (4 mas at 90 deg from
+it, 1.75 arcsec at its limb) and displaced in the direction of his own motion (20.5 arcsec for the
+Earth, 5 arcsec more in a low orbit). Directions are unit vectors in ICRS axes, in and out.
 """
 
 from __future__ import annotations
@@ -17,15 +22,75 @@ from typing import Literal, get_args
 import erfa
 import numpy as np
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Directions
 from starcat.errors import ConfigError
-from starcat.geometry.aberration import (
-    AU_KM,
-    LIGHT_KM_S,
-    aberrated,
-    deflected,
-    displaced_by_parallax,
-)
+
+LIGHT_KM_S = 299_792.458
+"""Speed of light in vacuum (exact)."""
+
+AU_KM = 149_597_870.7
+"""Astronomical unit (IAU 2012 Resolution B2, exact)."""
+
+_SUN_RADIUS_AU = 1.974_125_743_36e-8
+"""Schwarzschild radius of the Sun, au: ``2 GM / c^2``."""
+
+_MAS = np.radians(1.0 / 3_600_000.0)
+
+
+def displaced_by_parallax(u: Array, parallax_mas: Array, observer_au: Array) -> Array:
+    """Return directions as seen from a place that is not the barycentre.
+
+    The observer is at a barycentric position in au; a parallax that is NaN counts as 0.
+    """
+    parallax_rad = np.nan_to_num(parallax_mas) * _MAS
+    return _unit(u - parallax_rad[:, None] * observer_au)
+
+
+def deflected(u: Array, from_sun_au: Array) -> Array:
+    """Return directions of stars as the mass of the Sun bends their light.
+
+    ``from_sun_au`` is where the observer is, relative to the Sun, not zero. Stars shift away
+    from the Sun.
+
+    Within 9 arcmin of the middle of the Sun, behind its disc, the deflection falls to zero
+    instead of growing without limit.
+
+    Urban and Seidelmann (eds.) 2013, Explanatory Supplement to the Astronomical Almanac, 3rd
+    ed., eq. 7.63; the limit is that of SOFA's ``iauLdsun``.
+    """
+    distance_au = float(np.sqrt(from_sun_au @ from_sun_au))
+    e = from_sun_au / distance_au
+    limit = 1e-6 / max(distance_au * distance_au, 1.0)
+    cosine = u @ e
+    weight = _SUN_RADIUS_AU / distance_au / np.maximum(1.0 + cosine, limit)
+    return _unit(u + weight[:, None] * (e - cosine[:, None] * u))
+
+
+def aberrated(u: Array, velocity_km_s: Array) -> Array:
+    """Return directions as a moving observer sees them.
+
+    Stars shift towards the velocity; with the opposite velocity the same function takes them
+    back.
+
+    Exact in special relativity. What SOFA's ``iauAb`` adds for the potential of the Sun is below
+    a microarcsecond.
+
+    Urban and Seidelmann (eds.) 2013, eq. 7.40.
+
+    >>> v = np.array([0.0, 29.8, 0.0])
+    >>> shifted = aberrated(np.array([[1.0, 0.0, 0.0]]), v)
+    >>> round(float(np.degrees(shifted[0, 1])) * 3600, 1)
+    20.5
+    """
+    beta = velocity_km_s / LIGHT_KM_S
+    slower = np.sqrt(1.0 - beta @ beta)
+    along = u @ beta
+    return _unit(slower * u + (1.0 + along / (1.0 + slower))[:, None] * beta)
+
+
+def _unit(u: Array) -> Array:
+    return np.asarray(u / np.sqrt(np.einsum("ij,ij->i", u, u))[:, None])
+
 
 Origin = Literal["earth", "barycentre"]
 
@@ -82,15 +147,11 @@ class Observer:
         ----------
         time : str or datetime
             UTC, such as ``2026-11-22T10:00:00``; a time zone in it is heeded.
-        position_km : sequence of float, shape (3,), optional
-            Position relative to the origin, km, ICRS axes (of the Earth: GCRS, for which J2000
-            axes will do; not those of a two-line element set). The middle of the Earth by
-            default.
-        velocity_km_s : sequence of float, shape (3,), optional
-            Velocity relative to the origin, km/s, the same axes; that of the Earth by default.
+        position_km, velocity_km_s : sequence of float, shape (3,), optional
+            Relative to the origin, km and km/s, ICRS axes (of the Earth: GCRS, for which J2000
+            axes will do; not those of a two-line element set); those of the Earth by default.
         origin : {"earth", "barycentre"}
-            What both are relative to. Relative to the barycentre of the solar system both have
-            to be given.
+            What both are relative to; relative to the barycentre both have to be given.
 
         Returns
         -------
@@ -100,8 +161,7 @@ class Observer:
         Raises
         ------
         ConfigError
-            If the time is none, before 1900 or after 2099, or position and velocity are not
-            three numbers each, a velocity reaches that of light, or one is missing.
+            If an argument is out of range, such as a time before 1900 or after 2099, or missing.
         """
         moment = _utc(time)
         tt = _terrestrial(moment)
@@ -131,21 +191,11 @@ class Observer:
         sun_au = earth_au - np.array(heliocentric["p"])
         return cls(moment, tt, position_au, velocity, sun_au, earth_au, place is not None)
 
-    def apparent(self, directions: Array, parallax_mas: Array | None = None) -> Array:
+    def apparent(self, directions: Directions, parallax_mas: Array | None = None) -> Array:
         """Return where stars of a catalog are seen.
 
-        Parameters
-        ----------
-        directions : ndarray of float64, shape (N, 3)
-            ICRS unit vectors, as catalogs have them.
-        parallax_mas : ndarray of float64, shape (N,), optional
-            Annual parallaxes, mas, NaN where unknown; all 0 by default.
-
-        Returns
-        -------
-        ndarray of float64, shape (N, 3)
-            Unit vectors in the same axes: with parallax, light deflection by the Sun and
-            aberration, astropy's GCRS to 1 mas.
+        With parallax (mas, NaN where unknown), light deflection by the Sun and aberration:
+        astropy's GCRS to 1 mas.
         """
         u = directions
         if parallax_mas is not None:
@@ -154,27 +204,7 @@ class Observer:
 
 
 def numbers_of(name: str, text: str, count: int) -> list[float]:
-    """Return the numbers of a text such as ``1.5,-7.2,0``.
-
-    Parameters
-    ----------
-    name : str
-        What they are, for the message.
-    text : str
-        Numbers with commas between them.
-    count : int
-        How many there have to be.
-
-    Returns
-    -------
-    list of float
-        Finite.
-
-    Raises
-    ------
-    ConfigError
-        If they are not that many finite numbers.
-    """
+    """Return so many numbers of a text such as ``1.5,-7.2,0``, or raise ConfigError."""
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:

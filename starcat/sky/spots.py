@@ -13,14 +13,13 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Matrix, Pixels
 from starcat.geometry.attitude import matrix_from_quaternion, solve_wahba_svd
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
-from starcat.matcher.matcher import TOLERANCE_PX
 from starcat.matcher.observation import as_frame
 from starcat.matcher.result import MatchResult
-from starcat.matcher.searching import CERTAIN
+from starcat.matcher.settings import CERTAIN, TOLERANCE_PX
 from starcat.sky.bodies import Bodies, bodies_seen
 from starcat.sky.observer import Observer
 
@@ -50,34 +49,26 @@ def identify_in_time(
     Parameters
     ----------
     identify : callable
-        `Matcher.identify`, its camera and options filled in: it is given the centroids and the
-        keyword ``magnitudes``.
-    database : Database
-        The stars that it names.
-    centroids_px : array_like of float64, shape (N, 2)
-        Pixels.
+        `Matcher.identify`, its camera and options filled in.
+    database, observer : Database, Observer
+        The stars that it names; when and from where the frame was taken.
+    centroids_px, magnitudes : array_like of float64, shape (N, 2) and (N,)
+        Pixels, and magnitudes of any zero point.
     camera : Camera
-        The camera that took the frame; where the answer has found another focal length, that one
-        counts.
-    observer : Observer
-        When and from where.
-    magnitudes : array_like of float64, shape (N,), optional
-        Magnitudes of the centroids, of any zero point.
-    tolerance_px : float, default 2
-        Largest distance of a spot from its planet, beside the error of the ephemeris.
-    max_false_match_probability : float, default 1e-9
-        Less certain answers are withheld.
+        The camera that took the frame; a focal length that the answer has found counts instead.
+    tolerance_px, max_false_match_probability : float
+        As of `Matcher`; a spot may be off its planet by the error of the ephemeris too.
 
     Returns
     -------
     MatchResult
         Spots of planets are in ``dropped``, with the planet's name in small letters as the
-        reason, and no star. A frame that is not identified, and whose spots have a brightness,
-        is asked again without one or two of its three brightest spots; such an answer is taken
-        only if a planet is at each of them, and its probability is that of all these questions.
+        reason. A frame that is not identified is asked again without one or two of its three
+        brightest spots; such an answer counts if a planet is at each of them, with the
+        probability of all these questions.
     """
-    frame, mag = as_frame(centroids_px, magnitudes)
-    seen = bodies_seen(observer)
+    given = as_frame(centroids_px, camera, magnitudes)
+    frame, mag = given.centroids_px, given.magnitudes
     found = identify(frame, magnitudes=mag)
 
     def rows_of(result: MatchResult) -> dict[int, str]:
@@ -87,15 +78,14 @@ def identify_in_time(
         matrix = _apparent_matrix(result, eye, frame, observer)
         star_mag = np.where(result.star_index >= 0, database.mag[result.star_index], np.nan)
         return planets_among(
-            frame, matrix, eye, seen, magnitudes=mag, star_mag=star_mag,
+            frame, matrix, eye, bodies_seen(observer), magnitudes=mag, star_mag=star_mag,
             tolerance_px=tolerance_px, faint_limit_mag=float(database.mag.max()),
         )  # fmt: skip
 
     if found.status == "identified":
         names = rows_of(found)
         return _without(identify, frame, mag, names) if names else found
-    questions = _bright_rows(mag)
-    for left_out in questions:
+    for left_out in (questions := _bright_rows(mag)):
         again = identify(_unset(frame, left_out), magnitudes=mag)
         names = rows_of(again)
         chance = again.false_match_probability * (1 + len(questions))
@@ -107,8 +97,8 @@ def identify_in_time(
 
 
 def planets_among(
-    centroids_px: Array,
-    matrix: Array,
+    centroids_px: Pixels,
+    matrix: Matrix,
     camera: Camera,
     seen: Bodies,
     *,
@@ -119,33 +109,11 @@ def planets_among(
 ) -> dict[int, str]:
     """Return which centroids are planets, the Moon or the Sun.
 
-    Parameters
-    ----------
-    centroids_px : ndarray of float64, shape (N, 2)
-        Pixels; NaN for a centroid that is not to be used.
-    matrix : ndarray of float64, shape (3, 3)
-        Attitude, of apparent directions.
-    camera : Camera
-        The camera.
-    seen : Bodies
-        The bodies, as the observer sees them.
-    magnitudes : ndarray of float64, shape (N,), optional
-        Magnitudes of the centroids, of any zero point.
-    star_mag : ndarray of float64, shape (N,), optional
-        Magnitudes of the stars that were found for them, NaN where none.
-    tolerance_px : float, default 2
-        Largest distance of a spot from its planet, beside the error of the ephemeris and the
-        disc.
-    faint_limit_mag : float, optional
-        Bodies more than 1 mag fainter are not looked for.
-
-    Returns
-    -------
-    dict of int to str
-        Name of the body in small letters by row of the centroid. Of several centroids within
-        reach of one body the brightest is its spot, or the nearest without magnitudes. A spot
-        stays its star's if the star is brighter than the planet, or where the body is the Sun or
-        the Moon and shows a disc.
+    The matrix is of apparent directions; ``star_mag`` are magnitudes of the stars that were
+    found for the centroids, NaN where none. Returned is the name of the body in small letters
+    by row of the centroid. Of several centroids within reach of one body the brightest is its
+    spot, or the nearest without magnitudes. A spot stays its star's if the star is brighter
+    than the planet, or where the body is the Sun or the Moon and shows a disc.
     """
     rows: dict[int, str] = {}
     places = camera.pixels_from_directions(seen.directions @ matrix.T)
@@ -173,14 +141,12 @@ def planets_among(
 def _apparent_matrix(
     result: MatchResult, camera: Camera, frame: Array, observer: Observer
 ) -> Array:
-    """Return the attitude by apparent directions, from where the answer puts the spots."""
     body = camera.directions_from_pixels(frame[np.flatnonzero(result.star_index >= 0)])
     icrs = body @ matrix_from_quaternion(result.q_body_from_icrs)
     return solve_wahba_svd(body, observer.apparent(icrs))
 
 
 def _bright_rows(mag: Array | None) -> list[tuple[int, ...]]:
-    """Return the sets of spots that a frame is asked again without."""
     if mag is None or not np.isfinite(mag).any():
         return []
     rows = np.argsort(np.nan_to_num(mag, nan=np.inf), kind="stable")[:BRIGHTEST].tolist()

@@ -12,8 +12,7 @@ from pydantic import Field, model_validator
 
 from starcat.geometry.camera import Camera
 from starcat.specs.product_sections import Levels, Products
-from starcat.specs.section import FieldDeg, Mag, Section
-from starcat.specs.version import NAME_PATTERN, VERSION_PATTERN
+from starcat.specs.section import NAME_PATTERN, VERSION_PATTERN, FieldDeg, Mag, Section
 
 MOST_BINS = 10_000_000
 """Bins of a look-up table; each takes 8 bytes, and a tracker has no use for more."""

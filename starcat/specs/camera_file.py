@@ -34,11 +34,20 @@ COEFFICIENTS = tuple(field.name for field in fields(Distortion))
 def read_camera(path: Path) -> Camera:
     """Read a camera from a TOML file."""
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such camera file") from None
     except OSError as error:
         raise ConfigError(f"{path}: not a readable TOML file: {reason(error)}") from error
+    except ValueError as error:
+        raise ConfigError(f"{path}: not a readable TOML file: {error}") from error
+    return parse_camera(text, path)
+
+
+def parse_camera(text: str, path: Path) -> Camera:
+    """Return the camera of a TOML text; messages call it ``path``."""
+    try:
+        content = tomllib.loads(text)
     except ValueError as error:
         raise ConfigError(f"{path}: not a readable TOML file: {error}") from error
     if "camera" not in content:
@@ -73,7 +82,6 @@ def camera_toml(camera: Camera) -> str:
 
 
 def _camera(table: dict[str, Any], path: Path, prefix: str) -> Camera:
-    """Return the camera of a table whose keys stand behind a prefix."""
     _refuse_unknown(table, KEYS, path, prefix)
     for key in SIZES:
         if key not in table:

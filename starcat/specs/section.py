@@ -1,4 +1,9 @@
-"""What all sections of a spec share: they are frozen, and strict about what they are given."""
+"""What all sections of a spec share, and the patterns of names and versions.
+
+Sections are frozen, and strict about their values. A version is three numbers in ASCII digits
+without leading zeros, so that each version has one spelling; 18 digits fit into 64 bits. A registry
+and a lock file know the same names and versions.
+"""
 
 from __future__ import annotations
 
@@ -29,3 +34,21 @@ class Section(BaseModel):
     def _no_negative_zero(cls, value: Any) -> Any:
         """Return 0.0 for -0.0, which passes for a number that is not negative and is none."""
         return value + 0.0 if isinstance(value, float) else value
+
+
+NAME_PATTERN = r"^[a-z0-9][a-z0-9-]{0,63}$"
+
+_NUMBER = r"(0|[1-9][0-9]{0,17})"
+VERSION_PATTERN = rf"^{_NUMBER}\.{_NUMBER}\.{_NUMBER}$"
+
+
+def version_numbers(version: str) -> tuple[int, int, int]:
+    """Return what versions are sorted by, as semantic versions go.
+
+    Examples
+    --------
+    >>> version_numbers("1.10.0") > version_numbers("1.9.0")
+    True
+    """
+    major, minor, patch = (int(number) for number in version.split("."))
+    return major, minor, patch

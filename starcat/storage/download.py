@@ -285,7 +285,6 @@ def _appending(
 
 @contextmanager
 def _output(path: Path) -> Iterator[None]:
-    """Turn a failure to write into the error that says so."""
     try:
         yield
     except OSError as error:

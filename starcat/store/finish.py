@@ -1,9 +1,13 @@
-"""Finishing: the runs of a pixel in, its partition out; and the stars that border on others."""
+"""Finishing: the runs of a pixel in, its partition out; and the stars that border on others.
+
+The brightest stars of a partition come first, and each group of brightness in the order of the
+pixels: readers skip row groups by the least and greatest magnitude in them, so that to read only
+the bright stars of the whole sky takes one part in 64 of it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -13,11 +17,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from starcat.catalog.stars import floats_of
 from starcat.storage.atomic import placed
 from starcat.storage.schema import product_schema
-from starcat.store.brightness import bright_first, write_partition
-from starcat.store.index import RunIndex, read_index
-from starcat.store.layout import DATASET, REPEATED
+from starcat.store.layout import DATASET
 from starcat.store.ledger import Digests, digests_of
 from starcat.store.neighbours import COLUMNS, add_neighbours
 from starcat.store.pixels import (
@@ -29,57 +32,39 @@ from starcat.store.pixels import (
     pixel_field,
     runs_of,
 )
-from starcat.store.runs import places_of, read_shares, with_constants
+from starcat.store.plan import StorePlan
+from starcat.store.runs import RunIndex, places_of, read_index, read_shares, with_constants
 
 SKYMAP_ORDER = 6
 """Order of the map of star counts (55 arcmin)."""
 
-STAR_KEYS = ("star_id", "source_file", "source_line")
+ROW_GROUP_ROWS = 1 << 16
+_SHARES = (64, 8)
+"""The brightest 64th of the stars, then up to the brightest 8th, then the others."""
+
+_LEAST_ROWS = 1024
+"""A group of brightness that would be smaller than this is not made."""
 
 
-@dataclass(frozen=True)
-class Finish:
-    """What is asked of a worker that finishes a partition.
+def finish(
+    plan: StorePlan,
+    pixel: Pixel,
+    beside: tuple[Pixel, ...],
+    index_path: Path,
+    repeated_path: Path,
+    is_alone: bool,
+) -> tuple[dict[str, Any], Digests]:
+    """Write the partition of a pixel, and its stars that are in the margins of others.
 
-    Attributes
-    ----------
-    pixel : Pixel
-        The partition.
-    beside : tuple of Pixel
-        Partitions whose margin has stars of this one.
-    margin_rad : float
-        How far margins reach.
-    index, repeated : Path
-        Files that say what the runs hold, and which records are of a star read before.
-    catalog, borders : Path
-        Folder of the HATS catalog, and for the stars that border on other partitions.
-    collection : Path
-        Folder of the whole store.
-    is_alone : bool
-        Whether the catalog has but one star.
+    The files say what the runs hold, and which records are of a star read before; a star that is
+    alone in the whole catalog has no neighbour.
     """
-
-    pixel: Pixel
-    beside: tuple[Pixel, ...]
-    margin_rad: float
-    index: Path
-    repeated: Path
-    catalog: Path
-    borders: Path
-    collection: Path
-    is_alone: bool
-
-
-def finish(asked: Finish) -> tuple[dict[str, Any], Digests]:
-    """Write a partition."""
-    index = read_index(asked.index)
-    repeated = _read_places(asked.repeated)
-    pixel = asked.pixel
+    index, repeated = read_index(index_path), _read_places(repeated_path)
     stars = _in_order(read_shares(index.shares(pixel), pixel.first, pixel.end))
     stars, again = _without_repeated(stars, repeated)
     files: list[Path] = []
     if len(again):
-        path = asked.collection / REPEATED / f"{pixel.order}-{pixel.number}.parquet"
+        path = plan.repeated / f"{pixel.order}-{pixel.number}.parquet"
         path.parent.mkdir(exist_ok=True)
         with placed(path) as partial:
             schema = product_schema("stars").arrow_schema
@@ -92,9 +77,9 @@ def finish(asked: Finish) -> tuple[dict[str, Any], Digests]:
     def around(reach_rad: float) -> Iterator[pa.Table]:
         return _around(index, pixel, reach_rad, repeated)
 
-    stars = add_neighbours(stars, pixel, around, asked.is_alone)
-    files += _write_borders(stars, asked)
-    path = asked.catalog / DATASET / pixel.path
+    stars = add_neighbours(stars, pixel, around, is_alone)
+    files += _write_borders(stars, plan, pixel, beside)
+    path = plan.catalog / DATASET / pixel.path
     result["map"] = _map(stars[HEALPIX_COLUMN].to_numpy())
     ordered, rows = bright_first(stars)
     write_partition(with_constants(ordered, store_schema()), rows, path)
@@ -149,11 +134,13 @@ def _map(pixels: Pixels) -> list[list[int]]:
     return [number.tolist(), count.tolist()]
 
 
-def _write_borders(stars: pa.Table, asked: Finish) -> list[Path]:
+def _write_borders(
+    stars: pa.Table, plan: StorePlan, pixel: Pixel, beside: tuple[Pixel, ...]
+) -> list[Path]:
     """Write the stars that are in the margins of other partitions: one batch for each of those."""
-    if not asked.beside:
+    if not beside:
         return []
-    path = border_path(asked.borders, asked.pixel)
+    path = border_path(plan, pixel)
     pixels = stars[HEALPIX_COLUMN].to_numpy()
     schema = store_schema()
     with (
@@ -161,8 +148,8 @@ def _write_borders(stars: pa.Table, asked: Finish) -> list[Path]:
         pa.OSFile(str(partial), "wb") as sink,
         pa.ipc.new_file(sink, schema) as writer,
     ):
-        for other in asked.beside:
-            order, border = border_of(other, asked.margin_rad)
+        for other in beside:
+            order, border = border_of(other, plan.margin_rad)
             rows = rows_within(pixels, order, border, other)
             some = with_constants(stars.take(pa.array(rows)), schema)
             batches = some.combine_chunks().to_batches()
@@ -186,36 +173,19 @@ def rows_within(pixels: Pixels, order: int, wanted: Pixels, but: Pixel) -> NDArr
     return np.asarray(rows[~inside])
 
 
-def border_path(folder: Path, pixel: Pixel) -> Path:
+def border_path(plan: StorePlan, pixel: Pixel) -> Path:
     """Return the file of the stars of a partition that border on others."""
-    return folder / f"{pixel.order}-{pixel.number}.arrow"
+    return plan.borders / f"{pixel.order}-{pixel.number}.arrow"
 
 
-@dataclass(frozen=True)
-class Margin:
-    """What is asked of a worker that writes the margin of a partition.
-
-    Attributes
-    ----------
-    pixel : Pixel
-        The partition.
-    batches : tuple of (Path, int)
-        Where its neighbours' stars are.
-    catalog : Path
-        Folder of the HATS margin catalog.
-    """
-
-    pixel: Pixel
-    batches: tuple[tuple[Path, int], ...]
-    catalog: Path
-
-
-def write_margin(asked: Margin) -> tuple[dict[str, Any], Digests]:
-    """Write the margin of a partition."""
-    stars = _read_borders(asked.batches)
+def write_margin(
+    plan: StorePlan, pixel: Pixel, batches: tuple[tuple[Path, int], ...]
+) -> tuple[dict[str, Any], Digests]:
+    """Write the margin of a partition, from batches of the files of its neighbours' stars."""
+    stars = _read_borders(batches)
     if not len(stars):
         return {"rows": 0}, {}
-    path = asked.catalog / DATASET / asked.pixel.path
+    path = plan.margin / DATASET / pixel.path
     keys = (stars["star_id"].to_numpy(), stars[HEALPIX_COLUMN].to_numpy())
     ordered = stars.take(pa.array(np.lexsort(keys)))
     write_partition(ordered, (len(stars),), path)
@@ -228,3 +198,48 @@ def _read_borders(batches: Sequence[tuple[Path, int]]) -> pa.Table:
         with pa.OSFile(str(path)) as source:
             found.append(pa.ipc.open_file(source).get_batch(number))
     return pa.Table.from_batches(found, found[0].schema).combine_chunks()
+
+
+def bright_first(stars: pa.Table) -> tuple[pa.Table, tuple[int, ...]]:
+    """Return the stars of a partition in the order in which they are written."""
+    group = _groups(floats_of(stars, "mag"))
+    order = np.argsort(group, kind="stable")
+    counts = np.bincount(group)
+    return stars.take(pa.array(order)), tuple(counts[counts > 0].tolist())
+
+
+def _groups(mag: NDArray[np.float64]) -> NDArray[np.int8]:
+    known = mag[~np.isnan(mag)]
+    ranks = [len(known) // share for share in _SHARES if len(known) // share >= _LEAST_ROWS]
+    cuts = np.partition(known, ranks)[ranks] if ranks else known[:0]
+    # A magnitude that is a limit belongs to the fainter group, however many stars have it.
+    group = np.searchsorted(cuts, mag, side="right").astype(np.int8)
+    group[np.isnan(mag)] = len(cuts) + 1
+    return group
+
+
+def write_partition(stars: pa.Table, rows: tuple[int, ...], path: Path) -> None:
+    """Write a partition, the same bytes for the same stars and library."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    begin = 0
+    encodings = _encodings(stars.schema)
+    with placed(path) as partial, pq.ParquetWriter(partial, stars.schema, **encodings) as writer:
+        for count in rows:
+            writer.write_table(stars.slice(begin, count), row_group_size=ROW_GROUP_ROWS)
+            begin += count
+
+
+def _encodings(schema: pa.Schema) -> dict[str, object]:
+    """Return how columns are encoded: numbers that ascend by their differences."""
+    texts = [f.name for f in schema if pa.types.is_string(f.type) and f.name != "designation"]
+    encoding = {f.name: "BYTE_STREAM_SPLIT" for f in schema if pa.types.is_floating(f.type)}
+    for name in (HEALPIX_COLUMN, "star_id", "source_line"):
+        encoding[name] = "DELTA_BINARY_PACKED"
+    encoding["designation"] = "DELTA_LENGTH_BYTE_ARRAY"
+    return {
+        "compression": "zstd",
+        "compression_level": 1,
+        "use_dictionary": texts,
+        "column_encoding": {name: kind for name, kind in encoding.items() if name in schema.names},
+        "write_statistics": True,
+    }

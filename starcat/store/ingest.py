@@ -18,30 +18,35 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from starcat.catalog.blocks import Reading
-from starcat.catalog.file_parts import NAMED_PROBLEMS, FileFacts
-from starcat.catalog.ingest import check_band, given_files, missing_files, star_catalog
-from starcat.catalog.readers.files import InputFile
-from starcat.catalog.repeats import check_contents
+from starcat.catalog.ingest import ingest_options
+from starcat.catalog.parts import NAMED_PROBLEMS
 from starcat.catalog.source import data_source
+from starcat.catalog.source_files import FileFacts, SourceFiles
 from starcat.errors import OutputError
 from starcat.progress import Progress, no_progress
 from starcat.storage.atomic import Outcome, move_into_place, remove_partial, writing
 from starcat.storage.digests import file_sha256
-from starcat.store.account import Written, describe_store, make_manifest
 from starcat.store.cluster import cluster, run_tasks, versions
-from starcat.store.finish import Finish, Margin, border_path, finish
-from starcat.store.finish import write_margin as make_margin
-from starcat.store.index import find_repeated, read_runs, write_index
-from starcat.store.layout import REJECTED, REPEATED
-from starcat.store.ledger import RESUME_ADVICE, Job, Work
-from starcat.store.options import StoreOptions, rows_of_a_run
+from starcat.store.finish import border_path, finish, write_margin
+from starcat.store.ledger import RESUME_ADVICE, ResumePlan, Task
+from starcat.store.metadata import Written, describe_store, make_manifest
 from starcat.store.pixels import MAX_ORDER, Pixel, border_of
-from starcat.store.plan import partition_pixels, spill_order
-from starcat.store.runs import BUCKETS, HISTOGRAM_ORDER
-from starcat.store.split import Split, is_unchanged, split
+from starcat.store.plan import (
+    StoreOptions,
+    StorePlan,
+    partition_pixels,
+    rows_of_a_run,
+    spill_order,
+)
+from starcat.store.runs import (
+    BUCKETS,
+    HISTOGRAM_ORDER,
+    find_repeated,
+    read_runs,
+    write_index,
+)
+from starcat.store.split import is_unchanged, split, split_name
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -58,23 +63,12 @@ _BYTES_A_RECORD = 40
 
 @dataclass(frozen=True)
 class Stored:
-    """A catalog store that was made.
+    """A catalog store that was made."""
 
-    Attributes
-    ----------
-    folder : Path
-        Where it is.
-    outcome : {"written", "unchanged", "replaced"}
-        What happened to the folder.
-    manifest : dict
-        The content of its ``store.json``.
-    problems, notes : tuple of str
-        The first malformed records, and what a user should know of the inputs.
-    """
-
-    folder: Path
-    outcome: Outcome
-    manifest: dict[str, Any]
+    folder: Path  # where it is
+    outcome: Outcome  # what happened to the folder
+    manifest: dict[str, Any]  # the content of its ``store.json``
+    # problems, notes: the first malformed records, and what a user should know of the inputs
     problems: tuple[str, ...]
     notes: tuple[str, ...]
 
@@ -83,32 +77,13 @@ class Stored:
 class _Ingest:
     """A run that makes a store."""
 
-    work: Work
-    name: str
-    files: Sequence[InputFile]
-    how: Reading
-    options: StoreOptions
+    plan: StorePlan
+    files: SourceFiles
     client: Client
     progress: Progress
 
-    @property
-    def store(self) -> Path:
-        return self.work / "store"
-
-    @property
-    def catalog(self) -> Path:
-        return self.store / self.name
-
-    @property
-    def margin(self) -> Path:
-        return self.store / f"{self.name}_margin"
-
-    @property
-    def margin_rad(self) -> float:
-        return float(np.radians(self.options.margin_arcsec / 3600.0))
-
     def run(
-        self, jobs: Sequence[Job], stage: str, sizes: Sequence[int], total: int | None = None
+        self, tasks: Sequence[Task], stage: str, sizes: Sequence[int], total: int | None = None
     ) -> list[dict[str, Any]]:
         """Do tasks and say how far they are, in rows.
 
@@ -122,7 +97,7 @@ class _Ingest:
             rows += result["file"]["rows"] if "file" in result else result["rows"]
             self.progress(stage, rows, total if total is not None else rows * sum(sizes) // done)
 
-        return run_tasks(self.client, Job.run, jobs, report)
+        return run_tasks(self.client, Task.run, tasks, report)
 
 
 def ingest_to_store(
@@ -138,93 +113,90 @@ def ingest_to_store(
 ) -> Stored:
     """Read a star catalog of any size into a catalog store."""
     options = options or StoreOptions()
-    source = star_catalog(source_name)
-    how = Reading(source_name, check_band(source, band), epoch_jyear, read_limit_mag)
-    files = given_files(source, paths)
+    reading = ingest_options(source_name, band, epoch_jyear, read_limit_mag)
+    files = SourceFiles.find(data_source(source_name), paths)
     rows_of_a_run(options)
-    _check_output(output, options)
-    work = Work.of(output)
-    work.begin(_all_options(files, how, options), resume=options.resume)
-    size = sum(file.path.stat().st_size for file in files)
-    is_small = size < _SMALL_BYTES
-    with cluster(options.workers, options.scheduler, is_small=is_small) as client:
-        run = _Ingest(work, output.name, files, how, options, client, progress)
-        with writing(output.absolute().parent, RESUME_ADVICE):
-            manifest, problems = _make(run)
-    progress("store", 0, None)
-    remove_partial(run.store)
-    with writing(output.absolute().parent, RESUME_ADVICE):
-        outcome = move_into_place(run.store, output.absolute(), replace=options.replace)
-    shutil.rmtree(work.folder, ignore_errors=True)
-    return Stored(output, outcome, manifest, problems, tuple(manifest["notes"]))
-
-
-def _check_output(output: Path, options: StoreOptions) -> None:
     if output.exists() and not (options.replace or options.resume):
         raise OutputError(
             f"{output} already exists; choose another --output, or pass --replace", path=output
         )
+    plan = StorePlan(ResumePlan.of(output), output.name, reading, options)
+    plan.resume.begin(_all_options(plan, files), resume=options.resume)
+    is_small = sum(files.sizes) < _SMALL_BYTES
+    with (
+        cluster(options.workers, options.scheduler, is_small=is_small) as client,
+        writing(output.absolute().parent, RESUME_ADVICE),
+    ):
+        manifest, problems = _make(_Ingest(plan, files, client, progress))
+    progress("store", 0, None)
+    remove_partial(plan.store)
+    with writing(output.absolute().parent, RESUME_ADVICE):
+        outcome = move_into_place(plan.store, output.absolute(), replace=options.replace)
+    shutil.rmtree(plan.resume.folder, ignore_errors=True)
+    return Stored(output, outcome, manifest, problems, tuple(manifest["notes"]))
 
 
-def _all_options(files: Sequence[InputFile], how: Reading, options: StoreOptions) -> dict[str, Any]:
+def _all_options(plan: StorePlan, files: SourceFiles) -> dict[str, Any]:
     """Return all that the bytes of a store depend on."""
+    reading = plan.ingest
     return {
-        "source": how.source_name,
-        "band": how.band,
-        "epoch_jyear": how.epoch_jyear,
-        "read_limit_mag": how.read_limit_mag,
-        "inputs": [str(file.path.absolute()) for file in files],
-        "max_partition_rows": options.max_partition_rows,
-        "margin_arcsec": options.margin_arcsec,
+        "source": reading.source_name,
+        "band": reading.band,
+        "epoch_jyear": reading.epoch_jyear,
+        "read_limit_mag": reading.read_limit_mag,
+        "inputs": [str(file.path.absolute()) for file in files.files],
+        "max_partition_rows": plan.options.max_partition_rows,
+        "margin_arcsec": plan.options.margin_arcsec,
         "versions": versions(),
     }
 
 
 def _make(run: _Ingest) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Go through all steps, in the hidden folder."""
-    for folder in (run.store / REJECTED, run.work / "runs"):
+    plan = run.plan
+    for folder in (plan.rejected, plan.runs):
         folder.mkdir(parents=True, exist_ok=True)
-    order = _order(run.files)
+    order = spill_order(sum(run.files.sizes) // _BYTES_A_RECORD)
     parts = _split_all(run, order)
     facts = [FileFacts(**part["file"]) for part in parts]
-    source = data_source(run.how.source_name)
-    check_contents(run.files, facts, source)
-    content = _begin_partitions(run, facts)
-    indexes = [run.work / f"runs/file-{number:05}.npz" for number in range(len(run.files))]
+    run.files.check_contents(facts)
+    content = _begin_partitions(plan, facts)
+    indexes = [plan.runs / f"{split_name(number)}.npz" for number in range(len(parts))]
     runs = [
         one
         for path, part in zip(indexes, parts, strict=True)
         for one in read_runs(path, part["runs"])
     ]
-    index = _kept(run.work / "index.npz", partial(write_index, order=order, runs=runs))
-    places = _repeated(run, index)
-    repeated = _kept(run.work / "repeated.npy", lambda path: np.save(path, places))
-    pixels = _plan(run, indexes)
+    index = _kept(plan.resume / "index.npz", partial(write_index, order=order, runs=runs))
+    found = run_tasks(run.client, find_repeated, [(index, bucket) for bucket in range(BUCKETS)])
+    places = np.sort(np.concatenate(found))
+    repeated = _kept(plan.resume / "repeated.npy", lambda path: np.save(path, places))
+    pixels = _partitions(plan, indexes)
     left = int(sum(run.rows.sum() for run in runs)) - len(places)
-    beside = bordering(pixels, run.margin_rad)
+    beside = bordering(pixels, plan.margin_rad)
     finished = _finish_all(run, beside, index, repeated, left, content)
     margins = _margins_all(run, beside, finished, content)
     partitions = list(zip(pixels, finished, strict=True))
     written = Written(parts, len(places), partitions, margins)
-    manifest = make_manifest(run.name, run.how, written, missing_files(source, run.files))
-    describe_store(run.store, run.name, manifest, written, run.options)
+    manifest = make_manifest(plan.name, plan.ingest, written, run.files.notes)
+    describe_store(plan.store, plan.name, manifest, written, plan.options)
     problems = tuple(problem for part in parts for problem in part["problems"])
     return manifest, problems[:NAMED_PROBLEMS]
 
 
-def _order(files: Sequence[InputFile]) -> int:
-    """Return the order of the coarse pixels, by the size of the inputs."""
-    return spill_order(sum(file.path.stat().st_size for file in files) // _BYTES_A_RECORD)
-
-
 def _split_all(run: _Ingest, order: int) -> list[dict[str, Any]]:
-    rows = rows_of_a_run(run.options)
-    jobs = []
-    for number, file in enumerate(run.files):
-        asked = Split(number, file, run.how, order, rows, run.work / "runs", run.store / REJECTED)
-        jobs.append(Job(run.work, asked.name, split, asked, is_unchanged))
-    sizes = [file.path.stat().st_size for file in run.files]
-    return run.run(jobs, f"rows {run.how.source_name}", sizes)
+    plan = run.plan
+    tasks = [
+        Task(
+            plan.resume,
+            split_name(number),
+            split,
+            (plan, number, file, order),
+            partial(is_unchanged, file),
+        )
+        for number, file in enumerate(run.files.files)
+    ]
+    return run.run(tasks, f"rows {plan.ingest.source_name}", run.files.sizes)
 
 
 def _kept(path: Path, write: Callable[[Path], None]) -> Path:
@@ -235,55 +207,43 @@ def _kept(path: Path, write: Callable[[Path], None]) -> Path:
     return named
 
 
-def _begin_partitions(run: _Ingest, facts: Sequence[FileFacts]) -> str:
+def _begin_partitions(plan: StorePlan, facts: Sequence[FileFacts]) -> str:
     """Return a name for the content of the inputs, and remove what was made of another."""
     names = " ".join(fact.sha256 for fact in facts)
     content = hashlib.sha256(names.encode()).hexdigest()[:12]
-    note = run.work / "content"
+    note = plan.resume / "content"
     if not note.is_file() or note.read_text() != content:
-        for folder in (run.catalog, run.margin, run.store / REPEATED, run.work / "borders"):
+        for folder in (plan.catalog, plan.margin, plan.repeated, plan.borders):
             shutil.rmtree(folder, ignore_errors=True)
         note.write_text(content)
-    for folder in (run.catalog, run.work / "borders"):
+    for folder in (plan.catalog, plan.borders):
         folder.mkdir(exist_ok=True)
     return content
 
 
-def _repeated(run: _Ingest, index: Path) -> NDArray[np.int64]:
-    """Return the records of stars that were read before."""
-    found = run_tasks(run.client, find_repeated, [(index, bucket) for bucket in range(BUCKETS)])
-    return np.sort(np.concatenate(found))
-
-
-def _plan(run: _Ingest, indexes: Sequence[Path]) -> tuple[Pixel, ...]:
+def _partitions(plan: StorePlan, indexes: Sequence[Path]) -> tuple[Pixel, ...]:
     counts = np.zeros(12 * 4**HISTOGRAM_ORDER, dtype=np.int64)
     for path in indexes:
         with np.load(path) as held:
             counts[held["pixels"]] += held["counts"]
     pixels = np.flatnonzero(counts)
-    most = run.options.max_partition_rows
-    return partition_pixels(pixels, counts[pixels], HISTOGRAM_ORDER, most, run.name)
+    most = plan.options.max_partition_rows
+    return partition_pixels(pixels, counts[pixels], HISTOGRAM_ORDER, most, plan.name)
 
 
 def _finish_all(
     run: _Ingest, beside: Bordering, index: Path, repeated: Path, rows: int, content: str
 ) -> list[dict[str, Any]]:
-    jobs = []
-    for pixel, others in beside.items():
-        asked = Finish(
-            pixel,
-            others,
-            run.margin_rad,
-            index,
-            repeated,
-            run.catalog,
-            run.work / "borders",
-            run.store,
-            is_alone=rows == 1,
+    tasks = [
+        Task(
+            run.plan.resume,
+            f"finish-{content}-{pixel.order}-{pixel.number}",
+            finish,
+            (run.plan, pixel, others, index, repeated, rows == 1),
         )
-        name = f"finish-{content}-{pixel.order}-{pixel.number}"
-        jobs.append(Job(run.work, name, finish, asked))
-    return run.run(jobs, "rows by partition", [1] * len(jobs), rows)
+        for pixel, others in beside.items()
+    ]
+    return run.run(tasks, "rows by partition", [1] * len(tasks), rows)
 
 
 def bordering(pixels: Sequence[Pixel], margin_rad: float) -> Bordering:
@@ -313,14 +273,17 @@ def _margins_all(
     batches: dict[Pixel, list[tuple[Path, int]]] = {pixel: [] for pixel in beside}
     for pixel, others in beside.items():
         for number, other in enumerate(others if pixel in has_stars else ()):
-            batches[other].append((border_path(run.work / "borders", pixel), number))
-    jobs = []
-    asked_of = [pixel for pixel in beside if batches[pixel] and pixel in has_stars]
-    for pixel in asked_of:
-        asked = Margin(pixel, tuple(batches[pixel]), run.margin)
-        name = f"margin-{content}-{pixel.order}-{pixel.number}"
-        jobs.append(Job(run.work, name, make_margin, asked))
+            batches[other].append((border_path(run.plan, pixel), number))
+    wanted = [pixel for pixel in beside if batches[pixel] and pixel in has_stars]
+    tasks = [
+        Task(
+            run.plan.resume,
+            f"margin-{content}-{pixel.order}-{pixel.number}",
+            write_margin,
+            (run.plan, pixel, tuple(batches[pixel])),
+        )
+        for pixel in wanted
+    ]
     run.progress("margins", 0, None)
-    results = run_tasks(run.client, Job.run, jobs)
-    made = zip(asked_of, results, strict=True)
-    return [(pixel, facts) for pixel, facts in made if facts["rows"]]
+    results = run_tasks(run.client, Task.run, tasks)
+    return [(pixel, facts) for pixel, facts in zip(wanted, results, strict=True) if facts["rows"]]

@@ -39,37 +39,19 @@ REPEATED = "repeated"
 
 @dataclass(frozen=True)
 class Partition:
-    """A part of the sky and the files that hold its stars.
+    """A part of the sky and the files that hold its stars."""
 
-    Attributes
-    ----------
-    pixel : Pixel
-        The part.
-    paths : tuple of Path
-        One file, in catalogs of others at times several.
-    """
-
-    pixel: Pixel
-    paths: tuple[Path, ...]
+    pixel: Pixel  # the part
+    paths: tuple[Path, ...]  # one file, in catalogs of others at times several
 
 
 @dataclass(frozen=True)
 class HatsFolder:
-    """A HATS catalog as it lies on disk.
+    """A HATS catalog as it lies on disk."""
 
-    Attributes
-    ----------
-    folder : Path
-        The folder with ``hats.properties``.
-    properties : dict of str to str
-        What that file says.
-    partitions : tuple of Partition
-        By the first pixel of order 29.
-    """
-
-    folder: Path
-    properties: dict[str, str]
-    partitions: tuple[Partition, ...]
+    folder: Path  # the folder with ``hats.properties``
+    properties: dict[str, str]  # what that file says
+    partitions: tuple[Partition, ...]  # by the first pixel of order 29
 
     @property
     def name(self) -> str:
@@ -79,21 +61,11 @@ class HatsFolder:
 
 @dataclass(frozen=True)
 class Store:
-    """A catalog store, or a HATS catalog of others.
+    """A catalog store, or a HATS catalog of others."""
 
-    Attributes
-    ----------
-    folder : Path
-        What was given.
-    catalog : HatsFolder
-        The stars.
-    margin : HatsFolder, optional
-        Each partition's neighbours across its border.
-    """
-
-    folder: Path
-    catalog: HatsFolder
-    margin: HatsFolder | None
+    folder: Path  # what was given
+    catalog: HatsFolder  # the stars
+    margin: HatsFolder | None  # each partition's neighbours across its border
 
     @property
     def margin_arcsec(self) -> float:

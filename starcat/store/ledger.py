@@ -26,9 +26,6 @@ _DONE = "done"
 Digests = dict[Path, str]
 """Files and their SHA-256."""
 
-Task = Callable[[Any], tuple[dict[str, Any], Digests]]
-"""Does something and returns its result as plain values, and the files that it wrote."""
-
 
 def digests_of(files: Iterable[Path]) -> Digests:
     """Return the digests of files."""
@@ -36,19 +33,13 @@ def digests_of(files: Iterable[Path]) -> Digests:
 
 
 @dataclass(frozen=True)
-class Work:
-    """The hidden folder of a run.
+class ResumePlan:
+    """The hidden folder of a run."""
 
-    Attributes
-    ----------
-    folder : Path
-        ``.<name>.work`` beside the final name.
-    """
-
-    folder: Path
+    folder: Path  # ``.<name>.work`` beside the final name
 
     @classmethod
-    def of(cls, final: Path) -> Work:
+    def of(cls, final: Path) -> ResumePlan:
         """Return the folder for a store."""
         return cls(final.absolute().parent / f".{final.name}.work")
 
@@ -112,42 +103,27 @@ class Work:
         return self.folder / _DONE / f"{name}.json"
 
 
-def _always(_: Any, __: dict[str, Any]) -> bool:
-    return True
-
-
 @dataclass(frozen=True)
-class Job:
-    """A task with a name, which does not do what the ledger says is done.
+class Task:
+    """A call of a function that is made once: what the ledger has is not done again.
 
-    Attributes
-    ----------
-    work : Work
-        The run that it is a part of.
-    name : str
-        Unique in the run.
-    task : callable
-        What to do.
-    asked : object
-        What to call it with.
-    is_valid : callable, optional
-        Whether the result of an earlier run still holds, of what is asked and that result.
+    The function returns its result as plain values, and the files that it wrote.
     """
 
-    work: Work
-    name: str
-    task: Task
-    asked: Any
-    is_valid: Callable[[Any, dict[str, Any]], bool] = _always
+    plan: ResumePlan
+    name: str  # unique in the run
+    function: Callable[..., tuple[dict[str, Any], Digests]]
+    arguments: tuple[Any, ...]
+    is_valid: Callable[[dict[str, Any]], bool] | None = None  # whether an earlier result holds
 
     def run(self) -> dict[str, Any]:
         """Do the task and record it, if it is not done."""
-        before = self.work.done(self.name)
-        if before is not None and self.is_valid(self.asked, before):
+        before = self.plan.done(self.name)
+        if before is not None and (self.is_valid is None or self.is_valid(before)):
             return before
-        with writing(self.work.folder.parent, RESUME_ADVICE):
-            result, written = self.task(self.asked)
-            self.work.record(self.name, result, written)
+        with writing(self.plan.folder.parent, RESUME_ADVICE):
+            result, written = self.function(*self.arguments)
+            self.plan.record(self.name, result, written)
         return result
 
 

@@ -1,18 +1,114 @@
-"""The plan of a store: which pixels are its partitions, decided by counts of stars alone."""
+"""The plan of a store: how and where it is made, and which pixels are its partitions."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.catalog.parts import IngestOptions
 from starcat.errors import ConfigError
+from starcat.store.layout import REJECTED, REPEATED
+from starcat.store.ledger import ResumePlan
 from starcat.store.pixels import Pixel, Pixels
 
 MAX_ROWS = 500_000
 """Stars of a partition at most: a worker finishes one in some 400 MB."""
 
+MARGIN_ARCSEC = 10.0
+MEMORY_BYTES = 2 << 30
+
+_BASE_BYTES = 260 << 20
+_BYTES_A_RUN_ROW = 1_000
+_BYTES_A_PARTITION_ROW = 1_000
+_RUN_ROWS = (20_000, 250_000)
 _ROWS_A_BATCH = 8_192
 _SPILL_ORDERS = (2, 6)
+
+
+@dataclass(frozen=True)
+class StoreOptions:
+    """How a store is made."""
+
+    max_partition_rows: int = MAX_ROWS  # stars that a partition may hold
+    margin_arcsec: float = MARGIN_ARCSEC  # how far the margin of a partition reaches
+    # memory of all processes together; the bytes of the store do not depend on it
+    memory_bytes: int = MEMORY_BYTES
+    workers: int = 2  # processes on this machine
+    scheduler: str | None = None  # address of a Dask cluster to use instead
+    # resume, replace: whether to go on with an unfinished run, and to replace a store that differs
+    resume: bool = False
+    replace: bool = False
+
+
+def rows_of_a_run(options: StoreOptions) -> int:
+    """Return how many stars a run may have within the memory that is allowed."""
+    each = (options.memory_bytes - _BASE_BYTES) // options.workers - _BASE_BYTES
+    needed = options.max_partition_rows * _BYTES_A_PARTITION_ROW
+    if options.scheduler is None and each < needed:
+        least = (needed + _BASE_BYTES) * options.workers + _BASE_BYTES
+        raise ConfigError(
+            f"--memory {options.memory_bytes >> 20} MiB is too little for {options.workers} "
+            f"workers and partitions of {options.max_partition_rows:,} stars, which want "
+            f"{-(-least >> 20)} MiB; allow more, or use fewer --workers or a smaller "
+            "--max-partition-rows",
+            key="memory",
+            value=options.memory_bytes,
+        )
+    least, most = _RUN_ROWS
+    return int(min(max(each // _BYTES_A_RUN_ROW, least), most))
+
+
+@dataclass(frozen=True)
+class StorePlan:
+    """What every task that makes a store knows: what is read, how, and where files go."""
+
+    resume: ResumePlan
+    name: str
+    ingest: IngestOptions
+    options: StoreOptions
+
+    @property
+    def store(self) -> Path:
+        """The store before it gets its final name."""
+        return self.resume / "store"
+
+    @property
+    def catalog(self) -> Path:
+        """Folder of the HATS catalog."""
+        return self.store / self.name
+
+    @property
+    def margin(self) -> Path:
+        """Folder of the HATS margin catalog."""
+        return self.store / f"{self.name}_margin"
+
+    @property
+    def rejected(self) -> Path:
+        """Folder of the rejected records."""
+        return self.store / REJECTED
+
+    @property
+    def repeated(self) -> Path:
+        """Folder of the records whose star was read before."""
+        return self.store / REPEATED
+
+    @property
+    def runs(self) -> Path:
+        """Folder of the runs."""
+        return self.resume / "runs"
+
+    @property
+    def borders(self) -> Path:
+        """Folder of the stars that are in the margins of other partitions."""
+        return self.resume / "borders"
+
+    @property
+    def margin_rad(self) -> float:
+        """How far the margin of a partition reaches."""
+        return float(np.radians(self.options.margin_arcsec / 3600.0))
 
 
 def partition_pixels(

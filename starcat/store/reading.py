@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,26 +19,18 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from starcat.catalog.blocks import Reading, join_parts
-from starcat.catalog.file_parts import NAMED_PROBLEMS, FileFacts
-from starcat.catalog.ingest import (
-    Ingested,
-    check_balance,
-    check_band,
-    ingest,
-    star_catalog,
-    unmoved_stars,
-)
-from starcat.catalog.nearest import add_nearest_neighbours
-from starcat.catalog.readers.files import map_in_order
-from starcat.catalog.stars import floats_of, move_to_epoch, with_columns
+from starcat.catalog.ingest import Ingested, StarTables, ingest, ingest_options, ingested
+from starcat.catalog.parts import NAMED_PROBLEMS, IngestOptions
+from starcat.catalog.readers.blocks import map_in_order
+from starcat.catalog.source_files import FileFacts
+from starcat.catalog.stars import add_nearest_neighbours, floats_of, move_to_epoch, with_columns
 from starcat.catalog.verdict import Reason
 from starcat.errors import ConfigError, ProductError, SchemaError, SchemaVersionError
 from starcat.progress import Progress, no_progress
 from starcat.storage.digests import file_sha256
 from starcat.storage.schema import product_schema
-from starcat.store.account import MANIFEST_VERSION
 from starcat.store.layout import MANIFEST_NAME, REJECTED, REPEATED, Store, is_store, open_store
+from starcat.store.metadata import MANIFEST_VERSION
 
 NEEDED = ("star_id", "ra_deg", "dec_deg", "epoch_jyear", "mag")
 """Columns that a catalog of others must have; ``band`` is taken for the one asked for."""
@@ -74,78 +66,49 @@ def read_catalog(
             key="input",
             value=[str(path) for path in paths],
         )
-    wanted = check_band(star_catalog(source_name), band)
-    how = Reading(source_name, wanted, epoch_jyear, read_limit_mag)
-    read = _read_store(open_store(paths[0]), how, workers, progress)
-    check_balance(read)
+    options = ingest_options(source_name, band, epoch_jyear, read_limit_mag)
+    read = _read_store(open_store(paths[0]), options, workers, progress)
     return replace(read, stars=add_nearest_neighbours(read.stars, workers)) if neighbours else read
 
 
-@dataclass
-class _Found:
-    """What has been read of a store so far."""
-
-    stars: list[pa.Table] = field(default_factory=list)
-    rejected: list[pa.Table] = field(default_factory=list)
-    beyond: int = 0
-
-
-def _read_store(store: Store, how: Reading, workers: int, progress: Progress) -> Ingested:
+def _read_store(store: Store, options: IngestOptions, workers: int, progress: Progress) -> Ingested:
     manifest = read_manifest(store)
     if manifest is not None:
-        _check_made_for(store, manifest, how)
-    stage = f"rows {how.source_name}"
+        _check_made_for(store, manifest, options)
+    stage = f"rows {options.source_name}"
     partitions = [(number, path) for number, path in enumerate(_paths(store))]
-    found = _Found()
+    found = StarTables()
 
     def read(numbered: tuple[int, Path]) -> tuple[pa.Table, int]:
-        return _bright_rows(*numbered, how, is_ours=manifest is not None)
+        return _bright_rows(*numbered, options, is_ours=manifest is not None)
 
     done = 0
     rows = [0] * len(partitions)
     for (number, _), (stars, beyond) in zip(
         partitions, map_in_order(read, iter(partitions), workers), strict=True
     ):
-        found.stars.append(stars)
-        found.beyond += beyond
+        found.add(stars, counted=beyond)
         rows[number] = len(stars) + beyond
         done += rows[number]
         progress(stage, done, None if manifest is None else manifest["kept"])
     if manifest is not None:
         # What is beyond the limit of the store itself was only counted when it was made.
-        found.beyond += manifest["rejected"].get(Reason.beyond_read_limit.name, 0)
-        _read_beside(store, how, found)
+        found.counted += manifest["rejected"].get(Reason.beyond_read_limit.name, 0)
+        _read_beside(store, options, found)
         files = tuple(FileFacts(**file) for file in manifest["files"])
     else:
         files = _own_files(store, [path for _, path in partitions], rows)
-    return _joined(found, how, files, manifest)
-
-
-def _joined(
-    found: _Found,
-    how: Reading,
-    files: tuple[FileFacts, ...],
-    manifest: dict[str, Any] | None,
-) -> Ingested:
-    """Return what was read as reading the archive's files returns it."""
-    rejected = product_schema("rejected").arrow_schema.empty_table()
-    stars, left_out = join_parts(found.stars, [rejected, *found.rejected])
+    stars, rejected = found.joined()
     if manifest is None or manifest["epoch_jyear"] is None:
-        stars = _moved(stars, how.epoch_jyear)
-    product_schema("stars").check(stars)
-    malformed = left_out.filter(pc.equal(left_out["reason"], Reason.malformed_record.name))
+        stars = _moved(stars, options.epoch_jyear)
+    malformed = rejected.filter(pc.equal(rejected["reason"], Reason.malformed_record.name))
     malformed = malformed.sort_by([("source_file", "ascending"), ("source_line", "ascending")])
-    problems = tuple(
+    problems = [
         f"{files[row['source_file']].name} {row['detail']}"
         for row in malformed.slice(0, NAMED_PROBLEMS).to_pylist()
-    )
-    notes = (
-        *(manifest or {}).get("notes", ()),
-        *unmoved_stars(how.source_name, stars, how.epoch_jyear),
-    )
-    return Ingested(
-        how.source_name, how.band, stars, left_out, files, problems, notes, found.beyond
-    )
+    ]
+    notes = (manifest or {}).get("notes", ())
+    return ingested(options, stars, rejected, found.counted, files, problems, notes)
 
 
 def read_manifest(store: Store) -> dict[str, Any] | None:
@@ -176,49 +139,41 @@ def read_manifest(store: Store) -> dict[str, Any] | None:
     return manifest
 
 
-def _check_made_for(store: Store, manifest: dict[str, Any], how: Reading) -> None:
+def _check_made_for(store: Store, manifest: dict[str, Any], options: IngestOptions) -> None:
     """Check that a store was made of what a build asks for."""
-    limit = manifest["read_limit_mag"]
-    kept = [
-        ("source", manifest["source"], how.source_name, manifest["source"] == how.source_name),
-        ("band", manifest["band"], how.band, manifest["band"] == how.band),
-        (
-            "epoch_jyear",
-            manifest["epoch_jyear"],
-            how.epoch_jyear,
-            manifest["epoch_jyear"] in (None, how.epoch_jyear),
-        ),
-        (
-            "read_limit_mag",
-            limit,
-            how.read_limit_mag,
-            limit is None or (how.read_limit_mag is not None and how.read_limit_mag <= limit),
-        ),
-    ]
-    for key, has, asked, fits in kept:
-        if not fits:
-            option = f" --band '{how.band}'" if key == "band" else ""
-            raise ConfigError(
-                f"{store.folder}: the store has {key} {has}, {asked} is asked for; make one that "
-                f"fits with 'starcat ingest {how.source_name} --to hats{option} -o DIR'",
-                key=key,
-                value=has,
-            )
+    limit, wanted = manifest["read_limit_mag"], options.read_limit_mag
+    fits = {
+        "source": manifest["source"] == options.source_name,
+        "band": manifest["band"] == options.band,
+        "epoch_jyear": manifest["epoch_jyear"] in (None, options.epoch_jyear),
+        "read_limit_mag": limit is None or (wanted is not None and wanted <= limit),
+    }
+    for key in (key for key, does in fits.items() if not does):
+        asked = options.source_name if key == "source" else getattr(options, key)
+        option = f" --band '{options.band}'" if key == "band" else ""
+        raise ConfigError(
+            f"{store.folder}: the store has {key} {manifest[key]}, {asked} is asked for; make one "
+            f"that fits with 'starcat ingest {options.source_name} --to hats{option} -o DIR'",
+            key=key,
+            value=manifest[key],
+        )
 
 
 def _paths(store: Store) -> list[Path]:
     return [path for partition in store.catalog.partitions for path in partition.paths]
 
 
-def _bright_rows(number: int, path: Path, how: Reading, *, is_ours: bool) -> tuple[pa.Table, int]:
-    """Return a file's stars within the limit, and how many are beyond it."""
+def _bright_rows(
+    number: int, path: Path, options: IngestOptions, *, is_ours: bool
+) -> tuple[pa.Table, int]:
+    """Return a file's stars within the limit, and options many are beyond it."""
     names = product_schema("stars").arrow_schema.names
     try:
         with pq.ParquetFile(path) as file:
             has = file.schema_arrow.names
             _check_columns(path, has)
             columns = [name for name in names if name in has and not name.startswith("nearest_")]
-            groups = _groups_within(file, how.read_limit_mag)
+            groups = _groups_within(file, options.read_limit_mag)
             table = file.read_row_groups(groups, columns, use_threads=False)
             table = table.replace_schema_metadata(None)
             total = file.metadata.num_rows
@@ -226,9 +181,9 @@ def _bright_rows(number: int, path: Path, how: Reading, *, is_ours: bool) -> tup
         raise ProductError(
             f"{path}: cannot be read as Parquet ({error}); get the catalog again", path=path
         ) from error
-    if how.read_limit_mag is not None:
-        table = table.filter(pc.less_equal(table["mag"], how.read_limit_mag))
-    return _as_stars(table, number, how, is_ours=is_ours), total - len(table)
+    if options.read_limit_mag is not None:
+        table = table.filter(pc.less_equal(table["mag"], options.read_limit_mag))
+    return _as_stars(table, number, options, is_ours=is_ours), total - len(table)
 
 
 def _groups_within(file: pq.ParquetFile, limit: float | None) -> list[int]:
@@ -259,13 +214,13 @@ def _check_columns(path: Path, has: Sequence[str]) -> None:
         )
 
 
-def _as_stars(table: pa.Table, number: int, how: Reading, *, is_ours: bool) -> pa.Table:
+def _as_stars(table: pa.Table, number: int, options: IngestOptions, *, is_ours: bool) -> pa.Table:
     """Return rows as a table of the stars schema, with what a catalog of others lacks."""
     schema = product_schema("stars").arrow_schema
     count = len(table)
     given: dict[str, Any] = {
-        "catalog": pa.repeat(how.source_name, count),
-        "band": pa.repeat(how.band, count),
+        "catalog": pa.repeat(options.source_name, count),
+        "band": pa.repeat(options.band, count),
         "source_file": pa.repeat(pa.scalar(number, pa.int32()), count),
         "source_line": pa.array(np.arange(1, count + 1)),
         "quality_flags": pa.repeat(pa.scalar(0, pa.int32()), count),
@@ -286,7 +241,7 @@ def _as_stars(table: pa.Table, number: int, how: Reading, *, is_ours: bool) -> p
             columns.append(table[wanted.name].cast(wanted.type))
         elif wanted.name == "designation":
             words = table["star_id"].cast(pa.string())
-            columns.append(pc.binary_join_element_wise(how.source_name, words, " "))
+            columns.append(pc.binary_join_element_wise(options.source_name, words, " "))
         elif wanted.name in ("x", "y", "z"):
             columns.append(pa.array(np.zeros(count)))  # move_to_epoch fills them in
         else:
@@ -302,27 +257,26 @@ def _moved(stars: pa.Table, epoch_jyear: float | None) -> pa.Table:
     return with_columns(stars, move_to_epoch(columns, epoch_jyear))
 
 
-def _read_beside(store: Store, how: Reading, found: _Found) -> None:
+def _read_beside(store: Store, options: IngestOptions, found: StarTables) -> None:
     """Read rejected records, and those whose star was read before."""
-    limit = how.read_limit_mag
+    limit = options.read_limit_mag
     for path in sorted((store.folder / REPEATED).glob("*.parquet")):
         again = pq.read_table(path)
+        total = len(again)
         if limit is not None:
-            within = again.filter(pc.less_equal(again["mag"], limit))
-            found.beyond += len(again) - len(within)
-            again = within
-        found.stars.append(_as_stars(again, 0, how, is_ours=True))
+            again = again.filter(pc.less_equal(again["mag"], limit))
+        found.add(_as_stars(again, 0, options, is_ours=True), counted=total - len(again))
     for path in sorted((store.folder / REJECTED).glob("*.parquet")):
         rejected = pq.read_table(path, schema=product_schema("rejected").arrow_schema)
+        total = len(rejected)
         if limit is not None:
             listed = pc.or_(
                 pc.fill_null(pc.less_equal(rejected["mag"], limit), False),
                 pc.equal(rejected["reason"], Reason.malformed_record.name),
             )
-            found.beyond += len(rejected)
             rejected = rejected.filter(listed)
-            found.beyond -= len(rejected)
         found.rejected.append(rejected)
+        found.counted += total - len(rejected)
 
 
 def _own_files(store: Store, paths: Sequence[Path], rows: Sequence[int]) -> tuple[FileFacts, ...]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,15 @@ from numpy.typing import NDArray
 from starcat.catalog.stars import floats_of
 from starcat.storage.atomic import placed
 from starcat.storage.schema import product_schema
-from starcat.store.pixels import HEALPIX_COLUMN, Pixels, healpix_29, pixel_field, runs_of
+from starcat.store.pixels import (
+    HEALPIX_COLUMN,
+    Pixel,
+    Pixels,
+    at_order,
+    healpix_29,
+    pixel_field,
+    runs_of,
+)
 
 BUCKETS = 64
 HISTOGRAM_ORDER = 9
@@ -44,39 +53,23 @@ PLACES = np.dtype([("star_id", np.int64), ("place", np.int64)])
 
 @dataclass(frozen=True)
 class Run:
-    """A run on disk.
+    """A run on disk."""
 
-    Attributes
-    ----------
-    stars, places : Path
-        Arrow file of the stars; file of `PLACES`, by bucket.
-    pixels, rows : ndarray of int64, shape (B,)
-        Coarse pixel and number of stars of each batch.
-    buckets : ndarray of int64, shape (BUCKETS + 1,)
-        Where each bucket begins in ``places``.
-    """
-
+    # stars, places: arrow file of the stars; file of `PLACES`, by bucket
     stars: Path
     places: Path
+    # pixels, rows: shape (B,): coarse pixel and number of stars of each batch
     pixels: Pixels
     rows: NDArray[np.int64]
-    buckets: NDArray[np.int64]
+    buckets: NDArray[np.int64]  # shape (BUCKETS + 1,): where each bucket begins in ``places``
 
 
 @dataclass(frozen=True)
 class Share:
-    """The batches of a run that a partition reads.
+    """The batches of a run that a partition reads."""
 
-    Attributes
-    ----------
-    stars : Path
-        Arrow file of the run.
-    batches : tuple of int
-        Their numbers, ascending.
-    """
-
-    stars: Path
-    batches: tuple[int, ...]
+    stars: Path  # arrow file of the run
+    batches: tuple[int, ...]  # their numbers, ascending
 
 
 def places_of(stars: pa.Table) -> NDArray[np.int64]:
@@ -222,3 +215,86 @@ def with_constants(stars: pa.Table, schema: pa.Schema) -> pa.Table:
 
 def _constant(value: Any, count: int, kind: pa.DataType) -> pa.Array:
     return pa.nulls(count, kind) if value is None else pa.repeat(pa.scalar(value, kind), count)
+
+
+@dataclass(frozen=True)
+class RunIndex:
+    """Batches by coarse pixel."""
+
+    order: int  # order of the coarse pixels
+    paths: tuple[Path, ...]  # arrow files of the runs
+    pixels: Pixels  # shape (B,): coarse pixel of each batch, ascending
+    # runs, batches: shape (B,): number of its run, and its number in the run
+    runs: NDArray[np.int64]
+    batches: NDArray[np.int64]
+    # shape (R, BUCKETS + 1): where each bucket of numbers begins in the places of each run
+    buckets: NDArray[np.int64]
+
+    def shares(self, pixel: Pixel) -> list[Share]:
+        """Return the batches that hold the stars of a pixel."""
+        return self.shares_of(pixel.order, np.array([pixel.number]))
+
+    def shares_of(self, order: int, pixels: Pixels) -> list[Share]:
+        """Return the batches that hold the stars of several pixels."""
+        coarse = at_order(order, pixels, self.order)
+        begins = np.searchsorted(self.pixels, coarse)
+        ends = np.searchsorted(self.pixels, coarse, side="right")
+        ranges = [np.arange(b, e) for b, e in zip(begins, ends, strict=True) if e > b]
+        if not ranges:
+            return []
+        rows = np.concatenate(ranges)
+        shares: list[Share] = []
+        for run in np.unique(self.runs[rows]).tolist():
+            batches = np.sort(self.batches[rows[self.runs[rows] == run]])
+            shares.append(Share(self.paths[run], tuple(batches.tolist())))
+        return shares
+
+
+def read_runs(path: Path, count: int) -> list[Run]:
+    """Read what the runs of a file hold."""
+    with np.load(path) as held:
+        return [
+            Run(
+                path.with_name(f"{path.stem}-{k:04}.arrow"),
+                path.with_name(f"{path.stem}-{k:04}.places"),
+                held[f"batches{k}"],
+                held[f"rows{k}"],
+                held[f"buckets{k}"],
+            )
+            for k in range(count)
+        ]
+
+
+def write_index(path: Path, order: int, runs: Sequence[Run]) -> None:
+    """Write the index of all runs."""
+    empty = np.empty(0, dtype=np.int64)
+    pixels = np.concatenate([empty, *(run.pixels for run in runs)])
+    number = np.repeat(np.arange(len(runs)), [len(run.pixels) for run in runs])
+    batch = np.concatenate([empty, *(np.arange(len(run.pixels)) for run in runs)])
+    ascending = np.argsort(pixels, kind="stable")
+    np.savez(
+        path,
+        order=order,
+        paths=np.array([str(run.stars) for run in runs], dtype=np.str_),
+        pixels=pixels[ascending],
+        runs=number[ascending],
+        batches=batch[ascending],
+        buckets=np.array([run.buckets for run in runs]).reshape(len(runs), BUCKETS + 1),
+    )
+
+
+@lru_cache(maxsize=2)
+def read_index(path: Path) -> RunIndex:
+    """Read the index of all runs; a worker does so once."""
+    with np.load(path) as held:
+        paths = tuple(Path(text) for text in held["paths"].tolist())
+        names = ("pixels", "runs", "batches", "buckets")
+        return RunIndex(int(held["order"]), paths, *(held[name] for name in names))
+
+
+def find_repeated(asked: tuple[Path, int]) -> NDArray[np.int64]:
+    """Return the records of a bucket of numbers whose star was read before."""
+    index = read_index(asked[0])
+    ranges = index.buckets[:, asked[1] : asked[1] + 2].tolist()
+    files = [path.with_suffix(".places") for path in index.paths]
+    return repeated_places(list(zip(files, ranges, strict=True)))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections import Counter
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,59 +13,27 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from starcat.catalog.blocks import Part, Reading
-from starcat.catalog.file_parts import FileReading
 from starcat.catalog.ingest import count_by_reason
-from starcat.catalog.readers.files import InputFile
+from starcat.catalog.parts import FileReading, merged, parse_block, read_files
 from starcat.catalog.source import data_source
+from starcat.catalog.source_files import InputFile
 from starcat.catalog.verdict import Reason
 from starcat.storage.atomic import placed
 from starcat.storage.digests import file_sha256
 from starcat.storage.schema import product_schema
 from starcat.store.ledger import Digests, digests_of
 from starcat.store.pixels import runs_of
+from starcat.store.plan import StorePlan, rows_of_a_run
 from starcat.store.runs import HISTOGRAM_ORDER, Run, write_run
-
-
-@dataclass(frozen=True)
-class Split:
-    """What is asked of a worker that splits a file.
-
-    Attributes
-    ----------
-    number : int
-        Number of the file among the inputs.
-    file : InputFile
-        The file.
-    how : Reading
-        Which catalog, band, epoch and limit.
-    order : int
-        Order of the coarse pixels of the runs.
-    run_rows : int
-        Stars of a run: what is held in memory.
-    runs, rejected : Path
-        Folders for the runs, and for the rejected records.
-    """
-
-    number: int
-    file: InputFile
-    how: Reading
-    order: int
-    run_rows: int
-    runs: Path
-    rejected: Path
-
-    @property
-    def name(self) -> str:
-        """What its files are called."""
-        return f"file-{self.number:05}"
 
 
 @dataclass
 class _Written:
     """What has been written of a file so far."""
 
-    asked: Split
+    plan: StorePlan
+    name: str  # of its files
+    order: int  # of the coarse pixels of runs
     runs: list[Run] = field(default_factory=list)
     pixels: list[Any] = field(default_factory=list)
     files: list[Path] = field(default_factory=list)
@@ -73,8 +42,8 @@ class _Written:
 
     def stars(self, stars: pa.Table) -> None:
         """Write a run, and count its stars by pixel."""
-        name = f"{self.asked.name}-{len(self.runs):04}"
-        run, pixels = write_run(stars, self.asked.order, self.asked.runs, name)
+        name = f"{self.name}-{len(self.runs):04}"
+        run, pixels = write_run(stars, self.order, self.plan.runs, name)
         self.runs.append(run)
         fine, _, counts = runs_of(pixels, HISTOGRAM_ORDER)
         self.pixels.append((fine, counts))
@@ -82,7 +51,7 @@ class _Written:
 
     def rejected(self, rejected: pa.Table) -> None:
         """Append to the file's rejected records, in the order of their lines."""
-        path = self.asked.rejected / f"{self.asked.name}.parquet"
+        path = self.plan.rejected / f"{self.name}.parquet"
         if self.writer is None:
             schema = product_schema("rejected").arrow_schema
             partial = self.closing.enter_context(placed(path))
@@ -93,7 +62,7 @@ class _Written:
 
     def index(self) -> Path:
         """Write what the runs hold: batches, buckets and counts by pixel."""
-        path = self.asked.runs / f"{self.asked.name}.npz"
+        path = self.plan.runs / f"{self.name}.npz"
         pixels = np.concatenate([found for found, _ in self.pixels] or [np.empty(0, np.int64)])
         counts = np.concatenate([count for _, count in self.pixels] or [np.empty(0, np.int64)])
         fine, place = np.unique(pixels, return_inverse=True)
@@ -109,63 +78,40 @@ class _Written:
         return path
 
 
-def split(asked: Split) -> tuple[dict[str, Any], Digests]:
-    """Split a file."""
-    (asked.rejected / f"{asked.name}.parquet").unlink(missing_ok=True)
-    written = _Written(asked)
-    reading = FileReading(asked.file, asked.number, data_source(asked.how.source_name), asked.how)
-    counts: dict[str, int] = {}
+def split(
+    plan: StorePlan, number: int, file: InputFile, order: int
+) -> tuple[dict[str, Any], Digests]:
+    """Split the input with a number into runs, which have batches by pixels of an order."""
+    written = _Written(plan, split_name(number), order)
+    (plan.rejected / f"{written.name}.parquet").unlink(missing_ok=True)
+    reading = FileReading(file, number, data_source(plan.ingest.source_name))
+    parse = partial(parse_block, options=plan.ingest)
+    counts: Counter[str] = Counter()
     with written.closing:
-        for stars, rejected in _joined(_counted(reading, counts), asked.run_rows):
-            if len(stars):
-                written.stars(stars)
-            if len(rejected):
-                written.rejected(rejected)
+        for _, parts in read_files([reading], parse):
+            for part in merged(parts, rows_of_a_run(plan.options)):
+                counts.update(count_by_reason(part.rejected, part.counted))
+                if len(part.stars):
+                    written.stars(part.stars)
+                if len(part.rejected):
+                    written.rejected(part.rejected)
     kept = sum(int(run.rows.sum()) for run in written.runs)
-    facts = reading.facts
     result = {
-        "file": {
-            "name": facts.name,
-            "sha256": facts.sha256,
-            "bytes": facts.bytes,
-            "rows": facts.rows,
-        },
+        "file": asdict(reading.facts),
         "kept": kept,
         "rejected": {r.name: counts[r.name] for r in Reason if counts.get(r.name)},
-        "problems": list(reading.problems),
+        "problems": list(reading.named_problems),
         "runs": len(written.runs),
     }
     written.index()
     return result, digests_of(written.files)
 
 
-def is_unchanged(asked: Split, result: dict[str, Any]) -> bool:
+def split_name(number: int) -> str:
+    """Return what the files of an input are called."""
+    return f"file-{number:05}"
+
+
+def is_unchanged(file: InputFile, result: dict[str, Any]) -> bool:
     """Return whether a file is still what it was when it was split."""
-    return bool(file_sha256(asked.file.path) == result["file"]["sha256"])
-
-
-def _counted(parts: Iterable[Part], counts: dict[str, int]) -> Iterator[Part]:
-    """Count rejected records by reason as they come."""
-    for part in parts:
-        for name, count in count_by_reason(part.rejected, part.counted).items():
-            counts[name] = counts.get(name, 0) + count
-        yield part
-
-
-def _joined(parts: Iterable[Part], rows: int) -> Iterator[tuple[pa.Table, pa.Table]]:
-    """Join blocks until there are about so many rows."""
-    held: list[Part] = []
-    for part in parts:
-        held.append(replace(part, problems=[]))
-        if sum(len(each.stars) + len(each.rejected) for each in held) >= rows:
-            yield _tables(held)
-            held = []
-    if held:
-        yield _tables(held)
-
-
-def _tables(parts: list[Part]) -> tuple[pa.Table, pa.Table]:
-    return (
-        pa.concat_tables([part.stars for part in parts]),
-        pa.concat_tables([part.rejected for part in parts]),
-    )
+    return bool(file_sha256(file.path) == result["file"]["sha256"])

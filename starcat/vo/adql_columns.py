@@ -16,18 +16,10 @@ Columns = tuple[Column, ...]
 
 @dataclass(frozen=True)
 class Source:
-    """Something that stands after FROM.
+    """Something that stands after FROM."""
 
-    Attributes
-    ----------
-    name : str
-        Its alias, or the name of the table; lower case, empty where it has none.
-    columns : tuple of Column, optional
-        None where they are not known.
-    """
-
-    name: str
-    columns: Columns | None
+    name: str  # its alias, or the name of the table; lower case, empty where it has none
+    columns: Columns | None  # none where they are not known
 
 
 class Names:

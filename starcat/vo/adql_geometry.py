@@ -38,22 +38,15 @@ from starcat.vo.adql_terms import (
     times,
 )
 
-MARGIN_DEG = 1e-9
-"""By how much the band of declinations is wider that is looked at first."""
-
+MARGIN_DEG = 1e-9  # by how much the band of declinations is wider that is looked at first
 SQUARE_DEGREES = (180.0 / math.pi) ** 2
 
 
 @dataclass(frozen=True)
 class Point:
-    """A place.
+    """A place."""
 
-    Attributes
-    ----------
-    lon, lat : str
-        SQL of right ascension and declination, degrees.
-    """
-
+    # SQL of right ascension and declination, degrees.
     lon: str
     lat: str
 
@@ -80,18 +73,10 @@ class Point:
 
 @dataclass(frozen=True)
 class Circle:
-    """All places that are no farther from a centre than a radius.
+    """All places that are no farther from a centre than a radius."""
 
-    Attributes
-    ----------
-    centre : Point
-        Its centre.
-    radius : str
-        SQL of the radius, degrees.
-    """
-
-    centre: Point
-    radius: str
+    centre: Point  # its centre
+    radius: str  # SQL of the radius, degrees
 
     @property
     def value(self) -> str:
@@ -101,18 +86,10 @@ class Circle:
 
 @dataclass(frozen=True)
 class Polygon:
-    """What great circles between corners enclose.
+    """What great circles between corners enclose."""
 
-    Attributes
-    ----------
-    corners : tuple of Point
-        Three or more.
-    centre : Point, optional
-        The middle, if it was made from that.
-    """
-
-    corners: tuple[Point, ...]
-    centre: Point | None = None
+    corners: tuple[Point, ...]  # three or more
+    centre: Point | None = None  # the middle, if it was made from that
 
     @property
     def value(self) -> str:

@@ -8,11 +8,12 @@ Simple Cone Search 1.03, IVOA Recommendation, February 2008.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from starcat.errors import ConfigError, TargetMissing, quoted
+from starcat.exchange.columns import described, field_facts
 from starcat.exchange.formats import Format, response_format
 from starcat.exchange.votable_fields import error_document
 from starcat.query.names import quoted as sql_text
@@ -27,12 +28,10 @@ SEPARATION = "separation_deg"
 MEDIA_TYPE = "text/xml;content=x-votable"
 """What errors and, where no format is asked for, answers are sent as."""
 
-NAMES = ("designation", "star_id")
-"""Columns that tell a star from others, the best first."""
+NAMES = ("designation", "star_id")  # columns that tell a star from others, the best first
 
 _ID, _RA, _DEC = "ID_MAIN", "POS_EQ_RA_MAIN", "POS_EQ_DEC_MAIN"
-_BESIDE = ("band",)
-"""Columns without a UCD that belong to one that has it."""
+_BESIDE = ("band",)  # columns without a UCD that belong to one that has it
 
 _BRIEF, _USUAL, _ALL = 1, 2, 3
 _RANGES = {"RA": (0.0, 360.0), "DEC": (-90.0, 90.0), "SR": (0.0, 180.0)}
@@ -40,31 +39,16 @@ _RANGES = {"RA": (0.0, 360.0), "DEC": (-90.0, 90.0), "SR": (0.0, 180.0)}
 
 @dataclass(frozen=True)
 class ConeRequest:
-    """A circle on the sky, and what is wanted of the stars in it.
+    """A circle on the sky, and what is wanted of the stars in it."""
 
-    Attributes
-    ----------
-    ra_deg, dec_deg : float
-        Its centre, ICRS.
-    radius_deg : float
-        Its radius; 0 asks for the columns only.
-    verbosity : int
-        1 for identity and place, 2 for all columns with a UCD, 3 for all.
-    maxrec : int, optional
-        Rows at most; None where that is not said.
-    form : Format
-        How the answer is written.
-    media_type : str
-        What it is sent as.
-    """
-
+    # Its centre, ICRS.
     ra_deg: float
     dec_deg: float
-    radius_deg: float
-    verbosity: int
-    maxrec: int | None
-    form: Format
-    media_type: str
+    radius_deg: float  # its radius; 0 asks for the columns only
+    verbosity: int  # 1 for identity and place, 2 for all columns with a UCD, 3 for all
+    maxrec: int | None  # rows at most; None where that is not said
+    form: Format  # how the answer is written
+    media_type: str  # what it is sent as
 
 
 def cone_request(parameters: Iterable[tuple[str, str]]) -> ConeRequest:
@@ -110,22 +94,13 @@ def cone_query(view: View, asked: ConeRequest, maxrec: int) -> str:
 
 def with_ucds(batches: pa.RecordBatchReader, view: View) -> pa.RecordBatchReader:
     """Return rows whose columns have the UCDs that the standard asks for."""
-    import pyarrow as pa
-
     ra, dec = view.position or POSITION
     ucds = {_name_of(view): _ID, ra: _RA, dec: _DEC, SEPARATION: "pos.angDistance"}
-    schema = pa.schema(
-        field.with_metadata({**(field.metadata or {}), b"ucd": ucds[field.name].encode()})
-        if field.name in ucds
-        else field
+    facts = (
+        {**field_facts(field), "ucd": ucds[field.name]} if field.name in ucds else None
         for field in batches.schema
     )
-
-    def rows() -> Iterator[pa.RecordBatch]:
-        for batch in batches:
-            yield pa.record_batch(batch.columns, schema=schema)
-
-    return pa.RecordBatchReader.from_batches(schema, rows())
+    return described(batches, facts)
 
 
 def cone_error(text: str) -> bytes:

@@ -1,4 +1,4 @@
-"""What a TAP service tells of itself: VOSI's documents, and errors as VOTable.
+"""What a TAP service tells of itself: VOSI's documents, DALI's examples, errors as VOTable.
 
 The XML is that of vo-models, which has the elements of each schema in their order.
 
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import datetime
+from html import escape as html_escape
 from typing import Any, Literal, TypeVar
 from xml.sax.saxutils import escape
 
@@ -37,9 +38,11 @@ from vo_models.vosi.capabilities.models import VOSICapabilities
 from vo_models.vosi.tables.models import VOSITable, VOSITableSet
 
 from starcat.exchange.formats import TAP_FORMATS
-from starcat.vo.adql import GEOMETRY
-from starcat.vo.adql_functions import USER_FUNCTIONS
+from starcat.query.targets import POSITION
+from starcat.vo.adql import USER_FUNCTIONS
+from starcat.vo.adql_shapes import GEOMETRY
 from starcat.vo.tables import Column, Schema, Table, Tables, adql_name, full_name
+from starcat.vo.tap_schema import NAME
 from starcat.vo.uws import xml_text
 
 MEDIA_TYPE = "application/xml"
@@ -66,18 +69,12 @@ they read know no name for it yet."""
 
 @dataclass(frozen=True)
 class ServiceLimits:
-    """What the service grants.
+    """What the service grants."""
 
-    Attributes
-    ----------
-    run_s, keep_s : int
-        Seconds that a query may take, and that its answer is kept.
-    rows, upload_bytes : int
-        Rows of an answer, and bytes of an upload at most.
-    """
-
+    # Seconds that a query may take, and that its answer is kept.
     run_s: int
     keep_s: int
+    # Rows of an answer, and bytes of an upload at most.
     rows: int
     upload_bytes: int
 
@@ -253,3 +250,65 @@ def _utc(time: datetime) -> str:
 def _document(model: BaseXmlModel) -> bytes:
     found = model.to_xml(skip_empty=True, encoding="UTF-8", xml_declaration=True)
     return found if isinstance(found, bytes) else found.encode()
+
+
+def examples(tables: Tables) -> list[tuple[str, str, str]]:
+    """Return queries that run on the tables that there are."""
+    found = [
+        (
+            "tables",
+            "All tables, with what a row of each is",
+            f"SELECT table_name, description FROM {NAME}.tables ORDER BY table_name",
+        )
+    ]
+    with_places = [table for table in tables if _has(table, *POSITION, "mag")]
+    # What was rejected has places too.
+    stars = min(with_places, key=lambda table: table.name != "stars", default=None)
+    if stars is not None:
+        name = full_name(stars)
+        place = ", ".join(map(adql_name, POSITION))
+        found += [
+            (
+                "cone",
+                "Stars within 10 degrees of a place, the brightest first",
+                f"SELECT *, DISTANCE(POINT('ICRS', {place}), POINT('ICRS', 83.6, -5.4)) "
+                f"AS separation_deg FROM {name} "
+                f"WHERE 1 = CONTAINS(POINT('ICRS', {place}), CIRCLE('ICRS', 83.6, -5.4, 10)) "
+                "ORDER BY mag",
+            ),
+            (
+                "polygon",
+                "Stars within a polygon",
+                f"SELECT TOP 100 * FROM {name} "
+                f"WHERE 1 = CONTAINS(POINT('ICRS', {place}), "
+                "POLYGON('ICRS', 70, -20, 110, -20, 90, 20))",
+            ),
+            (
+                "counts",
+                "Stars by whole magnitudes",
+                f"SELECT magnitude, COUNT(*) AS stars FROM (SELECT FLOOR(mag) AS magnitude "
+                f"FROM {name}) AS m GROUP BY magnitude ORDER BY magnitude",
+            ),
+        ]
+    return found
+
+
+def examples_page(tables: Tables) -> str:
+    """Return a page with the examples."""
+    parts = "\n".join(
+        f'<div typeof="example" id="{name}" resource="#{name}">\n'
+        f'<h2 property="name">{html_escape(told)}</h2>\n'
+        f'<pre property="query">{html_escape(query)}</pre>\n</div>'
+        for name, told, query in examples(tables)
+    )
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n<!DOCTYPE html>\n'
+        '<html xmlns="http://www.w3.org/1999/xhtml" lang="en">\n'
+        "<head><title>Examples of ADQL</title></head>\n"
+        '<body vocab="http://www.ivoa.net/rdf/examples#">\n'
+        f"<h1>Examples of ADQL</h1>\n{parts}\n</body>\n</html>\n"
+    )
+
+
+def _has(table: Table, *names: str) -> bool:
+    return set(names) <= {column.name for column in table.columns}

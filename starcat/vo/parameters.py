@@ -26,46 +26,23 @@ _TABLE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}", re.ASCII)
 
 @dataclass(frozen=True)
 class Upload:
-    """A table that comes with a query.
+    """A table that comes with a query."""
 
-    Attributes
-    ----------
-    table : str
-        Its name after ``TAP_UPLOAD.``
-    part : str
-        Name of the part of the request that it is; empty where it is an answer of the service.
-    job_id : str
-        The job whose answer it is; empty where it is a part of the request.
-    """
-
-    table: str
+    table: str  # its name after TAP_UPLOAD.
+    # Name of the part of the request that it is; empty where it is an answer of the service.
     part: str = ""
-    job_id: str = ""
+    job_id: str = ""  # the job whose answer it is; empty where it is a part of the request
 
 
 @dataclass(frozen=True)
 class Question:
-    """What a request asks.
+    """What a request asks."""
 
-    Attributes
-    ----------
-    query : str
-        ADQL.
-    form : Format
-        How to write the answer.
-    max_rows : int
-        Rows of the answer at most.
-    uploads : tuple of Upload
-        The tables that come with it.
-    run_id : str
-        What the client calls it.
-    """
-
-    query: str
-    form: Format
-    max_rows: int
-    uploads: tuple[Upload, ...] = ()
-    run_id: str = ""
+    query: str  # ADQL
+    form: Format  # how to write the answer
+    max_rows: int  # rows of the answer at most
+    uploads: tuple[Upload, ...] = ()  # the tables that come with it
+    run_id: str = ""  # what the client calls it
 
 
 class Parameters:

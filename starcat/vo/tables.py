@@ -2,36 +2,45 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from starcat.query.columns import column_facts
+from starcat.query.result import column_facts
+from starcat.storage.parquet import DUCKDB_DATATYPES
+
+_CASTS = {
+    "TINYINT": "SMALLINT",
+    "USMALLINT": "INTEGER",
+    "UINTEGER": "BIGINT",
+    "UBIGINT": "BIGINT",
+    "HUGEINT": "BIGINT",
+    "UHUGEINT": "BIGINT",
+    "BIGNUM": "DOUBLE",
+}
+"""What the others become; any that is not named becomes a text."""
+
+_LIST = re.compile(r"(.*)\[\d*\]")
+
+_TIMES = ("DATE", "TIMESTAMP", "TIMESTAMP_S", "TIMESTAMP_MS", "TIMESTAMP_NS")
+"""What is written as a text of ISO 8601."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column as TAP_SCHEMA and VOTable describe it.
+    """A column as TAP_SCHEMA and VOTable describe it."""
 
-    Attributes
-    ----------
-    name : str
-        As the table has it, without quotes.
-    datatype, arraysize : str
-        VOTable's name of the type, and the size where it is an array or a text; else empty.
-    unit, ucd, description, xtype : str
-        Empty where there is none.
-    is_indexed, is_principal, is_standard : bool
-        Whether asking for it is fast, whether it is one to look at first, and whether a standard
-        defines it.
-    """
-
-    name: str
+    name: str  # as the table has it, without quotes
+    # VOTable's name of the type, and the size where it is an array or a text; else empty.
     datatype: str = "double"
     arraysize: str = ""
+    # Empty where there is none.
     unit: str = ""
     ucd: str = ""
     description: str = ""
     xtype: str = ""
+    # Whether asking for it is fast, whether it is one to look at first, and whether a standard
+    # defines it.
     is_indexed: bool = False
     is_principal: bool = False
     is_standard: bool = False
@@ -59,67 +68,35 @@ class Column:
 
 @dataclass(frozen=True)
 class Key:
-    """A reference of a table's column to that of another table.
+    """A reference of a table's column to that of another table."""
 
-    Attributes
-    ----------
-    column : str
-        The column that refers.
-    target, target_column : str
-        Full name of the table that it refers to, and the column there.
-    description : str
-        What the reference means.
-    """
-
-    column: str
+    column: str  # the column that refers
+    # Full name of the table that it refers to, and the column there.
     target: str
     target_column: str
-    description: str = ""
+    description: str = ""  # what the reference means
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table.
+    """A table."""
 
-    Attributes
-    ----------
-    schema, name : str
-        As the session has them, without quotes.
-    columns : tuple of Column
-        In order.
-    description : str
-        What a row is.
-    keys : tuple of Key
-        References to other tables.
-    view : str
-        Name of its view in a session, where it has another; else empty.
-    """
-
+    # As the session has them, without quotes.
     schema: str
     name: str
-    columns: tuple[Column, ...]
-    description: str = ""
-    keys: tuple[Key, ...] = ()
-    view: str = ""
+    columns: tuple[Column, ...]  # in order
+    description: str = ""  # what a row is
+    keys: tuple[Key, ...] = ()  # references to other tables
+    view: str = ""  # name of its view in a session, where it has another; else empty
 
 
 @dataclass(frozen=True)
 class Schema:
-    """A schema: the tables of a database, of a catalog, or those of TAP itself.
+    """A schema: the tables of a database, of a catalog, or those of TAP itself."""
 
-    Attributes
-    ----------
-    name : str
-        As the session has it.
-    description : str
-        What it is.
-    tables : tuple of Table
-        In order.
-    """
-
-    name: str
-    description: str
-    tables: tuple[Table, ...]
+    name: str  # as the session has it
+    description: str  # what it is
+    tables: tuple[Table, ...]  # in order
 
 
 class Tables:
@@ -179,3 +156,47 @@ def adql_name(name: str) -> str:
     if is_plain and name.upper() not in ADQL_SQL_KEYWORDS:
         return name
     return '"' + name.replace('"', '""') + '"'
+
+
+def votable_type(kind: str) -> tuple[str, str]:
+    """Return what VOTable calls a type of DuckDB after `cast`.
+
+    Examples
+    --------
+    >>> votable_type("INTEGER[]"), votable_type("DECIMAL(4,1)"), votable_type("DATE")
+    (('int', '*'), ('double', ''), ('char', '*'))
+    """
+    found = _LIST.fullmatch(kind)
+    if found:
+        item = _plain(found[1])
+        return ("unicodeChar" if item == "VARCHAR" else DUCKDB_DATATYPES[item]), "*"
+    if kind in _TIMES:
+        return "char", "*"
+    name = DUCKDB_DATATYPES[_plain(kind)]
+    return name, "*" if kind == "VARCHAR" or name == "unicodeChar" else ""
+
+
+def is_time(kind: str) -> bool:
+    """Return whether a type of DuckDB is a time that is written as a text."""
+    return kind in _TIMES
+
+
+def cast(value: str, kind: str) -> str:
+    """Return SQL of a value in a type that VOTable has."""
+    found = _LIST.fullmatch(kind)
+    if found:
+        item = _plain(found[1])
+        wanted = f"{item}[]" if item in DUCKDB_DATATYPES and item != "VARCHAR" else "VARCHAR"
+        return value if wanted == kind else f"CAST({value} AS {wanted})"
+    if kind in _TIMES:
+        return value
+    plain = _plain(kind)
+    return value if plain == kind else f"CAST({value} AS {plain})"
+
+
+def _plain(kind: str) -> str:
+    if kind in DUCKDB_DATATYPES:
+        return kind
+    if kind.startswith("DECIMAL"):
+        return "DOUBLE"
+    return _CASTS.get(kind, "VARCHAR")

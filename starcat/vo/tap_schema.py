@@ -13,13 +13,22 @@ from typing import TYPE_CHECKING
 
 from starcat.errors import SchemaError
 from starcat.exchange.columns import unit_text
-from starcat.query.columns import Facts, column_facts
 from starcat.query.names import identifier
+from starcat.query.result import Facts, column_facts
 from starcat.query.session import Session
 from starcat.query.targets import View
 from starcat.storage.parquet import write_parquet
-from starcat.vo.tables import Column, Key, Schema, Table, Tables, adql_name, full_name
-from starcat.vo.types import is_time, votable_type
+from starcat.vo.tables import (
+    Column,
+    Key,
+    Schema,
+    Table,
+    Tables,
+    adql_name,
+    full_name,
+    is_time,
+    votable_type,
+)
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -17,14 +17,13 @@ import pyarrow.parquet as pq
 
 from starcat.errors import ConfigError, quoted
 from starcat.query.names import identifier
+from starcat.storage.parquet import ARROW_DATATYPES
 from starcat.vo.tables import Column, Table
 from starcat.vo.tap_schema import UPLOADS
 
 MAX_COLUMNS = 1000
 
-MAX_UNPACKED = 16
-"""How many times its own size an upload may take in memory."""
-
+MAX_UNPACKED = 16  # how many times its own size an upload may take in memory
 LEAST_UNPACKED_BYTES = 64 << 20
 
 _READ_BYTES = 1 << 20
@@ -32,12 +31,6 @@ _READ_BYTES = 1 << 20
 _BYTES = {
     "boolean": 1, "bit": 1, "unsignedByte": 1, "short": 2, "int": 4, "long": 8, "char": 1,
     "unicodeChar": 4, "float": 4, "double": 8, "floatComplex": 8, "doubleComplex": 16,
-}  # fmt: skip
-
-_NAMES = {
-    pa.bool_(): "boolean", pa.uint8(): "unsignedByte", pa.int16(): "short", pa.int32(): "int",
-    pa.int64(): "long", pa.float32(): "float", pa.float64(): "double",
-    pa.string(): "unicodeChar",
 }  # fmt: skip
 
 
@@ -52,7 +45,7 @@ def read_upload(path: Path, name: str, folder: Path) -> Table:
             values = _times(values)
         kind = values.type
         is_list = pa.types.is_list(kind)
-        datatype = _NAMES.get(kind.value_type if is_list else kind, "char")
+        datatype = ARROW_DATATYPES.get(kind.value_type if is_list else kind, "char")
         size = "*" if is_list or datatype in ("char", "unicodeChar") else ""
         arrays.append(values)
         told = " ".join(str(field.description or "").split())

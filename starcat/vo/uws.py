@@ -32,42 +32,27 @@ from vo_models.voresource.types import UTCTimestamp
 
 _NOT_XML = re.compile("[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
-ACTIVE = ("PENDING", "QUEUED", "EXECUTING")
-"""Phases that a job leaves again."""
+ACTIVE = ("PENDING", "QUEUED", "EXECUTING")  # phases that a job leaves again
 
 
 @dataclass(frozen=True)
 class JobFacts:
-    """A job.
+    """A job."""
 
-    Attributes
-    ----------
-    job_id, owner, phase, run_id : str
-        Its name, who made it, how far it is, what the client calls it.
-    parameters : tuple of (str, str)
-        As the client gave them.
-    created_s, started_s, ended_s, destroyed_s : float
-        Seconds since 1970; the second and third are None before it is so far.
-    limit_s : float
-        Seconds that it may run.
-    error : str
-        Why it failed; empty where it did not.
-    media_type : str
-        Type of the result.
-    """
-
+    # Its name, who made it, how far it is, what the client calls it.
     job_id: str
     owner: str
     phase: str
     run_id: str
-    parameters: tuple[tuple[str, str], ...]
+    parameters: tuple[tuple[str, str], ...]  # as the client gave them
+    # Seconds since 1970; the second and third are None before it is so far.
     created_s: float
     started_s: float | None
     ended_s: float | None
     destroyed_s: float
-    limit_s: float
-    error: str = ""
-    media_type: str = ""
+    limit_s: float  # seconds that it may run
+    error: str = ""  # why it failed; empty where it did not
+    media_type: str = ""  # type of the result
 
 
 class _Parameters(Parameters, tag="parameters", ns="uws", nsmap=NSMAP):

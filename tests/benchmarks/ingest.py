@@ -23,7 +23,7 @@ sys.path.insert(0, {here!r})
 from pathlib import Path
 import bare_parsers, pyarrow.parquet
 from starcat.catalog.ingest import ingest
-from starcat.catalog.star_files import write_star_tables
+from starcat.catalog.ingest import write_star_tables
 paths = [Path(p) for p in {paths!r}]
 files = [f for p in paths for f in (sorted(p.iterdir()) if p.is_dir() else [p])]
 start = time.perf_counter()

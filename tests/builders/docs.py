@@ -12,11 +12,9 @@ from starcat.catalog.source import data_source, source_names
 from starcat.catalog.verdict import Reason
 from starcat.cli.main import app
 from starcat.evaluation.report.files import reproduction_page
-from starcat.query.gallery import gallery
-from starcat.query.macros import macros
+from starcat.query.gallery import gallery, macros
 from starcat.resources import resource_folder
-from starcat.specs.keys import REQUIRED, SpecKey, spec_sections
-from starcat.specs.spec_toml import toml_value
+from starcat.specs.keys import REQUIRED, SpecKey, spec_sections, toml_value
 from starcat.storage.schema import read_schema
 
 DOCS = Path(__file__).parents[2] / "docs"

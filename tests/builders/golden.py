@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 from catalog_folder import write_catalog_folder
 
 from starcat.artifact.reader import open_artifact
-from starcat.pipeline.build import build
+from starcat.pipeline.build import Built, build
 from starcat.specs.reading import preset
 
 MADE = "sao-12deg-made"
@@ -28,29 +28,17 @@ BUILDS = ("gaia-12deg", "sao-12deg", MADE)
 GOLDEN = Path(__file__).parents[1] / "golden"
 
 
-def golden_figures(name: str, catalogs: Path) -> dict[str, Any]:
-    """Build a preset and return what has to stay the same.
-
-    Parameters
-    ----------
-    name : str
-        A preset, or `MADE`.
-    catalogs : Path
-        Folder of the excerpts, or of the made catalogs.
-
-    Returns
-    -------
-    dict
-        By product: rows, digest of the exact columns, sums and first rows of the others.
-    """
+def golden_build(name: str, catalogs: Path, folder: Path) -> Built:
+    """Build a preset, or `MADE`, from the excerpts or the made catalogs."""
     inputs = {"sao": [catalogs / "sao.dat.gz"]} if name.startswith("sao") else {}
     if name == MADE:
         inputs["hipparcos"] = [catalogs / "hip_main.dat.gz"]
-    with tempfile.TemporaryDirectory() as folder:
-        artifact = open_artifact(
-            build(preset(name.removesuffix("-made")), inputs, Path(folder)).folder
-        )
-        return {product: figures(artifact.table(product)) for product in artifact.products}
+    return build(preset(name.removesuffix("-made")), inputs, folder)
+
+
+def golden_figures(artifact: Path) -> dict[str, Any]:
+    """Return what has to stay the same, by product."""
+    return {name: figures(table) for name, table in open_artifact(artifact).products.items()}
 
 
 def figures(table: pa.Table) -> dict[str, Any]:
@@ -81,7 +69,9 @@ def main() -> None:
             folder = Path(made) if name == MADE else catalogs
             if name == "sao-12deg" and not folder.is_dir():
                 continue
-            text = json.dumps(golden_figures(name, folder), indent=1, sort_keys=True)
+            with tempfile.TemporaryDirectory() as output:
+                found = golden_figures(golden_build(name, folder, Path(output)).folder)
+            text = json.dumps(found, indent=1, sort_keys=True)
             (GOLDEN / f"{name}.json").write_text(text + "\n", encoding="utf-8")
 
 

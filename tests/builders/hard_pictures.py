@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest
@@ -24,10 +25,9 @@ from starcat.catalog.stars import floats_of
 from starcat.geometry.attitude import matrix_from_quaternion, random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import directions_from_radec
-from starcat.images.identification import identify_frames, measure
 from starcat.images.image_file import write_image
 from starcat.images.render import Optics, render_image
-from starcat.images.scene import Scene, in_file_steps, scene_light
+from starcat.images.solve_files import identify_file
 from starcat.matcher.matcher import Matcher
 
 Array = NDArray[np.float64]
@@ -35,6 +35,52 @@ Rng = np.random.Generator
 
 RIGHT_PX = 3.0
 """A right attitude puts no corner of the frame farther from its place."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The sky behind the stars, and what is left of it in a file."""
+
+    # electrons of the gradient in the brightest corner or at the brightest edge; it is a tenth of
+    # that on the opposite side
+    town_light_e: float = 0.0
+    town_light_deg: float = 90.0  # direction in which it becomes brighter: 0 to the right, 90 down
+    moon_px: tuple[float, float] | None = None  # middle of the Moon; it may be outside of the frame
+    moon_radius_px: float = 22.0  # radius of its disk, which fills the well
+    glow_e: float = 0.0  # electrons of its glow at the edge of the disk
+    glow_px: float = 60.0  # distance from the Moon's middle at which the glow is half as bright
+    nebula_e: float = 0.0  # standard deviation of nebulous light, electrons
+    nebula_px: float = 20.0  # size of its structure
+    black_adu: float = 0.0  # step of the detector that is 0 in the file: what is darker is lost
+    adu_per_step: float = 1.0  # steps of the detector in a step of the file
+    bits: int = 16  # 8 or 16: what is brighter than the largest number is lost
+
+
+def scene_light(scene: Scene, camera_size: tuple[int, int], full_well_e: float, seed: int) -> Array:
+    """Return the mean number of electrons that a scene adds to the background."""
+    width, height = camera_size
+    y, x = np.mgrid[:height, :width] + 0.5
+    light = np.zeros((height, width))
+    if scene.town_light_e:
+        direction = np.radians(scene.town_light_deg)
+        along = np.cos(direction) * (x - 0.5 * width) + np.sin(direction) * (y - 0.5 * height)
+        part = (along - along.min()) / (along.max() - along.min())
+        light += scene.town_light_e * 10.0 ** (part - 1.0)
+    if scene.moon_px is not None:
+        distance = np.hypot(x - scene.moon_px[0], y - scene.moon_px[1])
+        light += scene.glow_e / (1.0 + (distance / scene.glow_px) ** 2)
+        light[distance < scene.moon_radius_px] += 2.0 * full_well_e
+    if scene.nebula_e:
+        noise = np.random.default_rng(seed).normal(size=(height, width))
+        cloud = gaussian_filter(noise, scene.nebula_px, mode="wrap")
+        light += np.maximum(scene.nebula_e * (cloud / cloud.std() + 1.0), 0.0)
+    return light
+
+
+def in_file_steps(adu: np.ndarray, scene: Scene) -> np.ndarray:
+    """Return an image of a detector as the file of a camera has it."""
+    steps = np.rint((adu.astype(np.float64) - scene.black_adu) / scene.adu_per_step)
+    return np.clip(steps, 0, 2**scene.bits - 1).astype(np.uint8 if scene.bits == 8 else np.uint16)
 
 
 @dataclass(frozen=True)
@@ -168,7 +214,8 @@ def worst_px(taken: Taken, q_body_from_icrs: Array, camera: Camera) -> float:
 def verdict(matcher: Matcher, taken: Taken) -> str:
     """``right``, ``wrong`` or the status, as the command would find it without an option."""
     camera = matcher.database.camera
-    [result] = identify_frames(matcher, measure(taken.path), camera)
+    [answer] = identify_file(taken.path, matcher)
+    result = answer.result
     if result.status != "identified":
         return result.status
     return "right" if worst_px(taken, result.q_body_from_icrs, camera) < RIGHT_PX else "wrong"

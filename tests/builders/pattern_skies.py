@@ -9,10 +9,9 @@ import numpy as np
 from starcat.geometry.attitude import matrix_from_quaternion
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database, ProductArrays
-from starcat.products.grid import grid_patterns
 from starcat.products.index import Index, Ragged
 from starcat.products.neighbours import find_neighbours
-from starcat.products.radial import radial_patterns
+from starcat.products.star_patterns import grid_patterns, radial_patterns
 from starcat.simulation.simulate import Frame, Noise, simulate_frames
 
 CAMERA = Camera(1024, 1024, fov_x_deg=16.0)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from starcat.images.identification import MeasuredFile, draw
+from starcat.images.picture import draw
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.matcher import Matcher
 from starcat.pipeline.build import build
@@ -36,9 +36,9 @@ def draw_field(artifact: Path, folder: Path) -> None:
     sky, camera = database.directions, database.camera
     frame = next(simulate_frames(sky, camera, 1, NOISE, SEED, database.mag))
     mag = np.round(frame.mag, 2)
-    measured = MeasuredFile([MeasuredFrame(NAME, frame.centroids_px, mag)])
+    measured = MeasuredFrame(NAME, frame.centroids_px, mag)
     result = matcher.identify(frame.centroids_px, magnitudes=mag)
-    draw(folder / "identified.png", measured, result, database, camera)
+    draw(folder / "identified.png", measured, None, result, database, camera)
 
 
 def main() -> None:

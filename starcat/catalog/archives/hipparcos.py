@@ -7,37 +7,19 @@ and 95th percentiles of the Hp magnitude, doubles as the components' separation 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.catalog.readers.records import Records
-from starcat.catalog.stars import StarBlock, join_flags, numbered, where_known
-from starcat.catalog.verdict import Reason, Verdicts
+from starcat.catalog.stars import Columns, join_flags, numbered, where_known
+from starcat.catalog.verdict import Verdicts
 
 COLUMNS = {
-    "hip_main": [
-        "hip",
-        "proxy",
-        "v_mag",
-        "var_flag",
-        "ra_deg",
-        "de_deg",
-        "pm_ra",
-        "pm_de",
-        "bt_mag",
-        "vt_mag",
-        "b_v",
-        "hp_mag",
-        "hp_max",
-        "hp_min",
-        "hvar_type",
-        "ccdm",
-        "n_comp",
-        "mult_flag",
-        "rho",
-        "dhp",
-        "hd",
-    ]
-}
+    "hip_main": (
+        "hip", "proxy", "v_mag", "var_flag", "ra_deg", "de_deg", "pm_ra", "pm_de", "bt_mag",
+        "vt_mag", "b_v", "hp_mag", "hp_max", "hp_min", "hvar_type", "ccdm", "n_comp", "mult_flag",
+        "rho", "dhp", "hd",
+    ),
+}  # fmt: skip
 
 _MAGNITUDES = {"V": "v_mag", "Hp": "hp_mag", "BT": "bt_mag", "VT": "vt_mag"}
 
@@ -45,58 +27,58 @@ CLASS_LOWER_BOUND_MAG = {b"2": 0.06, b"3": 0.61}
 """Least amplitude of class H6: 2 is 0.06 to 0.6 mag, 3 is more than 0.6 (in steps of 0.01)."""
 
 
-def stars(records: Records, band: str) -> StarBlock:
+def magnitudes(records: Records, band: str) -> Array:
+    """Return the magnitudes of Hipparcos records."""
+    return records[_MAGNITUDES[band]]
+
+
+def stars(records: Records, band: str, _: Verdicts) -> Columns:
     """Return the star-table columns of Hipparcos records."""
     number = records.integers("hip")
-    verdicts = Verdicts(len(records))
-    verdicts.reject(np.isnan(records["ra_deg"]) | np.isnan(records["de_deg"]), Reason.no_position)
     second = "Hp" if band != "Hp" else "V"
     n_comp = records["n_comp"]
     has_solution = ~records.is_blank("mult_flag")
     in_ccdm = ~records.is_blank("ccdm")
     is_class, is_type = ~records.is_blank("var_flag"), np.isin(records["hvar_type"], [b"P", b"U"])
     amplitude = amplitudes(records)
-    return StarBlock(
-        {
-            "star_id": number,
-            "designation": numbered("HIP", number),
-            "ra_deg": records["ra_deg"],
-            "dec_deg": records["de_deg"],
-            "epoch_jyear": 1991.25,
-            "pm_ra_cosdec_mas_yr": records["pm_ra"],
-            "pm_dec_mas_yr": records["pm_de"],
-            "mag": records[_MAGNITUDES[band]],
-            "band": band,
-            "second_mag": records[_MAGNITUDES[second]],
-            "second_band": second,
-            "colour_mag": records["b_v"],
-            "colour_bands": "B-V",
-            "double_flag": join_flags(
-                {
-                    "CCDM": (in_ccdm, records["ccdm"]),
-                    "H59": (has_solution, records["mult_flag"]),
-                    "Proxy": (~records.is_blank("proxy"), records["proxy"]),
-                }
-            ),
-            "is_flagged_double": has_solution | (n_comp > 1),
-            "companion_separation_arcsec": records["rho"],
-            "companion_delta_mag": records["dhp"],
-            "variable_flag": join_flags(
-                {"H6": (is_class, records["var_flag"]), "H52": (is_type, records["hvar_type"])}
-            ),
-            "is_flagged_variable": is_type | np.isin(records["var_flag"], [b"2", b"3"]),
-            "amplitude_mag": amplitude,
-            "amplitude_source": where_known(amplitude, "hipparcos"),
-            "hip_number": number,
-            "hd_number": records["hd"],
-        },
-        verdicts,
-    )
+    return {
+        "star_id": number,
+        "designation": numbered("HIP", number),
+        "ra_deg": records["ra_deg"],
+        "dec_deg": records["de_deg"],
+        "epoch_jyear": 1991.25,
+        "pm_ra_cosdec_mas_yr": records["pm_ra"],
+        "pm_dec_mas_yr": records["pm_de"],
+        "mag": records[_MAGNITUDES[band]],
+        "band": band,
+        "second_mag": records[_MAGNITUDES[second]],
+        "second_band": second,
+        "colour_mag": records["b_v"],
+        "colour_bands": "B-V",
+        "double_flag": join_flags(
+            {
+                "CCDM": (in_ccdm, records["ccdm"]),
+                "H59": (has_solution, records["mult_flag"]),
+                "Proxy": (~records.is_blank("proxy"), records["proxy"]),
+            }
+        ),
+        "is_flagged_double": has_solution | (n_comp > 1),
+        "companion_separation_arcsec": records["rho"],
+        "companion_delta_mag": records["dhp"],
+        "variable_flag": join_flags(
+            {"H6": (is_class, records["var_flag"]), "H52": (is_type, records["hvar_type"])}
+        ),
+        "is_flagged_variable": is_type | np.isin(records["var_flag"], [b"2", b"3"]),
+        "amplitude_mag": amplitude,
+        "amplitude_source": where_known(amplitude, "hipparcos"),
+        "hip_number": number,
+        "hd_number": records["hd"],
+    }
 
 
-def amplitudes(records: Records) -> NDArray[np.float64]:
+def amplitudes(records: Records) -> Array:
     """Return the amplitude in Hp of each record."""
-    amplitude: NDArray[np.float64] = records["hp_min"] - records["hp_max"]
+    amplitude: Array = records["hp_min"] - records["hp_max"]
     for flag, bound in CLASS_LOWER_BOUND_MAG.items():
         amplitude = np.where(records["var_flag"] == flag, np.fmax(amplitude, bound), amplitude)
     return amplitude

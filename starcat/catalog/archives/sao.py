@@ -11,79 +11,60 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Mask
 from starcat.catalog.readers.records import Records
-from starcat.catalog.stars import StarBlock, join_flags, numbered
+from starcat.catalog.stars import Columns, join_flags, numbered
 from starcat.catalog.verdict import Reason, Verdicts
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, tangent_axes
 
 COLUMNS = {
-    "sao": [
-        "sao",
-        "del_flag",
-        "p_mag",
-        "v_mag",
-        "sp_type",
-        "r_vmag",
-        "rem",
-        "dm_component",
-        "hd",
-        "m_hd",
-        "ra2000_h",
-        "ra2000_m",
-        "ra2000_s",
-        "pm_ra2000",
-        "de2000_sign",
-        "de2000_d",
-        "de2000_m",
-        "de2000_s",
-        "pm_de2000",
-        "ra2000_rad",
-        "de2000_rad",
-    ]
-}
+    "sao": (
+        "sao", "del_flag", "p_mag", "v_mag", "sp_type", "r_vmag", "rem", "dm_component", "hd",
+        "m_hd", "ra2000_h", "ra2000_m", "ra2000_s", "pm_ra2000", "de2000_sign", "de2000_d",
+        "de2000_m", "de2000_s", "pm_de2000", "ra2000_rad", "de2000_rad",
+    ),
+}  # fmt: skip
 
 PRINTED_PM_DEC_ARCSEC_YR = {208759: -0.180, 208795: -0.042, 212470: -0.072}
 """Proper motions that the printed catalog has and the file leaves blank (ReadMe of I/131A)."""
 
 
-def stars(records: Records, band: str) -> StarBlock:
+def magnitudes(records: Records, band: str) -> Array:
+    """Return the magnitudes of SAO records."""
+    return records["v_mag" if band == "V" else "p_mag"]
+
+
+def stars(records: Records, band: str, verdicts: Verdicts) -> Columns:
     """Return the star-table columns of SAO records."""
     number = records.integers("sao")
     ra_deg, dec_deg = _positions(records)
     pm_ra, pm_dec = _proper_motions(records, number, dec_deg)
     ra_deg, dec_deg, pm_ra, pm_dec = icrs_from_fk5(ra_deg, dec_deg, pm_ra, pm_dec)
-    verdicts = Verdicts(len(records))
     verdicts.reject(records["del_flag"] == b"D", Reason.deleted)
-    verdicts.reject(np.isnan(ra_deg) | np.isnan(dec_deg), Reason.no_position)
-    mag, second = ("v_mag", "p_mag") if band == "V" else ("p_mag", "v_mag")
     doubles, is_double, delta_mag = _duplicity(records)
     variable = np.isin(records["rem"], [4, 5, 6, 7])
     mean_of_range = records["r_vmag"] == 17
-    return StarBlock(
-        {
-            "star_id": number,
-            "designation": numbered("SAO", number),
-            "ra_deg": ra_deg,
-            "dec_deg": dec_deg,
-            "epoch_jyear": 2000.0,
-            "pm_ra_cosdec_mas_yr": pm_ra,
-            "pm_dec_mas_yr": pm_dec,
-            "mag": records[mag],
-            "band": band,
-            "second_mag": records[second],
-            "second_band": "P" if band == "V" else "V",
-            "double_flag": doubles,
-            "is_flagged_double": is_double,
-            "companion_delta_mag": delta_mag,
-            "variable_flag": join_flags(
-                {"Rem": (variable, _digit(records["rem"])), "r_Vmag=17": (mean_of_range, None)}
-            ),
-            "is_flagged_variable": variable | mean_of_range,
-            "hd_number": records["hd"],
-        },
-        verdicts,
-    )
+    return {
+        "star_id": number,
+        "designation": numbered("SAO", number),
+        "ra_deg": ra_deg,
+        "dec_deg": dec_deg,
+        "epoch_jyear": 2000.0,
+        "pm_ra_cosdec_mas_yr": pm_ra,
+        "pm_dec_mas_yr": pm_dec,
+        "mag": magnitudes(records, band),
+        "band": band,
+        "second_mag": records["p_mag" if band == "V" else "v_mag"],
+        "second_band": "P" if band == "V" else "V",
+        "double_flag": doubles,
+        "is_flagged_double": is_double,
+        "companion_delta_mag": delta_mag,
+        "variable_flag": join_flags(
+            {"Rem": (variable, _digit(records["rem"])), "r_Vmag=17": (mean_of_range, None)}
+        ),
+        "is_flagged_variable": variable | mean_of_range,
+        "hd_number": records["hd"],
+    }
 
 
 def icrs_from_fk5(
@@ -135,7 +116,7 @@ def _proper_motions(
     return pm_ra, pm_dec
 
 
-def _duplicity(records: Records) -> tuple[pa.Array, NDArray[np.bool_], Array]:
+def _duplicity(records: Records) -> tuple[pa.Array, Mask, Array]:
     rem, m_hd = records["rem"], records["m_hd"]
     by_rem = np.isin(rem, [1, 2, 3, 7])
     by_hd = np.isin(m_hd, [1, 2, 9])

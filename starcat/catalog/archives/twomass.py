@@ -11,41 +11,26 @@ import numpy as np
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from starcat.arrays import Array, Mask
 from starcat.catalog.photometry import blend_weights
-from starcat.catalog.quality import Quality, quality_flags
 from starcat.catalog.readers.records import Records
-from starcat.catalog.stars import StarBlock, join_flags, text_column
-from starcat.catalog.verdict import Reason, Verdicts
+from starcat.catalog.stars import Columns, join_flags, text_column
+from starcat.catalog.verdict import Quality, Reason, Verdicts, quality_flags
 
 COLUMNS = {
-    "psc": [
-        "ra",
-        "dec",
-        "designation",
-        "j_m",
-        "h_m",
-        "k_m",
-        "ph_qual",
-        "rd_flg",
-        "bl_flg",
-        "cc_flg",
-        "gal_contam",
-        "mp_flg",
-        "pts_key",
-        "jdate",
-        "use_src",
-    ]
-}
+    "psc": (
+        "ra", "dec", "designation", "j_m", "h_m", "k_m", "ph_qual", "rd_flg", "bl_flg", "cc_flg",
+        "gal_contam", "mp_flg", "pts_key", "jdate", "use_src",
+    ),
+}  # fmt: skip
 
 _BANDS = {"J": (0, "j_m"), "H": (1, "h_m"), "Ks": (2, "k_m")}
 
 
-def stars(records: Records, band: str) -> StarBlock:
+def stars(records: Records, band: str, verdicts: Verdicts) -> Columns:
     """Return the star-table columns of 2MASS records."""
     weights = blend_weights(band)
     mags = {name: _measured(records, name) for name in _BANDS}
-    mag = np.sum([weight * mags[name] for name, weight in weights.items()], axis=0)
-    verdicts = Verdicts(len(records))
     number = _identity(records)
     verdicts.reject(number == 0, Reason.no_identity)
     verdicts.reject(np.isnan(records["ra"]) | np.isnan(records["dec"]), Reason.no_position)
@@ -56,45 +41,42 @@ def stars(records: Records, band: str) -> StarBlock:
     second = "Ks" if "Ks" not in weights else "H" if "H" not in weights else "J"
     colour = "J-H" if second == "Ks" else "J-Ks"
     blended = _any_flag(records, "bl_flg", b"23456789", weights)
-    return StarBlock(
-        {
-            "star_id": number,
-            "designation": pc.binary_join_element_wise(
-                "2MASS J", text_column(records["designation"]), ""
-            ),
-            "ra_deg": records["ra"],
-            "dec_deg": records["dec"],
-            "epoch_jyear": 2000.0 + (records["jdate"] - 2451545.0) / 365.25,
-            "mag": mag,
-            "band": band,
-            "second_mag": mags[second],
-            "second_band": second,
-            "colour_mag": mags["J"] - mags[colour[2:]],
-            "colour_bands": colour,
-            "double_flag": join_flags({"bl_flg": (blended, records["bl_flg"])}),
-            "is_flagged_double": blended,
-            "quality_flags": quality_flags(
-                len(records),
-                {
-                    Quality.SATURATED: _any_flag(records, "rd_flg", b"3", weights),
-                    Quality.BLENDED: blended,
-                    Quality.POOR_PHOTOMETRY: _any_flag(records, "ph_qual", b"DEF", weights),
-                    Quality.CONTAMINATED: _any_flag(records, "cc_flg", b"pcdsb", weights)
-                    | (records["gal_contam"] == 2),
-                },
-            ),
-        },
-        verdicts,
-    )
+    return {
+        "star_id": number,
+        "designation": pc.binary_join_element_wise(
+            "2MASS J", text_column(records["designation"]), ""
+        ),
+        "ra_deg": records["ra"],
+        "dec_deg": records["dec"],
+        "epoch_jyear": 2000.0 + (records["jdate"] - 2451545.0) / 365.25,
+        "mag": magnitudes(records, band),
+        "band": band,
+        "second_mag": mags[second],
+        "second_band": second,
+        "colour_mag": mags["J"] - mags[colour[2:]],
+        "colour_bands": colour,
+        "double_flag": join_flags({"bl_flg": (blended, records["bl_flg"])}),
+        "is_flagged_double": blended,
+        "quality_flags": quality_flags(
+            len(records),
+            {
+                Quality.SATURATED: _any_flag(records, "rd_flg", b"3", weights),
+                Quality.BLENDED: blended,
+                Quality.POOR_PHOTOMETRY: _any_flag(records, "ph_qual", b"DEF", weights),
+                Quality.CONTAMINATED: _any_flag(records, "cc_flg", b"pcdsb", weights)
+                | (records["gal_contam"] == 2),
+            },
+        ),
+    }
 
 
-def magnitudes(records: Records, band: str) -> NDArray[np.float64]:
+def magnitudes(records: Records, band: str) -> Array:
     """Return the magnitudes of 2MASS records."""
     weights = blend_weights(band)
     return np.asarray(np.sum([weight * _measured(records, n) for n, weight in weights.items()], 0))
 
 
-def _measured(records: Records, band: str) -> NDArray[np.float64]:
+def _measured(records: Records, band: str) -> Array:
     """Return the magnitudes that were measured: NaN for upper limits and bands without a source."""
     _, column = _BANDS[band]
     limit = _any_flag(records, "ph_qual", b"UX", {band: 1.0})
@@ -102,9 +84,7 @@ def _measured(records: Records, band: str) -> NDArray[np.float64]:
     return np.where(limit | unmeasured, np.nan, records[column])
 
 
-def _any_flag(
-    records: Records, column: str, codes: bytes, bands: dict[str, float]
-) -> NDArray[np.bool_]:
+def _any_flag(records: Records, column: str, codes: bytes, bands: dict[str, float]) -> Mask:
     """Return where a flag column has one of the codes in any of the bands."""
     text = records[column]
     chars = text.view(np.uint8).reshape(len(text), text.dtype.itemsize)

@@ -10,95 +10,73 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from starcat.catalog.archives.tycho1 import tycho_identity
+from starcat.arrays import Array, Mask
 from starcat.catalog.photometry import johnson_v
-from starcat.catalog.quality import Quality, quality_flags
 from starcat.catalog.readers.records import Records
-from starcat.catalog.stars import StarBlock, join_flags
-from starcat.catalog.verdict import Reason, Verdicts
+from starcat.catalog.stars import Columns, join_flags
+from starcat.catalog.verdict import Quality, Verdicts, quality_flags
 
 COLUMNS = {
-    "tyc2": [
-        "tyc1",
-        "tyc2",
-        "tyc3",
-        "pflag",
-        "ra_mean_deg",
-        "de_mean_deg",
-        "pm_ra",
-        "pm_de",
-        "bt_mag",
-        "vt_mag",
-        "prox",
-        "hip",
-        "ccdm",
-        "ra_deg",
-        "de_deg",
-        "ep_ra_1990",
-        "ep_de_1990",
-        "posflg",
-    ],
-    "suppl_1": [
-        "tyc1",
-        "tyc2",
-        "tyc3",
-        "flag",
-        "ra_deg",
-        "de_deg",
-        "pm_ra",
-        "pm_de",
-        "mflag",
-        "bt_mag",
-        "vt_mag",
-        "prox",
-        "hip",
-        "ccdm",
-    ],
-}
+    "tyc2": (
+        "tyc1", "tyc2", "tyc3", "pflag", "ra_mean_deg", "de_mean_deg", "pm_ra", "pm_de", "bt_mag",
+        "vt_mag", "prox", "hip", "ccdm", "ra_deg", "de_deg", "ep_ra_1990", "ep_de_1990", "posflg",
+    ),
+    "suppl_1": (
+        "tyc1", "tyc2", "tyc3", "flag", "ra_deg", "de_deg", "pm_ra", "pm_de", "mflag", "bt_mag",
+        "vt_mag", "prox", "hip", "ccdm",
+    ),
+}  # fmt: skip
 
 PROX_BEYOND = 999
 """Value of ``prox`` for "no other star within 99.9 arcsec"; the unit is 0.1 arcsec."""
 
+_NUMBER_TEXTS = pa.array([str(number) for number in range(100_000)])
+"""Texts of all numbers that TYC2 and TYC3 can be, as looking up is faster than formatting."""
 
-def stars(records: Records, band: str) -> StarBlock:
+_REGION_TEXTS = pc.binary_join_element_wise("TYC", _NUMBER_TEXTS[:10_000], " ")
+"""Texts of all numbers that TYC1 can be, with the name of the catalog before them."""
+
+
+def magnitudes(records: Records, band: str) -> Array:
+    """Return the magnitudes of Tycho-2 records."""
+    return _magnitudes(records, band)[0]
+
+
+def stars(records: Records, band: str, _: Verdicts) -> Columns:
     """Return the star-table columns of Tycho-2 records."""
     place = _place_tyc2(records) if records.layout == "tyc2" else _place_suppl(records)
     number, designation = tycho_identity(records)
-    verdicts = Verdicts(len(records))
-    no_position = np.isnan(place["ra_deg"]) | np.isnan(place["dec_deg"])
-    verdicts.reject(no_position, Reason.no_position)
     in_ccdm = ~records.is_blank("ccdm")
     prox = records["prox"]
     photocentre = place.pop("is_photocentre")
     flag_parts = place.pop("double_flags")
     mag, bits = _magnitudes(records, band)
     bits[Quality.PHOTOCENTRE] = photocentre
-    return StarBlock(
-        {
-            **place,
-            "star_id": number,
-            "designation": designation,
-            "pm_ra_cosdec_mas_yr": records["pm_ra"],
-            "pm_dec_mas_yr": records["pm_de"],
-            "mag": mag,
-            "band": band,
-            "second_mag": records["bt_mag" if band != "BT" else "vt_mag"],
-            "second_band": "BT" if band != "BT" else "VT",
-            "colour_mag": records["bt_mag"] - records["vt_mag"],
-            "colour_bands": "BT-VT",
-            "double_flag": join_flags({**flag_parts, "CCDM": (in_ccdm, records["ccdm"])}),
-            "is_flagged_double": place_is_double(flag_parts) | in_ccdm,
-            "companion_separation_arcsec": np.where(prox < PROX_BEYOND, 0.1 * prox, np.nan),
-            "hip_number": records["hip"],
-            "quality_flags": quality_flags(len(records), bits),
-        },
-        verdicts,
-    )
+    return {
+        **place,
+        "star_id": number,
+        "designation": designation,
+        "pm_ra_cosdec_mas_yr": records["pm_ra"],
+        "pm_dec_mas_yr": records["pm_de"],
+        "mag": mag,
+        "band": band,
+        "second_mag": records["bt_mag" if band != "BT" else "vt_mag"],
+        "second_band": "BT" if band != "BT" else "VT",
+        "colour_mag": records["bt_mag"] - records["vt_mag"],
+        "colour_bands": "BT-VT",
+        "double_flag": join_flags({**flag_parts, "CCDM": (in_ccdm, records["ccdm"])}),
+        "is_flagged_double": place_is_double(flag_parts) | in_ccdm,
+        "companion_separation_arcsec": np.where(prox < PROX_BEYOND, 0.1 * prox, np.nan),
+        "hip_number": records["hip"],
+        "quality_flags": quality_flags(len(records), bits),
+    }
 
 
-def place_is_double(parts: dict[str, Any]) -> NDArray[np.bool_]:
+def place_is_double(parts: dict[str, Any]) -> Mask:
     """Return where any of a record's position flags means a double star."""
     return np.asarray(np.logical_or.reduce([where for where, _ in parts.values()]))
 
@@ -131,9 +109,7 @@ def _place_suppl(records: Records) -> dict[str, Any]:
     }
 
 
-def _magnitudes(
-    records: Records, band: str
-) -> tuple[NDArray[np.float64], dict[Quality, NDArray[np.bool_]]]:
+def _magnitudes(records: Records, band: str) -> tuple[Array, dict[Quality, Mask]]:
     bt, vt = records["bt_mag"], records["vt_mag"]
     if band == "BT":
         return bt, {}
@@ -149,3 +125,12 @@ def _magnitudes(
         Quality.COLOUR_OUT_OF_RANGE: v.is_out_of_range,
     }
     return v.mag, bits
+
+
+def tycho_identity(records: Records) -> tuple[NDArray[np.int64], pa.Array]:
+    """Return the packed number and the designation of Tycho records."""
+    parts = [records.integers(name) for name in ("tyc1", "tyc2", "tyc3")]
+    number = parts[0] * 1_000_000 + parts[1] * 10 + parts[2]
+    region = _REGION_TEXTS.take(pa.array(parts[0]))
+    texts = [_NUMBER_TEXTS.take(pa.array(part)) for part in parts[1:]]
+    return number, pc.binary_join_element_wise(region, *texts, "-")

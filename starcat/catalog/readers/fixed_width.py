@@ -1,4 +1,4 @@
-"""The reader of fixed-width records, driven by a source's column table.
+"""The readers of records of one length, as text or packed, driven by a source's column table.
 
 Numbers are read a column at a time over all records of a block: digits are weighted and
 summed as integers and divided once by a power of ten, which rounds exactly as a decimal
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array, Mask
 from starcat.catalog.readers.records import (
     Problem,
     Records,
@@ -55,6 +56,36 @@ def parse_fixed_width(
             columns[name] = _parse_numbers(field, column, line, bad, problems)
     records = Records(layout.name, line, columns).without(bad, problems)
     return reject_impossible_numbers(reject_required_blanks(records, layout), layout)
+
+
+def parse_binary(
+    data: bytes, layout: RecordFile, names: Sequence[str], first_line: int = 1
+) -> Records:
+    """Parse a block of packed little-endian records."""
+    size = layout.record_bytes or 1
+    columns = [layout.column(name) for name in names]
+    packed = np.dtype(
+        {
+            "names": list(names),
+            "formats": [column.format for column in columns],
+            "offsets": [column.bytes[0] - 1 if column.bytes else 0 for column in columns],
+            "itemsize": size,
+        }
+    )
+    count, rest = divmod(len(data), size)
+    table = np.frombuffer(data, dtype=packed, count=count)
+    line = np.arange(first_line, first_line + count, dtype=np.int64)
+    with np.errstate(invalid="ignore"):  # a signalling NaN is a NaN like any other
+        values = {
+            name: table[name].astype(np.int64 if packed[name].kind == "i" else np.float64)
+            for name in names
+        }
+    problems = []
+    if rest:
+        problems.append(
+            Problem(first_line + count, "record", None, f"{rest} bytes", f"{size} bytes")
+        )
+    return reject_impossible_numbers(Records(layout.name, line, values, problems), layout)
 
 
 def _byte_range(column: Column) -> tuple[int, int]:
@@ -103,7 +134,7 @@ def _split_uneven(
 
 
 def _check_literals(
-    chars: NDArray[np.uint8], line: NDArray[np.int64], layout: RecordFile, bad: NDArray[np.bool_]
+    chars: NDArray[np.uint8], line: NDArray[np.int64], layout: RecordFile, bad: Mask
 ) -> list[Problem]:
     """Mark the records that lack a separator where the layout has one."""
     problems: list[Problem] = []
@@ -125,9 +156,9 @@ def _parse_numbers(
     field: NDArray[np.uint8],
     column: Column,
     line: NDArray[np.int64],
-    bad: NDArray[np.bool_],
+    bad: Mask,
     problems: list[Problem],
-) -> NDArray[np.float64]:
+) -> Array:
     """Parse one numeric column; mark and report the records that it cannot read."""
     chars = np.ascontiguousarray(field.T)
     values, odd = _fixed_point(chars, column.decimals)
@@ -146,9 +177,7 @@ def _parse_numbers(
     return values
 
 
-def _fixed_point(
-    chars: NDArray[np.uint8], decimals: int | None
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _fixed_point(chars: NDArray[np.uint8], decimals: int | None) -> tuple[Array, Mask]:
     """Read fields whose point, if they have one, is where the format puts it.
 
     Return the values (NaN where blank), and which fields need reading one by one.
@@ -182,10 +211,10 @@ def _fixed_point(
 
 def _integer_part_is_regular(
     chars: NDArray[np.uint8],
-    is_digit: NDArray[np.bool_],
-    space: NDArray[np.bool_],
+    is_digit: Mask,
+    space: Mask,
     point: int,
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Return which fields have spaces, then at most one sign, then digits up to the point."""
     good = np.ones(chars.shape[1], dtype=bool)
     for k in range(point):
@@ -197,9 +226,7 @@ def _integer_part_is_regular(
     return good
 
 
-def _fraction_is_regular(
-    is_digit: NDArray[np.bool_], space: NDArray[np.bool_], point: int
-) -> NDArray[np.bool_]:
+def _fraction_is_regular(is_digit: Mask, space: Mask, point: int) -> Mask:
     """Return which fields have digits after the point, then blanks for decimals left out."""
     good = np.ones(is_digit.shape[1], dtype=bool)
     for k in range(point + 1, len(is_digit)):

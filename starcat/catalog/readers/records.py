@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array, Mask
 from starcat.catalog.source import Column, RecordFile
 
 _NUMBER = re.compile(rb"[+-]?(\d+(\.\d*)?|\.\d+)([eEdD][+-]?\d+)?")
@@ -28,23 +29,11 @@ def line_ends(data: bytes) -> int:
 
 @dataclass(frozen=True)
 class Problem:
-    """Why one line is not a record.
+    """Why one line is not a record."""
 
-    Attributes
-    ----------
-    line : int
-        1-based line in its file (record number in a binary file).
-    field : str
-        Column, or ``"record"`` where the line as a whole is wrong.
-    byte_range : tuple of int, optional
-        First and last byte of the field, 1-based inclusive.
-    found, expected : str
-        The two sides of the disagreement.
-    """
-
-    line: int
-    field: str
-    byte_range: tuple[int, int] | None
+    line: int  # 1-based in its file (record number in a binary file)
+    field: str  # the column, or "record" where the line as a whole is wrong
+    byte_range: tuple[int, int] | None  # of the field, 1-based inclusive
     found: str
     expected: str
 
@@ -57,24 +46,12 @@ class Problem:
 
 @dataclass(frozen=True)
 class Records:
-    """Columns of the good records of a block, in file order.
+    """Columns of the good records of a block, in file order."""
 
-    Attributes
-    ----------
-    layout : str
-        Name of the record layout (``RecordFile.name``).
-    line : ndarray of int64, shape (N,)
-        1-based line of each record in its file.
-    columns : dict of str to ndarray, shape (N,)
-        float64 with NaN for "no value" (int64 for binary integers), or fixed-width bytes.
-    problems : list of Problem
-        Lines left out, in file order.
-    """
-
-    layout: str
-    line: NDArray[np.int64]
-    columns: dict[str, NDArray[Any]]
-    problems: list[Problem] = field(default_factory=list)
+    layout: str  # name of the record layout
+    line: NDArray[np.int64]  # 1-based line of each record in its file
+    columns: dict[str, NDArray[Any]]  # float64, NaN for "no value"; int64; or fixed-width bytes
+    problems: list[Problem] = field(default_factory=list)  # lines left out, in file order
 
     def __len__(self) -> int:
         return len(self.line)
@@ -82,22 +59,27 @@ class Records:
     def __getitem__(self, name: str) -> NDArray[Any]:
         return self.columns[name]
 
+    @property
+    def rows(self) -> int:
+        """Records of the block, good and malformed."""
+        return len(self.line) + len(self.problems)
+
     def integers(self, name: str) -> NDArray[np.int64]:
         """Return a required column as int64."""
         return self.columns[name].astype(np.int64)
 
-    def is_blank(self, name: str) -> NDArray[np.bool_]:
+    def is_blank(self, name: str) -> Mask:
         """Return where a text column is blank."""
         text = self.columns[name]
         chars = text.view(np.uint8).reshape(len(text), text.dtype.itemsize)
         return np.asarray((chars <= 32).all(axis=1))
 
-    def where(self, chosen: NDArray[np.bool_]) -> Records:
+    def where(self, chosen: Mask) -> Records:
         """Return some of the records, with all problems."""
         columns = {name: values[chosen] for name, values in self.columns.items()}
         return replace(self, line=self.line[chosen], columns=columns)
 
-    def without(self, bad: NDArray[np.bool_], problems: Sequence[Problem]) -> Records:
+    def without(self, bad: Mask, problems: Sequence[Problem]) -> Records:
         """Return the records that are not bad, with more problems listed."""
         merged = sorted([*self.problems, *problems], key=lambda problem: problem.line)
         if not bad.any():
@@ -141,7 +123,7 @@ def number_from_text(text: bytes) -> float:
     return number
 
 
-def apply_nulls(values: NDArray[np.float64], column: Column) -> None:
+def apply_nulls(values: Array, column: Column) -> None:
     """Set the numbers that stand for "no value" to NaN, in place."""
     for text in column.null:
         if _NUMBER.fullmatch(text.encode()):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from starcat.evaluation.experiment import Attitudes, Experiment
 from starcat.evaluation.paper import Paper, Row, Statistic, product_mib, tolerance_for
-from starcat.evaluation.trial import Attitudes, Trial
 from starcat.geometry.camera import Camera
 from starcat.simulation.simulate import Noise
 
@@ -41,18 +41,27 @@ def rows(quick: bool) -> list[Row]:
     for roll_deg in ROLLS_DEG:
         for label, (method, answer) in WAYS.items():
             stars = Attitudes("stars", count, roll_deg=roll_deg)
-            trial = _trial(f"roll-{roll_deg:g}-{label}", method, answer, stars, NOISE)
+            experiment = _experiment(f"roll-{roll_deg:g}-{label}", method, answer, stars, NOISE)
             made.append(
-                Row("Roll", f"{label}, {roll_deg:g} deg", PRESET, trial, "reference", x=roll_deg)
+                Row(
+                    "Roll",
+                    f"{label}, {roll_deg:g} deg",
+                    PRESET,
+                    experiment,
+                    "reference",
+                    x=roll_deg,
+                )
             )
     for scale in SCALES:
         for label, (method, answer) in WAYS.items():
             camera, assumed = camera_of_scale(scale)
             stars = Attitudes("stars", count, roll_deg=0.0)
-            trial = _trial(
+            experiment = _experiment(
                 f"scale-{scale:g}-{label}", method, answer, stars, NOISE, camera, assumed
             )
-            made.append(Row("Scale", f"{label}, {scale:g}", PRESET, trial, "reference", x=scale))
+            made.append(
+                Row("Scale", f"{label}, {scale:g}", PRESET, experiment, "reference", x=scale)
+            )
     return made + _whole_library(5 * count)
 
 
@@ -66,14 +75,16 @@ def _whole_library(count: int) -> list[Row]:
             ("L2 with starcat, centred on a star", "stars", "matcher"),
             ("L2 with starcat, anywhere", "random", "matcher"),
         ):
-            trial = _trial(
+            experiment = _experiment(
                 f"library-{value:g}-{label}", "hausdorff_l2", answer, Attitudes(kind, count), noise
             )
-            made.append(Row(group, f"{label}, {value:g} px", PRESET, trial, "reference", x=value))
+            made.append(
+                Row(group, f"{label}, {value:g} px", PRESET, experiment, "reference", x=value)
+            )
     return made
 
 
-def _trial(
+def _experiment(
     name: str,
     method: str,
     answer: str,
@@ -81,8 +92,8 @@ def _trial(
     noise: Noise,
     camera: Camera | None = None,
     assumed: Camera | None = None,
-) -> Trial:
-    return Trial(
+) -> Experiment:
+    return Experiment(
         f"s1-{name}".lower().replace(" ", "-").replace(",", ""),
         method,
         attitudes,

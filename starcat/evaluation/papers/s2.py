@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
-from starcat.evaluation.paper import Paper, Row, Statistic, tolerance_for
-from starcat.evaluation.trial import Attitudes, Trial
+from starcat.evaluation.experiment import Attitudes, Experiment
+from starcat.evaluation.paper import Paper, Row, tolerance_for
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.simulation.simulate import Noise
@@ -60,8 +59,8 @@ def rows(quick: bool) -> list[Row]:
     ]
 
 
-def _trial(name: str, method: str, attitudes: Attitudes, noise: Noise) -> Trial:
-    return Trial(
+def _experiment(name: str, method: str, attitudes: Attitudes, noise: Noise) -> Experiment:
+    return Experiment(
         f"s2-{name}-{method}",
         method,
         attitudes,
@@ -79,12 +78,12 @@ def _ideal(grid: Attitudes) -> list[Row]:
         goal_percent, goal_ms = (99.81, 7.2) if is_own else (percent, None)
         made.append(
             Row("Ideal images (table 3)", label, PRESET,
-                _trial("ideal", method, grid, Noise(limit_mag=LIMIT_MAG)), "reference",
+                _experiment("ideal", method, grid, Noise(limit_mag=LIMIT_MAG)), "reference",
                 percent, ms, goal_percent, goal_ms)
         )  # fmt: skip
     made.append(
         Row("Ideal images (table 3)", "triangle of S4", PRESET,
-            _trial("ideal", "triangle", grid, Noise(limit_mag=LIMIT_MAG)), "reference",
+            _experiment("ideal", "triangle", grid, Noise(limit_mag=LIMIT_MAG)), "reference",
             note="not in the paper: starcat's default")
     )  # fmt: skip
     return made
@@ -110,33 +109,35 @@ def _curve(
             published, wanted = (percent, goal) if is_last and is_own else (None, None)
             made.append(
                 Row(group, f"{PUBLISHED.get(method, ('triangle of S4',))[0]}, {value:g} {unit}",
-                    PRESET, _trial(slug, method, attitudes, noise), "reference",
+                    PRESET, _experiment(slug, method, attitudes, noise), "reference",
                     published, None, wanted, x=value)
             )  # fmt: skip
     return made
 
 
 def _guide_stars_alone(grid: Attitudes) -> Row:
-    trial = _trial("guides-magnitude-1", "dynamic_angle", grid, _noise("Magnitude noise", 1.0))
+    experiment = _experiment(
+        "guides-magnitude-1", "dynamic_angle", grid, _noise("Magnitude noise", 1.0)
+    )
     return Row("Magnitude noise, guide stars alone", "dynamic angle, 1 mag", PRESET,
-               replace(trial, guide_stars_only=True), "reference", 98.84, None, 98.9,
+               replace(experiment, guide_stars_only=True), "reference", 98.84, None, 98.9,
                note="nothing else shines, as in the paper's images it seems")  # fmt: skip
 
 
 def _other_readings(grid: Attitudes) -> list[Row]:
     noise = _noise("Magnitude noise", 1.0)
-    base = _trial("share-magnitude-1", "dynamic_angle", grid, noise)
+    base = _experiment("share-magnitude-1", "dynamic_angle", grid, noise)
     unhidden = replace(noise, is_limit_true=True)
     readings = (
         ("a quarter of the frame explained", replace(base, min_share=SHARE_OF_SEEN),
          "the noise hides a quarter of the guide stars: the share asked for is less by as much"),
-        ("no star vanishes", _trial("seen-magnitude-1", "dynamic_angle", grid, unhidden),
+        ("no star vanishes", _experiment("seen-magnitude-1", "dynamic_angle", grid, unhidden),
          "the true magnitude decides what is seen, the noise only what is measured"),
     )  # fmt: skip
     return [
-        Row("Magnitude noise, other readings", f"dynamic angle, 1 mag, {label}", PRESET, trial,
+        Row("Magnitude noise, other readings", f"dynamic angle, 1 mag, {label}", PRESET, experiment,
             "reference", 98.84, None, 98.9, note=note)
-        for label, trial, note in readings
+        for label, experiment, note in readings
     ]  # fmt: skip
 
 
@@ -154,7 +155,7 @@ def _distorted(grid: Attitudes, fewer: Attitudes) -> list[Row]:
     made = []
     for method, (label, _, _, percent) in PUBLISHED.items():
         is_own = method == "dynamic_angle"
-        trial = Trial(
+        experiment = Experiment(
             f"s2-barrel-{method}",
             method,
             grid if is_own else fewer,
@@ -166,15 +167,10 @@ def _distorted(grid: Attitudes, fewer: Attitudes) -> list[Row]:
             seed=2021,
         )
         made.append(
-            Row("Barrel distortion (table 4)", label, PRESET, trial, "reference", percent, None,
-                99.6 if is_own else None, note=f"k1 = {BARREL.k1:g}, the matcher is not told")
+            Row("Barrel distortion (table 4)", label, PRESET, experiment, "reference", percent,
+                None, 99.6 if is_own else None, note=f"k1 = {BARREL.k1:g}, the matcher is not told")
         )  # fmt: skip
     return made
-
-
-def statistics(artifacts: dict[str, Path], quick: bool) -> list[Statistic]:
-    """Return S2's numbers that need no trial: there are none."""
-    return []
 
 
 PAPER = Paper(
@@ -183,7 +179,6 @@ PAPER = Paper(
     citation="Sun et al. 2021, Acta Optica Sinica",
     presets=(PRESET,),
     rows=rows,
-    statistics=statistics,
     deviations=(
         "Images show the whole catalog up to the limit: doubles that the camera cannot split as "
         "one spot, variables, and with magnitude noise also stars below the limit. The paper "

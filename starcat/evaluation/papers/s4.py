@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from starcat.evaluation.experiment import Attitudes, Experiment
 from starcat.evaluation.paper import Paper, Row, Statistic, product_mib, tolerance_for
-from starcat.evaluation.trial import Attitudes, Trial
 from starcat.simulation.simulate import Noise
 
 PRESET = "2mass-8x6"
@@ -30,8 +30,8 @@ def rows(quick: bool) -> list[Row]:
     ]
 
 
-def _trial(name: str, method: str, count: int, noise: Noise) -> Trial:
-    return Trial(
+def _experiment(name: str, method: str, count: int, noise: Noise) -> Experiment:
+    return Experiment(
         f"s4-{name}-{method}",
         method,
         Attitudes("random", count),
@@ -57,7 +57,7 @@ def _curve(
             slug = f"{group.lower().replace(' ', '-')}-{value:g}"
             made.append(
                 Row(group, f"{label}, {value:g} {unit}", PRESET,
-                    _trial(slug, method, count, _noise(group, value)), "attitude",
+                    _experiment(slug, method, count, _noise(group, value)), "attitude",
                     percent if is_last else None, None,
                     goal if is_last and method == "triangle" else None, goal_over="4+", x=value)
             )  # fmt: skip
@@ -66,9 +66,9 @@ def _curve(
 
 def _unhidden(count: int) -> Row:
     noise = replace(_noise("Magnitude noise", 1.0), is_limit_true=True)
-    trial = _trial("seen-magnitude-1", "triangle", count, noise)
-    return Row("Magnitude noise, no star vanishes", f"{METHODS['triangle']}, 1 mag", PRESET, trial,
-               "attitude", 98.0, None, 98.0, goal_over="4+",
+    experiment = _experiment("seen-magnitude-1", "triangle", count, noise)
+    return Row("Magnitude noise, no star vanishes", f"{METHODS['triangle']}, 1 mag", PRESET,
+               experiment, "attitude", 98.0, None, 98.0, goal_over="4+",
                note="the true magnitude decides what is seen, the noise only what is measured",
     )  # fmt: skip
 
@@ -85,13 +85,13 @@ def _mixed(count: int) -> list[Row]:
     note = "1 px, 20 % false stars, 0.5 mag"
     group = "Mixed noise"
     return [
-        Row(group, METHODS["triangle"], PRESET, _trial("mixed", "triangle", count, MIXED),
+        Row(group, METHODS["triangle"], PRESET, _experiment("mixed", "triangle", count, MIXED),
             "attitude", 95.5, 14.27, 98.0, 1.5, "4+", note=note),
         Row(group, f"{METHODS['triangle']}, C library", PRESET,
-            replace(_trial("mixed-installed", "triangle", count, MIXED), engine="auto"),
+            replace(_experiment("mixed-installed", "triangle", count, MIXED), engine="auto"),
             "attitude", 95.5, 14.27, 98.0, 1.5, "4+",
             note="as it is installed: the C library, numpy where there was no compiler"),
-        Row(group, METHODS["pairs"], PRESET, _trial("mixed", "pairs", count, MIXED),
+        Row(group, METHODS["pairs"], PRESET, _experiment("mixed", "pairs", count, MIXED),
             "attitude", 82.4, 68.45, note=note),
     ]  # fmt: skip
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from starcat.evaluation.experiment import Attitudes, Experiment
 from starcat.evaluation.paper import Paper, Row, Statistic, product_mib, tolerance_for
-from starcat.evaluation.trial import Attitudes, Trial
 from starcat.simulation.simulate import Noise
 
 PRESET = "sao-12deg"
@@ -52,7 +52,7 @@ def _point(
         slug = f"{group}-{value:g}-{label}".lower().replace(",", "").replace(" ", "-")
         # The bare method meets every reference set with every separation.
         frames = count if label != "mean of minima" else max(40, count // 4)
-        trial = Trial(
+        experiment = Experiment(
             f"s5-{slug}",
             method,
             Attitudes("random", frames),
@@ -67,7 +67,7 @@ def _point(
         percent = published[1] if published and here and is_method else None
         goal = published[2] if published and here and label == "starcat" else None
         made.append(
-            Row(group, f"{label}, {value:g} {unit}".rstrip(), PRESET, trial, "two_stars",
+            Row(group, f"{label}, {value:g} {unit}".rstrip(), PRESET, experiment, "two_stars",
                 percent, 112.5 if percent and group == "Position noise" else None, goal, x=value)
         )  # fmt: skip
     return made

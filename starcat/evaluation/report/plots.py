@@ -9,9 +9,9 @@ from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
-from starcat.evaluation.report.columns import Line, method_of
-from starcat.evaluation.report.tables import groups_of
-from starcat.report.plots import headline, own_style
+from starcat.evaluation.report.tables import Line, groups_of, method_of
+from starcat.images.figure_file import own_style, write_figure
+from starcat.report.plots import STYLE, headline
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,7 +50,7 @@ def draw_rates(title: str, lines: Sequence[Line], series: Sequence[str]) -> Figu
     frames = sorted({line["frames"] for line in lines})
     several = f"{frames[0]:,}" + (f" to {frames[-1]:,}" if len(frames) > 1 else "")
     places = _places({line["x"] for line in lines})
-    with own_style():
+    with own_style(STYLE):
         figure = Figure(figsize=(7.2, 4.0))
         below = f"{several} frames a point; bars: 95 % interval (Wilson)"
         headline(figure, title[:1].upper() + title[1:], below)
@@ -80,7 +80,6 @@ def _places(x: Iterable[float]) -> dict[float, float]:
 def _draw_curves(
     axes: Axes, lines: Sequence[Line], series: Sequence[str], places: Mapping[float, float]
 ) -> list[Any]:
-    """Draw all curves; return what the legend shows."""
     shown = list(dict.fromkeys(series_of(line) for line in lines))
     width = max(places.values()) - min(places.values())
     handles = []
@@ -142,10 +141,5 @@ def _limits(lines: Sequence[Line]) -> tuple[float, float]:
 
 def save_small_svg(figure: Figure, path: Path) -> None:
     """Write a drawing as an SVG file whose letters are text: a sixth of the bytes."""
-    import matplotlib
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-
-    with own_style():
-        matplotlib.rcParams["svg.fonttype"] = "none"
-        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        FigureCanvasSVG(figure).print_figure(path, metadata=nothing)
+    with own_style({**STYLE, "svg.fonttype": "none"}):
+        write_figure(figure, path)

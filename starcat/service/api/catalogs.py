@@ -66,16 +66,7 @@ def _facts(offered: Offered) -> CatalogFacts:
         records=source.rows,
         citation=source.citation,
         licence=source.licence,
-        read=[
-            ReadFacts(
-                band=one.band,
-                epoch_jyear=one.epoch_jyear,
-                stars=one.stars,
-                brightest_mag=one.brightest_mag,
-                faintest_mag=one.faintest_mag,
-            )
-            for one in offered.read
-        ],
+        read=[ReadFacts.model_validate(one, from_attributes=True) for one in offered.read],
         hint=None
         if offered.is_here
         else f"the operator can get it with 'starcat fetch {source.name}', or set "

@@ -7,24 +7,25 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Request
 from fastapi.responses import JSONResponse, Response, StreamingResponse
+from pydantic import BaseModel, Field
 
 from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.errors import TargetMissing
 from starcat.releases.tree import Blob
 from starcat.service.access import Publisher, Reader
-from starcat.service.api.database_models import (
-    CoverageAnswer,
-    DatabaseFacts,
-    DatabaseFile,
-    Databases,
-    facts_of,
-)
-from starcat.service.archive import archive_bytes, archive_chunks
-from starcat.service.file_answers import FILE, REVALIDATED, file_answer, has_already, type_of
 from starcat.service.library import Database
 from starcat.service.problems import Problem
 from starcat.service.removal import remove_database
 from starcat.service.service import Service, TheService
+from starcat.service.transfers import (
+    FILE,
+    REVALIDATED,
+    archive_bytes,
+    archive_chunks,
+    file_answer,
+    has_already,
+    type_of,
+)
 
 router = APIRouter(prefix="/databases", tags=["databases"])
 
@@ -35,6 +36,82 @@ DatabaseId = Annotated[
 REPORT, COVERAGE, FIELDS = "report/report.json", "report/coverage.json", "report/coverage.csv"
 
 SAME: dict[int | str, dict[str, Any]] = {304: FILE[304]}
+
+
+class DatabaseFacts(BaseModel):
+    """What a database was made from, and what it holds."""
+
+    id: str = Field(
+        description="Beginning of the digest of what it was made from.",
+        examples=["0123456789abcdef"],
+    )
+    name: str = Field(examples=["gaia-12deg"])
+    version: str = Field(examples=["1.0.0"])
+    title: str = Field(description="Name of its folder.", examples=["gaia-12deg-1.0.0"])
+    description: str = Field(description="What the spec says of it.")
+    frame: str = Field(description="Axes of all positions.", examples=["ICRS"])
+    epoch_jyear: float = Field(description="Epoch of all positions, Julian year.")
+    catalog: str = Field(description="The star catalog.", examples=["gaia"])
+    stars: int = Field(description="Guide stars.")
+    bytes: int = Field(description="Size of all files together, without the manifest.")
+    products: dict[str, int] = Field(description="Rows of each product.")
+    manifest_sha256: str = Field(description="Digest that the manifest carries of itself.")
+    spec: dict[str, Any] = Field(description="The spec, with all defaults.")
+    software: dict[str, str] = Field(description="Versions of what built it.")
+
+
+class Databases(BaseModel):
+    """All databases there are."""
+
+    databases: list[DatabaseFacts]
+
+
+class DatabaseFile(BaseModel):
+    """A file of a database."""
+
+    path: str = Field(description="Within its folder.", examples=["stars.parquet"])
+    bytes: int = Field(description="Size.")
+    sha256: str = Field(description="Digest of the content; also its ETag.")
+    content_type: str = Field(examples=["application/vnd.apache.parquet"])
+
+
+class CoverageFields(BaseModel):
+    """Stars, pairs and triangles by field: lists of the same length."""
+
+    boresight: list[int] = Field(description="Number of the boresight.")
+    ra_deg: list[float] = Field(description="Right ascension of the boresight, degrees.")
+    dec_deg: list[float] = Field(description="Declination, degrees.")
+    stars: list[int]
+    pairs: list[int]
+    triangles: list[int]
+
+
+class CoverageAnswer(BaseModel):
+    """How many stars, pairs and triangles the fields of a database hold."""
+
+    summary: dict[str, Any] = Field(description="As 'starcat coverage --json' prints it.")
+    fields: CoverageFields
+
+
+def facts_of(database: Database) -> DatabaseFacts:
+    """Return what is said of a database."""
+    manifest, spec = database.manifest, database.spec
+    return DatabaseFacts(
+        id=database.id,
+        name=database.name,
+        version=database.version,
+        title=database.title,
+        description=database.description,
+        frame=manifest["frame"],
+        epoch_jyear=manifest["epoch_jyear"],
+        catalog=spec["catalog"]["source"],
+        stars=database.products.get("stars", 0),
+        bytes=database.bytes,
+        products=database.products,
+        manifest_sha256=str(manifest.get("manifest_sha256", "")),
+        spec=spec,
+        software=manifest["software"],
+    )
 
 
 @router.get("", summary="All databases")

@@ -15,15 +15,14 @@ from fastapi import APIRouter, Query, Request
 from fastapi import Path as PathParameter
 from fastapi.responses import Response
 from pydantic import BaseModel, Field, ValidationError
-from starlette.datastructures import FormData, UploadFile
+from starlette.datastructures import UploadFile
 
-from starcat.images.identification import IMAGE_SUFFIXES
+from starcat.failures import validation_message
+from starcat.images.solve_files import IMAGE_SUFFIXES, IdentifyOptions
 from starcat.service.access import Reader
-from starcat.service.file_answers import type_of
-from starcat.service.identifying import CAMERA_NAME, IdentifyOptions
 from starcat.service.problems import MEDIA_TYPE, Problem, ProblemDetails
 from starcat.service.service import Service, TheService
-from starcat.service.uploading import safe_name, scratch_folder
+from starcat.service.transfers import safe_name, scratch_folder, type_of
 
 UNKNOWN_TYPE: dict[int | str, dict[str, Any]] = {
     415: {
@@ -131,8 +130,8 @@ async def identify(
     database: DatabaseId, request: Request, service: TheService, reader: Reader
 ) -> Identified:
     """Identify the stars of frames and find the camera's attitude."""
-    async with _asked(request, service.settings.upload_mib) as asked:
-        found, _ = await service.sandbox.run(_identify, service, database, asked, None)
+    async with _sent(request, service.settings.upload_mib) as (frames, options):
+        found, _ = await service.sandbox.run(_identify, service, database, frames, options, None)
     return Identified.model_validate(found)
 
 
@@ -156,27 +155,41 @@ async def picture(
     kind: Annotated[Kind, Query(alias="format")] = "png",
 ) -> Response:
     """Return the first frame as a picture with its stars named, or as it is where none is."""
-    async with _asked(request, service.settings.upload_mib) as asked:
-        _, drawn = await service.sandbox.run(_identify, service, database, asked, kind)
+    async with _sent(request, service.settings.upload_mib) as (frames, options):
+        _, drawn = await service.sandbox.run(_identify, service, database, frames, options, kind)
     return Response(drawn, media_type=type_of(f"picture.{kind}"))
 
 
 @dataclass(frozen=True)
-class _Asked:
-    """What a request brought."""
+class FrameUpload:
+    """A file of frames on its way: the name it may have, and its content."""
 
     name: str
     content: BinaryIO
-    options: IdentifyOptions
+
+    @classmethod
+    def of_form(cls, upload: UploadFile, most_mib: float) -> FrameUpload:
+        """Return the file that a form holds."""
+        if upload.size is None or upload.size > most_mib * MIB:
+            raise Problem(413, f"the file is larger than {most_mib:g} MiB; send a smaller one")
+        return cls(safe_name(upload.filename, SUFFIXES, "frame"), upload.file)
 
 
 @asynccontextmanager
-async def _asked(request: Request, most_mib: float) -> AsyncIterator[_Asked]:
+async def _sent(
+    request: Request, most_mib: float
+) -> AsyncIterator[tuple[FrameUpload, IdentifyOptions]]:
     """Give what a request brought; its file is closed afterwards."""
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind == "multipart/form-data":
         async with request.form(max_files=1, max_fields=4) as form:
-            yield _of_form(form, most_mib)
+            upload = form.get("file")
+            if not isinstance(upload, UploadFile):
+                raise Problem(
+                    422, "no file was sent; send centroids or an image as 'file'", key="file"
+                )
+            frames = FrameUpload.of_form(upload, most_mib)
+            yield frames, _options(_json(str(form.get("options") or "{}"), "options"))
         return
     if kind != "application/json":
         raise Problem(
@@ -189,17 +202,7 @@ async def _asked(request: Request, most_mib: float) -> AsyncIterator[_Asked]:
         raise Problem(422, "expected an object with 'centroids_px', or with 'frames'", key="body")
     options = _options(content.pop("options", {}))
     # Not named by whoever sent it: messages call it so.
-    yield _Asked("frame.json", io.BytesIO(json.dumps(content).encode()), options)
-
-
-def _of_form(form: FormData, most_mib: float) -> _Asked:
-    upload = form.get("file")
-    if not isinstance(upload, UploadFile):
-        raise Problem(422, "no file was sent; send centroids or an image as 'file'", key="file")
-    if upload.size is None or upload.size > most_mib * MIB:
-        raise Problem(413, f"the file is larger than {most_mib:g} MiB; send a smaller one")
-    options = _options(_json(str(form.get("options") or "{}"), "options"))
-    return _Asked(safe_name(upload.filename, SUFFIXES, "frame"), upload.file, options)
+    yield FrameUpload("frame.json", io.BytesIO(json.dumps(content).encode())), options
 
 
 def _json(text: str, where: str) -> Any:
@@ -213,38 +216,40 @@ def _options(content: Any) -> IdentifyOptions:
     try:
         return IdentifyOptions.model_validate(content)
     except ValidationError as error:
-        first = error.errors(include_url=False, include_context=False)[0]
-        key = ".".join(["options", *map(str, first["loc"])])
-        raise Problem(
-            422,
-            f"{key}: {first['msg']} (found {str(first['input'])[:80]!r}); "
-            "/api/v1/identify/options says what there is",
-            key=key,
-        ) from None
+        where, found = validation_message(error, show_input=True)
+        key = f"options.{where}" if where else "options"
+        told = f"{key}: {found}; /api/v1/identify/options says what there is"
+        raise Problem(422, told, key=key) from None
 
 
 def _identify(
-    service: Service, database: str, asked: _Asked, kind: Kind | None
+    service: Service,
+    database: str,
+    frames: FrameUpload,
+    options: IdentifyOptions,
+    kind: Kind | None,
 ) -> tuple[dict[str, Any], bytes]:
-    artifact = service.library.find(database).folder
+    return identify_upload(service, service.library.find(database).folder, frames, options, kind)
+
+
+def identify_upload(
+    service: Service,
+    artifact: Path,
+    frames: FrameUpload,
+    options: IdentifyOptions,
+    kind: Kind | None,
+) -> tuple[dict[str, Any], bytes]:
+    """Identify frames in the sandbox; return the answers and the picture of the first."""
     with scratch_folder(service.paths) as folder:
-        _keep(asked, folder)
-        found = service.sandbox.call(
-            "identify",
-            {
-                "folder": str(folder),
-                "file": asked.name,
-                "artifact": str(artifact),
-                "options": asked.options.model_dump(),
-                "picture": kind,
-            },
-        )
+        with (folder / frames.name).open("wb") as file:
+            shutil.copyfileobj(frames.content, file)
+        arguments = {
+            "folder": str(folder),
+            "file": frames.name,
+            "artifact": str(artifact),
+            "options": options.model_dump(),
+            "picture": kind,
+        }
+        found = service.sandbox.call("identify", arguments)
         drawn = folder / f"picture.{kind}"
         return found, drawn.read_bytes() if drawn.is_file() else b""
-
-
-def _keep(asked: _Asked, folder: Path) -> None:
-    with (folder / asked.name).open("wb") as kept:
-        shutil.copyfileobj(asked.content, kept)
-    if asked.options.camera:
-        (folder / CAMERA_NAME).write_text(asked.options.camera, encoding="utf-8")

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any
+from functools import partial
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from starcat.geometry.sphere import radec_from_directions
 from starcat.pipeline.estimate import Estimate
 from starcat.pipeline.starter import Starter, advice
-from starcat.products.coverage import Spread
 from starcat.specs.build_spec import BuildSpec, CameraSpec
+from starcat.specs.keys import spec_toml
 from starcat.specs.reading import preset
-from starcat.specs.spec_toml import spec_toml
+
+MOST_FIELDS = 50_000
+"""Fields that are listed one by one at the most."""
 
 
 class CheckedSpec(BaseModel):
@@ -43,11 +48,13 @@ class Presets(BaseModel):
 class SpreadFacts(BaseModel):
     """How a number is spread over the fields."""
 
+    model_config = ConfigDict(from_attributes=True)
+
     minimum: int
     one_percent: int = Field(description="1 % of the fields have no more.")
     median: int
     maximum: int
-    mean: float
+    mean: Annotated[float, AfterValidator(partial(round, ndigits=3))]
 
 
 class WorstField(BaseModel):
@@ -98,6 +105,16 @@ class EstimateAnswer(BaseModel):
     in_words: str = Field(description="The line that 'starcat build' prints.")
 
 
+class CoverageMap(BaseModel):
+    """Guide stars by field: lists of the same length, in the order of the tiling."""
+
+    ra_deg: list[float] = Field(description="Right ascension of the boresight, degrees.")
+    dec_deg: list[float] = Field(description="Declination, degrees.")
+    stars: list[int] = Field(description="Guide stars in the field.")
+    fields: int = Field(description="Fields of the tiling.")
+    step: int = Field(description="1, or every how manyth field is listed of a tiling of many.")
+
+
 class StarterRequest(BaseModel):
     """A camera that a spec is wanted for."""
 
@@ -134,6 +151,8 @@ class StarterRequest(BaseModel):
 
 class LimitFigures(BaseModel):
     """What a magnitude limit leaves in a field."""
+
+    model_config = ConfigDict(from_attributes=True)
 
     faint_limit_mag: float
     guide_stars: int
@@ -180,7 +199,7 @@ def estimate_answer(found: Estimate) -> EstimateAnswer:
         guide_stars=cost.stars,
         fields=FieldFigures(
             count=cost.fields,
-            stars=_spread(coverage.stars),
+            stars=SpreadFacts.model_validate(coverage.stars),
             enough_share=round(found.enough_share, 6),
             full_share=round(found.full_share, 6),
             worst=WorstField(
@@ -206,28 +225,24 @@ def estimate_answer(found: Estimate) -> EstimateAnswer:
 
 def starter_answer(starter: Starter) -> StarterAnswer:
     """Return what is said of a first spec."""
-    rows = [
-        LimitFigures(
-            faint_limit_mag=row.faint_limit_mag,
-            guide_stars=row.guide_stars,
-            stars=_spread(row.stars),
-        )
-        for row in (*starter.limits, starter.thinned)
-    ]
     return StarterAnswer(
         checked=checked_spec(starter.spec),
-        limits=rows[:-1],
-        thinned=rows[-1],
+        limits=[LimitFigures.model_validate(row) for row in starter.limits],
+        thinned=LimitFigures.model_validate(starter.thinned),
         advice=list(advice(starter)),
         in_words=starter.cost.in_words,
     )
 
 
-def _spread(spread: Spread) -> SpreadFacts:
-    return SpreadFacts(
-        minimum=spread.minimum,
-        one_percent=spread.one_percent,
-        median=spread.median,
-        maximum=spread.maximum,
-        mean=round(spread.mean, 3),
+def coverage_answer(found: Estimate) -> CoverageMap:
+    """Return the guide stars of each field, or of some of very many."""
+    count = found.fields.count
+    step = -(-len(count) // MOST_FIELDS)
+    ra_deg, dec_deg = radec_from_directions(found.fields.boresights[::step])
+    return CoverageMap(
+        ra_deg=np.round(ra_deg, 4).tolist(),
+        dec_deg=np.round(dec_deg, 4).tolist(),
+        stars=count[::step].tolist(),
+        fields=len(count),
+        step=step,
     )

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query
-from fastapi.responses import JSONResponse, Response, StreamingResponse
+from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from starcat.exchange.formats import FILE_FORMATS, FORMATS, FileFormat
-from starcat.query.gallery import gallery
-from starcat.query.macros import macros
+from starcat.query.gallery import gallery, macros
+from starcat.query.targets import View
 from starcat.service.access import Reader
-from starcat.service.asking import Question, file_of, named_text, rows_of
 from starcat.service.problems import Problem
 from starcat.service.service import Service, TheService
+from starcat.service.sql import SqlQuery, named_text, result_file, result_table
 
 router = APIRouter(prefix="/sql", tags=["sql"])
 
@@ -152,15 +151,16 @@ async def ask(question: SqlQuestion, service: TheService, reader: Reader) -> Res
 @router.get("/queries", summary="Queries by name")
 def queries(reader: Reader) -> list[GalleryQuery]:
     """Return the queries that people ask often, with their values."""
-    return [GalleryQuery.model_validate(asdict(query)) for query in gallery().values()]
+    return [
+        GalleryQuery.model_validate(query, from_attributes=True) for query in gallery().values()
+    ]
 
 
 @router.get("/macros", summary="Functions of queries")
 def all_macros(reader: Reader) -> list[MacroFacts]:
     """Return the functions that queries have beside those of DuckDB."""
-    facts = ("name", "arguments", "is_table", "help", "example")
     listed = sorted(macros(), key=lambda macro: (macro.is_table, macro.name))
-    return [MacroFacts(**{fact: getattr(one, fact) for fact in facts}) for one in listed]
+    return [MacroFacts.model_validate(one, from_attributes=True) for one in listed]
 
 
 @router.get("/views", summary="Tables of targets")
@@ -176,7 +176,7 @@ async def views(
     return await service.query_pool.run(_views, service, target)
 
 
-def _checked(service: Service, question: SqlQuestion) -> Question:
+def _checked(service: Service, question: SqlQuestion) -> SqlQuery:
     """Return what is asked, within the limits that the operator set."""
     if (question.query is None) == (question.named is None):
         raise Problem(422, "give either a query or the name of one", key="query")
@@ -190,25 +190,18 @@ def _checked(service: Service, question: SqlQuestion) -> Question:
     else:
         text, values = question.query or "", dict(question.values)  # type: ignore[arg-type]
     time_s = min(question.time_limit_s or settings.query_time_s, settings.query_time_s)
-    return Question(question.targets, text, values, min(question.max_rows or default, most), time_s)
+    return SqlQuery(question.targets, text, values, min(question.max_rows or default, most), time_s)
 
 
-def _rows(service: Service, asked: Question) -> Response:
-    found = rows_of(service, asked)
+def _rows(service: Service, query: SqlQuery) -> Response:
     # What JSON has was made sure of: a model would check every value once more.
-    return JSONResponse({"columns": found.columns, "rows": found.rows, "is_cut": found.is_cut})
+    return JSONResponse(result_table(service, query).as_json())
 
 
-def _file(service: Service, asked: Question, form: str) -> Response:
-    found = file_of(service, asked, form)
-    kind = FORMATS[form]
-    headers = {
-        "Content-Length": str(found.size),
-        "Content-Disposition": f'attachment; filename="answer{kind.suffix}"',
-        "X-Starcat-Rows": str(found.rows),
-        "X-Starcat-Cut": str(found.is_cut).lower(),
-    }
-    return StreamingResponse(found.chunks, media_type=kind.media_type, headers=headers)
+def _file(service: Service, query: SqlQuery, form: str) -> Response:
+    found = result_file(service, query, form)
+    counts = {"X-Starcat-Rows": str(found.rows), "X-Starcat-Cut": str(found.is_cut).lower()}
+    return found.response("answer", counts)
 
 
 def _views(service: Service, targets: list[str]) -> list[ViewFacts]:
@@ -218,18 +211,17 @@ def _views(service: Service, targets: list[str]) -> list[ViewFacts]:
                 target=target.name,
                 view=view.name,
                 description=view.schema.description if view.schema else "",
-                columns=[
-                    ViewColumn(
-                        name=c.name, dtype=c.dtype, unit=c.unit or "", description=c.description
-                    )
-                    for c in view.schema.columns
-                ]
-                if view.schema
-                else [
-                    ViewColumn(name=name, dtype="", unit="", description="")
-                    for name in view.columns
-                ],
+                columns=_columns(view),
             )
             for target in session.targets
             for view in target.views
         ]
+
+
+def _columns(view: View) -> list[ViewColumn]:
+    if view.schema is None:
+        return [ViewColumn(name=name, dtype="", unit="", description="") for name in view.columns]
+    return [
+        ViewColumn(name=one.name, dtype=one.dtype, unit=one.unit or "", description=one.description)
+        for one in view.schema.columns
+    ]

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import secrets
 import sqlite3
-import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -19,55 +16,30 @@ State = Literal["queued", "running", "done", "failed", "cancelled"]
 
 ENDED: tuple[State, ...] = ("done", "failed", "cancelled")
 
+QUERY = "query"
+"""Kind of the rows that are asynchronous queries of TAP, which only `starcat.service.vo` shows."""
+
 
 @dataclass(frozen=True)
 class Job:
-    """A job.
+    """A job; times are seconds since 1970."""
 
-    Attributes
-    ----------
-    id : str
-        Thirty-two hexadecimal digits.
-    kind : {"build", "ingest", "evaluate"}
-        What is to be done.
-    key : str
-        SHA-256 of all that the result depends on.
-    owner : str
-        Name of who asked for it.
-    title : str
-        For people, such as ``gaia-12deg 1.0.0``.
-    state : {"queued", "running", "done", "failed", "cancelled"}
-        How far it is.
-    request : dict
-        What was asked for, as JSON has it.
-    created_s, started_s, ended_s : float
-        Seconds since 1970; the last two None before.
-    attempt : int
-        How often it was begun.
-    stage, done, total
-        The stage that it is in, and how much of that is done of how much, where that is known.
-    error : dict, optional
-        Problem details, where it failed.
-    result : dict, optional
-        What it made, such as ``{"database": "0123456789abcdef"}``.
-    """
-
-    id: str
+    id: str  # 32 hexadecimal digits
     kind: Kind
-    key: str
+    key: str  # SHA-256 of all that the result depends on
     owner: str
-    title: str
+    title: str  # for people, such as "gaia-12deg 1.0.0"
     state: State
     request: dict[str, Any]
     created_s: float
     started_s: float | None
     ended_s: float | None
-    attempt: int
+    attempt: int  # how often it was begun
     stage: str | None
-    done: int | None
+    done: int | None  # of the stage
     total: int | None
-    error: dict[str, Any] | None
-    result: dict[str, Any] | None
+    error: dict[str, Any] | None  # problem details
+    result: dict[str, Any] | None  # such as {"database": "0123456789abcdef"}
 
     @property
     def has_ended(self) -> bool:
@@ -77,48 +49,24 @@ class Job:
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened to a job.
+    """Something that happened to a job: ``data`` is a state, a stage, or a line of the log."""
 
-    Attributes
-    ----------
-    number : int
-        1, 2, 3 ... of its job.
-    at_s : float
-        Seconds since 1970.
-    kind : {"state", "stage", "log"}
-        What changed.
-    data : dict
-        The state; the stage with ``done`` and ``total``; or a line of the log.
-    """
-
-    number: int
+    number: int  # 1, 2, 3 ... of its job
     at_s: float
-    kind: str
+    kind: str  # "state", "stage" or "log"
     data: dict[str, Any]
 
 
 class JobStore:
-    """The jobs of a service."""
+    """The builds, ingests and evaluations of a service."""
 
     def __init__(self, records: Records) -> None:
         self._records = records
 
-    def add(
-        self, kind: Kind, request: Mapping[str, Any], *, key: str, title: str, owner: str
-    ) -> Job:
-        """Remember a new job."""
-        with self._records.writing() as connection:
-            job_id = insert_job(connection, kind, request, key=key, title=title, owner=owner)
-        return self.get(job_id)
-
     def get(self, job_id: str) -> Job:
         """Return a job."""
-        checked(job_id, JOB_ID, "job")
         with self._records.reading() as connection:
-            row = connection.execute("SELECT * FROM jobs WHERE id = ?", (job_id,)).fetchone()
-        if row is None:
-            raise TargetMissing(f"no job has the id {job_id!r}; the list of them tells theirs")
-        return job_of(row)
+            return job_in(connection, job_id)
 
     def all(
         self,
@@ -161,39 +109,19 @@ class JobStore:
 
 def _where(**wanted: str | None) -> tuple[str, list[str]]:
     given = {name: value for name, value in wanted.items() if value is not None}
-    conditions = " AND ".join(f"{name} = ?" for name in given)
-    return (f"WHERE {conditions}" if given else ""), list(given.values())
+    conditions = " AND ".join(["kind != ?", *(f"{name} = ?" for name in given)])
+    return f"WHERE {conditions}", [QUERY, *given.values()]
 
 
-def insert_job(
-    connection: sqlite3.Connection,
-    kind: Kind,
-    request: Mapping[str, Any],
-    *,
-    key: str,
-    title: str,
-    owner: str,
-) -> str:
-    """Remember a new job within a transaction."""
-    job_id = secrets.token_hex(16)
-    connection.execute(
-        "INSERT INTO jobs (id, kind, key, owner, title, state, request, created_s) "
-        "VALUES (?, ?, ?, ?, ?, 'queued', ?, ?)",
-        (job_id, kind, key, owner, title, json.dumps(request), time.time()),
-    )
-    add_event(connection, job_id, "state", {"state": "queued"})
-    return job_id
-
-
-def add_event(
-    connection: sqlite3.Connection, job_id: str, kind: str, data: Mapping[str, Any]
-) -> None:
-    """Remember that something happened to a job."""
-    connection.execute(
-        "INSERT INTO job_events (job, number, at_s, kind, data) SELECT ?, "
-        "1 + coalesce(max(number), 0), ?, ?, ? FROM job_events WHERE job = ?",
-        (job_id, time.time(), kind, json.dumps(data), job_id),
-    )
+def job_in(connection: sqlite3.Connection, job_id: str) -> Job:
+    """Return a job within a transaction."""
+    checked(job_id, JOB_ID, "job")
+    row = connection.execute(
+        "SELECT * FROM jobs WHERE id = ? AND kind != ?", (job_id, QUERY)
+    ).fetchone()
+    if row is None:
+        raise TargetMissing(f"no job has the id {job_id!r}; the list of them tells theirs")
+    return job_of(row)
 
 
 def job_of(row: sqlite3.Row) -> Job:
@@ -202,3 +130,8 @@ def job_of(row: sqlite3.Row) -> Job:
     for name in ("request", "error", "result"):
         content[name] = None if content[name] is None else json.loads(content[name])
     return Job(**content)
+
+
+def job_problem(title: str, status: int, detail: str) -> dict[str, Any]:
+    """Return problem details of a job that failed."""
+    return {"type": "about:blank", "title": title, "status": status, "detail": detail}

@@ -1,19 +1,20 @@
 """What may become of a job: each step is one transaction, and only one can take it.
 
-A job is begun by whoever turns it from queued to running. From then on the number of the attempt
-says whose job it is: what an earlier attempt still has to say is not heard.
+The table is the queue: a job is begun by whoever turns its row from queued to running. From then
+on the number of the attempt says whose job it is: what an earlier attempt reports is not taken.
 """
 
 from __future__ import annotations
 
 import json
+import secrets
 import sqlite3
 import time
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
-from starcat.errors import TargetMissing
-from starcat.service.jobs.job import Job, Kind, State, add_event, insert_job, job_of
+from starcat.service.jobs.job import Job, Kind, State, job_in, job_of, job_problem
 from starcat.service.problems import Problem
 from starcat.service.records import Records
 
@@ -22,6 +23,8 @@ MAX_INTERRUPTED = 8
 
 MAX_LOG_LINES = 2000
 """Lines of the log of a job that are kept, all attempts together."""
+
+_NO_STAGE = "stage = NULL, done = NULL, total = NULL"
 
 
 def add_once(
@@ -35,15 +38,26 @@ def add_once(
     most_waiting: int,
     has_result: Callable[[Job], bool],
     check: Callable[[], None],
-) -> tuple[str, bool]:
-    """Remember a job, unless one is there that does the same."""
+) -> tuple[Job, bool]:
+    """Return the job that does what is asked for, and whether it is new.
+
+    ``has_result`` tells whether the result of a job that is done still exists; ``check`` raises
+    where there is no room for a new one.
+    """
     with records.writing() as connection:
-        there = _same(connection, key, has_result)
-        if there is not None:
-            return there.id, False
+        same = _same(connection, key, has_result)
+        if same is not None:
+            return same, False
         check()
         _check_waiting(connection, owner, most_waiting)
-        return insert_job(connection, kind, request, key=key, title=title, owner=owner), True
+        job_id, now_s = secrets.token_hex(16), time.time()
+        connection.execute(
+            "INSERT INTO jobs (id, kind, key, owner, title, state, request, created_s, queued_s) "
+            "VALUES (?, ?, ?, ?, ?, 'queued', ?, ?, ?)",
+            (job_id, kind, key, owner, title, json.dumps(request), now_s, now_s),
+        )
+        _add_event(connection, job_id, "state", {"state": "queued"})
+        return job_in(connection, job_id), True
 
 
 def _same(
@@ -61,7 +75,8 @@ def _same(
 
 def _check_waiting(connection: sqlite3.Connection, owner: str, most: int) -> None:
     [waiting] = connection.execute(
-        "SELECT count(*) FROM jobs WHERE owner = ? AND state = 'queued'", (owner,)
+        "SELECT count(*) FROM jobs WHERE owner = ? AND state = 'queued' AND kind != 'query'",
+        (owner,),
     ).fetchone()
     if waiting >= most:
         raise Problem(
@@ -72,49 +87,53 @@ def _check_waiting(connection: sqlite3.Connection, owner: str, most: int) -> Non
         )
 
 
-def claim(records: Records, job_id: str, *, is_away: bool = False) -> Job | None:
-    """Begin a job."""
+def is_waiting(records: Records, kinds: Sequence[str]) -> bool:
+    """Return whether a job of some kinds waits."""
+    with records.reading() as connection:
+        return connection.execute(_first(kinds), kinds).fetchone() is not None
+
+
+def begin_next(records: Records, kinds: Sequence[str]) -> Job | None:
+    """Begin the job of some kinds that has waited for longest; None where none waits."""
     with records.writing() as connection:
         row = connection.execute(
-            "UPDATE jobs SET state = 'running', started_s = ?, heard_s = ?, "
-            "attempt = attempt + 1, wants_end = 0, stage = NULL, done = NULL, total = NULL, "
-            "error = NULL WHERE id = ? AND state = 'queued' RETURNING *",
-            (time.time(), time.time() if is_away else None, job_id),
+            "UPDATE jobs SET state = 'running', started_s = ?, attempt = attempt + 1, "
+            f"cancel_requested = 0, {_NO_STAGE}, error = NULL WHERE id = ({_first(kinds)}) "
+            "RETURNING *",
+            (time.time(), *kinds),
         ).fetchone()
         if row is None:
             return None
         job = job_of(row)
-        add_event(connection, job_id, "state", {"state": "running", "attempt": job.attempt})
+        _add_event(connection, job.id, "state", {"state": "running", "attempt": job.attempt})
     return job
 
 
-def running_here(records: Records) -> list[tuple[str, int]]:
-    """Return the jobs that run on this machine."""
-    with records.reading() as connection:
-        rows = connection.execute(
-            "SELECT id, attempt FROM jobs WHERE state = 'running' AND heard_s IS NULL "
-            "ORDER BY created_s"
-        ).fetchall()
-    return [(row["id"], row["attempt"]) for row in rows]
+def _first(kinds: Sequence[str]) -> str:
+    marks = ", ".join("?" * len(kinds))
+    return (
+        f"SELECT id FROM jobs WHERE state = 'queued' AND kind IN ({marks}) "
+        "ORDER BY queued_s, id LIMIT 1"
+    )
 
 
-def silent_since(records: Records, then_s: float) -> list[tuple[str, int]]:
-    """Return the jobs on other machines that nobody has heard of."""
+def running_jobs(records: Records) -> list[Job]:
+    """Return the jobs that run, of all kinds."""
     with records.reading() as connection:
         rows = connection.execute(
-            "SELECT id, attempt FROM jobs WHERE state = 'running' AND heard_s < ?", (then_s,)
+            "SELECT * FROM jobs WHERE state = 'running' ORDER BY created_s"
         ).fetchall()
-    return [(row["id"], row["attempt"]) for row in rows]
+    return [job_of(row) for row in rows]
 
 
 def cancel(records: Records, job_id: str) -> None:
     """End a job that waits, and ask for the end of one that runs."""
     with records.writing() as connection:
-        job = _job(connection, job_id)
+        job = job_in(connection, job_id)
         if job.state == "queued":
             _end(connection, job_id, "cancelled")
         elif job.state == "running":
-            connection.execute("UPDATE jobs SET wants_end = 1 WHERE id = ?", (job_id,))
+            connection.execute("UPDATE jobs SET cancel_requested = 1 WHERE id = ?", (job_id,))
         elif job.state != "cancelled":
             raise Problem(409, f"job {job_id} has ended already; it is {job.state}")
 
@@ -124,66 +143,76 @@ def retry(
 ) -> None:
     """Have a job wait once more."""
     with records.writing() as connection:
-        job = _job(connection, job_id)
-        there = _same(connection, job.key, has_result)
-        if there is not None:
-            what = "it" if there.id == job_id else f"job {there.id} does the same and"
-            raise Problem(409, f"job {job_id} need not be tried again: {what} is {there.state}")
+        job = job_in(connection, job_id)
+        same = _same(connection, job.key, has_result)
+        if same is not None:
+            what = "it" if same.id == job_id else f"job {same.id} does the same and"
+            raise Problem(409, f"job {job_id} need not be tried again: {what} is {same.state}")
         _check_waiting(connection, job.owner, most_waiting)
         connection.execute(
-            "UPDATE jobs SET state = 'queued', interrupted = 0, wants_end = 0, ended_s = NULL, "
-            "stage = NULL, done = NULL, total = NULL, error = NULL, result = NULL WHERE id = ?",
-            (job_id,),
+            "UPDATE jobs SET state = 'queued', queued_s = ?, interrupted = 0, ended_s = NULL, "
+            f"cancel_requested = 0, {_NO_STAGE}, error = NULL, result = NULL WHERE id = ?",
+            (time.time(), job_id),
         )
-        add_event(connection, job_id, "state", {"state": "queued"})
+        _add_event(connection, job_id, "state", {"state": "queued"})
 
 
-def interrupt(records: Records, job_id: str, attempt: int) -> None:
-    """Say that whoever ran a job is gone: it waits again, unless that was too often."""
+def interrupt(records: Records, job: Job) -> None:
+    """Have a job wait again whose attempt is lost, unless that was too often."""
     with records.writing() as connection:
         row = connection.execute(
-            "UPDATE jobs SET interrupted = interrupted + 1 "
-            "WHERE id = ? AND attempt = ? AND state = 'running' RETURNING interrupted, wants_end",
-            (job_id, attempt),
+            "UPDATE jobs SET interrupted = interrupted + 1 WHERE id = ? AND attempt = ? "
+            "AND state = 'running' RETURNING interrupted, cancel_requested",
+            (job.id, job.attempt),
         ).fetchone()
         if row is None:
             return
-        if row["wants_end"]:
-            _end(connection, job_id, "cancelled")
+        if row["cancel_requested"]:
+            _end(connection, job.id, "cancelled")
         elif row["interrupted"] >= MAX_INTERRUPTED:
             detail = (
                 f"the service ended {row['interrupted']} times while this job ran, which may be "
                 "because of it; ask for less, or try it again"
             )
-            error = {"type": "about:blank", "title": "Interrupted", "status": 500, "detail": detail}
-            _end(connection, job_id, "failed", error=error)
+            _end(connection, job.id, "failed", job_problem("Interrupted", 500, detail))
         else:
-            _wait_again(connection, job_id)
+            _requeue(connection, job.id)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How an attempt ended; ``queued`` where the service stops, and the job is to run again."""
+
+    state: Literal["done", "failed", "cancelled", "queued"]
+    content: Mapping[str, Any] = field(default_factory=dict)  # the result, or problem details
 
 
 class Attempt:
-    """An attempt at a job: what it has to say is remembered while the job is its own."""
+    """An attempt at a job: what it reports is taken while the job is its own."""
 
     def __init__(self, records: Records, job: Job) -> None:
         self._records = records
         self.job = job
 
-    def wants_end(self) -> bool:
-        """Return whether the job is to end: it was cancelled, or is another attempt's."""
+    def cancel_requested(self) -> bool:
+        """Return whether it has to end: the job was cancelled, or is another attempt's."""
         with self._records.reading() as connection:
             row = connection.execute(
-                "SELECT wants_end FROM jobs WHERE id = ? AND attempt = ? AND state = 'running'",
+                "SELECT cancel_requested FROM jobs WHERE id = ? AND attempt = ? "
+                "AND state = 'running'",
                 (self.job.id, self.job.attempt),
             ).fetchone()
-        return row is None or bool(row["wants_end"])
+        return row is None or bool(row["cancel_requested"])
 
-    def be_heard(self) -> bool:
-        """Say that its worker, on another machine, is there; return whether the job is its own."""
-        with self._records.writing() as connection:
-            return self._update(connection, "heard_s = ?", time.time())
+    def report(self, message: Mapping[str, Any]) -> None:
+        """Take a message of the process: ``stage``, ``done``, ``total``; or ``log``, ``level``."""
+        if "stage" in message:
+            self.report_stage(message["stage"], message["done"], message["total"])
+        elif "log" in message:
+            self.log(message["level"], message["log"])
 
-    def tell_stage(self, stage: str, done: int, total: int | None) -> None:
-        """Say how far it is; of each stage the last event is kept."""
+    def report_stage(self, stage: str, done: int, total: int | None) -> None:
+        """Record how much of a stage is done; of the events of a stage only the last is kept."""
         with self._records.writing() as connection:
             changed = self._update(connection, "stage = ?, done = ?, total = ?", stage, done, total)
             if not changed:
@@ -193,15 +222,15 @@ class Attempt:
                 "AND json_extract(data, '$.stage') = ?",
                 (self.job.id, stage),
             ).fetchone()[0]
-            add_event(
+            _add_event(
                 connection, self.job.id, "stage", {"stage": stage, "done": done, "total": total}
             )
             connection.execute(
                 "DELETE FROM job_events WHERE job = ? AND number = ?", (self.job.id, before)
             )
 
-    def tell(self, level: str, text: str) -> None:
-        """Say a line of the log."""
+    def log(self, level: str, text: str) -> None:
+        """Add a line to the log; the level is info, warning or error."""
         with self._records.writing() as connection:
             if not self._is_mine(connection):
                 return
@@ -209,33 +238,20 @@ class Attempt:
                 "SELECT count(*) FROM job_events WHERE job = ? AND kind = 'log'", (self.job.id,)
             ).fetchone()
             if lines < MAX_LOG_LINES:
-                add_event(connection, self.job.id, "log", {"level": level, "text": text})
+                _add_event(connection, self.job.id, "log", {"level": level, "text": text})
             elif lines == MAX_LOG_LINES:
                 text = f"the log ends here, after {lines:,} lines"
-                add_event(connection, self.job.id, "log", {"level": "warning", "text": text})
+                _add_event(connection, self.job.id, "log", {"level": "warning", "text": text})
 
-    def succeed(self, result: Mapping[str, Any]) -> None:
-        """Say that it is done."""
-        self._close("done", result=result)
-
-    def fail(self, error: Mapping[str, Any]) -> None:
-        """Say that it has failed."""
-        self._close("failed", error=error)
-
-    def be_cancelled(self) -> None:
-        """Say that it was ended because somebody asked for that."""
-        self._close("cancelled")
-
-    def wait_again(self) -> None:
-        """Say that it was ended because the service stops, and is to be begun again."""
+    def end(self, outcome: Outcome) -> None:
+        """Record how it ended."""
         with self._records.writing() as connection:
-            if self._is_mine(connection):
-                _wait_again(connection, self.job.id)
-
-    def _close(self, state: State, **content: Mapping[str, Any]) -> None:
-        with self._records.writing() as connection:
-            if self._is_mine(connection):
-                _end(connection, self.job.id, state, **content)
+            if not self._is_mine(connection):
+                return
+            if outcome.state == "queued":
+                _requeue(connection, self.job.id)
+            else:
+                _end(connection, self.job.id, outcome.state, outcome.content)
 
     def _is_mine(self, connection: sqlite3.Connection) -> bool:
         return self._update(connection, "attempt = ?", self.job.attempt)
@@ -248,42 +264,30 @@ class Attempt:
         return bool(done.rowcount)
 
 
-def _job(connection: sqlite3.Connection, job_id: str) -> Job:
-    row = connection.execute("SELECT * FROM jobs WHERE id = ?", (job_id,)).fetchone()
-    if row is None:
-        raise TargetMissing(f"no job has the id {job_id[:80]!r}; the list of them tells theirs")
-    return job_of(row)
-
-
-def _wait_again(connection: sqlite3.Connection, job_id: str) -> None:
-    connection.execute(
-        "UPDATE jobs SET state = 'queued', stage = NULL, done = NULL, total = NULL WHERE id = ?",
-        (job_id,),
-    )
-    add_event(connection, job_id, "state", {"state": "queued"})
+def _requeue(connection: sqlite3.Connection, job_id: str) -> None:
+    connection.execute(f"UPDATE jobs SET state = 'queued', {_NO_STAGE} WHERE id = ?", (job_id,))
+    _add_event(connection, job_id, "state", {"state": "queued"})
 
 
 def _end(
-    connection: sqlite3.Connection,
-    job_id: str,
-    state: State,
-    *,
-    result: Mapping[str, Any] | None = None,
-    error: Mapping[str, Any] | None = None,
+    connection: sqlite3.Connection, job_id: str, state: State, content: Mapping[str, Any] = {}
 ) -> None:
-    told: dict[str, Any] = {"state": state}
-    if result is not None:
-        told["result"] = dict(result)
-    if error is not None:
-        told["error"] = dict(error)
+    column = {"done": "result", "failed": "error"}.get(state)
+    told = {} if column is None else {column: dict(content)}
+    result, error = (json.dumps(told[one]) if one in told else None for one in ("result", "error"))
     connection.execute(
-        "UPDATE jobs SET state = ?, ended_s = ?, wants_end = 0, result = ?, error = ? WHERE id = ?",
-        (
-            state,
-            time.time(),
-            None if result is None else json.dumps(result),
-            None if error is None else json.dumps(error),
-            job_id,
-        ),
+        "UPDATE jobs SET state = ?, ended_s = ?, cancel_requested = 0, result = ?, error = ? "
+        "WHERE id = ?",
+        (state, time.time(), result, error, job_id),
     )
-    add_event(connection, job_id, "state", told)
+    _add_event(connection, job_id, "state", {"state": state, **told})
+
+
+def _add_event(
+    connection: sqlite3.Connection, job_id: str, kind: str, data: Mapping[str, Any]
+) -> None:
+    connection.execute(
+        "INSERT INTO job_events (job, number, at_s, kind, data) SELECT ?, "
+        "1 + coalesce(max(number), 0), ?, ?, ? FROM job_events WHERE job = ?",
+        (job_id, time.time(), kind, json.dumps(data), job_id),
+    )

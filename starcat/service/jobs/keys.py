@@ -11,9 +11,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from starcat.catalog.fetching.locate import locate
-from starcat.catalog.readers.files import find_files
 from starcat.catalog.source import data_source
+from starcat.catalog.source_files import SourceFiles, locate
 from starcat.errors import SourceMissing, reason
 from starcat.service.jobs.job import Kind
 from starcat.service.records import Records
@@ -30,6 +29,13 @@ def build_key(records: Records, spec: BuildSpec) -> str:
     """Return the key of a build."""
     inputs = {name: source_digests(records, name) for name in spec.sources}
     return key_of("build", {"spec": spec.recorded(), "inputs": inputs})
+
+
+def ingest_key(records: Records, request: Mapping[str, Any]) -> str:
+    """Return the key of an ingest."""
+    source = str(request["source"])
+    inputs = {source: source_digests(records, source)}
+    return key_of("ingest", {**request, "inputs": inputs})
 
 
 def key_of(kind: Kind, content: Mapping[str, Any]) -> str:
@@ -59,7 +65,7 @@ def source_files(name: str, paths: Iterable[Path]) -> list[Path]:
             # The partitions of a store are named in its metadata, with their digests.
             found += sorted(one for one in path.iterdir() if one.is_file())
         else:
-            found += [file.path for file in find_files(data_source(name), [path])]
+            found += [file.path for file in SourceFiles.find(data_source(name), [path]).files]
     return found
 
 

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from starcat.errors import ProductError, TargetMissing
-from starcat.service.jobs.ground import Ground
 from starcat.service.problems import Problem
+
+if TYPE_CHECKING:
+    from starcat.service.service import Service
 
 GIB = 2**30
 
 
-def check_room(service: Ground, owner: str) -> None:
+def check_room(service: Service, owner: str) -> None:
     """Check that there is room for what a user wants to have made."""
     short = disk_shortage(service)
     if short is not None:
@@ -22,7 +25,7 @@ def check_room(service: Ground, owner: str) -> None:
         raise Problem(409, full)
 
 
-def disk_shortage(service: Ground) -> str | None:
+def disk_shortage(service: Service) -> str | None:
     """Return what to say where the disk is nearly full."""
     free_gib = shutil.disk_usage(service.paths.root).free / GIB
     if free_gib >= service.settings.free_gib:
@@ -33,7 +36,7 @@ def disk_shortage(service: Ground) -> str | None:
     )
 
 
-def owner_excess(service: Ground, owner: str, more_bytes: int = 0) -> str | None:
+def owner_excess(service: Service, owner: str, more_bytes: int = 0) -> str | None:
     """Return what to say where a user's databases take more of the disk than they may."""
     taken_gib = (owned_bytes(service, owner) + more_bytes) / GIB
     if taken_gib < service.settings.disk_gib:
@@ -44,7 +47,7 @@ def owner_excess(service: Ground, owner: str, more_bytes: int = 0) -> str | None
     )
 
 
-def owned_bytes(service: Ground, owner: str) -> int:
+def owned_bytes(service: Service, owner: str) -> int:
     """Return how much of the disk the databases of a user take."""
     with service.records.reading() as connection:
         rows = connection.execute(

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from starcat.catalog.ingest import check_band, star_catalog
+from starcat.catalog.ingest import ingest_options
 from starcat.errors import TargetMissing
 from starcat.service.access import Principal, Role
 from starcat.service.jobs.job import Job, Kind
 from starcat.service.jobs.job_states import add_once, cancel, retry
-from starcat.service.jobs.keys import build_key, key_of, source_digests
+from starcat.service.jobs.keys import build_key, ingest_key, key_of
 from starcat.service.jobs.limits import check_room
 from starcat.service.problems import Problem
 from starcat.service.service import Service
@@ -27,15 +27,7 @@ Format = Literal["parquet", "hats"]
 
 @dataclass(frozen=True)
 class Submitted:
-    """What became of a request for a job.
-
-    Attributes
-    ----------
-    job : Job
-        The job that does it.
-    is_new : bool
-        Whether it was not there before.
-    """
+    """What became of a request for a job: the job that does it, perhaps one that there was."""
 
     job: Job
     is_new: bool
@@ -61,13 +53,12 @@ def submit_ingest(
     """Have a catalog read."""
     request = {
         "source": source,
-        "band": check_band(star_catalog(source), band),
+        "band": ingest_options(source, band).band,
         "epoch_jyear": epoch_jyear,
         "read_limit_mag": read_limit_mag,
         "to": to,
     }
-    inputs = {source: source_digests(service.records, source)}
-    key = key_of("ingest", {**request, "inputs": inputs})
+    key = ingest_key(service.records, request)
     return _submit(service, "ingest", request, key, f"{source} ({to})", owner)
 
 
@@ -98,7 +89,7 @@ def submit_evaluation(
 def _submit(
     service: Service, kind: Kind, request: Mapping[str, Any], key: str, title: str, owner: str
 ) -> Submitted:
-    job_id, is_new = add_once(
+    job, is_new = add_once(
         service.records,
         kind,
         request,
@@ -109,9 +100,8 @@ def _submit(
         has_result=lambda job: has_result(service, job),
         check=lambda: check_room(service, owner),
     )
-    if is_new:
-        service.queue.send(job_id)
-    return Submitted(service.jobs.get(job_id), is_new)
+    service.wake_slots()
+    return Submitted(job, is_new)
 
 
 def has_result(service: Service, job: Job) -> bool:
@@ -147,7 +137,7 @@ def retry_job(service: Service, job_id: str, principal: Principal) -> Job:
         most_waiting=service.settings.jobs_waiting,
         has_result=lambda one: has_result(service, one),
     )
-    service.queue.send(job_id)
+    service.wake_slots()
     return service.jobs.get(job_id)
 
 

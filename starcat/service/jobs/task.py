@@ -17,13 +17,13 @@ import threading
 import time
 import traceback
 from contextlib import suppress
-from pathlib import Path
 from typing import IO, Any
 
 from starcat.errors import StarcatError
 from starcat.query.confinement import limit_memory
+from starcat.service.jobs.job import job_problem
 from starcat.service.jobs.work import Order, do_job, prepare
-from starcat.service.paths import ServicePaths
+from starcat.service.sandbox.child import own_output
 from starcat.storage.locks import locked
 
 NICENESS = 10
@@ -39,21 +39,17 @@ NO_THREAD = "can't start new thread"
 
 _SET_PARENT_DEATH_SIGNAL = 1
 
-PROGRAM = (
-    "import sys; sys.path[:] = sys.argv[1:]; from starcat.service.jobs.task import main; main()"
-)
 
+class Messages:
+    """What happens, written as lines of JSON."""
 
-class Teller:
-    """Says what happens, as lines of JSON."""
-
-    def __init__(self, output: IO[str]) -> None:
+    def __init__(self, output: IO[bytes]) -> None:
         self._output = output
         self._lock = threading.Lock()
         self._stage, self._at_s = "", 0.0
 
-    def tell_stage(self, stage: str, done: int, total: int | None) -> None:
-        """Say how far it is, unless that was said a moment ago."""
+    def stage(self, stage: str, done: int, total: int | None) -> None:
+        """Write how much of a stage is done, unless that was written a moment ago."""
         now = time.monotonic()
         is_last = total is not None and done >= total
         with self._lock:
@@ -63,55 +59,53 @@ class Teller:
             if is_last and not is_new and now - self._at_s < 0.05:
                 return
             self._stage, self._at_s = stage, now
-        self.say(
+        self.write(
             {"stage": stage, "done": int(done), "total": None if total is None else int(total)}
         )
 
-    def tell(self, level: str, text: str) -> None:
-        """Say a line of the log."""
-        self.say({"log": text[:MAX_LINE], "level": level})
+    def log(self, level: str, text: str) -> None:
+        """Write a line of the log."""
+        self.write({"log": text[:MAX_LINE], "level": level})
 
-    def say(self, content: dict[str, Any]) -> None:
-        """Say anything."""
+    def write(self, content: dict[str, Any]) -> None:
+        """Write any message."""
         with self._lock:
-            self._output.write(json.dumps(content) + "\n")
+            self._output.write(json.dumps(content).encode() + b"\n")
             self._output.flush()
 
 
 class _Lines(logging.Handler):
     """What starcat logs, as lines of the job's log."""
 
-    def __init__(self, teller: Teller) -> None:
+    def __init__(self, messages: Messages) -> None:
         super().__init__(logging.INFO)
-        self._teller = teller
+        self._messages = messages
 
     def emit(self, record: logging.LogRecord) -> None:
         level = "info" if record.levelno < logging.WARNING else "warning"
-        self._teller.tell(level, record.getMessage())
+        self._messages.log(level, record.getMessage())
 
 
 def main() -> None:
     """Read the order, and do it."""
     end_with_parent()
-    output = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # what a library prints is no message
-    order = _order(json.loads(sys.stdin.buffer.readline()))
+    messages = Messages(own_output())
+    order = Order(**json.loads(sys.stdin.buffer.readline()))
     threading.Thread(target=_end_with_input, daemon=True).start()
     with suppress(OSError, AttributeError):
         os.nice(NICENESS)
         # What answers somebody who waits gets a processor at once, where Linux can do that.
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-    teller = Teller(output)
     logger = logging.getLogger("starcat")
     logger.setLevel(logging.INFO)
-    logger.addHandler(_Lines(teller))
+    logger.addHandler(_Lines(messages))
     with locked(order.paths.job_lock(order.job_id)):
         prepare(order.kind)
         limit_memory(order.memory_bytes)
         try:
-            teller.say({"result": do_job(order, teller.tell_stage, teller.tell)})
+            messages.write({"result": do_job(order, messages.stage, messages.log)})
         except Exception as error:
-            teller.say({"error": _told(error, order)})
+            messages.write({"error": _problem_of(error, order)})
     sys.stderr.flush()
     os._exit(0)  # whatever threads of libraries do
 
@@ -131,13 +125,8 @@ def _end_with_input() -> None:
     os._exit(1)
 
 
-def _order(content: dict[str, Any]) -> Order:
-    paths = ServicePaths(Path(content.pop("root")))
-    return Order(paths=paths, **content)
-
-
-def _told(error: Exception, order: Order) -> dict[str, Any]:
-    """Return what to say of an exception: details for whoever asked, the rest for the operator."""
+def _problem_of(error: Exception, order: Order) -> dict[str, Any]:
+    """Return problem details of an exception; a traceback is the operator's."""
     from starcat.failures import failure_of
     from starcat.service.problems import ProblemDetails, problem_of, without_folders
 
@@ -145,11 +134,9 @@ def _told(error: Exception, order: Order) -> dict[str, Any]:
         return memory_problem(order.memory_bytes)
     if isinstance(error, OSError) and not isinstance(error, StarcatError):
         failure = failure_of(error, "the job")
+        detail = without_folders(failure.message)
         problem = ProblemDetails(
-            title="The system refused",
-            status=500,
-            detail=without_folders(failure.message),
-            kind=failure.kind,
+            title="The system refused", status=500, detail=detail, kind=failure.kind
         )
     else:
         problem = problem_of(error)
@@ -164,4 +151,4 @@ def memory_problem(memory_bytes: int) -> dict[str, Any]:
         f"the job took more than the {memory_bytes / 2**30:.3g} GiB of memory that it may "
         "(job_memory_gib); ask for less, or ask the operator for more"
     )
-    return {"type": "about:blank", "title": "Out of memory", "status": 422, "detail": detail}
+    return job_problem("Out of memory", 422, detail)

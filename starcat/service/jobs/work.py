@@ -16,41 +16,33 @@ from typing import Any
 
 from starcat.errors import TargetMissing
 from starcat.progress import Progress
-from starcat.service.jobs.job import Kind
+from starcat.service.jobs.job import Job, Kind
 from starcat.service.library import Library
 from starcat.service.paths import ServicePaths
+from starcat.service.settings import Settings
 from starcat.storage.atomic import sync
 
-Tell = Callable[[str, str], None]
-"""Called with a level of the log and a line."""
+Log = Callable[[str, str], None]
+"""Called with a level and a line of the log."""
 
 
 @dataclass(frozen=True)
 class Order:
-    """What the process of a job is told to do.
+    """What the process of a job is told to do."""
 
-    Attributes
-    ----------
-    paths : ServicePaths
-        What lies where.
-    job_id, kind, key, request
-        As those of `starcat.service.jobs.job.Job`.
-    memory_bytes : int
-        Memory that the process may take.
-    scheduler : str, optional
-        Address of a Dask cluster.
-    threads : int
-        Threads that it may use.
-    """
-
-    paths: ServicePaths
+    root: str  # of the service
     job_id: str
     kind: Kind
     key: str
     request: Mapping[str, Any]
     memory_bytes: int
-    scheduler: str | None
+    scheduler: str | None  # address of a Dask cluster, for stores
     threads: int
+
+    @property
+    def paths(self) -> ServicePaths:
+        """Files and folders of the service."""
+        return ServicePaths(Path(self.root))
 
     @property
     def work(self) -> Path:
@@ -64,14 +56,14 @@ def prepare(kind: Kind) -> None:
         import_module(name)
 
 
-def do_job(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
+def do_job(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
     """Do a job."""
     shutil.rmtree(order.work, ignore_errors=True)
     order.work.mkdir(parents=True)
-    return _DOES[order.kind](order, progress, tell)
+    return _DOES[order.kind](order, progress, log)
 
 
-def _build(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
+def _build(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
     database_id = order.key[:16]
     library = Library(order.paths)
     result = {"database": database_id}
@@ -80,7 +72,7 @@ def _build(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
     except TargetMissing:
         pass
     else:
-        tell("info", f"database {database_id} is there already")
+        log("info", f"database {database_id} is there already")
         return result
     from starcat.pipeline.build import build
     from starcat.specs.reading import spec_from_dict
@@ -93,15 +85,15 @@ def _build(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
         made,
         workers=order.threads,
         progress=progress,
-        announce=lambda cost: tell("info", cost.in_words),
+        announce=lambda cost: log("info", cost.in_words),
         max_memory_bytes=order.memory_bytes,
     )
     for problem in built.problems:
-        tell("warning", problem)
+        log("warning", problem)
     for warning in built.warnings:
-        tell("warning", warning)
+        log("warning", warning)
     clean = built.rates[0]
-    tell(
+    log(
         "info",
         f"{clean.identified} of {clean.identifiable} clean frames were identified, "
         f"{clean.wrong} wrongly",
@@ -121,8 +113,8 @@ def place_database(made: Path, final: Path) -> None:
     sync(final.parent)
 
 
-def _ingest(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
-    from starcat.catalog.fetching.locate import locate
+def _ingest(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
+    from starcat.catalog.source_files import locate
 
     asked = order.request
     source, to = str(asked["source"]), asked["to"]
@@ -134,7 +126,7 @@ def _ingest(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
     made = order.work / name
     if to == "hats":
         from starcat.store.ingest import ingest_to_store
-        from starcat.store.options import StoreOptions
+        from starcat.store.plan import StoreOptions
 
         options = StoreOptions(
             memory_bytes=order.memory_bytes, workers=order.threads, scheduler=order.scheduler
@@ -142,7 +134,8 @@ def _ingest(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
         stored = ingest_to_store(source, paths, made, **how, options=options, progress=progress)
         problems, notes, rows = stored.problems, stored.notes, int(stored.manifest["kept"])
     else:
-        from starcat.catalog.star_files import rejected_path, write_star_tables
+        from starcat.catalog.ingest import write_star_tables
+        from starcat.catalog.verdict import rejected_path
         from starcat.store.reading import read_catalog
 
         read = read_catalog(source, paths, **how, workers=order.threads, progress=progress)
@@ -151,7 +144,7 @@ def _ingest(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
         if rejected_path(made).exists():
             rejected_path(made).replace(rejected_path(final))
     for line in (*problems, *notes):
-        tell("warning", line)
+        log("warning", line)
     if made.is_dir() and final.is_dir():  # the same content: it has the same key
         shutil.rmtree(made)
     else:
@@ -160,7 +153,7 @@ def _ingest(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
     return {**result, "rows": rows}
 
 
-def _evaluate(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
+def _evaluate(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
     from starcat.matcher.matcher import Matcher
     from starcat.simulation.selftest import self_test
 
@@ -168,7 +161,7 @@ def _evaluate(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
     database = Library(order.paths).database(str(asked["database"]))
     noise_px = float(asked["noise_px"])
     matcher = Matcher.open(database.folder, None, tolerance_px=max(0.5, 4.0 * noise_px))
-    tell("info", f"{asked['frames']} frames of each kind, of {database.title}")
+    log("info", f"{asked['frames']} frames of each kind, of {database.title}")
     rates = self_test(
         matcher,
         int(asked["frames"]),
@@ -180,7 +173,7 @@ def _evaluate(order: Order, progress: Progress, tell: Tell) -> dict[str, Any]:
     return {"database": database.id, "rates": [each.as_dict() for each in rates]}
 
 
-_DOES: Mapping[Kind, Callable[[Order, Progress, Tell], dict[str, Any]]] = {
+_DOES: Mapping[Kind, Callable[[Order, Progress, Log], dict[str, Any]]] = {
     "build": _build,
     "ingest": _ingest,
     "evaluate": _evaluate,
@@ -189,9 +182,23 @@ _DOES: Mapping[Kind, Callable[[Order, Progress, Tell], dict[str, Any]]] = {
 
 _NEEDS: Mapping[Kind, tuple[str, ...]] = {
     "build": ("starcat.pipeline.build", "matplotlib.backends.backend_agg"),
-    "ingest": ("starcat.catalog.star_files", "starcat.store.ingest"),
+    "ingest": ("starcat.catalog.ingest", "starcat.store.ingest"),
     "evaluate": ("starcat.simulation.selftest",),
 }
+
+
+def order_of(job: Job, settings: Settings, root: str) -> Order:
+    """Return the order of a job in a service, or in a folder of another machine."""
+    return Order(
+        root=root,
+        job_id=job.id,
+        kind=job.kind,
+        key=job.key,
+        request=job.request,
+        memory_bytes=int(settings.job_memory_gib * 2**30),
+        scheduler=settings.scheduler,
+        threads=threads_of(settings.workers),
+    )
 
 
 def threads_of(workers: int) -> int:

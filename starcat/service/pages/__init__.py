@@ -9,24 +9,20 @@ from starcat.service.pages import (
     databases,
     home,
     identify,
-    interface,
     jobs,
     new,
     releases,
-    sign_in,
-    static_files,
+    rendering,
 )
 
 ROUTERS: tuple[APIRouter, ...] = (
-    static_files.router,
-    sign_in.router,
+    rendering.static_router,
     home.router,
     new.router,
     jobs.router,
     databases.router,
     console.router,
     identify.router,
-    interface.router,
     releases.router,
 )
 """Routers of the page, in the order in which they are asked."""

@@ -8,20 +8,19 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from fastapi import Depends, Query, Request
-from fastapi.responses import Response, StreamingResponse
+from fastapi.responses import Response
 from starlette.concurrency import run_in_threadpool
 
 from starcat.errors import QueryError, StarcatError, TargetMissing
 from starcat.exchange.formats import FORMATS, PAGE_FORMATS, PageFormat
-from starcat.query.answer import cell_text
-from starcat.query.gallery import NamedQuery, gallery, guessed, named_query
-from starcat.query.macros import macros
+from starcat.query.gallery import NamedQuery, gallery, guessed, macros, named_query
+from starcat.query.result import ResultTable
 from starcat.service.access import Reader
-from starcat.service.asking import Question, Rows, file_of, rows_of
 from starcat.service.pages.facts import database_row, products_of
 from starcat.service.pages.rendering import page_router, render
 from starcat.service.problems import Problem, ProblemDetails, problem_of
 from starcat.service.service import Service, TheService
+from starcat.service.sql import SqlQuery, result_file, result_table
 
 router = page_router()
 
@@ -38,83 +37,36 @@ FIRST = "SELECT designation, mag, ra_deg, dec_deg\nFROM stars\nORDER BY mag\nLIM
 """What stands in the console before anything was asked."""
 
 _NAMES = re.compile(r"\$([A-Za-z_]\w{0,63})")
-_NUMERIC = re.compile(r"[UH]*(TINY|SMALL|BIG|HUGE)?INT|DOUBLE|FLOAT|DECIMAL")
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What the form of the console says.
+class ConsoleForm:
+    """The fields of the console."""
 
-    Attributes
-    ----------
-    query : str
-        SQL; empty where nothing was asked yet.
-    named : str
-        Query of the gallery that was chosen; empty without one.
-    other : str
-        Id of a second database; empty without one.
-    rows : int
-        Rows to show at most.
-    values : dict of str to str
-        Texts of the values of the ``$name`` in it.
-    """
-
-    query: str = ""
-    named: str = ""
-    other: str = ""
-    rows: int = 100
-    values: dict[str, str] = field(default_factory=dict)
+    query: str = ""  # SQL; empty before anything was asked
+    named: str = ""  # query of the gallery that was chosen
+    other: str = ""  # id of a second database
+    rows: int = 100  # to show at most
+    values: dict[str, str] = field(default_factory=dict)  # texts of the ``$name`` in it
 
 
-@dataclass(frozen=True)
-class Cells:
-    """An answer as the page shows it.
-
-    Attributes
-    ----------
-    columns : list of mapping
-        ``name``, ``unit`` and ``description`` of each.
-    numbers : list of bool
-        Which columns are numbers.
-    rows : list of list of str
-        Texts.
-    is_cut : bool
-        Whether there are more.
-    """
-
-    columns: list[dict[str, str]]
-    numbers: list[bool]
-    rows: list[list[str]]
-    is_cut: bool
-
-
-@dataclass(frozen=True)
-class _Shown:
-    """What the console shows, or its answer alone."""
-
-    asked: Asked
-    answer: Cells | None
-    problem: ProblemDetails | None
-    is_part: bool
-
-
-def asked_of(
+def console_form(
     request: Request,
     query: Annotated[str, Query(max_length=MAX_TEXT)] = "",
     named: Annotated[str, Query(max_length=100)] = "",
     other: Annotated[str, Query(max_length=64)] = "",
     rows: Annotated[int, Query(ge=1, le=max(ROWS))] = 100,
-) -> Asked:
-    """Return what the form of the console says."""
+) -> ConsoleForm:
+    """Return the fields of the console from an address."""
     values = {
         name.removeprefix(VALUE): text
         for name, text in request.query_params.items()
         if name.startswith(VALUE) and len(name) < 80
     }
-    return Asked(query.replace("\r\n", "\n"), named, other, rows, values)
+    return ConsoleForm(query.replace("\r\n", "\n"), named, other, rows, values)
 
 
-TheAsked = Annotated[Asked, Depends(asked_of)]
+TheForm = Annotated[ConsoleForm, Depends(console_form)]
 
 
 @router.get("/databases/{database_id}/sql")
@@ -123,89 +75,88 @@ async def console(
     service: TheService,
     _: Reader,
     database_id: str,
-    asked: TheAsked,
+    form: TheForm,
     part: Annotated[Literal["", "answer"], Query()] = "",
 ) -> Response:
-    """Show the console with the answer to what was asked; the script wants the answer alone."""
-    answer: Cells | None = None
+    """Show the console with the answer to its query; the script wants the answer alone."""
+    answer: ResultTable | None = None
     problem: ProblemDetails | None = None
-    if asked.query:
+    if form.query:
         try:
-            found = await service.query_pool.run(_rows, service, database_id, asked)
-            answer = cells_of(found)
+            answer = await service.query_pool.run(_rows, service, database_id, form)
         except TargetMissing:
             raise  # the page itself is not there
         except (StarcatError, Problem) as error:
             problem = problem_of(error)
-    shown = _Shown(asked, answer, problem, is_part=bool(part))
-    return await run_in_threadpool(_page, request, service, database_id, shown)
+    content = {"asked": form, "answer": answer, "problem": problem}
+    return await run_in_threadpool(
+        _page, request, service, database_id, content, is_part=bool(part)
+    )
 
 
 @router.get("/databases/{database_id}/sql/file")
 async def answer_file(
-    service: TheService, _: Reader, database_id: str, asked: TheAsked, form: PageFormat = "csv"
+    service: TheService, _: Reader, database_id: str, asked: TheForm, form: PageFormat = "csv"
 ) -> Response:
     """Give all rows of an answer as a file."""
     database = service.library.database(database_id)
-    question = question_of(service, database.id, asked, service.settings.max_rows)
-    found = await service.query_pool.run(file_of, service, question, form)
-    kind = FORMATS[form]
-    headers = {
-        "Content-Length": str(found.size),
-        "Content-Disposition": f'attachment; filename="{database.title}{kind.suffix}"',
-    }
-    return StreamingResponse(found.chunks, media_type=kind.media_type, headers=headers)
+    query = _checked(service, database.id, asked, service.settings.max_rows)
+    found = await service.query_pool.run(result_file, service, query, form)
+    return found.response(database.title, {})
 
 
-def question_of(service: Service, database_id: str, asked: Asked, most: int) -> Question:
-    """Return what is asked as the service answers it."""
-    if not asked.query.strip():
+def _rows(service: Service, database_id: str, form: ConsoleForm) -> ResultTable:
+    most = min(form.rows, service.settings.max_rows)
+    found = result_table(service, _checked(service, database_id, form, most))
+    return found.with_json_values()
+
+
+def _checked(service: Service, database_id: str, form: ConsoleForm, most: int) -> SqlQuery:
+    """Return the query of a form with its values as numbers where they look like numbers."""
+    if not form.query.strip():
         raise QueryError('the query is empty; try "SELECT count(*) FROM stars"')
-    targets = [database_id, *([asked.other] if asked.other else [])]
-    chosen = _chosen(asked.named)
+    targets = [database_id, *([form.other] if form.other else [])]
+    chosen = _chosen(form.named)
     values: Mapping[str, Any]
-    if chosen is not None and asked.query.strip() == chosen.text.strip():
+    if chosen is not None and form.query.strip() == chosen.text.strip():
         if chosen.targets != len(targets):
             raise QueryError(f"{chosen.name} is about {chosen.targets} targets; choose the other")
         known = {value.name for value in chosen.values}
-        values = chosen.with_values({n: t for n, t in asked.values.items() if n in known})
+        values = chosen.with_values({n: t for n, t in form.values.items() if n in known})
     else:
-        values = {name: guessed(text) for name, text in asked.values.items()}
-    return Question(targets, asked.query, values, most, service.settings.query_time_s)
+        values = {name: guessed(text) for name, text in form.values.items()}
+    return SqlQuery(targets, form.query, values, most, service.settings.query_time_s)
 
 
-def _rows(service: Service, database_id: str, asked: Asked) -> Rows:
-    most = min(asked.rows, service.settings.max_rows)
-    return rows_of(service, question_of(service, database_id, asked, most))
-
-
-def _page(request: Request, service: Service, database_id: str, shown: _Shown) -> Response:
+def _page(
+    request: Request,
+    service: Service,
+    database_id: str,
+    content: dict[str, Any],
+    *,
+    is_part: bool,
+) -> Response:
     database = service.library.database(database_id)
-    asked, problem = shown.asked, shown.problem
-    content = {
-        "row": database_row(service, database),
-        "asked": asked,
-        "answer": shown.answer,
-        "problem": problem,
-        "formats": {name: FORMATS[name].title for name in PAGE_FORMATS},
-    }
+    problem: ProblemDetails | None = content["problem"]
     status = 200 if problem is None else problem.status
-    if shown.is_part:
+    if is_part:
         return render(request, "console_answer.html", status=status, **content)
-    chosen = _chosen(asked.named)
-    text = asked.query or (chosen.text if chosen else FIRST)
+    form: ConsoleForm = content["asked"]
+    chosen = _chosen(form.named)
+    text = form.query or (chosen.text if chosen else FIRST)
+    others = [one for one in service.library.databases() if one.id != database.id]
     return render(
         request,
         "console.html",
         status=status,
         **content,
+        row=database_row(service, database),
+        formats={name: FORMATS[name].title for name in PAGE_FORMATS},
         tab="sql",
         text=text,
         chosen=chosen,
-        values=values_in(text, chosen, asked.values),
-        others=[
-            (one.id, one.title) for one in service.library.databases() if one.id != database.id
-        ],
+        values=_values_in(text, chosen, form.values),
+        others=[(one.id, one.title) for one in others],
         queries=list(gallery().values()),
         macros=sorted(macros(), key=lambda macro: (not macro.is_table, macro.name)),
         products=products_of(database.manifest),
@@ -218,10 +169,10 @@ def _chosen(name: str) -> NamedQuery | None:
     return named_query(name) if name else None
 
 
-def values_in(
+def _values_in(
     text: str, chosen: NamedQuery | None, given: Mapping[str, str]
 ) -> list[tuple[str, str, str]]:
-    """Return the values that a query can be given."""
+    """Return name, text and meaning of the values that a query can be given."""
     known = {value.name: value for value in chosen.values} if chosen else {}
     return [
         (
@@ -231,13 +182,3 @@ def values_in(
         )
         for name in dict.fromkeys(_NAMES.findall(text))
     ]
-
-
-def cells_of(found: Rows) -> Cells:
-    """Return an answer as the page shows it."""
-    numbers = [
-        bool(_NUMERIC.match(column["type"])) and "[" not in column["type"]
-        for column in found.columns
-    ]
-    rows = [[cell_text(value) for value in row] for row in found.rows]
-    return Cells(found.columns, numbers, rows, found.is_cut)

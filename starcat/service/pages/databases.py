@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from fastapi import Query, Request
 from fastapi.responses import JSONResponse, RedirectResponse, Response
 from starlette.concurrency import run_in_threadpool
 
 from starcat.artifact.diff import Difference, diff_artifacts
 from starcat.artifact.reader import Artifact
-from starcat.errors import TargetMissing
+from starcat.errors import ProductError, TargetMissing
+from starcat.geometry.sphere import directions_from_radec
 from starcat.matcher.methods.table import METHODS
+from starcat.report.coverage_map import Fields, field_at, raster_png, sky_map
+from starcat.report.sky_map import nearest_raster
 from starcat.service.access import Builder, Reader, Role
 from starcat.service.jobs.submission import submit_evaluation
 from starcat.service.library import Database
-from starcat.service.pages import sky
 from starcat.service.pages.facts import (
     MANIFEST_DIGEST,
     database_row,
@@ -24,7 +29,6 @@ from starcat.service.pages.facts import (
     report_of,
 )
 from starcat.service.pages.rendering import page_router, render
-from starcat.service.pages.simulated import camera_of
 from starcat.service.service import Service, TheService
 
 router = page_router()
@@ -32,6 +36,9 @@ router = page_router()
 REPORT_PAGE = "report/index.html"
 REPORT_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; sandbox"
 """A report has its style and its plots inside, and nothing else; no script of it runs."""
+
+COVERAGE = "report/coverage.csv"
+RASTER_WIDTH = 960
 
 FIELDS_SHOWN = 25
 """Fields of the tiling on a page."""
@@ -86,18 +93,18 @@ def coverage_page(
 ) -> Response:
     """Show the map of the sky and the fields of the tiling."""
     database = service.library.database(database_id)
-    fields = sky.fields_of(database)
+    fields = fields_of(database)
     pages = max(1, -(-len(fields) // FIELDS_SHOWN))
     page = min(page, pages)
-    numbers = sky.ordered(fields, order)[(page - 1) * FIELDS_SHOWN : page * FIELDS_SHOWN]
+    numbers = _ordered(fields, order)[(page - 1) * FIELDS_SHOWN : page * FIELDS_SHOWN]
     return render(
         request,
         "coverage.html",
         **_head(service, database, "coverage"),
         report=report_of(database),
-        sky_map=sky.sky_map(fields),
-        fields=[sky.field_at(fields, number) for number in numbers],
-        fov=_field_of_view(database),
+        sky_map=sky_map(fields),
+        fields=[field_at(fields, number) for number in numbers],
+        fov=(database.camera.fov_x_deg, database.camera.fov_y_deg),
         order=order,
         page=page,
         pages=pages,
@@ -105,18 +112,54 @@ def coverage_page(
     )
 
 
+def fields_of(database: Database) -> Fields:
+    """Read the fields of a database."""
+    path = database.folder / COVERAGE
+    try:
+        return _read_fields(path, path.stat().st_mtime_ns)
+    except (OSError, ValueError) as error:
+        raise ProductError(
+            f"{database.title}: {COVERAGE} cannot be read ({type(error).__name__}); build the "
+            "database again",
+            path=path,
+        ) from error
+
+
+@lru_cache(maxsize=16)
+def _read_fields(path: Path, changed_ns: int) -> Fields:
+    table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2, usecols=range(1, 6))
+    ra_deg, dec_deg, *counts = table.T
+    return Fields(ra_deg, dec_deg, *(one.astype(np.int64) for one in counts))
+
+
+def _ordered(fields: Fields, order: Order) -> list[int]:
+    """Return the numbers of the fields in an order."""
+    if order == "number":
+        return list(range(len(fields)))
+    stars = fields.stars if order == "fewest" else -fields.stars
+    return list(np.argsort(stars, kind="stable").tolist())
+
+
+@lru_cache(maxsize=16)
+def _map_png(database_id: str, fields: Fields) -> bytes:
+    directions = directions_from_radec(fields.ra_deg, fields.dec_deg)
+    nearest = nearest_raster(directions, np.arange(len(fields)), RASTER_WIDTH)
+    return raster_png(nearest, fields.stars)
+
+
 @router.get("/databases/{database_id}/coverage.png")
 def coverage_raster(service: TheService, _: Reader, database_id: str) -> Response:
     """Give the raster of the map of the sky."""
     database = service.library.database(database_id)
-    raster = sky.map_png(database.id, sky.fields_of(database))
-    return Response(raster, media_type="image/png", headers=KEPT)
+    return Response(
+        _map_png(database.id, fields_of(database)), media_type="image/png", headers=KEPT
+    )
 
 
 @router.get("/databases/{database_id}/fields.json")
 def fields_of_map(service: TheService, _: Reader, database_id: str) -> Response:
     """Give the fields of the tiling to the script of the map."""
-    fields = sky.fields_of(service.library.database(database_id))
+    fields = fields_of(service.library.database(database_id))
     content = {
         "ra_deg": fields.ra_deg.round(4).tolist(),
         "dec_deg": fields.dec_deg.round(4).tolist(),
@@ -189,9 +232,3 @@ def evaluate(service: TheService, builder: Builder, database_id: str) -> Respons
 def _head(service: Service, database: Database, tab: str) -> dict[str, Any]:
     """Return what the head of every page of a database needs."""
     return {"row": database_row(service, database), "database": database, "tab": tab}
-
-
-def _field_of_view(database: Database) -> tuple[float, float]:
-    """Return the full angles of the field across width and height, degrees."""
-    camera = camera_of(database)
-    return camera.fov_x_deg, camera.fov_y_deg

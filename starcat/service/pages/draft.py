@@ -7,17 +7,18 @@ it has fields for and leaves all others; with a text that was edited, the fields
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
+
+import tomlkit
+from tomlkit.exceptions import TOMLKitError
 
 from starcat.catalog.source import data_source, source_names
 from starcat.errors import ConfigError, StarcatError
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.keys import REQUIRED, SpecKey, spec_sections
 from starcat.specs.reading import content_of_toml, spec_from_dict
-from starcat.specs.spec_toml import toml_value
 
 ORIGIN = "spec"
 """What messages call the text."""
@@ -67,39 +68,19 @@ _OF_LENS = {
 
 _USUAL_PIXEL_UM = 5.5
 
-_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
-
 _KEYS: Mapping[str, SpecKey] = {key.path: key for part in spec_sections() for key in part.keys}
 
 
 @dataclass(frozen=True)
 class Draft:
-    """A spec as far as it is.
+    """A spec as far as it is."""
 
-    Attributes
-    ----------
-    text : str
-        The TOML.
-    values : dict of str to str
-        What the fields show, by key.
-    lens : {"field", "focal"}
-        Whether the camera is told by its field, or by focal length and pixel.
-    products : dict of str to bool
-        Which are made.
-    bands : tuple of str
-        Of the catalog.
-    spec : BuildSpec or None
-        The spec, where nothing is wrong.
-    error : ConfigError or None
-        What is wrong.
-    """
-
-    text: str
-    values: dict[str, str]
-    lens: str
-    products: dict[str, bool]
-    bands: tuple[str, ...]
-    spec: BuildSpec | None
+    text: str  # TOML
+    values: dict[str, str]  # what the fields show, by key
+    lens: str  # "field" or "focal": the camera is told by its field, or by its lens
+    products: dict[str, bool]  # which are made
+    bands: tuple[str, ...]  # of the catalog
+    spec: BuildSpec | None  # None: something is wrong
     error: ConfigError | None
 
     @property
@@ -137,11 +118,10 @@ def draft_of_form(form: Mapping[str, str]) -> Draft:
         return known
     content = content_of_toml(before, ORIGIN)
     try:
-        _fill(content, form)
-        _prune(content)
+        edit = _edit(content, form)
     except ConfigError as error:
         return _draft(content, before, None, error)
-    return known if content == content_of_toml(before, ORIGIN) else draft_of_content(content)
+    return _checked(edit.content, edit.text(before)) if edit.changes else known
 
 
 def _with_fields_of(form: Mapping[str, str], draft: Draft) -> Draft:
@@ -157,56 +137,7 @@ def _with_fields_of(form: Mapping[str, str], draft: Draft) -> Draft:
 
 def draft_of_content(content: Mapping[str, Any]) -> Draft:
     """Return the draft of a spec that is parsed."""
-    return _checked(content, plain_toml(content))
-
-
-def plain_toml(content: Mapping[str, Any]) -> str:
-    """Return TOML without comments.
-
-    Examples
-    --------
-    >>> print(plain_toml({"name": "a", "camera": {"width_px": 64}}), end="")
-    name = "a"
-    <BLANKLINE>
-    [camera]
-    width_px = 64
-    """
-    return "\n".join(_tables(content, ())) if content else ""
-
-
-def _tables(content: Mapping[str, Any], path: tuple[str, ...]) -> list[str]:
-    lines = [f"{_key(k)} = {_inline(v)}\n" for k, v in content.items() if not isinstance(v, dict)]
-    parts = []
-    if lines or (path and not content):
-        head = f"[{'.'.join(map(_key, path))}]\n" if path else ""
-        parts.append(head + "".join(lines))
-    for name, value in content.items():
-        if isinstance(value, dict):
-            parts += _tables(value, (*path, name))
-    return parts
-
-
-def _key(name: str) -> str:
-    return name if _BARE_KEY.fullmatch(name) else toml_value(name)
-
-
-def _inline(value: Any) -> str:
-    if isinstance(value, list):
-        return f"[{', '.join(map(_inline, value))}]"
-    if isinstance(value, dict):
-        return (
-            "{" + ", ".join(f"{_key(name)} = {_inline(one)}" for name, one in value.items()) + "}"
-        )
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    if _is_huge(value):
-        return hex(value)
-    return toml_value(value) if isinstance(value, bool | int | float | str) else f"{value}"
-
-
-def _is_huge(value: Any) -> bool:
-    """Return whether a number has more digits than Python writes; none is in any range."""
-    return isinstance(value, int) and value.bit_length() > 1000
+    return _checked(content, tomlkit.dumps(content))
 
 
 def without_defaults(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -260,47 +191,76 @@ def _shown(key: str, content: Mapping[str, Any]) -> str:
         value = "" if default is REQUIRED or default is None else default
     if key == "selection.bright_limit_mag" and value == _KEYS[key].default:
         return ""  # No star is that bright: there is no limit.
-    if _is_huge(value):
+    if isinstance(value, int) and value.bit_length() > 1000:  # more digits than Python writes
         return hex(value)[:40]
     return f"{value:.12g}" if isinstance(value, float) else str(value)
 
 
-def _fill(content: dict[str, Any], form: Mapping[str, str]) -> None:
-    """Put the values of a form's fields into a spec."""
+class _Edit:
+    """Changes of the content of a text."""
+
+    def __init__(self, content: dict[str, Any]) -> None:
+        self.content = content
+        self.changes: dict[str, Any] = {}
+
+    def put(self, path: str, value: Any) -> None:
+        """Change a key; None removes it."""
+        if value is not None or _at(self.content, path) is not None:
+            _put(self.content, path, value)
+            self.changes[path] = value
+
+    def text(self, before: str) -> str:
+        """Return the text with the changes, its comments and its order."""
+        try:
+            document = tomlkit.parse(before)
+            for path, value in self.changes.items():
+                _put(document, path, value)
+            text = tomlkit.dumps(document)
+            if content_of_toml(text, ORIGIN) == self.content:
+                return text
+        except (TOMLKitError, ConfigError, ValueError, TypeError, LookupError, RecursionError):
+            pass  # a text whose order cannot be kept, as some with dotted keys
+        return tomlkit.dumps(self.content)
+
+
+def _edit(content: dict[str, Any], form: Mapping[str, str]) -> _Edit:
+    """Return the changes that the fields of a form make."""
+    edit = _Edit(content)
     source = _at(content, "catalog.source")
     for key in FIELDS:
         if key in form and form[key].strip() != _shown(key, content):
-            _put(content, key, _typed(key, form[key].strip()))
+            edit.put(key, _typed(key, form[key].strip()))
     if form.get("catalog.source", source) != source:
         bands = bands_of(form["catalog.source"])
         if _at(content, "catalog.band") not in bands:
-            _put(content, "catalog.band", bands[0] if bands else None)
+            edit.put("catalog.band", bands[0] if bands else None)
     lens = form.get(LENS)
     if lens in _OF_LENS:
-        _change_lens(content, lens)
+        _change_lens(edit, lens)
     if "products" in form:
         for name in PRODUCTS:
             is_wanted = f"products.{name}.{ENABLED}" in form
             if is_wanted != (_at(content, f"products.{name}.{ENABLED}") is not False):
-                _put(content, f"products.{name}.{ENABLED}", None if is_wanted else False)
+                edit.put(f"products.{name}.{ENABLED}", None if is_wanted else False)
+    return edit
 
 
-def _change_lens(content: dict[str, Any], lens: str) -> None:
+def _change_lens(edit: _Edit, lens: str) -> None:
     """Tell a camera by its field or by its lens; what is known of it is kept."""
     width, fov, focal, pixel = (
-        _number(content, f"camera.{name}")
+        _number(edit.content, f"camera.{name}")
         for name in ("width_px", "fov_x_deg", "focal_length_mm", "pixel_um")
     )
     if lens == "focal" and width and fov and focal is None:
         pixel = pixel or _USUAL_PIXEL_UM
         tangent = math.tan(math.radians(min(fov, 170.0)) / 2.0)
-        _put(content, "camera.pixel_um", pixel)
-        _put(content, "camera.focal_length_mm", round(width * pixel / 2000.0 / tangent, 4))
+        edit.put("camera.pixel_um", pixel)
+        edit.put("camera.focal_length_mm", round(width * pixel / 2000.0 / tangent, 4))
     if lens == "field" and width and focal and pixel and fov is None:
         fov = 2.0 * math.degrees(math.atan(width * pixel / 2000.0 / focal))
-        _put(content, "camera.fov_x_deg", round(fov, 4))
+        edit.put("camera.fov_x_deg", round(fov, 4))
     for key in _OF_LENS[lens]:
-        _put(content, key, None)
+        edit.put(key, None)
 
 
 def _number(content: Mapping[str, Any], key: str) -> float | None:
@@ -330,23 +290,20 @@ def _at(content: Mapping[str, Any], path: str) -> Any:
 
 
 def _put(content: dict[str, Any], path: str, value: Any) -> None:
-    if value is None and _at(content, path) is None:
-        return
+    """Change a key; a table inside another that becomes empty goes too."""
     *tables, name = path.split(".")
+    inside = []
     for table in tables:
-        content = content.setdefault(table, {})
+        if table not in content:
+            content[table] = {}
+        inside.append((content, table))
+        content = content[table]
         if not isinstance(content, dict):
             raise ConfigError(f"{path}: {table} is a value, not a table of the spec", key=TEXT)
-    if value is None:
-        content.pop(name, None)
-    else:
+    if value is not None:
         content[name] = value
-
-
-def _prune(content: dict[str, Any]) -> None:
-    """Remove tables inside others that have become empty; those at the top are needed."""
-    for value in content.values():
-        if isinstance(value, dict):
-            _prune(value)
-            for name in [key for key, inner in value.items() if inner == {}]:
-                del value[name]
+        return
+    content.pop(name, None)
+    for outer, table in reversed(inside[1:]):
+        if not outer[table]:
+            del outer[table]

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.errors import ProductError, reason
 from starcat.releases.publishing import recorded
-from starcat.service.jobs.job import Job
 from starcat.service.library import Database
-from starcat.service.paths import ServicePaths
 from starcat.service.service import Service
-from starcat.specs.build_spec import CameraSpec
 from starcat.storage.schema import product_schema
 
 REPORT = "report/report.json"
@@ -30,64 +28,26 @@ MAX_JOBS = 1000
 
 @dataclass(frozen=True)
 class Row:
-    """A database as the list shows it.
+    """A database as lists and heads of pages show it."""
 
-    Attributes
-    ----------
-    id, title, name, version, description : str
-        Which it is.
-    catalog : str
-        Name of the star catalog, with the band.
-    camera : str
-        Pixels and field of view, in words.
-    stars, bytes : int
-        Guide stars, and the size of all files.
-    rates : list of mapping
-        Shares of the self-test, the clean frames first; empty without a report.
-    is_released : bool
-        Whether exactly this is in the registry.
-    built_s : float
-        Seconds since 1970.
-    """
-
-    id: str
-    title: str
-    name: str
-    version: str
-    description: str
-    catalog: str
-    camera: str
-    stars: int
-    bytes: int
-    rates: list[Mapping[str, Any]]
-    is_released: bool
-    built_s: float
+    database: Database
+    rates: list[Mapping[str, Any]]  # of the self-test, the clean frames first
+    is_released: bool  # whether exactly this is in the registry
+    built_s: float  # seconds since 1970
 
 
 @dataclass(frozen=True)
 class Product:
-    """A product of a database.
-
-    Attributes
-    ----------
-    name, schema, description, parquet : str
-        Its name, the version of its schema, what a row is and what else is stored, its file.
-    rows, bytes : int
-        Records, and the size of the Parquet file.
-    in_database : bool
-        Whether the matcher's file has it too.
-    columns : list of (str, str, str, str)
-        Name, type, unit and meaning of each column.
-    """
+    """A product of a database."""
 
     name: str
-    schema: str
-    description: str
-    parquet: str
+    schema: str  # with its version
+    description: str  # what a row is, and what else is stored
+    parquet: str  # its file
     rows: int
-    bytes: int
-    in_database: bool
-    columns: list[tuple[str, str, str, str]]
+    bytes: int  # of the file
+    in_database: bool  # whether the matcher's file has it too
+    columns: list[tuple[str, str, str, str]]  # name, type, unit and meaning of each
 
     @property
     def summary(self) -> str:
@@ -97,51 +57,30 @@ class Product:
 
 def database_rows(service: Service) -> list[Row]:
     """Return all databases as the list shows them."""
-    released = released_digests(service.paths)
-    built = built_times(service.jobs.all(state="done", most=MAX_JOBS))
-    return [_row(one, released, built) for one in service.library.databases()]
+    return _rows(service, service.library.databases())
 
 
 def database_row(service: Service, database: Database) -> Row:
     """Return one database as the list shows it."""
-    built = built_times(service.jobs.all(state="done", most=MAX_JOBS))
-    return _row(database, released_digests(service.paths), built)
+    return _rows(service, [database])[0]
 
 
-def released_digests(paths: ServicePaths) -> dict[str, str]:
-    """Return what was published."""
-    return {release.title: release.manifest.sha256 for release in recorded(paths.registry)}
-
-
-def built_times(jobs: Iterable[Job]) -> dict[str, float]:
-    """Return when databases were built."""
-    times: dict[str, float] = {}
-    for job in jobs:
+def _rows(service: Service, databases: list[Database]) -> list[Row]:
+    released = {one.title: one.manifest.sha256 for one in recorded(service.paths.registry)}
+    built: dict[str, float] = {}
+    for job in service.jobs.all(state="done", most=MAX_JOBS):
         made = (job.result or {}).get("database")
         if job.kind == "build" and made and job.ended_s:
-            times[str(made)] = job.ended_s
-    return times
-
-
-def _row(one: Database, released: Mapping[str, str], built: Mapping[str, float]) -> Row:
-    manifest = one.manifest
-    spec = manifest["spec"]
-    band = spec["catalog"].get("band")
-    itself = one.folder / "manifest.json"
-    return Row(
-        id=one.id,
-        title=one.title,
-        name=one.name,
-        version=one.version,
-        description=str(spec.get("description") or ""),
-        catalog=f"{spec['catalog']['source']}{f' ({band})' if band else ''}",
-        camera=CameraSpec.model_validate(spec["camera"]).camera().in_words,
-        stars=int(manifest["products"]["stars"]["rows"]),
-        bytes=total_bytes(manifest),
-        rates=_rates(one),
-        is_released=one.title in released and released[one.title] == one.manifest_blob.sha256,
-        built_s=built.get(one.id) or itself.stat().st_mtime,
-    )
+            built[str(made)] = job.ended_s
+    return [
+        Row(
+            one,
+            _rates(one),
+            one.title in released and released[one.title] == one.manifest_blob.sha256,
+            built.get(one.id) or (one.folder / MANIFEST_NAME).stat().st_mtime,
+        )
+        for one in databases
+    ]
 
 
 def _rates(database: Database) -> list[Mapping[str, Any]]:
@@ -150,11 +89,6 @@ def _rates(database: Database) -> list[Mapping[str, Any]]:
         return list(report_of(database).get("self_test", ()))
     except ProductError:
         return []
-
-
-def total_bytes(manifest: Mapping[str, Any]) -> int:
-    """Return the size of all files of an artifact, without its manifest."""
-    return sum(int(facts["bytes"]) for facts in manifest["files"].values())
 
 
 def products_of(manifest: Mapping[str, Any]) -> list[Product]:

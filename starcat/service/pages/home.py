@@ -1,8 +1,11 @@
-"""The start: what this service has, what to do first, and how programs reach it."""
+"""The way in: the start, the page to sign in at, and the REST interface in words."""
 
 from __future__ import annotations
 
-from fastapi import Request
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from fastapi import Query, Request
 from fastapi.responses import Response
 
 from starcat.service.access import Reader
@@ -35,6 +38,76 @@ def home(request: Request, service: TheService, reader: Reader) -> Response:
         release_count=len(releases),
         jobs=[job for job in jobs if job.state not in ENDED],
         address=address_of(request, service),
-        example=newest_first[0] if newest_first else None,
+        example=newest_first[0].database if newest_first else None,
         needs_token=reader.name != "anonymous",
     )
+
+
+@router.get("/sign-in")
+def sign_in_page(
+    request: Request, next_address: Annotated[str, Query(alias="next")] = "/"
+) -> Response:
+    """Show who is signed in, and the form for a token."""
+    return sign_in_form(request, next_address)
+
+
+def sign_in_form(
+    request: Request, next_address: str, error: str | None = None, status: int = 200
+) -> Response:
+    """Return the page to sign in at."""
+    address = own_path(next_address)
+    return render(request, "sign_in.html", status=status, next=address, error=error)
+
+
+def own_path(address: str) -> str:
+    """Return a path of this service that a browser may be led to.
+
+    Examples
+    --------
+    >>> [own_path(one) for one in ("/jobs?state=done", "//elsewhere.example", "https://x.example")]
+    ['/jobs?state=done', '/', '/']
+    """
+    is_own = address.startswith("/") and not address.startswith("//") and "\\" not in address
+    return address if is_own and address.isprintable() else "/"
+
+
+@dataclass(frozen=True)
+class Operation:
+    """What an address does."""
+
+    # method, path, summary, description: as the schema has them
+    method: str
+    path: str
+    summary: str
+    description: str
+    parameters: list[tuple[str, str, str]]  # name, where it stands, and meaning of each
+    answers: list[tuple[str, str]]  # status and meaning of each
+
+
+@router.get("/api/docs")
+def interface(request: Request, reader: Reader) -> Response:
+    """Show the REST interface."""
+    return render(request, "interface.html", groups=operations_of(request.app.openapi()))
+
+
+def operations_of(schema: dict[str, Any]) -> dict[str, list[Operation]]:
+    """Return the operations of a schema."""
+    groups: dict[str, list[Operation]] = {}
+    for path, methods in schema["paths"].items():
+        for method, told in methods.items():
+            [tag, *_] = told.get("tags") or ["other"]
+            groups.setdefault(tag, []).append(_operation(method.upper(), path, told))
+    return groups
+
+
+def _operation(method: str, path: str, told: dict[str, Any]) -> Operation:
+    parameters = [
+        (str(one.get("name", "")), str(one.get("in", "")), str(one.get("description", "")))
+        for one in told.get("parameters", [])
+    ]
+    answers = [
+        (status, str(one.get("description", "")))
+        for status, one in sorted(told.get("responses", {}).items())
+    ]
+    summary, description = str(told.get("summary", "")), str(told.get("description", ""))
+    return Operation(method, path, summary, description, parameters, answers)

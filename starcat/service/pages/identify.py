@@ -5,11 +5,8 @@ from __future__ import annotations
 import base64
 import io
 import math
-import shutil
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any
 
 from fastapi import Query, Request
 from fastapi.responses import Response
@@ -18,44 +15,35 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData, UploadFile
 
 from starcat.errors import StarcatError
-from starcat.images.identification import IMAGE_SUFFIXES
+from starcat.failures import validation_message
+from starcat.images.render import write_simulated
+from starcat.images.solve_files import IdentifyOptions
+from starcat.matcher.database import open_database
 from starcat.matcher.methods.table import METHODS
 from starcat.service.access import Reader
-from starcat.service.identifying import IdentifyOptions
+from starcat.service.api.identify import MIB, SUFFIXES, FrameUpload, identify_upload
 from starcat.service.library import Database
 from starcat.service.pages.centroid_text import centroid_file
 from starcat.service.pages.rendering import page_router, render
-from starcat.service.pages.simulated import camera_of, frame_suffix, write_frame
 from starcat.service.problems import Problem, problem_of
 from starcat.service.service import Service, TheService
-from starcat.service.uploading import safe_name, scratch_folder
+from starcat.service.transfers import scratch_folder
+from starcat.simulation.simulate import Noise, simulate_frames
 
 router = page_router()
 
-SUFFIXES = (*IMAGE_SUFFIXES, ".csv", ".json")
-MIB = 2**20
 MAX_SEED = 2**31 - 1
+
+MAX_PIXELS = 2**23
+"""Frames with more are given as centroids, not as pictures."""
+
+NOISE_PX = 0.3
+"""Noise of a centroid, each axis."""
 
 FIELDS = (
     "database", "method", "field_error", "tolerance_px", "centroids", "brightness", "seed",
 )  # fmt: skip
 """Fields of the form that are texts."""
-
-
-@dataclass(frozen=True)
-class Frame:
-    """What is to be identified.
-
-    Attributes
-    ----------
-    name : str
-        Name that its file may have.
-    keep : callable
-        Writes the file to a path.
-    """
-
-    name: str
-    keep: Callable[[Path], None]
 
 
 @router.get("/identify")
@@ -84,8 +72,8 @@ async def identify(request: Request, service: TheService, _: Reader) -> Response
 def _answer(service: Service, form: FormData, given: dict[str, str]) -> dict[str, Any]:
     """Return what the page shows of an answer."""
     database = service.library.database(given["database"])
-    frame, options = frame_of(form, given, database, service), options_of(given)
-    found, picture = identified(service, database, frame, options)
+    frame, options = frame_of(form, given, database, service), options_of(given, service)
+    found, picture = identify_upload(service, database.folder, frame, options, "png")
     first = found["frames"][0]
     return {
         "found": found,
@@ -128,19 +116,18 @@ def _page(request: Request, service: Service, given: dict[str, str], **answer: A
     )
 
 
-def frame_of(form: FormData, given: dict[str, str], database: Database, service: Service) -> Frame:
+def frame_of(
+    form: FormData, given: dict[str, str], database: Database, service: Service
+) -> FrameUpload:
     """Return the frame that a form brings."""
     if given["seed"]:
         number = _number(given["seed"], "seed")
         seed = int(min(max(number or 0, 0), MAX_SEED))
         name = f"simulated-{seed}{frame_suffix(database)}"
-        return Frame(name, lambda path: write_frame(path, database, seed))
+        return FrameUpload(name, io.BytesIO(_simulated(service, database, name, seed)))
     upload = form.get("file")
     if isinstance(upload, UploadFile) and upload.filename:
-        if upload.size is None or upload.size > service.settings.upload_mib * MIB:
-            raise Problem(413, f"the file is larger than {service.settings.upload_mib:g} MiB")
-        file = upload.file
-        return Frame(safe_name(upload.filename, SUFFIXES, "frame"), lambda path: _copy(file, path))
+        return FrameUpload.of_form(upload, service.settings.upload_mib)
     if not given["centroids"].strip():
         raise Problem(
             422,
@@ -150,10 +137,10 @@ def frame_of(form: FormData, given: dict[str, str], database: Database, service:
         )
     is_mag = given["brightness"] == "mag"
     suffix, text = centroid_file(given["centroids"], "mag" if is_mag else "light")
-    return Frame(f"pasted{suffix}", lambda path: _write(path, text))
+    return FrameUpload(f"pasted{suffix}", io.BytesIO(text.encode()))
 
 
-def options_of(given: dict[str, str]) -> IdentifyOptions:
+def options_of(given: dict[str, str], service: Service) -> IdentifyOptions:
     """Return how a frame is to be identified."""
     percent = _number(given["field_error"], "field_error")
     content = {
@@ -162,30 +149,11 @@ def options_of(given: dict[str, str]) -> IdentifyOptions:
         "tolerance_px": _number(given["tolerance_px"], "tolerance_px"),
     }
     try:
-        return IdentifyOptions.model_validate(content)
+        options = IdentifyOptions.model_validate(content)
     except ValidationError as error:
-        first = error.errors(include_url=False, include_context=False)[0]
-        key = str(first["loc"][0])
-        raise Problem(422, f"{key}: {first['msg']} (found {first['input']!r})", key=key) from None
-
-
-def identified(
-    service: Service, database: Database, frame: Frame, options: IdentifyOptions
-) -> tuple[dict[str, Any], bytes]:
-    """Identify a frame and draw it, in a process of the sandbox."""
-    limited = options.model_copy(update={"time_limit_s": service.settings.query_time_s})
-    with scratch_folder(service.paths) as folder:
-        frame.keep(folder / frame.name)
-        arguments = {
-            "folder": str(folder),
-            "file": frame.name,
-            "artifact": str(database.folder),
-            "options": limited.model_dump(),
-            "picture": "png",
-        }
-        found = service.sandbox.call("identify", arguments)
-        drawn = folder / "picture.png"
-        return found, drawn.read_bytes() if drawn.is_file() else b""
+        key, found = validation_message(error, show_input=True)
+        raise Problem(422, f"{key}: {found}", key=key) from None
+    return options.model_copy(update={"time_limit_s": service.settings.query_time_s})
 
 
 def _simulated(service: Service, database: Database, name: str, seed: int) -> bytes:
@@ -218,7 +186,7 @@ def _field_deg(answer: dict[str, Any], database: Database) -> float | None:
     focal_length_px = answer.get("focal_length_px")
     if not focal_length_px:
         return None
-    half = 0.5 * camera_of(database).width_px / float(focal_length_px)
+    half = 0.5 * database.camera.width_px / float(focal_length_px)
     return 2.0 * math.degrees(math.atan(half))
 
 
@@ -233,10 +201,16 @@ def _number(text: str, name: str) -> float | None:
         ) from None
 
 
-def _copy(file: BinaryIO, path: Path) -> None:
-    with path.open("wb") as kept:
-        shutil.copyfileobj(file, kept)
+def frame_suffix(database: Database) -> str:
+    """Return the suffix of the file of a simulated frame: a picture unless it were too large."""
+    camera = database.camera
+    return ".png" if camera.width_px * camera.height_px <= MAX_PIXELS else ".csv"
 
 
-def _write(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
+def write_frame(path: Path, database: Database, seed: int) -> None:
+    """Write a simulated frame."""
+    stars = open_database(database.folder, ())
+    frame = next(
+        simulate_frames(stars.directions, stars.camera, 1, Noise(NOISE_PX), seed, mag=stars.mag)
+    )
+    write_simulated(path, frame, stars.camera, seed)

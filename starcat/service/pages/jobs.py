@@ -47,21 +47,11 @@ router = page_router()
 
 @dataclass(frozen=True)
 class Step:
-    """A step of a job.
+    """A step of a job."""
 
-    Attributes
-    ----------
-    name : str
-        For people.
-    words : str
-        First words of its stages.
-    state : {"done", "current", "failed", "open"}
-        How far it is.
-    """
-
-    name: str
-    words: str
-    state: str
+    name: str  # for people
+    words: str  # first words of its stages
+    state: str  # how far it is
 
 
 @router.get("/jobs")

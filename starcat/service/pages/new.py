@@ -105,7 +105,7 @@ def preview(request: Request, service: TheService, form: Form, _: Reader) -> Res
         "errors": draft.errors,
         "wrong": ENVIRONMENT.get_template("new_wrong.html").render(told),
         "result": ENVIRONMENT.get_template("new_result.html").render(preview=seen),
-        "summary": summary(seen),
+        "summary": _summary(seen, draft, error),
         "is_busy": error is not None and error.status == 503,
         "is_known": seen is not None,
         "stars": [] if seen is None or seen.map is None else seen.estimate.fields.count.tolist(),
@@ -149,7 +149,7 @@ def _page(
         problem=error and error.detail,
         errors=draft.errors,
         refused=problem and problem.detail,
-        summary=summary(seen),
+        summary=_summary(seen, draft, error),
         is_first=is_first,
         presets=[(name, preset(name).description) for name in preset_names()],
         chosen=chosen,
@@ -159,10 +159,11 @@ def _page(
     )
 
 
-def summary(seen: Preview | None) -> str:
-    """Return what a spec would give in one line."""
+def _summary(seen: Preview | None, draft: Draft, problem: ProblemDetails | None) -> str:
+    """Return what a spec would give in one line, or why that is not known."""
     if seen is None:
-        return "No estimate: something in the spec is not right yet."
+        why = next(iter(draft.errors.values()), problem.detail if problem else "")
+        return f"No estimate: {why}" if why else ""
     found = seen.estimate
     stars = found.coverage.stars
     return (

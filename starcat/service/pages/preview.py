@@ -8,14 +8,20 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starcat.arrays import Array
 from starcat.geometry.sphere import radec_from_directions, saff_kuijlaars
 from starcat.pipeline.estimate import Estimate
+from starcat.report.coverage_map import (
+    Bin,
+    Counts,
+    Fields,
+    SkyMap,
+    bins_of,
+    raster_png,
+    sky_map,
+)
 from starcat.report.sky_map import nearest_raster
-from starcat.service.pages.sky import Bin, Fields, SkyMap, bins_of, coloured_png, sky_map
-
-Counts = NDArray[np.int64]
 
 MAP_WIDTH = 720
 """Columns of the raster of a map: what a card of the page is wide."""
@@ -29,46 +35,22 @@ BAR_WIDTH, BAR_HEIGHT = 100.0, 30.0
 
 @dataclass(frozen=True)
 class File:
-    """A file of a database.
-
-    Attributes
-    ----------
-    name : str
-        Of the file, or of the folder.
-    bytes : int
-        Its size.
-    rows : int or None
-        Records in it, where it is a product's.
-    share : float
-        Its size, over that of the largest.
-    """
+    """A file of a database, or the folder of the report."""
 
     name: str
     bytes: int
-    rows: int | None
-    share: float
+    rows: int | None  # None: it is no product's
+    share: float  # its size, over that of the largest
 
 
 @dataclass(frozen=True)
 class Bar:
-    """A bar of the histogram of stars in a field.
+    """A bar of the histogram of stars in a field, in a box of `BAR_WIDTH` and `BAR_HEIGHT`."""
 
-    Attributes
-    ----------
-    least, most : int
-        Stars of a field.
-    fields : int
-        How many have so many.
-    colour : str
-        Class of the colour that the map has for them.
-    x, width, y, height : float
-        Where it stands, in a box of `BAR_WIDTH` and `BAR_HEIGHT`.
-    """
-
-    least: int
+    least: int  # stars of a field
     most: int
     fields: int
-    colour: str
+    colour: str  # class of the colour that the map has for them
     x: float
     width: float
     y: float
@@ -77,27 +59,13 @@ class Bar:
 
 @dataclass(frozen=True)
 class Preview:
-    """What a spec would give.
-
-    Attributes
-    ----------
-    estimate : Estimate
-        The figures.
-    files : list of File
-        The largest first.
-    bars : list of Bar
-        How many fields have how many stars.
-    map : SkyMap or None
-        What is drawn upon the raster; None where the tiling is too fine for a map.
-    picture : str
-        The raster, as an address that holds it.
-    """
+    """What a spec would give."""
 
     estimate: Estimate
-    files: list[File]
+    files: list[File]  # the largest first
     bars: list[Bar]
-    map: SkyMap | None
-    picture: str
+    map: SkyMap | None  # None: the tiling is too fine for a map
+    picture: str  # the raster, as an address that holds it
 
 
 def preview_of(estimate: Estimate) -> Preview:
@@ -106,14 +74,14 @@ def preview_of(estimate: Estimate) -> Preview:
     ra_deg, dec_deg = _tiling(len(counts))
     none = np.zeros_like(counts)
     fields = Fields(ra_deg, dec_deg, counts, none, none)
-    bins = bins_of(fields)
+    bins = bins_of(counts)
     is_mapped = len(counts) <= MOST_MAPPED
     return Preview(
         estimate,
         _files(estimate),
         _bars(counts, bins),
         sky_map(fields) if is_mapped else None,
-        _picture(counts, bins) if is_mapped else "",
+        _picture(counts) if is_mapped else "",
     )
 
 
@@ -124,7 +92,7 @@ def tiling_content(count: int) -> dict[str, Any]:
 
 
 @lru_cache(maxsize=4)
-def _tiling(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _tiling(count: int) -> tuple[Array, Array]:
     return radec_from_directions(saff_kuijlaars(count))
 
 
@@ -169,15 +137,10 @@ def _bars(counts: Counts, bins: tuple[Bin, ...]) -> list[Bar]:
 
 
 @lru_cache(maxsize=4)
-def _nearest(count: int) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """Return which dots of the raster are on the sky, and the field nearest to each of those."""
-    raster = nearest_raster(saff_kuijlaars(count), np.arange(count), MAP_WIDTH)
-    inside = ~np.isnan(raster)
-    return inside, raster[inside].astype(np.int64)
+def _nearest(count: int) -> Array:
+    return nearest_raster(saff_kuijlaars(count), np.arange(count), MAP_WIDTH)
 
 
-def _picture(counts: Counts, bins: tuple[Bin, ...]) -> str:
-    inside, nearest = _nearest(len(counts))
-    raster = np.full(inside.shape, np.nan)
-    raster[inside] = counts[nearest]
-    return f"data:image/png;base64,{base64.b64encode(coloured_png(raster, bins)).decode()}"
+def _picture(counts: Counts) -> str:
+    raster = raster_png(_nearest(len(counts)), counts)
+    return f"data:image/png;base64,{base64.b64encode(raster).decode()}"

@@ -72,7 +72,7 @@ def _page(
         releases=newest_first,
         address=address_of(request, service),
         unreleased=[
-            (row.id, f"{row.name} {row.version}")
+            (row.database.id, f"{row.database.name} {row.database.version}")
             for row in database_rows(service)
             if not row.is_released
         ],

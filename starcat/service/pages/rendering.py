@@ -1,8 +1,13 @@
-"""Pages out of templates, and errors as pages."""
+"""Pages out of templates, errors as pages, and the files that pages need.
+
+The digest of style sheets, scripts and pictures is in their address.
+"""
 
 from __future__ import annotations
 
+import hashlib
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
@@ -12,7 +17,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from starlette.exceptions import HTTPException
 
 from starcat.service.access import principal_of
-from starcat.service.pages.static_files import static_address
 from starcat.service.problems import Problem, RenderingRoute, as_json, problem_of
 from starcat.version import __version__
 
@@ -24,6 +28,30 @@ NAVIGATION = (
     ("/releases", "Releases"),
 )
 """Address and name of what the head of every page leads to."""
+
+
+MEDIA_TYPES = {
+    ".css": "text/css; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".svg": "image/svg+xml",
+}
+
+FILES = {
+    path.name: path.read_bytes()
+    for path in sorted((Path(__file__).parent / "static").iterdir())
+    if path.suffix in MEDIA_TYPES
+}
+"""All of them by name, read once: no path is ever made of a request."""
+
+DIGEST = hashlib.sha256(b"".join(FILES[name] for name in sorted(FILES))).hexdigest()[:12]
+"""One digest for all, so that a script may import another by its name."""
+
+
+def static_address(name: str) -> str:
+    """Return the address of a static file."""
+    if name not in FILES:
+        raise KeyError(name)
+    return f"/static/{DIGEST}/{name}"
 
 
 def count_text(value: float | None) -> str:
@@ -154,3 +182,18 @@ def add_missing_page(app: FastAPI) -> None:
 def _error_page(request: Request, error: Exception) -> Response:
     problem = problem_of(error)
     return render(request, "error.html", status=problem.status, problem=problem)
+
+
+static_router = APIRouter(include_in_schema=False)
+
+
+@static_router.get("/static/{digest}/{name}")
+def static_file(digest: str, name: str) -> Response:
+    """Give a static file; those of an older version are gone."""
+    if digest != DIGEST or name not in FILES:
+        raise Problem(404, "there is no such file of the page; load the page again")
+    return Response(
+        FILES[name],
+        media_type=MEDIA_TYPES[Path(name).suffix],
+        headers={"Cache-Control": "public, max-age=31536000, immutable", "ETag": f'"{DIGEST}"'},
+    )

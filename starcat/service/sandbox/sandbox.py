@@ -46,6 +46,10 @@ class Sandbox:
         error = error_of_kind(answer["kind"], answer["message"], key=answer["key"])
         raise error or RuntimeError(f"{answer['kind']}: {answer['message']}")
 
+    def convert(self, source: Path, target: Path, form: str) -> None:
+        """Have an Arrow stream made a file of some format: some need the table in memory."""
+        self.call("convert", {"source": str(source), "target": str(target), "form": form})
+
     def _begin(self, _: None) -> Child:
         child = Child(
             "starcat.service.sandbox.worker:serve",
@@ -70,6 +74,5 @@ class Sandbox:
                 raise late from None
             raise Problem(
                 422,
-                "the process that read it ended by itself, as it does upon damaged files; send "
-                "another",
+                "the process that read the file crashed, as it does on damaged files; send another",
             ) from None

@@ -11,13 +11,50 @@ import os
 import signal
 import sys
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from starcat.query.confinement import forbid_writing, limit_memory, limit_time
-from starcat.service.identifying import identify
 from starcat.service.sandbox.child import own_output
 from starcat.vo.uploads import upload_facts
+
+if TYPE_CHECKING:
+    from starcat.images.solve_files import IdentifyOptions
+    from starcat.matcher.matcher import Matcher
+
+MATCHERS = 4
+"""Databases that are kept open with the options that they were opened with."""
+
+
+def identify(
+    folder: str, file: str, artifact: str, options: dict[str, Any], picture: str | None = None
+) -> dict[str, Any]:
+    """Identify the frames of a file in a folder; draw the first one beside it, as PNG or SVG."""
+    from starcat.images.solve_files import MATCHER_OPTIONS, IdentifyOptions, identify_file
+
+    os.chdir(folder)  # so that messages say the name of the file alone
+    chosen = IdentifyOptions.model_validate(options)
+    # What is not about the matcher does not open another.
+    own = IdentifyOptions(**chosen.model_dump(include=set(MATCHER_OPTIONS)))
+    answers = identify_file(Path(file), _matcher(artifact, own), chosen)
+    found = list(answers)
+    if picture is not None and found:
+        answers.draw(Path(f"picture.{picture}"), found[0])
+    is_any = any(answer.result.ok for answer in found)
+    return {
+        "database": answers.matcher.database.name,
+        "method": answers.matcher.method,
+        "frames": [answer.content() for answer in found],
+        "notes": answers.notes(found[0] if found else None, is_any_identified=is_any),
+    }
+
+
+@lru_cache(maxsize=MATCHERS)
+def _matcher(artifact: str, options: IdentifyOptions) -> Matcher:
+    from starcat.images.solve_files import open_matcher
+
+    return open_matcher(Path(artifact), options)
 
 
 def convert(source: str, target: str, form: str) -> int:

@@ -31,11 +31,11 @@ from starcat.vo.documents import (
     MEDIA_TYPE,
     availability,
     capabilities,
+    examples_page,
     for_tap_plus,
     table_document,
     tableset,
 )
-from starcat.vo.examples import examples_page
 from starcat.vo.parameters import Question, question
 
 router = APIRouter(prefix=PREFIX, tags=["TAP"], route_class=TapRoute)

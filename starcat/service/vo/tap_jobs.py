@@ -1,276 +1,263 @@
-"""Routers of TAP's asynchronous queries: jobs as UWS 1.1 has them."""
+"""Asynchronous queries of TAP: jobs of the kind ``query``, with a folder each for their files.
+
+Slots of the server answer them (`starcat.service.jobs.slots`).
+"""
 
 from __future__ import annotations
 
-import asyncio
-import math
+import json
+import secrets
+import shutil
+import sqlite3
 import time
-from datetime import UTC, datetime
-from typing import Annotated
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
-from fastapi import APIRouter, Depends, Query, Request
-from fastapi.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
+from starcat.errors import ConfigError, StarcatError, TargetMissing
+from starcat.service.jobs.job import QUERY
+from starcat.service.jobs.job_states import Attempt, Outcome
+from starcat.service.paths import JOB_ID, ServicePaths, checked
+from starcat.service.problems import Problem, problem_of
+from starcat.service.records import Records
+from starcat.service.vo.tap_queries import TapQueries
+from starcat.storage.atomic import make_folder, whole_file
+from starcat.vo.documents import ServiceLimits
+from starcat.vo.parameters import Parameters, Upload, question
+from starcat.vo.uws import JobFacts
 
-from starcat.errors import ConfigError, TargetMissing, quoted
-from starcat.exchange.formats import TAP_FORMATS
-from starcat.service.access import Reader
-from starcat.service.service import Service, TheService
-from starcat.service.vo.tap_request import FORM, PREFIX, TapRoute, TheRequest, base_url
-from starcat.service.vo.tap_store import RESULT
-from starcat.vo.documents import MEDIA_TYPE, VOTABLE_TYPE, error_votable
-from starcat.vo.uws import (
-    ACTIVE,
-    JobFacts,
-    iso_time,
-    job_document,
-    jobs_document,
-    parameters_document,
-    results_document,
-)
+RESULT = "result"
+"""Name of the file with the answer, in the folder of a job."""
 
-router = APIRouter(prefix=f"{PREFIX}/async", tags=["TAP"], route_class=TapRoute)
+MAX_WAITING = 100
+"""Jobs of one user that may be pending, queued or executing."""
 
-MAX_WAIT_S = 60.0
-"""How long a request may wait for a change of phase."""
+RETRY_S = 0.5
+"""How long to wait before asking again for a session while all are in use."""
 
-LOOK_S = 0.1
+PHASES = {
+    "pending": "PENDING",
+    "queued": "QUEUED",
+    "running": "EXECUTING",
+    "done": "COMPLETED",
+    "failed": "ERROR",
+    "cancelled": "ABORTED",
+}
+"""The phase of UWS of each state of a job."""
 
-PHASES = (*ACTIVE, "COMPLETED", "ERROR", "ABORTED", "UNKNOWN", "HELD", "SUSPENDED", "ARCHIVED")
-
-
-def own_job(job_id: str, service: TheService, who: Reader) -> JobFacts:
-    """Return the job of a request, which is one of who asks."""
-    return service.tap.jobs.job(job_id, who.name)
-
-
-TheJob = Annotated[JobFacts, Depends(own_job)]
+ACTIVE = ("pending", "queued", "running")
 
 
-@router.get("", summary="Jobs of who asks (UWS)")
-def list_jobs(
-    request: Request,
-    service: TheService,
-    who: Reader,
-    phases: Annotated[list[str] | None, Query(alias="PHASE")] = None,
-    after: Annotated[str | None, Query(alias="AFTER")] = None,
-    last: Annotated[int | None, Query(alias="LAST", ge=1)] = None,
-) -> Response:
-    """Return jobs, the newest first; all that are not archived where no phase is given."""
-    for phase in phases or ():
-        if phase not in PHASES:
-            raise ConfigError(
-                f"PHASE is {quoted(phase)}; it is one of {', '.join(PHASES)}", key="PHASE"
+class _Unwanted(Exception):  # noqa: N818 - the name reads as the fact
+    """The job was aborted, or the server stops."""
+
+
+class QueryJobs:
+    """The asynchronous queries of a service."""
+
+    def __init__(
+        self,
+        records: Records,
+        paths: ServicePaths,
+        limits: ServiceLimits,
+        queries: TapQueries,
+        wake_slots: Callable[[], None],
+    ) -> None:
+        self._records = records
+        self._paths = paths
+        self._limits = limits
+        self._queries = queries
+        self._wake_slots = wake_slots
+
+    def create(self, owner: str) -> JobFacts:
+        """Make a job without parameters, which is not run yet."""
+        self.sweep()
+        job_id, now_s = secrets.token_hex(16), time.time()
+        request = {"parameters": [], "files": {}, "run_id": "", "limit_s": self._limits.run_s}
+        make_folder(self.folder(job_id))
+        with self._records.writing() as connection:
+            [waiting] = connection.execute(
+                "SELECT count(*) FROM jobs WHERE kind = ? AND owner = ? AND state IN (?, ?, ?)",
+                (QUERY, owner, *ACTIVE),
+            ).fetchone()
+            if waiting >= MAX_WAITING:
+                raise ConfigError(
+                    f"{waiting} jobs of {owner} are not at their end, and so many are allowed; "
+                    "run, abort or delete some"
+                )
+            connection.execute(
+                "INSERT INTO jobs (id, kind, key, owner, title, state, request, created_s, "
+                "destroyed_s) VALUES (?, ?, '', ?, '', 'pending', ?, ?, ?)",
+                (job_id, QUERY, owner, json.dumps(request), now_s, now_s + self._limits.keep_s),
             )
-    since = None if after is None else _seconds("AFTER", after)
-    found = [
-        job
-        for job in service.tap.jobs.jobs(who.name)
-        if (not phases or job.phase in phases) and (since is None or job.created_s > since)
-    ]
-    return _xml(jobs_document(found[:last], f"{base_url(request)}/async"))
+        return self.job(job_id)
+
+    def job(self, job_id: str, owner: str | None = None) -> JobFacts:
+        """Return a job."""
+        row = self._row(job_id)
+        if owner not in (None, row["owner"]) or row["destroyed_s"] < time.time():
+            raise _no_job(job_id)
+        return _facts(row)
+
+    def jobs(self, owner: str) -> list[JobFacts]:
+        """Return all jobs of somebody, the newest first."""
+        with self._records.reading() as connection:
+            rows = connection.execute(
+                "SELECT * FROM jobs WHERE kind = ? AND owner = ? AND destroyed_s >= ? "
+                "ORDER BY created_s DESC, id",
+                (QUERY, owner, time.time()),
+            ).fetchall()
+        return [_facts(row) for row in rows]
+
+    def folder(self, job_id: str) -> Path:
+        """Return the folder with the uploads and the answer of a job."""
+        return self._paths.results / checked(job_id, JOB_ID, "job")
+
+    def answers(self, uploads: Sequence[Upload], owner: str) -> dict[str, Path]:
+        """Return the answers of other jobs that a question is about, by the ids of these."""
+        found = {}
+        for one in uploads:
+            if one.job_id:
+                phase = self.job(one.job_id, owner).phase
+                found[one.job_id] = self.folder(one.job_id) / RESULT
+                if phase != "COMPLETED":
+                    raise TargetMissing(f"UPLOAD of {one.table}: the job is {phase}, no answer yet")
+        return found
+
+    def set_parameters(
+        self, job_id: str, given: Sequence[tuple[str, str]], files: Mapping[str, Path]
+    ) -> None:
+        """Set parameters of a job that has not been run; others keep their values."""
+        names = {name for name, _ in given}
+        request = _request(self._row(job_id))
+        kept = [(name, value) for name, value in request["parameters"] if name not in names]
+        request["parameters"] = [*kept, *given]
+        request["files"] |= {part: path.name for part, path in files.items()}
+        request["run_id"] = dict(request["parameters"]).get("RUNID", "")
+        self._change(job_id, ("pending",), request=json.dumps(request))
+
+    def set_limit(self, job_id: str, seconds: float) -> None:
+        """Set how long a job that has not been run may run, at most what is granted."""
+        most = float(self._limits.run_s)
+        limit_s = min(seconds, most) if seconds > 0 else most
+        request = {**_request(self._row(job_id)), "limit_s": limit_s}
+        self._change(job_id, ("pending",), request=json.dumps(request))
+
+    def set_destruction(self, job_id: str, at_s: float) -> None:
+        """Set when a job goes, at most as late as is granted."""
+        latest = self.job(job_id).created_s + self._limits.keep_s
+        self._change(job_id, tuple(PHASES), destroyed_s=min(at_s, latest))
+
+    def run(self, job_id: str) -> None:
+        """Let a job be answered, as soon as a slot is free."""
+        self._change(job_id, ("pending",), state="queued", queued_s=time.time())
+        self._wake_slots()
+
+    def abort(self, job_id: str) -> None:
+        """End a job that is not at its end; whoever answers it finds that out."""
+        self._change(job_id, ACTIVE, state="cancelled", ended_s=time.time())
+
+    def delete(self, job_id: str) -> None:
+        """Forget a job and its answer."""
+        with self._records.writing() as connection:
+            connection.execute("DELETE FROM jobs WHERE id = ? AND kind = ?", (job_id, QUERY))
+        shutil.rmtree(self.folder(job_id), ignore_errors=True)
+
+    def sweep(self) -> None:
+        """Remove the jobs whose time is over."""
+        with self._records.reading() as connection:
+            rows = connection.execute(
+                "SELECT id FROM jobs WHERE kind = ? AND destroyed_s < ?", (QUERY, time.time())
+            ).fetchall()
+        for row in rows:
+            self.delete(row["id"])
+
+    def answer(self, attempt: Attempt, is_stopping: Callable[[], bool]) -> Outcome:
+        """Answer a job that a slot has begun."""
+
+        def check(*_: object) -> None:
+            if is_stopping() or attempt.cancel_requested():
+                raise _Unwanted
+
+        job_id = attempt.job.id
+        try:
+            while True:
+                try:
+                    return self._written(job_id, check)
+                except Problem as error:
+                    if error.status != 503:  # all sessions are in use
+                        raise
+                check()
+                time.sleep(RETRY_S)
+        except _Unwanted:
+            return Outcome("queued" if is_stopping() else "cancelled")
+        except (StarcatError, Problem) as error:
+            return Outcome("failed", {"detail": problem_of(error).detail})
+        finally:
+            if attempt.cancel_requested() and not self._exists(job_id):
+                shutil.rmtree(self.folder(job_id), ignore_errors=True)
+
+    def _written(self, job_id: str, check: Callable[..., None]) -> Outcome:
+        """Write the answer of a job into its file."""
+        row = self._row(job_id)
+        job, folder = _facts(row), self.folder(job_id)
+        asked = question(Parameters(job.parameters), self._queries.most_rows)
+        files = {part: folder / name for part, name in _request(row)["files"].items()}
+        files |= self.answers(asked.uploads, job.owner)
+        with whole_file(folder / RESULT) as path, path.open("wb") as stream:
+            for part in self._queries.answer(asked, files, job.limit_s, check):
+                check()
+                stream.write(part)
+        return Outcome("done", {"media_type": asked.form.tap_type})
+
+    def _exists(self, job_id: str) -> bool:
+        with self._records.reading() as connection:
+            found = connection.execute("SELECT 1 FROM jobs WHERE id = ?", (job_id,)).fetchone()
+        return found is not None
+
+    def _row(self, job_id: str) -> sqlite3.Row:
+        checked(job_id, JOB_ID, "job")
+        with self._records.reading() as connection:
+            row: sqlite3.Row | None = connection.execute(
+                "SELECT * FROM jobs WHERE id = ? AND kind = ?", (job_id, QUERY)
+            ).fetchone()
+        if row is None:
+            raise _no_job(job_id)
+        return row
+
+    def _change(self, job_id: str, states: tuple[str, ...], **values: object) -> None:
+        """Set columns of a job if it is in one of some states."""
+        setting = ", ".join(f"{name} = ?" for name in values)
+        within = ", ".join("?" * len(states))
+        with self._records.writing() as connection:
+            connection.execute(
+                f"UPDATE jobs SET {setting} WHERE id = ? AND kind = ? AND state IN ({within})",
+                (*values.values(), job_id, QUERY, *states),
+            )
 
 
-@router.post("", summary="Make a job (UWS)", openapi_extra=FORM)
-def make_job(given: TheRequest, request: Request, service: TheService, who: Reader) -> Response:
-    """Make a job of the parameters of TAP; with PHASE=RUN it is run."""
-    phase = given.parameters.one("PHASE")
-    if phase not in (None, "RUN"):
-        raise ConfigError(f"PHASE is {quoted(phase or '')}; a new job takes RUN only", key="PHASE")
-    kept = [(name, value) for name, value in given.parameters.items() if name != "PHASE"]
-    job = service.tap.jobs.create(who.name, [])
-    files = given.keep(service.tap.jobs.folder(job.job_id))
-    service.tap.jobs.set_parameters(job.job_id, kept, files)
-    if phase == "RUN":
-        service.tap.runner.run(job.job_id)
-    return _see(request, job)
+def _no_job(job_id: str) -> TargetMissing:
+    return TargetMissing(f"no job has the id {job_id}; the list of jobs tells theirs")
 
 
-@router.get("/{job_id}", summary="A job (UWS)")
-async def get_job(
-    job: TheJob,
-    request: Request,
-    service: TheService,
-    wait: Annotated[int | None, Query(alias="WAIT", ge=-1)] = None,
-    phase: Annotated[str | None, Query(alias="PHASE")] = None,
-) -> Response:
-    """Return all that is known of a job; with WAIT after its phase has changed."""
-    if wait is not None and phase in (None, job.phase):
-        most_s = MAX_WAIT_S if wait < 0 else min(wait, MAX_WAIT_S)
-        job = await _changed(service, job, most_s)
-    return _xml(job_document(job, _address(request, job)))
+def _request(row: sqlite3.Row) -> dict[str, Any]:
+    return dict(json.loads(row["request"]))
 
 
-@router.post("/{job_id}", summary="Delete a job, or set parameters (UWS)")
-def change_job(given: TheRequest, job: TheJob, request: Request, service: TheService) -> Response:
-    """Delete a job with ACTION=DELETE."""
-    action = given.parameters.one("ACTION")
-    if action is not None:
-        if action.upper() != "DELETE":
-            raise ConfigError(f"ACTION is {quoted(action)}; it may be DELETE", key="ACTION")
-        return _deleted(request, service, job)
-    if given.parameters.one("PHASE") is not None:
-        return set_phase(given, job, request, service)
-    return set_parameters(given, job, request, service)
-
-
-@router.delete("/{job_id}", summary="Delete a job (UWS)")
-def delete_job(job: TheJob, request: Request, service: TheService) -> Response:
-    """Forget a job and its answer; a query that runs is ended."""
-    return _deleted(request, service, job)
-
-
-@router.get("/{job_id}/phase", summary="Phase of a job (UWS)")
-def get_phase(job: TheJob) -> Response:
-    """Return the phase."""
-    return PlainTextResponse(job.phase)
-
-
-@router.post("/{job_id}/phase", summary="Run or abort a job (UWS)")
-def set_phase(given: TheRequest, job: TheJob, request: Request, service: TheService) -> Response:
-    """Run a job that is pending, or abort one that is not at its end."""
-    phase = given.parameters.one("PHASE")
-    if phase == "RUN":
-        service.tap.runner.run(job.job_id)
-    elif phase == "ABORT":
-        service.tap.runner.abort(job.job_id)
-    else:
-        raise ConfigError(f"PHASE is {quoted(phase or '')}; it may be RUN or ABORT", key="PHASE")
-    return _see(request, job)
-
-
-@router.get("/{job_id}/executionduration", summary="Seconds that a job may run (UWS)")
-def get_limit(job: TheJob) -> Response:
-    """Return seconds."""
-    return PlainTextResponse(str(int(job.limit_s)))
-
-
-@router.post("/{job_id}/executionduration", summary="Set how long a job may run (UWS)")
-def set_limit(given: TheRequest, job: TheJob, request: Request, service: TheService) -> Response:
-    """Set seconds, at most what the service grants; 0 for that."""
-    text = given.parameters.one("EXECUTIONDURATION") or ""
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = math.nan
-    if not 0 <= seconds < math.inf:
-        raise ConfigError(
-            f"EXECUTIONDURATION is {quoted(text)}; it is seconds", key="EXECUTIONDURATION"
-        )
-    service.tap.jobs.set_limit(job.job_id, seconds)
-    return _see(request, job)
-
-
-@router.get("/{job_id}/destruction", summary="When a job goes (UWS)")
-def get_destruction(job: TheJob) -> Response:
-    """Return a time, UTC."""
-    return PlainTextResponse(iso_time(job.destroyed_s))
-
-
-@router.post("/{job_id}/destruction", summary="Set when a job goes (UWS)")
-def set_destruction(
-    given: TheRequest, job: TheJob, request: Request, service: TheService
-) -> Response:
-    """Set a time, at most as late as the service grants."""
-    text = given.parameters.one("DESTRUCTION") or ""
-    service.tap.jobs.set_destruction(job.job_id, _seconds("DESTRUCTION", text))
-    return _see(request, job)
-
-
-@router.get("/{job_id}/quote", summary="When a job will be at its end (UWS)")
-def get_quote(job: TheJob) -> Response:
-    """Return nothing: that is not known."""
-    return PlainTextResponse("")
-
-
-@router.get("/{job_id}/owner", summary="Who made a job (UWS)")
-def get_owner(job: TheJob) -> Response:
-    """Return the name of the token, or anonymous."""
-    return PlainTextResponse(job.owner)
-
-
-@router.get("/{job_id}/parameters", summary="Parameters of a job (UWS)")
-def get_parameters(job: TheJob) -> Response:
-    """Return parameters as they were given."""
-    return _xml(parameters_document(job))
-
-
-@router.post("/{job_id}/parameters", summary="Set parameters of a job (UWS)")
-def set_parameters(
-    given: TheRequest, job: TheJob, request: Request, service: TheService
-) -> Response:
-    """Set parameters of a job that is pending."""
-    if job.phase != "PENDING":
-        raise ConfigError(f"the job is {job.phase}; parameters are set before it is run")
-    files = given.keep(service.tap.jobs.folder(job.job_id))
-    service.tap.jobs.set_parameters(job.job_id, given.parameters.items(), files)
-    return _see(request, job)
-
-
-@router.get("/{job_id}/results", summary="Where the answer is (UWS)")
-def get_results(job: TheJob, request: Request) -> Response:
-    """Return the addresses of results."""
-    return _xml(results_document(job, _address(request, job)))
-
-
-@router.get("/{job_id}/results/result", summary="The answer of a job (TAP)")
-def get_result(job: TheJob, service: TheService) -> Response:
-    """Return the answer in the format that was asked for."""
-    path = service.tap.jobs.folder(job.job_id) / RESULT
-    if job.phase != "COMPLETED" or not path.is_file():
-        raise TargetMissing(
-            f"the job is {job.phase} and has no answer; its phase tells when it has"
-        )
-    suffix = next((one.suffix for one in TAP_FORMATS if one.tap_type == job.media_type), ".vot")
-    return FileResponse(
-        path,
-        media_type=job.media_type,
-        filename=f"result{suffix}",
-        content_disposition_type="inline",
+def _facts(row: sqlite3.Row) -> JobFacts:
+    request = _request(row)
+    error, result = (json.loads(row[name] or "{}") for name in ("error", "result"))
+    return JobFacts(
+        job_id=row["id"],
+        owner=row["owner"],
+        phase=PHASES[row["state"]],
+        run_id=request["run_id"],
+        parameters=tuple((name, value) for name, value in request["parameters"]),
+        created_s=row["created_s"],
+        started_s=row["started_s"],
+        ended_s=row["ended_s"],
+        destroyed_s=row["destroyed_s"],
+        limit_s=request["limit_s"],
+        error=error.get("detail", ""),
+        media_type=result.get("media_type", ""),
     )
-
-
-@router.get("/{job_id}/error", summary="Why a job has no answer (TAP)")
-def get_error(job: TheJob) -> Response:
-    """Return the error as a VOTable."""
-    if job.phase != "ERROR":
-        raise TargetMissing(f"the job is {job.phase} and has no error")
-    return Response(error_votable(job.error), media_type=VOTABLE_TYPE)
-
-
-async def _changed(service: Service, job: JobFacts, most_s: float) -> JobFacts:
-    """Return a job when its phase is another than it was, or some time later."""
-    ends = time.monotonic() + most_s
-    found = job
-    while found.phase == job.phase and job.phase in ACTIVE and time.monotonic() < ends:
-        await asyncio.sleep(LOOK_S)
-        found = service.tap.jobs.job(job.job_id)
-    return found
-
-
-def _deleted(request: Request, service: Service, job: JobFacts) -> Response:
-    service.tap.runner.abort(job.job_id)
-    service.tap.jobs.delete(job.job_id)
-    return RedirectResponse(f"{base_url(request)}/async", 303)
-
-
-def _see(request: Request, job: JobFacts) -> Response:
-    return RedirectResponse(_address(request, job), 303)
-
-
-def _address(request: Request, job: JobFacts) -> str:
-    return f"{base_url(request)}/async/{job.job_id}"
-
-
-def _xml(content: bytes) -> Response:
-    return Response(content, media_type=MEDIA_TYPE)
-
-
-def _seconds(name: str, text: str) -> float:
-    """Return a time that a request has, in seconds since 1970."""
-    try:
-        moment = datetime.fromisoformat(text.strip())
-        return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
-    except (ValueError, OverflowError):
-        raise ConfigError(
-            f"{name} is {quoted(text)}; it is a time such as 2026-01-31T12:00:00Z", key=name
-        ) from None

@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from starcat.errors import ConfigError
 from starcat.exchange.columns import Label
+from starcat.exchange.formats import Format
+from starcat.exchange.writers import result_chunks
 from starcat.progress import Progress, no_progress
 from starcat.service.paths import ServicePaths
 from starcat.service.query_pool import QueryPool
 from starcat.service.sandbox.sandbox import Sandbox
-from starcat.service.vo.tap_answers import Answers
+from starcat.service.transfers import chunks_of, scratch_folder, write_rows
 from starcat.service.vo.tap_tables import TapTables
-from starcat.vo.adql import translate
-from starcat.vo.answer import ask
+from starcat.vo.adql import ask, translate
 from starcat.vo.parameters import Question, Upload
 from starcat.vo.tables import Schema, Table
 from starcat.vo.tap_schema import UPLOADS
 from starcat.vo.uploads import table_of_facts
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 _LABEL = Label("result")
 
@@ -33,7 +38,7 @@ class TapQueries:
         self,
         paths: ServicePaths,
         tables: TapTables,
-        sessions: QueryPool,
+        query_pool: QueryPool,
         sandbox: Sandbox,
         most_rows: int,
     ) -> None:
@@ -41,15 +46,14 @@ class TapQueries:
         self.most_rows = most_rows
         self._paths = paths
         self._tables = tables
-        self._sessions = sessions
-        self._answers = Answers(paths, sandbox)
+        self._query_pool = query_pool
 
     def answer(
         self,
         asked: Question,
         files: Mapping[str, Path],
         time_s: float | None = None,
-        progress: Progress = no_progress,
+        progress: Progress | Callable[..., None] = no_progress,
     ) -> Generator[bytes, None, None]:
         """Yield the answer to a question."""
         with self._uploaded(asked.uploads, files) as (folder, uploaded):
@@ -59,9 +63,24 @@ class TapQueries:
                 tables = tables.with_schema(uploaded)
                 targets.append(folder)
             translated = translate(asked.query, tables)
-            with self._sessions.session(targets, time_s) as session:
+            with self._query_pool.session(targets, time_s) as session:
                 batches = ask(session, translated, asked.max_rows, progress)
-                yield from self._answers.chunks(batches, asked.form, asked.max_rows)
+                yield from self._chunks(batches, asked.form, asked.max_rows)
+
+    def _chunks(
+        self, batches: pa.RecordBatchReader, form: Format, max_rows: int
+    ) -> Iterator[bytes]:
+        """Yield an answer in a format; FITS, held in memory as a whole, is another process's."""
+        if form.name != "fits":
+            scratch = self._paths.scratch
+            yield from result_chunks(batches, form, scratch, label=_LABEL, maxrec=max_rows)
+            return
+        with scratch_folder(self._paths) as folder:
+            rows, result = folder / "rows.arrow", folder / "result.fits"
+            write_rows(batches, rows, max_rows)
+            self._sandbox.convert(rows, result, "fits")
+            chunks = chunks_of(result.open("rb"))
+        yield from chunks
 
     @contextmanager
     def _uploaded(

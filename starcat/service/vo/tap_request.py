@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import Depends, Request
 from fastapi.responses import Response
-from fastapi.routing import APIRoute
 from starlette.datastructures import FormData, UploadFile
 from starlette.exceptions import HTTPException
 
 from starcat.errors import ConfigError, StarcatError
-from starcat.service.problems import Problem, problem_of
+from starcat.service.problems import Problem, RenderingRoute, as_json, problem_of
 from starcat.service.service import Service, service_of
 from starcat.vo.documents import VOTABLE_TYPE, error_votable
 from starcat.vo.parameters import MAX_UPLOADS, Parameters
@@ -72,50 +70,26 @@ FORM: dict[str, Any] = {
 
 _COPIED_BYTES = 1 << 20
 
-_logger = logging.getLogger(__name__)
 
-Handler = Callable[[Request], Coroutine[Any, Any, Response]]
-
-
-class TapRoute(APIRoute):
+class TapRoute(RenderingRoute):
     """A route whose errors are VOTables, but for those of who may do what."""
 
-    def get_route_handler(self) -> Handler:
-        """Return the handler with errors caught."""
-        handle = super().get_route_handler()
-
-        async def answer(request: Request) -> Response:
-            try:
-                return await handle(request)
-            except (StarcatError, Problem) as error:
-                if isinstance(error, Problem) and error.status in (401, 403):
-                    raise
-                return error_response(error)
-
-        return answer
-
-
-def error_response(error: Exception) -> Response:
-    """Return an error as TAP has it."""
-    problem = problem_of(error)
-    headers = error.headers if isinstance(error, Problem) else None
-    return Response(error_votable(problem.detail), problem.status, headers, VOTABLE_TYPE)
+    def render(self, error: Exception, request: Request) -> Response:
+        """Return an error as TAP has it."""
+        problem = problem_of(error)
+        is_own = isinstance(error, StarcatError | Problem)
+        if not is_own or problem.status in (401, 403):
+            return as_json(error)
+        headers = getattr(error, "headers", None)
+        return Response(error_votable(problem.detail), problem.status, headers, VOTABLE_TYPE)
 
 
 @dataclass(frozen=True)
 class TapRequest:
-    """A request.
-
-    Attributes
-    ----------
-    parameters : Parameters
-        Of the address and of the body.
-    uploads : dict of str to UploadFile
-        Parts of the body that are files, by their names.
-    """
+    """What a request says, in its address and its body."""
 
     parameters: Parameters
-    uploads: dict[str, UploadFile]
+    uploads: dict[str, UploadFile]  # parts of the body that are files, by their names
 
     def keep(self, folder: Path) -> dict[str, Path]:
         """Copy the files of the request into a folder."""

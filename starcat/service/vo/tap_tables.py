@@ -12,7 +12,7 @@ import threading
 from dataclasses import dataclass
 from pathlib import Path
 
-from starcat.catalog.star_files import rejected_path
+from starcat.catalog.verdict import rejected_path
 from starcat.errors import StarcatError
 from starcat.service.library import Library
 from starcat.service.paths import ServicePaths
@@ -26,27 +26,19 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class TapState:
-    """What there is to be asked.
+    """What there is to be asked."""
 
-    Attributes
-    ----------
-    targets : tuple of Path
-        What a session has to open, TAP_SCHEMA at the end.
-    tables : Tables
-        All tables, with TAP_SCHEMA.
-    """
-
-    targets: tuple[Path, ...]
-    tables: Tables
+    targets: tuple[Path, ...]  # what a session has to open, TAP_SCHEMA at the end
+    tables: Tables  # all tables, with TAP_SCHEMA
 
 
 class TapTables:
     """The tables of a service, as they are now."""
 
-    def __init__(self, paths: ServicePaths, library: Library, sessions: QueryPool) -> None:
+    def __init__(self, paths: ServicePaths, library: Library, query_pool: QueryPool) -> None:
         self._paths = paths
-        self._shelf = library
-        self._sessions = sessions
+        self._library = library
+        self._query_pool = query_pool
         self._looking = threading.Lock()
         self._state: tuple[str, TapState] | None = None
 
@@ -65,7 +57,7 @@ class TapTables:
         """Return what there is on disk, and what each is."""
         found = {
             database.folder: f"Guide-star database {database.name}, version {database.version}"
-            for database in self._shelf.databases()
+            for database in self._library.databases()
         }
         for path in sorted(self._paths.catalogs.iterdir()):
             is_table = path.suffix == ".parquet" and path != rejected_path(path)
@@ -84,7 +76,7 @@ class TapTables:
 
     def _opens(self, path: Path) -> bool:
         try:
-            with self._sessions.session([path]):
+            with self._query_pool.session([path]):
                 return True
         except StarcatError:
             return False
@@ -94,7 +86,7 @@ class TapTables:
         folder = self._paths.scratch / f"tap-{key}" / NAME
         schemas: tuple[Schema, ...] = ()
         if about:
-            with self._sessions.session(list(about)) as session:
+            with self._query_pool.session(list(about)) as session:
                 names = [target.name for target in session.targets]
                 told = dict(zip(names, about.values(), strict=True))
                 schemas = session_schemas(session, told)

@@ -1,0 +1,198 @@
+"""Get the files of a data source into a folder, whole and checked, or not at all.
+
+Input is a `DataSource` and a folder; output is a `FetchReport`. A body goes to
+``<name>.part``, is continued there after an interruption, is checked on arrival and only
+then gets its name; a file that fails the checks is kept as ``<name>.rejected``. Processes that
+fetch into the same folder at the same time wait for each other, file by file.
+
+pooch gives the cache folder, the digests and FTP; `starcat.storage.download` continues downloads.
+Several addresses for one file and keeping a file whose digest is wrong are done here. This
+module does not unpack, and reads no star.
+"""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from starcat.catalog.integrity import (
+    ExpectedFile,
+    LockEntry,
+    check_download,
+    expected_files,
+    read_lock,
+)
+from starcat.catalog.source import DataSource
+from starcat.errors import DownloadError, OutputError, SourceError
+from starcat.progress import Progress, no_progress
+from starcat.storage.download import (
+    DownloadOptions,
+    beside,
+    download,
+    forget_part,
+    part_of,
+    rename,
+)
+from starcat.storage.locks import locked
+
+Status = Literal["downloaded", "resumed", "present"]
+"""Whether a file was fetched in one go, continued from an earlier part, or already there."""
+
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class FetchedFile:
+    """One file that is in the folder and is what it should be."""
+
+    name: str
+    path: Path
+    bytes: int  # as published, that is before unpacking
+    sha256: str
+    rows: int
+    url: str  # where it came from; empty for a file that somebody put there by hand
+    status: Status
+
+
+@dataclass(frozen=True)
+class FetchReport:
+    """What `fetch_source` did."""
+
+    source: str
+    files: tuple[FetchedFile, ...]  # in the order of the data source
+
+
+def fetch_source(
+    source: DataSource,
+    folder: Path,
+    *,
+    parts: Sequence[str] = (),
+    retries: int = 3,
+    timeout_s: float = 60.0,
+    backoff_s: float = 1.0,
+    progress: Progress = no_progress,
+) -> FetchReport:
+    """Get the files of a source into a folder and check them.
+
+    Notes
+    -----
+    The number of records of a file in parts is checked when its last part arrives. A file with
+    the right digest is not asked for again. Several processes may fetch into one folder: each
+    file is downloaded by one of them, and the others wait for it.
+    """
+    wanted = expected_files(source, parts)
+    _make_writable(folder)
+    read_lock(folder)
+    options = DownloadOptions(retries, timeout_s, backoff_s, progress)
+    return FetchReport(source.name, tuple(_fetch_file(file, folder, options) for file in wanted))
+
+
+def _make_writable(folder: Path) -> None:
+    """Make the folder and write to it once, before anything is downloaded."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OutputError(
+            f"cannot write to the folder {folder}: {error}. Name another one, or set "
+            "STARCAT_CACHE.",
+            path=folder,
+        ) from error
+
+
+def _fetch_file(expected: ExpectedFile, folder: Path, options: DownloadOptions) -> FetchedFile:
+    """Take the file that is there, or else the first address that delivers.
+
+    Who holds the lock of the file is alone with its part, which can be continued later. A second
+    process waits for it and then finds the file. Where there are no locks, every process has a
+    part of its own, which no other continues.
+    """
+    mark = folder / f".{expected.names[0]}.fetching"
+    with locked(mark) as is_alone:
+        try:
+            suffix = "" if is_alone else f".{secrets.token_hex(4)}"
+            return _present(expected, folder) or _download(expected, folder, suffix, options)
+        finally:
+            mark.unlink(missing_ok=True)
+
+
+def _present(expected: ExpectedFile, folder: Path) -> FetchedFile | None:
+    found = (folder / name for name in expected.names if (folder / name).exists())
+    path = next(found, None)
+    return _take_present(expected, path) if path else None
+
+
+def _download(
+    expected: ExpectedFile, folder: Path, suffix: str, options: DownloadOptions
+) -> FetchedFile:
+    failures: list[tuple[str, SourceError]] = []
+    for name, url in expected.addresses:
+        own = beside(folder / name, suffix)
+        try:
+            status = download(url, own, options)
+            return _take_arrived(expected, own, folder / name, url, status)
+        except SourceError as error:
+            _logger.warning("%s: %s", url, error)
+            failures.append((url, error))
+    raise _none_delivered(expected, failures)
+
+
+def _none_delivered(
+    expected: ExpectedFile, failures: Sequence[tuple[str, SourceError]]
+) -> SourceError:
+    """Return the error for a file that no address delivered.
+
+    Where one delivered a file that is wrong, that is the error: it says more than a failed
+    download.
+    """
+    wrong = [error for _, error in failures if not isinstance(error, DownloadError)]
+    reasons = "\n".join(f"  {url}: {error}" for url, error in failures)
+    if not wrong:
+        return DownloadError(
+            f"{expected.names[0]} came from none of its addresses:\n{reasons}\n"
+            "Try again later: what has arrived is kept. Or put the file there by hand.",
+            source=expected.source.name,
+        )
+    if len(failures) > 1:
+        wrong[0].args = (f"{wrong[0]}\nAll addresses failed:\n{reasons}",)
+    return wrong[0]
+
+
+def _take_present(expected: ExpectedFile, path: Path) -> FetchedFile:
+    """Check a file that is in the folder; it is left as it is."""
+    if not path.is_file():
+        raise OutputError(f"{path} is in the way: it is not a file. Move it.", path=path)
+    try:
+        entry = check_download(expected, path, path, url="")
+    except SourceError as error:
+        error.args = (f"{error} The file is {path}: move it away to fetch it again.",)
+        raise
+    return _fetched(path, entry, entry.url, "present")
+
+
+def _take_arrived(
+    expected: ExpectedFile, own: Path, path: Path, url: str, status: Status
+) -> FetchedFile:
+    """Check a file that has come, then give it its name or set it aside."""
+    part = part_of(own)
+    try:
+        entry = check_download(expected, part, path, url=url)
+    except SourceError as error:
+        error.path = beside(path, ".rejected")
+        rename(part, error.path)
+        forget_part(own)
+        error.args = (f"{str(error).rstrip('.')}. The file is kept as {error.path}.",)
+        raise
+    rename(part, path)
+    forget_part(own)
+    return _fetched(path, entry, url, status)
+
+
+def _fetched(path: Path, entry: LockEntry, url: str, status: Status) -> FetchedFile:
+    return FetchedFile(path.name, path, entry.bytes, entry.sha256, entry.rows, url, status)

@@ -1,1 +1,0 @@
-"""Fetching: where archive files come from, and where they are looked for."""

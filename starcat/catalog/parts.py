@@ -1,0 +1,312 @@
+"""One archive file in, its parts out: blocks parsed in order, with the checks of a whole file.
+
+Every record of a block is in the stars of its part, in the rejected records with one reason, or
+counted as beyond the read limit. What a file holds in memory at a time is a few blocks. The
+joining of files is `starcat.catalog.ingest`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from operator import itemgetter
+from typing import Protocol, TypeVar
+
+import numpy as np
+import pyarrow as pa
+
+from starcat.arrays import Array
+from starcat.catalog.archives import gaia, hipparcos, sao, twomass, tycho1, tycho2
+from starcat.catalog.readers.blocks import Block, DigestReader, map_in_order, read_blocks
+from starcat.catalog.readers.delimited import parse_delimited
+from starcat.catalog.readers.fixed_width import parse_binary, parse_fixed_width
+from starcat.catalog.readers.records import Problem, Records
+from starcat.catalog.source import DataSource
+from starcat.catalog.source_files import FileFacts, InputFile
+from starcat.catalog.stars import (
+    Columns,
+    move_to_epoch,
+    split_by_verdict,
+    table_from_columns,
+)
+from starcat.catalog.verdict import Reason, Verdicts
+from starcat.errors import ParseError, SourceError
+from starcat.progress import Progress, no_progress
+
+_PARSERS = {
+    "fixed_width": parse_fixed_width,
+    "delimited": parse_delimited,
+    "binary": parse_binary,
+}
+
+NAMED_PROBLEMS = 20
+"""Malformed records of a file that are listed; the others are counted."""
+
+MAX_MALFORMED_FRACTION = 0.01
+"""Above this share of malformed records (and more than 10 of them) a file is refused."""
+
+_MOST_BLOCKS, _MOST_REJECTED = 256, 1 << 18
+"""Blocks and rejected records that are joined into one part at most."""
+
+RANGES = {
+    "star_id": (-(2.0**63), 2.0**63 - 1024.0),
+    "ra_deg": (0.0, 360.0),
+    "dec_deg": (-90.0, 90.0),
+    "epoch_jyear": (1800.0, 2200.0),
+    "pm_ra_cosdec_mas_yr": (-100_000.0, 100_000.0),
+    "pm_dec_mas_yr": (-100_000.0, 100_000.0),
+    "mag": (-30.0, 100.0),
+    "second_mag": (-30.0, 100.0),
+}
+"""Least and greatest value of the columns of a star, both included. Barnard's star, the fastest
+that is known, moves 10,400 mas/yr."""
+
+
+class Archive(Protocol):
+    """What ingest needs of a catalog's module: what its records mean."""
+
+    @property
+    def COLUMNS(self) -> Mapping[str, Sequence[str]]:  # noqa: N802
+        """Columns to parse, by layout."""
+
+    def magnitudes(self, records: Records, band: str, /) -> Array:
+        """Return the magnitudes of records; those beyond a read limit go no further."""
+
+    def stars(self, records: Records, band: str, verdicts: Verdicts, /) -> Columns:
+        """Return the star-table columns of records, and reject those that are no stars."""
+
+
+CATALOGS: dict[str, Archive] = {
+    "sao": sao,
+    "hipparcos": hipparcos,
+    "tycho1": tycho1,
+    "tycho2": tycho2,
+    "2mass": twomass,
+    "gaia": gaia,
+}
+"""The star catalogs, by the name of their data source."""
+
+
+@dataclass(frozen=True)
+class IngestOptions:
+    """Which records of a catalog are read, and how."""
+
+    source_name: str  # one of `CATALOGS`
+    band: str  # of `mag`
+    epoch_jyear: float | None = None  # None leaves every star at its own epoch
+    read_limit_mag: float | None = None  # fainter records are counted and not held
+
+
+@dataclass(frozen=True)
+class Part:
+    """One block after parsing, or several joined."""
+
+    rows: int  # records in it, good and malformed
+    stars: pa.Table
+    rejected: pa.Table
+    problems: list[Problem]  # why records are malformed
+    counted: int = 0  # records beyond the read limit, which are in neither table
+
+
+def parse_block(block: Block, number: int, options: IngestOptions) -> Part:
+    """Return the stars and the rejected records of a block of the file with a number."""
+    layout, catalog = block.file.layout, CATALOGS[options.source_name]
+    names, band = catalog.COLUMNS[layout.name], options.band
+    records = _PARSERS[layout.layout](block.data, layout, names, block.first_line)
+    rows, counted = records.rows, 0
+    if options.read_limit_mag is not None:
+        is_held = catalog.magnitudes(records, band) <= options.read_limit_mag
+        counted = len(records) - int(np.count_nonzero(is_held))
+        records = records.where(is_held)
+    verdicts = Verdicts(len(records))
+    columns = check_ranges(catalog.stars(records, band, verdicts), verdicts)
+    columns = move_to_epoch(columns, options.epoch_jyear)
+    columns |= {"catalog": options.source_name, "source_file": number, "source_line": records.line}
+    table = table_from_columns("stars", columns, len(records))
+    stars, rejected = split_by_verdict(table, verdicts)
+    if records.problems:
+        malformed = _malformed_rows(records.problems, number, options)
+        rejected = pa.concat_tables([rejected, malformed])
+    return Part(rows, stars, rejected, records.problems, counted)
+
+
+def check_ranges(columns: Columns, verdicts: Verdicts) -> Columns:
+    """Reject the records without a position, or with values that no star can have.
+
+    The readers leave out fields that their archive's layout does not allow; this holds for what
+    every catalog makes of the fields. A right ascension of 360 deg becomes 0.
+    """
+    found = {
+        name: np.asarray(columns[name], dtype=np.float64) for name in RANGES if name in columns
+    }
+    for name in ("ra_deg", "dec_deg", "epoch_jyear"):
+        verdicts.reject(np.isnan(found[name]), Reason.no_position)
+    for name, values in found.items():
+        least, greatest = RANGES[name]
+        verdicts.reject((values < least) | (values > greatest), Reason.impossible_value)
+    return {**columns, "ra_deg": np.where(found["ra_deg"] == 360.0, 0.0, found["ra_deg"])}
+
+
+def _malformed_rows(problems: Sequence[Problem], number: int, options: IngestOptions) -> pa.Table:
+    columns: Columns = {
+        "catalog": options.source_name,
+        "band": options.band,
+        "source_file": number,
+        "source_line": np.array([problem.line for problem in problems]),
+        "reason": Reason.malformed_record.name,
+        "detail": pa.array([str(problem) for problem in problems]),
+    }
+    return table_from_columns("rejected", columns, len(problems))
+
+
+class Parsed(Protocol):
+    """A block after parsing: how many records it has, and which of them are malformed."""
+
+    @property
+    def rows(self) -> int:
+        """Number of records, good and malformed."""
+
+    @property
+    def problems(self) -> Sequence[Problem]:
+        """Why records are malformed."""
+
+
+_Parsed = TypeVar("_Parsed", bound=Parsed)
+
+
+class FileReading:
+    """One file that is read, and what is known of it so far."""
+
+    def __init__(self, file: InputFile, number: int, source: DataSource) -> None:
+        self.file, self.number, self.source = file, number, source
+        self.rows = self.malformed = 0
+        self.problems: list[Problem] = []  # the first `NAMED_PROBLEMS`
+        self._digest: DigestReader | None = None
+
+    def blocks(self) -> Iterator[Block]:
+        """Read the file from its beginning to its end."""
+        return read_blocks(self.file, self.source.name, self._end)
+
+    def _end(self, digest: DigestReader) -> None:
+        self._digest = digest
+
+    def add(self, part: Parsed) -> None:
+        """Count the records of the next block, of which one at least is good in the first."""
+        problems = part.problems
+        if problems and not self.rows and part.rows == len(problems):
+            raise self._error(
+                f"none of the first {len(problems)} records is one of {self.source.name} "
+                f"({self.file.layout.name}): {problems[0]}. Is this the right archive?",
+                problems[0],
+            )
+        self.rows += part.rows
+        self.malformed += len(problems)
+        self.problems += problems[: NAMED_PROBLEMS - len(self.problems)]
+
+    @property
+    def facts(self) -> FileFacts:
+        """What the manifest says of the file, which has been read to its end.
+
+        Raises
+        ------
+        ParseError
+            If it has no record, or more than 10 of them and 1 % are malformed.
+        """
+        path, digest = self.file.path, self._digest
+        if digest is None:
+            raise SourceError(f"{path}: not read to its end", path=path)
+        if not self.rows:
+            raise self._error(
+                f"no record in the file; expected records of {self.source.name} "
+                f"({self.file.layout.name}). Is this the right archive?"
+            )
+        if self.malformed > 10 and self.malformed > MAX_MALFORMED_FRACTION * self.rows:
+            raise self._error(
+                f"{self.malformed} of {self.rows} records are malformed; at most "
+                f"{MAX_MALFORMED_FRACTION:.0%} may be. The first: {self.problems[0]}",
+                self.problems[0],
+            )
+        return FileFacts(path.name, digest.sha256, digest.bytes_read, self.rows)
+
+    @property
+    def named_problems(self) -> tuple[str, ...]:
+        """The first malformed records, each with file, line and bytes."""
+        return tuple(f"{self.file.path.name} {problem}" for problem in self.problems)
+
+    def _error(self, what: str, first: Problem | None = None) -> ParseError:
+        return ParseError(
+            f"{self.file.path}: {what}",
+            source=self.source.name,
+            path=self.file.path,
+            line=first.line if first else None,
+            byte_range=first.byte_range if first else None,
+            field=first.field if first else None,
+        )
+
+
+def read_files(
+    readings: Sequence[FileReading],
+    parse: Callable[[Block, int], _Parsed],
+    workers: int = 0,
+    progress: Progress = no_progress,
+) -> Iterator[tuple[FileReading, Iterator[_Parsed]]]:
+    """Give each file and its parsed blocks, in order.
+
+    Workers are threads that parse blocks while this one reads, those of the next file too; without
+    any, this one does both.
+    """
+
+    def parse_numbered(item: tuple[FileReading, Block]) -> tuple[FileReading, _Parsed]:
+        return item[0], parse(item[1], item[0].number)
+
+    def counted() -> Iterator[tuple[FileReading, _Parsed]]:
+        blocks = _blocks_of_all(readings, progress)
+        for reading, part in map_in_order(parse_numbered, blocks, workers):
+            reading.add(part)
+            yield reading, part
+
+    for reading, pairs in groupby(counted(), key=itemgetter(0)):
+        yield reading, (part for _, part in pairs)
+
+
+def _blocks_of_all(
+    readings: Sequence[FileReading], progress: Progress
+) -> Iterator[tuple[FileReading, Block]]:
+    sizes = [reading.file.path.stat().st_size for reading in readings]
+    for number, reading in enumerate(readings):
+        before, stage = sum(sizes[:number]), f"read {reading.source.name}"
+        for block in reading.blocks():
+            progress(stage, before + block.bytes_read, sum(sizes))
+            yield reading, block
+        progress(stage, before + sizes[number], sum(sizes))
+
+
+def merged(parts: Iterable[Part], rows: int) -> Iterator[Part]:
+    """Join blocks until there are about so many stars: with a read limit they have few each."""
+    held: list[Part] = []
+    for part in parts:
+        held.append(part)
+        stars, rejected = (sum(len(table) for table in tables) for tables in _tables(held))
+        if stars >= rows or rejected >= _MOST_REJECTED or len(held) >= _MOST_BLOCKS:
+            yield _joined(held)
+            held = []
+    if held:
+        yield _joined(held)
+
+
+def _tables(parts: Sequence[Part]) -> tuple[list[pa.Table], list[pa.Table]]:
+    return [part.stars for part in parts], [part.rejected for part in parts]
+
+
+def _joined(parts: Sequence[Part]) -> Part:
+    if len(parts) == 1:
+        return parts[0]
+    stars, rejected = (pa.concat_tables(tables).combine_chunks() for tables in _tables(parts))
+    return Part(
+        sum(part.rows for part in parts),
+        stars,
+        rejected,
+        [problem for part in parts for problem in part.problems],
+        sum(part.counted for part in parts),
+    )

@@ -1,0 +1,246 @@
+"""The files of a source on disk: which of the paths given they are, and where else they may be.
+
+A source is given as a file (plain or ``.gz``), several files, or a folder that holds them under
+the archive's names, in parts or whole.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import pooch
+
+from starcat.catalog.archives.gaia import embedded_sky
+from starcat.catalog.source import DataSource, RecordFile, data_source, source_names
+from starcat.errors import SourceError, SourceMissing
+
+CATALOGS_VARIABLE = "STARCAT_CATALOGS"
+
+
+@dataclass(frozen=True)
+class InputFile:
+    """One file on disk and the layout of its records."""
+
+    path: Path
+    layout: RecordFile
+
+
+@dataclass(frozen=True)
+class FileFacts:
+    """One input file as the manifest records it."""
+
+    name: str  # without its folder
+    sha256: str  # of the file as it lies on disk
+    bytes: int
+    rows: int  # records in it, malformed ones included
+
+
+@dataclass(frozen=True)
+class SourceFiles:
+    """The files of one source, in reading order."""
+
+    source: DataSource
+    files: tuple[InputFile, ...]
+
+    @classmethod
+    def find(cls, source: DataSource, paths: Sequence[Path]) -> SourceFiles:
+        """Find the files that paths name, which are files or folders.
+
+        Raises
+        ------
+        SourceMissing
+            If there is none, a path does not exist, or a folder lacks a file or a part that is
+            not optional.
+        SourceError
+            If a file of the archive is given twice.
+        """
+        found: list[InputFile] = []
+        for path in paths:
+            if path.is_dir():
+                found += _files_in_folder(source, path)
+            elif path.exists():
+                found.append(InputFile(path, named_layout(source, path) or source.files[0]))
+            else:
+                expected = " and ".join(file.file_names[0] + "[.gz]" for file in source.files)
+                raise SourceMissing(
+                    f"{source.name}: {path} does not exist; give a file or a folder with "
+                    f"{expected}",
+                    source=source.name,
+                    path=path,
+                )
+        if not found:
+            raise SourceMissing(f"{source.name}: no input files given", source=source.name)
+        # Files may have any names; only those of the archive say what is in them.
+        named = [file.path for file in found if named_layout(source, file.path)]
+        files = cls(source, tuple(found))
+        files._check_duplicates(
+            (path.name.removesuffix(".gz"), path, f"{path.name.removesuffix('.gz')} is there twice")
+            for path in named
+        )
+        return files
+
+    @cached_property
+    def sizes(self) -> tuple[int, ...]:
+        """Bytes of each file, as it lies on disk."""
+        return tuple(file.path.stat().st_size for file in self.files)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """A note for each optional file of the source that is not among these."""
+        given = {file.layout.name for file in self.files}
+        return tuple(
+            f"{self.source.name}: {layout.file_names[0]} is not among the inputs "
+            f"({layout.description})"
+            for layout in self.source.files
+            if layout.optional and layout.name not in given
+        )
+
+    def check_contents(self, facts: Sequence[FileFacts]) -> None:
+        """Check that no two of the first files have the same content, whatever their names."""
+        what = "two files have the same content (sha256 {}…)"
+        self._check_duplicates(
+            (fact.sha256, file.path, what.format(fact.sha256[:12]))
+            for file, fact in zip(self.files, facts, strict=False)
+        )
+
+    def _check_duplicates(self, keyed: Iterable[tuple[str, Path, str]]) -> None:
+        """Raise for a key that came before: every star of that file would be read twice."""
+        seen: dict[str, Path] = {}
+        for key, path, what in keyed:
+            if key in seen:
+                raise SourceError(
+                    f"{self.source.name}: {what}: {seen[key]} and {path}; expected each part of "
+                    "the archive once. Leave one of them out, or fetch the part that should be "
+                    "there instead",
+                    source=self.source.name,
+                    path=path,
+                )
+            seen[key] = path
+
+
+def named_layout(source: DataSource, path: Path) -> RecordFile | None:
+    """Return the layout of a source whose archive name a file has, with or without ``.gz``."""
+    name = path.name.removesuffix(".gz")
+    for layout in source.files:
+        for pattern in layout.file_names:
+            stem = re.escape(pattern).replace(re.escape("{part}"), r"\w+")
+            if re.fullmatch(stem, name):
+                return layout
+    return None
+
+
+def source_of_file(path: Path) -> str | None:
+    """Return the source whose archive name a file has."""
+    named = (name for name in source_names() if named_layout(data_source(name), path))
+    return next(named, None)
+
+
+def lacking(source: DataSource, folder: Path) -> tuple[str, ...] | None:
+    """Return the names of the files that a folder lacks; None where it has none of the source.
+
+    Optional files are not named: where none is lacking, the source can be read from the folder.
+    """
+    lacks: list[str] = []
+    has_some = False
+    for layout in source.files:
+        every = [_parts_in_folder(layout, name, folder) for name in layout.file_names]
+        has_some |= any(path for parts in every for path in parts.values())
+        if layout.optional or any(all(parts.values()) for parts in every):
+            continue
+        fullest = max(every, key=lambda parts: sum(path is not None for path in parts.values()))
+        lacks.append(_few([name for name, path in fullest.items() if path is None]))
+    return tuple(lacks) if has_some else None
+
+
+def _parts_in_folder(layout: RecordFile, name: str, folder: Path) -> dict[str, Path | None]:
+    """Return where the files of one of a layout's names are; None where they are not."""
+    found: dict[str, Path | None] = {}
+    for part in layout.parts if "{part}" in name else ("",):
+        each = name.replace("{part}", part)
+        beside = (folder / each, folder / f"{each}.gz")
+        found[each] = next((path for path in beside if path.is_file()), None)
+    return found
+
+
+def _few(names: Sequence[str]) -> str:
+    return f"{', '.join(names[:8])}{' …' if len(names) > 8 else ''}"
+
+
+def _files_in_folder(source: DataSource, folder: Path) -> list[InputFile]:
+    found: list[InputFile] = []
+    for layout in source.files:
+        paths = _layout_in_folder(source, layout, folder)
+        if not paths and not layout.optional:
+            raise SourceMissing(
+                f"{source.name}: {folder} has no {layout.file_names[0]}[.gz]; fetch it with "
+                f"'starcat fetch {source.name}' or name the file itself",
+                source=source.name,
+                path=folder,
+            )
+        found += [InputFile(path, layout) for path in paths]
+    return found
+
+
+def _layout_in_folder(source: DataSource, layout: RecordFile, folder: Path) -> list[Path]:
+    for name in layout.file_names:
+        paths = list(_parts_in_folder(layout, name, folder).values())
+        found = [path for path in paths if path is not None]
+        if len(found) == len(paths):
+            return found
+        if found:
+            missing = [part for part, path in zip(layout.parts, paths, strict=True) if path is None]
+            raise SourceMissing(
+                f"{source.name}: {folder} has {len(found)} of {len(paths)} parts of {name}; "
+                f"missing: {_few(missing)}. "
+                "Fetch the rest, or name the parts one by one to use only them",
+                source=source.name,
+                path=folder,
+            )
+    return []
+
+
+def cache_folder() -> Path:
+    """Return the folder that downloads go to by default."""
+    chosen = os.environ.get("STARCAT_CACHE")
+    return Path(chosen).expanduser() if chosen else Path(pooch.os_cache("starcat"))
+
+
+def locate(source_name: str, given: Mapping[str, Sequence[Path]]) -> list[Path]:
+    """Return the paths to read a source from: given for it, or the first folder that has all of it.
+
+    The folders are those given for other sources, ``$STARCAT_CATALOGS`` and the cache.
+    """
+    source = data_source(source_name)
+    if given.get(source_name):
+        return list(given[source_name])
+    folders = [path if path.is_dir() else path.parent for paths in given.values() for path in paths]
+    if os.environ.get(CATALOGS_VARIABLE):
+        folders.append(Path(os.environ[CATALOGS_VARIABLE]))
+    folders = list(dict.fromkeys([*folders, cache_folder()]))
+    lacks = {folder: lacking(source, folder) for folder in folders if folder.is_dir()}
+    for folder, missing in lacks.items():
+        if missing == ():
+            return [folder]
+    if source_name == "gaia":
+        return [embedded_sky()]
+    raise SourceMissing(
+        f"{source_name} ({source.title}): {_missing_where(lacks, folders)}. Name it with --input "
+        f"{source_name}=PATH, set ${CATALOGS_VARIABLE} to the folder that has "
+        f"{source.files[0].file_names[-1]}[.gz], or run 'starcat fetch {source_name}'",
+        source=source_name,
+    )
+
+
+def _missing_where(lacks: Mapping[Path, tuple[str, ...] | None], folders: Sequence[Path]) -> str:
+    """Say that no folder has a file of the source, or else what those lack that have some."""
+    partly = [f"{folder} lacks {' and '.join(m)}" for folder, m in lacks.items() if m]
+    searched = ", ".join(str(folder) for folder in folders if not lacks.get(folder))
+    if not partly:
+        return f"no file found in {searched}"
+    nothing = f"; no file found in {searched}" if searched else ""
+    return f"no folder has all of its files: {'; '.join(partly)}{nothing}"

@@ -1,0 +1,110 @@
+"""What an answer is worth: the frame's truth beside what the matcher said of it.
+
+One flat record a frame; every success rule is a condition on its fields, so a rate under any
+rule is a query over the records.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.arrays import Array
+from starcat.geometry.attitude import matrix_from_quaternion
+from starcat.geometry.camera import Camera
+from starcat.matcher.database import Database
+from starcat.matcher.result import MatchResult
+from starcat.simulation.simulate import Frame
+
+
+@dataclass(frozen=True)
+class Score:
+    """One frame and its answer."""
+
+    frame: int
+    n_centroids: int  # what the frame holds; guide stars are those that the camera saw
+    n_guide_stars: int
+    n_false: int
+    status: str  # status of the answer: ``identified``, ``no_match`` or ``too_few_stars``
+    n_named: int  # centroids with a star; those with their own; those with a star that is elsewhere
+    n_right: int
+    n_wrong: int
+    is_reference_right: bool  # the guide star nearest to the centre of the frame has its own name
+    # largest displacement of a corner of the frame, pixels; NaN without an attitude
+    attitude_error_px: float
+    boresight_error_arcsec: float  # the same, across and about the true boresight
+    roll_error_arcsec: float
+    false_match_probability: float  # the probability that the matcher states
+    time_ms: float  # processor time of the identification
+
+
+FIELDS = tuple(field.name for field in fields(Score))
+"""Columns of the records."""
+
+
+def score(
+    number: int,
+    frame: Frame,
+    result: MatchResult,
+    database: Database,
+    camera: Camera,
+    reach_px: float,
+    time_ms: float,
+) -> Score:
+    """Compare an answer with the truth."""
+    named = result.star_index
+    is_named = named >= 0
+    right = is_named & (named == frame.star_index)
+    other = np.flatnonzero(is_named & ~right)
+    place = camera.pixels_from_directions(database.directions[named[other]] @ frame.matrix.T)
+    away = np.hypot(*(place - frame.centroids_px[other]).T)
+    error_px, across, about = _attitude_errors(frame.matrix, result.q_body_from_icrs, camera)
+    return Score(
+        frame=number,
+        n_centroids=len(frame.star_index),
+        n_guide_stars=frame.n_stars,
+        n_false=int(frame.is_false.sum()),
+        status=result.status,
+        n_named=int(is_named.sum()),
+        n_right=int(right.sum()),
+        n_wrong=int((~(away <= reach_px)).sum()),
+        is_reference_right=_is_reference_right(frame, right, camera),
+        attitude_error_px=error_px,
+        boresight_error_arcsec=across,
+        roll_error_arcsec=about,
+        false_match_probability=result.false_match_probability,
+        time_ms=time_ms,
+    )
+
+
+def reference_of(frame: Frame, camera: Camera) -> int | None:
+    """Return the centroid of the guide star that is nearest to the centre."""
+    guides = np.flatnonzero(frame.star_index >= 0)
+    if not len(guides):
+        return None
+    offset = frame.centroids_px[guides] - [0.5 * camera.width_px, 0.5 * camera.height_px]
+    return int(guides[np.argmin(np.hypot(*offset.T))])
+
+
+def _is_reference_right(frame: Frame, right: NDArray[np.bool_], camera: Camera) -> bool:
+    reference = reference_of(frame, camera)
+    return reference is not None and bool(right[reference])
+
+
+def _attitude_errors(truth: Array, q: Array, camera: Camera) -> tuple[float, float, float]:
+    """Return the errors of an attitude: at the corners (pixels), across and about (arcsec)."""
+    if not np.isfinite(q).all():
+        return math.nan, math.nan, math.nan
+    turn = matrix_from_quaternion(q) @ truth.T
+    # The antisymmetric part of a small rotation is its angle about each axis.
+    x, y, z = turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]
+    arcsec = math.degrees(1.0) * 3600.0
+    right_angle = math.atan2(math.hypot(x, y, z), float(np.trace(turn)) - 1.0)
+    scale = right_angle / max(math.hypot(x, y, z), 1e-300)
+    w, h = float(camera.width_px), float(camera.height_px)
+    corners = camera.directions_from_pixels(np.array([[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]]))
+    moved = np.linalg.norm(corners @ turn.T - corners, axis=1).max() * camera.focal_length_px
+    return float(moved), arcsec * scale * math.hypot(x, y), arcsec * scale * abs(z)

@@ -1,0 +1,413 @@
+"""Frames of a file to answers: the same for the command, the REST interface and the page.
+
+A file holds centroids or is an image. `identify_file` measures it and answers its frames one after
+the other, each when it is asked for; an answer is JSON, a row of a table, a picture or a WCS.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from starcat.errors import ConfigError
+from starcat.geometry.camera import Camera
+from starcat.matcher.centroids import (
+    MeasuredFrame,
+    read_frames,
+    read_stream,
+    said_of_columns,
+    upside_down,
+)
+from starcat.matcher.matcher import Matcher
+from starcat.matcher.result import MatchResult
+from starcat.matcher.settings import SCALE_FREE
+from starcat.matcher.tracking import Tracker
+from starcat.specs.camera_file import parse_camera
+
+if TYPE_CHECKING:
+    from starcat.sky.in_time import SkyInTime
+    from starcat.sky.observer import Observer
+
+Content = dict[str, Any]
+
+STDIN = Path("-")
+
+IMAGE_SUFFIXES = (
+    ".fits", ".fit", ".fts", ".gz", ".fz", ".png", ".tif", ".tiff", ".jpg", ".jpeg",
+)  # fmt: skip
+"""Files that are read as images; all others hold centroids."""
+
+FOV_ERROR_OF_IMAGES = 0.02
+"""Error of the focal length that is allowed for an image where none is stated: who describes a
+camera by its data sheet is seldom farther off."""
+
+CAMERA_NAME = "camera.toml"
+"""What messages call the text of a camera file."""
+
+MATCHER_OPTIONS = (
+    *("method", "tolerance_px", "noise_px", "noise_mag", "max_false_match_probability"),
+    *("min_share", "max_steps", "time_limit_s"),
+)
+"""Options that a matcher is opened with; the others are about a file."""
+
+
+class IdentifyOptions(BaseModel):
+    """How frames are identified; each as the option of 'starcat identify' with that name."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    method: str | None = Field(None, max_length=40, description="By default the best there is.")
+    tolerance_px: float | None = Field(
+        None, ge=0.01, le=200, description="Largest error of a centroid; by default 2."
+    )
+    noise_px: float | None = Field(
+        None, ge=0.01, le=50, description="Noise of a centroid, each axis; for tolerance_px."
+    )
+    noise_mag: float | None = Field(None, ge=0.001, le=10, description="Noise of magnitudes.")
+    max_false_match_probability: float = Field(
+        1e-9, ge=0, le=1, description="Less certain answers are withheld."
+    )
+    fov_error: float | None = Field(
+        None, ge=0, le=0.5, description="Error of the field that is allowed; 0.02 for images."
+    )
+    fov_deg: tuple[float, float] | None = Field(
+        None, description="Smallest and largest field across the width, of an unknown camera."
+    )
+    size_px: tuple[int, int] | None = Field(
+        None, description="Width and height of a frame of centroids; with fov_deg."
+    )
+    min_share: float | None = Field(
+        None, ge=0, le=1, description="Least share of the frame to be explained; a third."
+    )
+    max_steps: int | None = Field(None, ge=1, description="Steps of a search.")
+    time_limit_s: float | None = Field(None, ge=0.001, description="Seconds that a frame may take.")
+    flip: bool | None = Field(None, description="First row at the bottom; y upwards.")
+    psf_sigma_px: float | None = Field(
+        None, ge=0.3, le=20, description="Width of a star in an image; by default measured."
+    )
+    threshold: float = Field(5.0, ge=1, le=1000, description="Least signal over noise of a spot.")
+    # Measured: spots beyond the brightest 200 identify no further picture, and cost time.
+    most_spots: int = Field(200, ge=4, le=10_000, description="Brightest spots that are used.")
+    plane: int | None = Field(None, ge=0, description="Plane of a FITS cube, from 0.")
+    bayer: bool = Field(False, description="The image is a raw colour mosaic.")
+    camera: str | None = Field(
+        None, max_length=20_000, description="Text of a camera file; the database's by default."
+    )
+    prior_q: tuple[float, float, float, float] | None = Field(
+        None, description="Expected attitude; with prior_error_deg."
+    )
+    prior_error_deg: float | None = Field(
+        None, gt=0, le=20, description="Largest error of prior_q."
+    )
+
+    @model_validator(mode="after")
+    def _go_together(self) -> IdentifyOptions:
+        if (self.prior_q is None) != (self.prior_error_deg is None):
+            raise ValueError("prior_q and prior_error_deg go together; give both, or neither")
+        if self.fov_deg is not None and self.fov_error is not None:
+            raise ValueError("give either fov_deg, a range of fields, or fov_error, not both")
+        if self.size_px is not None and self.fov_deg is None:
+            raise ValueError("size_px is the size of frames with fov_deg")
+        return self
+
+
+@dataclass(frozen=True)
+class LocalInputs:
+    """What only who runs starcat on his own machine can give beside the options."""
+
+    camera: Camera | None = None  # in place of the text of a camera file
+    dark: Path | None = None  # an image with the lid on, which is subtracted
+    mask: Path | None = None  # an image, not zero where no stars are wanted
+    observer: Observer | None = None
+    track: bool = False  # the frames are a sequence
+
+
+@dataclass(frozen=True)
+class MeasuredFile:
+    """The centroids of a file, and the image (height, width) that they were found in, if any."""
+
+    frames: Sequence[MeasuredFrame]
+    image: NDArray[Any] | None = None
+
+
+@dataclass(frozen=True)
+class FrameAnswer:
+    """A frame, the stars and the attitude found for it, and what the time adds to them."""
+
+    frame: MeasuredFrame
+    result: MatchResult
+    observer: Observer | None = None
+
+    @cached_property
+    def sky(self) -> SkyInTime | None:
+        """The attitude without aberration, and planets; None without an observer or an answer."""
+        camera, database = self.result.camera, self.result.database
+        if self.observer is None or database is None or camera is None:
+            return None
+        from starcat.sky.in_time import sky_in_time
+
+        centroids_px = self.frame.centroids_px
+        return sky_in_time(self.result, database, centroids_px, camera, self.observer)
+
+    def content(self) -> Content:
+        """Return the answer as ``starcat identify --json`` prints it."""
+        found = {"frame": self.frame.name, **facts(self.result), "stars": self._stars()}
+        if self.observer is not None:
+            found["in_time"] = None if self.sky is None else self.sky.content()
+        return found
+
+    def _stars(self) -> list[Content]:
+        reasons, stars = dict(self.result.dropped), self.result.stars
+        row_of = {spot: row for row, spot in enumerate(stars.spot.tolist())}
+        numbers = (
+            *("mag", "ra_deg", "dec_deg"),
+            *("dx_px", "dy_px", "separation_arcsec", "difference_mag"),
+        )
+        columns = {name: getattr(stars, name).tolist() for name in numbers}
+        content = []
+        for number, (x, y) in enumerate(self.frame.centroids_px.tolist()):
+            one: Content = {"x_px": _or_none(x), "y_px": _or_none(y), "star": None, "mag": None}
+            row = row_of.get(number)
+            if row is not None:
+                one |= {"star": stars.star[row], "star_id": str(stars.star_id[row])}
+                one |= {name: _or_none(column[row]) for name, column in columns.items()}
+            if number in reasons:
+                one["dropped"] = reasons[number]
+            content.append(one)
+        return content
+
+
+def facts(result: MatchResult) -> Content:
+    """Return what an answer says of the whole frame, as JSON has it."""
+    found: Content = {"status": result.status, "origin": result.origin}
+    found["n_matched"] = result.n_matched
+    if result.ok:
+        camera = result.camera
+        found |= {
+            "boresight_ra_deg": result.boresight_ra_deg,
+            "boresight_dec_deg": result.boresight_dec_deg,
+            "roll_deg": result.roll_deg,
+            "q_body_from_icrs": result.q_body_from_icrs.tolist(),
+            "covariance_arcsec2": [
+                [_or_none(value) for value in row] for row in result.covariance_arcsec2.tolist()
+            ],
+            "residual_arcsec": result.residual_arcsec,
+            "false_match_probability": result.false_match_probability,
+            "focal_length_px": None if camera is None else camera.focal_length_px,
+            "focal_length_error_px": result.focal_length_error_px,
+        }
+    elif result.refusal is not None:
+        why = result.refusal
+        found["refusal"] = {
+            "reason": why.reason,
+            "words": why.message,
+            "advice": why.hint,
+            "n_matched": why.n_matched,
+            "false_match_probability": why.false_match_probability,
+            "share": why.share,
+        }
+    return {**found, "time_s": _or_none(result.time_s)}
+
+
+def _or_none(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+@dataclass(frozen=True)
+class FileAnswers:
+    """The answers to the frames of a file; each is found when the iteration reaches it."""
+
+    path: Path
+    matcher: Matcher
+    measured: MeasuredFile
+    camera: Camera
+    options: IdentifyOptions
+    local: LocalInputs
+
+    def __iter__(self) -> Iterator[FrameAnswer]:
+        """Identify the frames one after the other."""
+        identify, is_image = self._identify(), self.measured.image is not None
+        for given in self.measured.frames:
+            turned = self.options.flip and not is_image
+            frame = upside_down(given, self.camera.height_px) if turned else given
+            result = identify(frame.centroids_px, magnitudes=frame.mag)
+            yield FrameAnswer(frame, result, self.local.observer)
+
+    def _identify(self) -> Callable[..., MatchResult]:
+        """Return what identifies a frame, its options filled in."""
+        matcher, camera, options = self.matcher, self.camera, self.options
+        image, observer = self.measured.image, self.local.observer
+        if image is not None and image.shape != (camera.height_px, camera.width_px):
+            height, width = image.shape
+            raise ConfigError(
+                f"the image has {width} x {height} px, the camera {camera.width_px} x "
+                f"{camera.height_px}; describe the camera that took it with --camera"
+            )
+        fov_error = options.fov_error
+        if fov_error is None or options.fov_deg is not None:
+            can = matcher.method in SCALE_FREE and matcher.database.image is None
+            is_loose = options.fov_deg is None and image is not None and can
+            fov_error = FOV_ERROR_OF_IMAGES if is_loose else 0.0
+        identify = partial(self._search(), camera=camera, fov_error=fov_error)
+        if observer is None:
+            return identify
+        if self.local.track:
+            raise ConfigError(
+                "--track does not tell planets from stars; leave out --time, or --track"
+            )
+        from starcat.sky.spots import identify_in_time
+
+        def identify_with_planets(centroids_px: Any, magnitudes: Any) -> MatchResult:
+            return identify_in_time(
+                identify,
+                matcher.database,
+                centroids_px,
+                camera,
+                observer,
+                magnitudes=magnitudes,
+                tolerance_px=matcher.tolerance_px,
+                max_false_match_probability=matcher.max_false_match_probability,
+            )
+
+        return identify_with_planets
+
+    def _search(self) -> Callable[..., MatchResult]:
+        """Return how the matcher searches: the whole sky, near an attitude, or along a sequence."""
+        options = self.options
+        if options.prior_q is None and not self.local.track:
+            return partial(self.matcher.identify, fov_deg=options.fov_deg)
+        if options.fov_deg is not None:
+            raise ConfigError(
+                "--fov is for frames of an unknown camera; leave out --track and --prior-q"
+            )
+        if self.local.track:
+            return Tracker(self.matcher).identify
+        prior, error_deg = list(options.prior_q or ()), options.prior_error_deg
+        return partial(self.matcher.identify, prior=prior, prior_error_deg=error_deg)
+
+    def notes(
+        self, first: FrameAnswer | None, *, is_any_identified: bool, flip: str = "flip"
+    ) -> list[str]:
+        """Return what a user should know beside the answers; ``flip`` is what to try."""
+        unknown = said_of_columns([first.frame]) if first else None
+        notes = [unknown] if unknown else []
+        if self.measured.image is not None and not is_any_identified:
+            notes.append(f"An image that was read upside down is never identified: try {flip}.")
+        return notes
+
+    def draw(self, path: Path, answer: FrameAnswer) -> None:
+        """Draw a frame with its stars circled and named, as PNG or SVG."""
+        from starcat.images.picture import draw
+
+        if answer.result.database is not None:
+            database, image = answer.result.database, self.measured.image
+            camera = answer.result.camera or self.camera
+            draw(path, answer.frame, image, answer.result, database, camera, answer.sky)
+
+    def write_wcs(self, path: Path, answer: FrameAnswer) -> None:
+        """Write a FITS copy of the image with the world coordinates that were found."""
+        from starcat.images.image_file import write_wcs
+
+        if self.measured.image is not None:
+            write_wcs(path, self.path, self.measured.image, answer.result, flip=self.options.flip)
+
+
+def open_matcher(artifact: Path, options: IdentifyOptions) -> Matcher:
+    """Open the database of an artifact, or an onboard image, for identifying with some options."""
+    given: dict[str, Any] = {name: getattr(options, name) for name in MATCHER_OPTIONS}
+    method = given.pop("method")
+    return Matcher.open(
+        artifact, method, **{name: value for name, value in given.items() if value is not None}
+    )
+
+
+def identify_file(
+    path: Path,
+    artifact: Path | Matcher,
+    options: IdentifyOptions | None = None,
+    local: LocalInputs | None = None,
+) -> FileAnswers:
+    """Measure a file, or ``-`` for stdin, and identify its frames when they are asked for."""
+    chosen, own = options or IdentifyOptions(), local or LocalInputs()
+    matcher = artifact if isinstance(artifact, Matcher) else open_matcher(artifact, chosen)
+    camera = own.camera or matcher.database.camera
+    if chosen.camera is not None:
+        camera = parse_camera(chosen.camera, Path(CAMERA_NAME))
+    measured = measure(path, chosen, own)
+    if chosen.fov_deg is not None:
+        camera = _camera_of_size(measured, chosen.size_px, camera)
+    return FileAnswers(path, matcher, measured, camera, chosen, own)
+
+
+def measure(
+    path: Path, options: IdentifyOptions | None = None, local: LocalInputs | None = None
+) -> MeasuredFile:
+    """Read centroids, or find them in an image."""
+    chosen = options or IdentifyOptions()
+    if path == STDIN:
+        # Its frames are only ever gone through.
+        return MeasuredFile(cast(Sequence[MeasuredFrame], _frames_of_stdin()))
+    if path.suffix.lower() not in IMAGE_SUFFIXES:
+        return MeasuredFile(read_frames(path))
+    from starcat.images.centroiding import find_spots
+
+    image = _read_picture(path, chosen, local or LocalInputs())
+    try:
+        spots = find_spots(
+            image,
+            threshold_sigma=chosen.threshold,
+            psf_sigma_px=chosen.psf_sigma_px,
+            most_spots=chosen.most_spots,
+        )
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}", key=error.key, value=error.value) from error
+    return MeasuredFile([MeasuredFrame(path.stem, spots.centroids_px, spots.mag)], image)
+
+
+def _frames_of_stdin() -> Iterator[MeasuredFrame]:
+    try:
+        yield from read_stream(sys.stdin)
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"stdin: not text ({error}); expected CSV or JSON") from error
+
+
+def _read_picture(path: Path, options: IdentifyOptions, local: LocalInputs) -> NDArray[Any]:
+    from starcat.images.image_file import (
+        grey_of_mosaic,
+        read_image,
+        without_dark,
+        without_dead_zones,
+    )
+
+    flip = options.flip
+    image: NDArray[Any] = read_image(path, flip=flip, plane=options.plane)
+    if local.dark is not None:
+        image = without_dark(image, read_image(local.dark, flip=flip))
+    if options.bayer:
+        image = grey_of_mosaic(image)
+    if local.mask is not None:
+        image = without_dead_zones(image, read_image(local.mask, flip=flip))
+    return image
+
+
+def _camera_of_size(
+    measured: MeasuredFile, size_px: tuple[int, int] | None, known: Camera
+) -> Camera:
+    width, height = size_px or (known.width_px, known.height_px)
+    if measured.image is not None:
+        height, width = measured.image.shape
+        if size_px not in (None, (width, height)):
+            raise ConfigError(
+                f"the image has {width} x {height} px, --size says {size_px[0]} x {size_px[1]}; "
+                "leave --size out",
+                key="size",
+            )
+    return Camera(width, height, fov_x_deg=known.fov_x_deg)

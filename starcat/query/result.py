@@ -1,0 +1,342 @@
+"""What a query finds: its first rows as a `ResultTable`, all rows as an `Answer` or as they come.
+
+A column keeps the unit and the meaning of the product's column whose name it has. Any other column
+gets the unit that its name ends with, as everywhere in starcat: ``x_deg`` is in degrees.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from decimal import Decimal
+from functools import cached_property, partial
+from html import escape
+from itertools import chain
+from typing import TYPE_CHECKING, Any
+
+from starcat.errors import ConfigError
+from starcat.progress import Progress, no_progress
+from starcat.query.engine import Allowance, Engine
+
+if TYPE_CHECKING:
+    import pandas as pd  # type: ignore[import-untyped, unused-ignore]
+    import pyarrow as pa
+    from astropy.table import Table
+
+    from starcat.query.targets import View
+
+SHOWN_ROWS = 20  # rows that a notebook shows
+SHOWN_ITEMS = 6  # items of a list that a cell shows
+LARGEST_WHOLE = 2**53 - 1  # the largest whole number that every reader of JSON keeps
+_NUMERIC = re.compile(r"[UH]*(TINY|SMALL|BIG|HUGE)?INT|DOUBLE|FLOAT|DECIMAL")
+
+UNIT_SUFFIXES = {
+    "_mas_yr": "mas/yr",
+    "_mas": "mas",
+    "_arcsec": "arcsec",
+    "_jyear": "yr",
+    "_deg": "deg",
+    "_rad": "rad",
+    "_mag": "mag",
+    "_px": "pix",
+}
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What is known of a column; empty where there is none."""
+
+    unit: str = ""
+    description: str = ""
+    ucd: str = ""
+
+    def as_metadata(self) -> dict[str, str]:
+        """Return the facts as the metadata of an Arrow field."""
+        return {key: value for key, value in vars(self).items() if value}
+
+    def __str__(self) -> str:
+        return f"{self.description} [{self.unit}]" if self.unit else self.description
+
+
+def facts_by_name(views: Iterable[View]) -> dict[str, Facts]:
+    """Return what is known of columns by their name.
+
+    Where views disagree on what a name means, only the unit is kept, if they agree on that.
+    """
+    found: dict[str, Facts] = {}
+    for view in views:
+        for column in view.schema.columns if view.schema else ():
+            facts = Facts(column.unit, column.description, column.ucd)
+            before = found.setdefault(column.name, facts)
+            if before != facts:
+                found[column.name] = Facts(facts.unit if facts.unit == before.unit else "")
+    return found
+
+
+def column_facts(name: str, known: Mapping[str, Facts]) -> Facts:
+    """Return the facts of the view's column of that name, else the unit that the name ends with.
+
+    Examples
+    --------
+    >>> column_facts("width_deg", {}).unit
+    'deg'
+    """
+    if name in known:
+        return known[name]
+    return Facts(next((unit for end, unit in UNIT_SUFFIXES.items() if name.endswith(end)), ""))
+
+
+@dataclass(frozen=True)
+class ResultColumn:
+    """A column of a query's result."""
+
+    name: str
+    type: str  # as DuckDB calls it
+    unit: str
+    description: str
+
+    @property
+    def is_number(self) -> bool:
+        """Whether its values are numbers, which stand at the right of a table."""
+        return bool(_NUMERIC.match(self.type)) and "[" not in self.type
+
+
+@dataclass(frozen=True)
+class ResultTable:
+    """The first rows that a query found."""
+
+    columns: tuple[ResultColumn, ...]
+    rows: Sequence[Sequence[Any]]
+    is_cut: bool  # whether there are more rows
+
+    @classmethod
+    def from_json(cls, found: Mapping[str, Any]) -> ResultTable:
+        """Return the table that a service sent."""
+        columns = tuple(ResultColumn(**column) for column in found["columns"])
+        return cls(columns, found["rows"], found["is_cut"])
+
+    def with_json_values(self) -> ResultTable:
+        """Return the same with values that JSON has."""
+        return replace(self, rows=[[json_value(value) for value in row] for row in self.rows])
+
+    def as_json(self) -> dict[str, Any]:
+        """Return plain values for JSON, for `from_json`."""
+        columns = [asdict(column) for column in self.columns]
+        rows = self.with_json_values().rows
+        return {"columns": columns, "rows": rows, "is_cut": self.is_cut}
+
+    @property
+    def texts(self) -> list[list[str]]:
+        """The values as a table shows them."""
+        return [[cell_text(value) for value in row] for row in self.rows]
+
+
+class Answer:
+    """What a query found.
+
+    Parameters
+    ----------
+    found : pyarrow.Table
+        All rows; units and meanings in the field metadata.
+    """
+
+    def __init__(self, found: pa.Table) -> None:
+        self._found = found
+
+    @property
+    def columns(self) -> list[str]:
+        """Names of the columns, in order."""
+        return list(self._found.column_names)
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return int(self._found.num_rows)
+
+    def __iter__(self) -> Iterator[tuple[Any, ...]]:
+        """Go through the rows, each a tuple of Python values."""
+        for batch in self._found.to_batches():
+            yield from zip(*(column.to_pylist() for column in batch.columns), strict=True)
+
+    def to_arrow(self) -> pa.Table:
+        """Return the rows as an Arrow table.
+
+        Returns
+        -------
+        pyarrow.Table
+            Units and meanings in the field metadata (``unit``, ``description``).
+        """
+        return self._found
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return the rows as a pandas data frame.
+
+        Returns
+        -------
+        pandas.DataFrame
+            One column each.
+
+        Raises
+        ------
+        ConfigError
+            If pandas is not installed.
+        """
+        try:
+            import pandas  # noqa: F401 - pyarrow says less clearly that it is missing
+        except ImportError:
+            raise ConfigError("to_pandas needs pandas: python -m pip install pandas") from None
+        return self._found.to_pandas()
+
+    def to_table(self) -> Table:
+        """Return the rows as an astropy table.
+
+        Returns
+        -------
+        astropy.table.Table
+            With units and meanings; nulls are masked.
+        """
+        import pyarrow as pa
+
+        from starcat.exchange.array_files import astropy_table
+        from starcat.exchange.columns import plain_batch, plain_schema
+        from starcat.exchange.numpy_columns import numpy_columns
+
+        schema = plain_schema(self._found.schema)
+        batches = [plain_batch(batch, schema) for batch in self._found.to_batches()]
+        plain = pa.Table.from_batches(batches, schema)
+        return astropy_table(numpy_columns(plain.combine_chunks(), signed=False))
+
+    def __repr__(self) -> str:
+        """Return the size and the first columns in one line."""
+        names = ", ".join(self.columns[:6]) + (", ..." if len(self.columns) > 6 else "")
+        return f"<Answer: {len(self):,} rows of {names}>"
+
+    def _repr_html_(self) -> str:
+        """Return the first rows as a table for a notebook."""
+        heads = "".join(f"<th>{escape(name)}</th>" for name in self.columns)
+        rows = "".join(
+            f"<tr>{''.join(f'<td>{escape(str(cell))}</td>' for cell in row)}</tr>"
+            for row, _ in zip(self, range(SHOWN_ROWS), strict=False)
+        )
+        more = len(self) - SHOWN_ROWS
+        rest = f"<p>and {more:,} more rows</p>" if more > 0 else ""
+        return f"<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>{rest}"
+
+
+class RunningQuery:
+    """A query of a session; nothing runs before rows or columns are wanted.
+
+    What is wrong with the query, QueryError or QueryLimitError, is raised while it runs.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        text: str,
+        values: dict[str, Any] | None,
+        known: Mapping[str, Facts],
+        allowance: Allowance,
+        progress: Progress = no_progress,
+    ) -> None:
+        self._ask = partial(engine.ask, allowance=allowance, progress=progress)
+        self._text = text
+        self._values = values
+        self._known = known
+
+    @cached_property
+    def _described(self) -> list[tuple[str, str]]:
+        """Names and types of the columns."""
+        [found] = self._ask("columns", self._text, self._values)
+        return list(found)
+
+    @property
+    def columns(self) -> list[str]:
+        """Names, in order."""
+        return [name for name, _ in self._described]
+
+    @property
+    def types(self) -> list[str]:
+        """DuckDB's names of their types."""
+        return [kind for _, kind in self._described]
+
+    def table(self, count: int) -> ResultTable:
+        """Return the first rows with what is known of their columns."""
+        rows = self.rows(count + 1)
+        columns = tuple(
+            ResultColumn(name, kind, facts.unit, facts.description)
+            for name, kind in self._described
+            for facts in (column_facts(name, self._known),)
+        )
+        return ResultTable(columns, rows[:count], len(rows) > count)
+
+    def rows(self, count: int) -> list[tuple[Any, ...]]:
+        """Return the first rows."""
+        *parts, (described, last) = self._ask("rows", self._text, self._values, count)
+        # Known now, without looking at the files once more.
+        self._described = described
+        return list(chain(*parts, last))
+
+    def batches(self) -> pa.RecordBatchReader:
+        """Return all rows as Arrow batches, with units and meanings in the field metadata.
+
+        They are to be read before the next query.
+        """
+        import pyarrow as pa
+
+        [begun] = self._ask("batches", self._text, self._values)
+        schema = pa.schema(
+            field.with_metadata(column_facts(field.name, self._known).as_metadata())
+            for field in pa.ipc.open_stream(begun).schema
+        )
+        return pa.RecordBatchReader.from_batches(schema, self._batches(schema))
+
+    def _batches(self, schema: pa.Schema) -> Iterator[pa.RecordBatch]:
+        """Give the batches that follow, with a schema that has the metadata."""
+        import pyarrow as pa
+
+        while (found := self._ask("next_batch")[0]) is not None:
+            for batch in pa.ipc.open_stream(found):
+                yield pa.record_batch(batch.columns, schema=schema)
+
+
+def cell_text(value: Any) -> str:
+    """Return a value as a table shows it.
+
+    Examples
+    --------
+    >>> cell_text(0.1 + 0.2), cell_text(None), cell_text([1, 2])
+    ('0.3', '', '[1, 2]')
+    """
+    if value is None:
+        return ""
+    if isinstance(value, float):
+        return f"{value:.10g}"
+    if isinstance(value, list):
+        more = [f"… {len(value)} in all"] if len(value) > SHOWN_ITEMS else []
+        return f"[{', '.join([cell_text(item) for item in value[:SHOWN_ITEMS]] + more)}]"
+    return str(value)
+
+
+def json_value(value: Any) -> Any:
+    """Return a value as JSON has it: whole numbers that readers may round, and times, as texts.
+
+    Examples
+    --------
+    >>> json_value(2**60), json_value(float("nan")), json_value([1, 0.5])
+    ('1152921504606846976', None, [1, 0.5])
+    """
+    if value is None or isinstance(value, bool | str):
+        return value
+    if isinstance(value, int):
+        return value if abs(value) <= LARGEST_WHOLE else str(value)
+    if isinstance(value, float | Decimal):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, list | tuple):
+        return [json_value(item) for item in value]
+    if isinstance(value, dict):
+        return {str(key): json_value(item) for key, item in value.items()}
+    if isinstance(value, dt.date | dt.time):
+        return value.isoformat()
+    return value.hex() if isinstance(value, bytes) else str(value)

@@ -1,0 +1,113 @@
+"""Views with the places of rows, which the macros ``cone``, ``box`` and ``field`` look at.
+
+Each target has a schema of them beside its own, which SHOW TABLES leaves out. A view there is the
+table with ``_place_ra_deg`` and ``_place_dec_deg``, whatever these columns are called in it, and
+with the file of a row in ``_place_file`` where the table is spread over the sky in many files. What
+is known of these files is a variable of the view's name. A macro compares it with a constant place
+once, before DuckDB opens a file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from starcat.query.names import quoted, quoted_name
+from starcat.query.targets import POSITION, Target, View
+
+_MACROS = Path(__file__).parent / "sql" / "spatial_macros.sql"
+
+_NUMBERS = ["x", "y", "z", "cosine", "sine", "reach", "ra_from", "ra_to", "dec_from", "dec_to"]
+"""What is known of each file beside its name. Angles are in degrees."""
+
+_NEAR = "_may_be_near(found, file, known, ra, dec, radius)"
+_BETWEEN = "_may_be_between(file, known, ra_min, ra_max, dec_min, dec_max)"
+
+_IN_FILES = {
+    _NEAR: "_is_beside(found, ra - 360 * floor(ra / 360), _half_width(dec, radius)) "
+    "AND _is_wanted(file, _files_near(known, ra, dec, radius))",
+    _BETWEEN: "_is_wanted(file, _files_between(known, ra_min, ra_max, dec_min, dec_max))",
+}
+"""What a row of a store is asked first; of other targets nothing, which takes less time."""
+
+
+def place_macros() -> str:
+    """Return the SQL that makes what the macros with places share."""
+    return _MACROS.read_text(encoding="utf-8").strip()
+
+
+def places_schema(target: Target) -> str:
+    """Return the schema of the views with places of a target."""
+    return f"_places_{target.name}"
+
+
+def place_statements(target: Target) -> Iterator[str]:
+    """Give the SQL that makes the views with places of a target."""
+    schema = places_schema(target)
+    yield f"CREATE SCHEMA IF NOT EXISTS {schema};"
+    is_store = any(view.pixels for view in target.views)
+    for macro, asked in _IN_FILES.items():
+        yield f"CREATE MACRO {schema}.{macro} AS ({asked if is_store else 'true'});"
+    for view in target.views:
+        place = ", ".join(
+            f"{value} AS _place_{name}"
+            for value, name in zip(_position(view), POSITION, strict=True)
+        )
+        if view.pixels:
+            rows = f"SELECT *, {place} {reading(view, ', filename = ' + quoted('_place_file'))}"
+        else:
+            rows = f"SELECT *, {place}, '' AS _place_file {reading(view)}"
+        yield f"CREATE VIEW {schema}.{view.name} AS {rows};"
+        if is_store:
+            variable = quoted_name(f"{schema}.{view.name}")
+            yield f"SET VARIABLE {variable} = {_known_of_files(view)};"
+
+
+def reading(view: View, more: str = "") -> str:
+    """Return the SQL that reads the files of a view."""
+    files = ", ".join(map(quoted, view.files))
+    return f"FROM read_parquet([{files}], hive_partitioning = false{more})"
+
+
+def _position(view: View) -> tuple[str, str]:
+    """Return SQL for right ascension and declination of a row, degrees."""
+    named = view.position or POSITION
+    by_lower = {column.lower(): column for column in view.columns}
+    missing = [name for name in named if name.lower() not in by_lower]
+    if missing:
+        told = quoted(
+            f"{view.name} has no column {' and no '.join(missing)}; cone, box and field are for "
+            "tables with places, name another with of := 'TABLE'"
+        )
+        return f"error({told})::DOUBLE", f"error({told})::DOUBLE"
+    ra, dec = (quoted_name(by_lower[name.lower()]) for name in named)
+    if view.position is None:
+        return ra, dec
+    # Of a catalog of others it is not known whether right ascensions are from 0 or from -180 on.
+    return f"({ra}::DOUBLE - 360 * floor({ra}::DOUBLE / 360))", f"{dec}::DOUBLE"
+
+
+def _known_of_files(view: View) -> str:
+    """Return a list, as SQL writes it, of circles and boxes on the sky that hold the files."""
+    if not view.pixels:
+        kinds = ", ".join(f"{name} DOUBLE" for name in _NUMBERS)
+        return f"[]::STRUCT(file VARCHAR, {kinds}, files BIGINT)[]"
+    import numpy as np
+
+    from starcat.query.partitions import extents
+
+    found = extents(view.pixels)
+    reach = np.radians(found.reach_deg)
+    table = np.column_stack([
+        found.centre, np.cos(reach), np.sin(reach), found.reach_deg,
+        found.ra_from_deg, found.ra_to_deg, found.dec_from_deg, found.dec_to_deg,
+    ])  # fmt: skip
+    rows = ", ".join(
+        f"({quoted(file)}, {', '.join(map(repr, numbers))})"
+        for file, numbers in zip(view.files, table.tolist(), strict=True)
+    )
+    row = ", ".join(f"'{name}': {name}" for name in ("file", *_NUMBERS))
+    names = ", ".join(("file", *_NUMBERS))
+    return (
+        f"(SELECT list({{{row}, 'files': {len(view.files)}}}) FROM (VALUES {rows}) AS t({names}))"
+    )

@@ -1,0 +1,282 @@
+"""Maps of the guide stars in each field: the raster and the lines of a page, and one SVG by itself.
+
+All are Mollweide's projection with the same colours. One unit of the lines is a hundredth of the
+radius of the sphere that is projected.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from html import escape
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from starcat.arrays import Array
+from starcat.geometry.sphere import saff_kuijlaars
+from starcat.matcher.chance import MIN_STARS
+from starcat.report.sky_map import HALF_HEIGHT, HALF_WIDTH, galactic_equator, project
+
+Counts = NDArray[np.int64]
+
+UNIT = 100.0
+COLOURS = (
+    "a3263a",
+    "26284f", "2b3f78", "2a5a93", "26769f", "2a91a1", "46ab99", "74c38a", "acd87a", "e8e673",
+)  # fmt: skip
+"""Those of ``--map-0`` to ``--map-9`` in the style sheet; the first is of fields with too few."""
+
+MOST_DOTS = 2500
+"""Dots of an SVG by itself; each takes some 75 bytes."""
+
+SCALE = 125.0
+WIDTH, HEIGHT = round(2 * SCALE * HALF_WIDTH) + 16, round(2 * SCALE * HALF_HEIGHT) + 44
+
+
+@dataclass(frozen=True, eq=False)
+class Fields:
+    """The fields of a tiling, in its order."""
+
+    ra_deg: Array  # boresights, (F,)
+    dec_deg: Array
+    stars: Counts  # (F,)
+    pairs: Counts
+    triangles: Counts
+
+    def __len__(self) -> int:
+        """Return the number of fields."""
+        return len(self.ra_deg)
+
+
+@dataclass(frozen=True)
+class Field:
+    """One of the fields, with its place among the lines of a map."""
+
+    number: int
+    ra_deg: float
+    dec_deg: float
+    stars: int
+    pairs: int
+    triangles: int
+    x: float
+    y: float
+
+
+@dataclass(frozen=True)
+class Bin:
+    """A colour of a map, and the numbers of stars that it stands for."""
+
+    name: str  # class in the style sheet: ``m0`` to ``m9``
+    least: int
+    most: int | None  # None: no limit
+
+    @property
+    def colour(self) -> str:
+        """Six hexadecimal digits."""
+        return COLOURS[int(self.name[1:])]
+
+    @property
+    def text(self) -> str:
+        """The numbers of stars."""
+        if self.most is None:
+            return f"{self.least} or more"
+        return f"{self.least}" if self.least == self.most else f"{self.least}–{self.most}"
+
+
+def bins_of(stars: Counts) -> tuple[Bin, ...]:
+    """Return the colours for fields with so many stars."""
+    least = int(stars.min())
+    first = max(least, MIN_STARS)
+    most = int(np.quantile(stars, 0.995, method="inverted_cdf"))
+    count = min(len(COLOURS) - 1, max(most - first + 1, 1))
+    edges = [first + (most - first + 1) * k // count for k in range(count)]
+    bins = [Bin("m0", 0, MIN_STARS - 1)] if least < MIN_STARS else []
+    for k, low in enumerate(edges):
+        colour = 1 if count == 1 else 1 + k * (len(COLOURS) - 2) // (count - 1)
+        bins.append(Bin(f"m{colour}", low, edges[k + 1] - 1 if k + 1 < count else None))
+    return tuple(bins)
+
+
+def bin_numbers(bins: tuple[Bin, ...], stars: Counts) -> Counts:
+    """Return for each number of stars the index of its bin."""
+    return np.searchsorted([one.least for one in bins], stars, side="right") - 1
+
+
+def raster_png(nearest: Array, stars: Counts) -> bytes:
+    """Return a map as PNG from the index of the nearest field, NaN outside of the sky."""
+    from PIL import Image
+
+    inside = ~np.isnan(nearest)
+    bins = bins_of(stars)
+    colours = np.array([int(one.name[1:]) + 1 for one in bins], dtype=np.uint8)
+    pixels = np.zeros(nearest.shape, dtype=np.uint8)
+    pixels[inside] = colours[bin_numbers(bins, stars)][nearest[inside].astype(np.int64)]
+    image = Image.fromarray(pixels)
+    image.putpalette(bytes(3) + bytes.fromhex("".join(COLOURS)))
+    file = io.BytesIO()
+    image.save(file, "PNG", transparency=0, optimize=False)
+    return file.getvalue()
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of the map, with its label."""
+
+    path: str  # for the attribute ``d`` of a path
+    label: str
+    x: float
+    y: float
+
+
+@dataclass(frozen=True)
+class SkyMap:
+    """The lines that are drawn upon the raster, and its legend."""
+
+    half_width: float
+    half_height: float
+    bins: tuple[Bin, ...]
+    meridians: tuple[Line, ...]
+    parallels: tuple[Line, ...]
+    milky_way: str  # path of the galactic equator
+    emptiest: Field
+
+
+def sky_map(fields: Fields) -> SkyMap:
+    """Return the lines and the legend of a map."""
+    return SkyMap(
+        round(HALF_WIDTH * UNIT, 1),
+        round(HALF_HEIGHT * UNIT, 1),
+        bins_of(fields.stars),
+        _meridians(),
+        _parallels(),
+        _milky_way(),
+        field_at(fields, int(np.argmin(fields.stars))),
+    )
+
+
+def field_at(fields: Fields, number: int) -> Field:
+    """Return one of the fields with its place on the map."""
+    ra_deg, dec_deg = float(fields.ra_deg[number]), float(fields.dec_deg[number])
+    stars, pairs, triangles = (
+        int(one[number]) for one in (fields.stars, fields.pairs, fields.triangles)
+    )
+    return Field(number, ra_deg, dec_deg, stars, pairs, triangles, *_place(ra_deg, dec_deg))
+
+
+def _place(ra_deg: float, dec_deg: float) -> tuple[float, float]:
+    x, y = project([ra_deg], [dec_deg])
+    return round(float(x[0]) * UNIT, 1), round(float(-y[0]) * UNIT, 1)
+
+
+@cache
+def _meridians() -> tuple[Line, ...]:
+    """Return the meridians, every 60 degrees but for that of the edge."""
+    dec = np.linspace(-90.0, 90.0, 61)
+    return tuple(
+        Line(_path(*project(np.full(61, ra), dec)), f"{ra}°", *_place(ra, 0.0))
+        for ra in (0, 60, 120, 240, 300)
+    )
+
+
+@cache
+def _parallels() -> tuple[Line, ...]:
+    """Return the parallels, every 30 degrees; labels stand left of the edge."""
+    lines = []
+    for dec in range(-60, 90, 30):
+        x, y = project([180.0, 180.0], [dec, dec])
+        end = np.array([-abs(x[0]), abs(x[0])])
+        label = f"{dec:+d}°".replace("-", "\N{MINUS SIGN}") if dec else "0°"
+        at = round(float(-1.03 * abs(x[0]) * UNIT), 1), round(float(-1.03 * y[0] * UNIT), 1)
+        lines.append(Line(_path(end, y), label, *at))
+    return tuple(lines)
+
+
+@cache
+def _milky_way() -> str:
+    x, y = project(*galactic_equator(181))
+    jumps = np.flatnonzero(np.abs(np.diff(x)) > 0.5 * HALF_WIDTH) + 1
+    parts = zip(np.split(x, jumps), np.split(y, jumps), strict=True)
+    return "".join(_path(*part) for part in parts)
+
+
+def _path(x: Array, y: Array) -> str:
+    points = [f"{a:.1f} {b:.1f}" for a, b in zip(x * UNIT, -y * UNIT, strict=True)]
+    return f"M{'L'.join(points)}"
+
+
+def coverage_svg(title: str, guide_stars: int, ra_deg: Array, dec_deg: Array, stars: Counts) -> str:
+    """Return a map of dots with titles, which needs no script and no style sheet.
+
+    Of a fine tiling neighbouring fields share a dot, which tells of the one with the fewest stars.
+    """
+    dots = min(len(stars), MOST_DOTS)
+    group = _groups(len(stars), dots)
+    # The first of a group after sorting by group, then by stars, is the poorest field of it.
+    order = np.lexsort((stars, group))
+    _, first, size = np.unique(group[order], return_index=True, return_counts=True)
+    shown = order[first]
+    bins = bins_of(stars)
+    radius = 0.98 * SCALE * HALF_WIDTH * np.sqrt(2.0 / dots)
+    x, y = project(ra_deg[shown], dec_deg[shown])
+    drawn: list[list[str]] = [[] for _ in bins]
+    columns = (
+        bin_numbers(bins, stars[shown]),
+        WIDTH / 2 + SCALE * x,
+        8 + SCALE * (HALF_HEIGHT - y),
+        ra_deg[shown],
+        dec_deg[shown],
+        stars[shown],
+        size,
+    )
+    for k, cx, cy, ra, dec, count, of in zip(*(one.tolist() for one in columns), strict=True):
+        more = f", fewest of {of}" if of > 1 else ""
+        drawn[k].append(
+            f'<circle cx="{cx:.0f}" cy="{cy:.0f}" r="{radius:.1f}">'
+            f"<title>RA {ra:.1f} Dec {dec:+.1f}: {count}{more}</title></circle>"
+        )
+    # Where dots overlap, poor fields lie on top.
+    groups = [
+        f'<g fill="#{one.colour}">{"".join(circles)}</g>'
+        for one, circles in zip(bins, drawn, strict=True)
+    ]
+    return "".join((*_head(title, guide_stars, stars), *reversed(groups), *_legend(bins)))
+
+
+def _head(title: str, guide_stars: int, stars: Counts) -> list[str]:
+    name = escape(title)
+    middle = int(np.quantile(stars, 0.5, method="inverted_cdf"))
+    told = (
+        f"{guide_stars:,} guide stars; {len(stars):,} fields have {stars.min()} to "
+        f"{stars.max()}, {middle} in the middle. Mollweide's projection, ICRS; right "
+        "ascension 0 is in the middle and grows to the left."
+    )
+    return [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" '
+        f'aria-label="{name}: {told}" font-family="sans-serif" font-size="12">',
+        f"<title>{name}: guide stars by field</title><desc>{told}</desc>",
+        f'<ellipse cx="{WIDTH / 2:.0f}" cy="{8 + SCALE * HALF_HEIGHT:.0f}" '
+        f'rx="{SCALE * HALF_WIDTH:.0f}" ry="{SCALE * HALF_HEIGHT:.0f}" fill="#8883"/>',
+    ]
+
+
+def _legend(bins: tuple[Bin, ...]) -> list[str]:
+    step, y = (WIDTH - 16) / len(bins), HEIGHT - 26
+    parts = ['<g fill="currentColor">']
+    for k, one in enumerate(bins):
+        parts.append(
+            f'<rect x="{8 + k * step:.0f}" y="{y}" width="{step - 4:.0f}" height="8" '
+            f'fill="#{one.colour}"/><text x="{8 + k * step:.0f}" y="{y + 21}">{one.text}</text>'
+        )
+    return [*parts, "</g></svg>\n"]
+
+
+@lru_cache(maxsize=8)
+def _groups(fields: int, dots: int) -> Counts:
+    """Return the dot that each field of a tiling belongs to."""
+    if fields == dots:
+        return np.arange(fields)
+    _, nearest = cKDTree(saff_kuijlaars(dots)).query(saff_kuijlaars(fields))
+    return np.asarray(nearest, dtype=np.int64)
