@@ -287,13 +287,13 @@ def test_a_stopped_campaign_goes_on_where_it_was(
     lost = tmp_path / "S0" / "all.parquet"
     left = lost.with_name(".all.parquet.0.partial")
     lost.rename(left)  # as if killed just before it was done
-    ran, part = [], experiment._run_part
+    ran, whole = [], experiment.score_frames
 
-    def counted(task: Any) -> Any:
-        ran.append(task[0].name)
-        return part(task)
+    def counted(one: Experiment, artifact: Path) -> Any:
+        ran.append(one.name)
+        return whole(one, artifact)
 
-    monkeypatch.setattr(experiment, "_run_part", counted)
+    monkeypatch.setattr(experiment, "score_frames", counted)
     again = run_paper(PAPER, {"small": small_artifact}, tmp_path, workers=1)
     assert ran == ["all"]
     for name in ("all", "few", "noise-1-pairs"):
