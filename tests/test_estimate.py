@@ -32,9 +32,7 @@ FILES = {"2mass-8x6": {"2mass": "psc_estimated.gz"}}
 
 
 @pytest.fixture(scope="module")
-def small(
-    tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]
-) -> tuple[Path, dict[str, list[Path]]]:
+def small(tmp_path_factory, sao_lines):
     folder = tmp_path_factory.mktemp("sao")
     (folder / "sao.dat").write_bytes(b"".join(sao_lines))
     return folder, {"sao": [folder / "sao.dat"]}
