@@ -9,9 +9,10 @@ import pytest
 from rich.console import Console
 
 from starcat.artifact.verify import Finding, Verification
-from starcat.cli.terminal.artifacts import print_rebuilt, print_verification
-from starcat.cli.terminal.console import StageBars, print_table
-from starcat.cli.terminal.exports import print_exported
+from starcat.cli.artifacts import print_rebuilt, print_verification
+from starcat.cli.bars import StageBars
+from starcat.cli.console import print_table
+from starcat.cli.exchange import print_exported
 from starcat.exchange.export import Exported
 from starcat.pipeline.rebuild import FileChange, Rebuilt
 from starcat.progress import BYTE_STAGES

@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 import pytest
 from astropy.stats import binom_conf_interval
 
-from starcat.cli.terminal.evaluations import print_evaluation
+from starcat.cli.evaluation import print_evaluation
 from starcat.errors import ConfigError, ProductError
 from starcat.evaluation import experiment
 from starcat.evaluation import run as evaluate

@@ -12,9 +12,8 @@ import pyarrow.parquet as pq
 from starcat.evaluation.experiment import Attitudes, Experiment, description, run_experiment
 from starcat.evaluation.papers import s2, s4
 from starcat.geometry.camera import Camera
-from starcat.matcher.fast import library_version
-from starcat.simulation.simulate import Frame, Noise, simulate_frame
-from starcat.simulation.sky import Sky
+from starcat.matcher.c_engine import library_version
+from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame
 
 CAMERA = Camera(1024, 1024, fov_x_deg=12.0)
 

@@ -14,7 +14,7 @@ from typing import Any
 import pyarrow as pa
 import pytest
 
-from starcat.cli.terminal.console import progress_bars
+from starcat.cli.console import progress_bars
 from starcat.errors import ConfigError, ProductError, SourceMissing
 from starcat.failures import DEFECT, MAX_MESSAGE, failure_of, hint_in
 from starcat.pipeline import build as pipeline
@@ -30,7 +30,7 @@ def breaking(monkeypatch: pytest.MonkeyPatch) -> Callable[[BaseException], None]
         def broken(*_: object, **__: object) -> None:
             raise error
 
-        monkeypatch.setattr("starcat.cli.terminal.builds.print_sources", broken)
+        monkeypatch.setattr("starcat.cli.catalogs.print_sources", broken)
 
     return set_up
 
@@ -132,7 +132,7 @@ def test_a_recursion_without_end_is_a_defect(starcat: Run, monkeypatch: pytest.M
     def deeper(**given: Any) -> None:
         deeper(**given)
 
-    monkeypatch.setattr("starcat.cli.terminal.builds.print_sources", deeper)
+    monkeypatch.setattr("starcat.cli.catalogs.print_sources", deeper)
     run = starcat(["sources"])
     assert run.code == 70
     assert "RecursionError" in run.err

@@ -20,11 +20,11 @@ from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import verify_artifact
 from starcat.errors import ProductError, StarcatError
 from starcat.matcher.database import open_database
-from starcat.matcher.layout import LAYOUT
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
 from starcat.simulation.simulate import Noise, simulate_frames
 from starcat.storage.digests import file_sha256, json_bytes
+from starcat.storage.product_table import PRODUCTS
 
 FEW = settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 MANY = settings(FEW, max_examples=1000)
@@ -206,7 +206,7 @@ STRUCTURES: dict[str, Structure] = {
     "other numbers": holding(np.linspace(0.0, 1.0, 10)),
 }
 
-DATASETS = [(product, name) for product, layout in LAYOUT.items() for name in layout.datasets]
+DATASETS = [(product, name) for product, layout in PRODUCTS.items() for name in layout.datasets]
 USED = sorted({name for method in METHODS.values() for name in ("stars", *method.products)})
 
 
@@ -319,7 +319,7 @@ def run_structures(some: settings, copy: Path, frame: Any, other: Path) -> None:
     @given(data=st.data())
     def run(data: st.DataObject) -> None:
         product = data.draw(st.sampled_from(USED))
-        names = LAYOUT[product].datasets
+        names = PRODUCTS[product].datasets
         kind = data.draw(st.sampled_from(["structure", "values", "values", "attribute"]))
         if kind == "structure":
             name = data.draw(st.sampled_from(names))

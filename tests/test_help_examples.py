@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 from every_command import every_command
 
-from starcat.cli.commands.shared import chosen_spec
+from starcat.cli.options import chosen_spec
 from starcat.matcher.database import open_database
 from starcat.pipeline.build import build
 from starcat.simulation.simulate import Noise, simulate_frames

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from starcat.artifact.reader import open_artifact
-from starcat.cli.terminal import onboard
+from starcat.cli import exchange as onboard
 from starcat.exchange.onboard import contents_of
 from starcat.matcher.database import open_database
 from starcat.onboard.image import Contents, make_image

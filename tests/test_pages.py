@@ -6,20 +6,33 @@ import re
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
+from urllib.parse import urljoin
 
 import pytest
 from fastapi.testclient import TestClient
+from shelved import DATABASE, client_of, shelve
 
-from starcat.service.app import make_app
-from starcat.service.jobs.job_states import Attempt, claim
+from starcat.service.jobs.job_states import Attempt, Outcome, begin_next
 from starcat.service.pages.draft import draft_of_form, draft_of_text
 from starcat.service.pages.rendering import DIGEST, FILES
-from starcat.service.settings import Settings
 from starcat.specs.reading import preset, preset_names, read_spec
 
-HOSTILE = '"><script>alert(1)</script><img src=x onerror=alert(1)>'
+PAGE = f"/databases/{DATABASE}"
+LATER = "fedcba9876543210"
 
-BASE = "http://127.0.0.1:8000"
+PAGES = [
+    "/",
+    "/databases",
+    PAGE,
+    f"{PAGE}/coverage",
+    f"{PAGE}/sql?query=FROM+stars+LIMIT+2",
+    f"{PAGE}/compare?other={LATER}",
+    "/identify",
+    "/releases",
+]
+"""Pages of databases."""
+
+HOSTILE = '"><script>alert(1)</script><img src=x onerror=alert(1)>'
 
 SPEC = """\
 name = "small"
@@ -43,14 +56,16 @@ count = 300
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("service")
+def root(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path, artifact_version) -> Path:
+    root = tmp_path_factory.mktemp("pages") / "service"
+    shelve(root, small_artifact)
+    shelve(root, artifact_version("1.1.0"), LATER)
+    return root
 
 
 @pytest.fixture(scope="module")
 def client(root: Path) -> Iterator[TestClient]:
-    settings = Settings(root=root, anonymous="publisher", workers=0)
-    with TestClient(make_app(settings), base_url=BASE) as client:
+    with client_of(root, anonymous="publisher") as client:
         yield client
 
 
@@ -59,11 +74,12 @@ def job(client: TestClient) -> str:
     """A job that failed: its address."""
     address = _asked(client, "hostile")
     records = client.app.state.service.records
-    attempt = Attempt(records, claim(records, address.rpartition("/")[2]))
-    attempt.tell_stage("read gaia", 5_000_000, 19_000_000)
-    attempt.tell("warning", f"a line {HOSTILE}")
-    attempt.tell_stage(f"self-test {HOSTILE}", 3, 400)
-    attempt.fail({"title": "Unprocessable Content", "status": 422, "detail": f"why {HOSTILE}"})
+    attempt = Attempt(records, begin_next(records, ["build"]))
+    attempt.report_stage("read gaia", 5_000_000, 19_000_000)
+    attempt.log("warning", f"a line {HOSTILE}")
+    attempt.report_stage(f"self-test {HOSTILE}", 3, 400)
+    problem = {"title": "Unprocessable Content", "status": 422, "detail": f"why {HOSTILE}"}
+    attempt.end(Outcome("failed", problem))
     return address
 
 
@@ -109,7 +125,7 @@ def pages(client: TestClient, job: str) -> dict[str, str]:
     """All pages of this part by address."""
     addresses = ["/new", "/new?preset=sao-12deg-512", f"/new?job={job[6:]}", "/jobs", job]
     addresses += ["/jobs?state=failed", "/jobs?state=done", "/sign-in", "/jobs/nothing"]
-    addresses += ["/api/docs"]
+    addresses += ["/api/docs", *PAGES]
     return {address: client.get(address).text for address in addresses}
 
 
@@ -138,13 +154,15 @@ def test_a_page_has_no_address_elsewhere_and_its_links_lead_somewhere(pages, cli
     known = {}
     for address, text in pages.items():
         for found in Page(text).addresses():
-            assert found.startswith(("/", "#")), (address, found)
+            assert found.startswith(("/", "#", "?")), (address, found)
             assert not found.startswith("//"), (address, found)
-            path = found.partition("#")[0]
-            is_ours = (
-                path and path not in others and not path.startswith(("/databases/", "/api/v1/"))
-            )
-            if is_ours and not path.endswith(("/cancel", "/retry", "/preview", "/tiling")):
+            path = urljoin(address, found).partition("#")[0]
+            is_ours = path not in others and not path.startswith(("/databases/", "/api/v1/"))
+            if (
+                is_ours
+                and found[0] != "#"
+                and not path.endswith(("/cancel", "/retry", "/preview", "/tiling"))
+            ):
                 known.setdefault(path, client.get(path).status_code)
     assert {path: status for path, status in known.items() if status != 200} == {}
     assert len(known) > 8
@@ -204,8 +222,7 @@ def test_styles_and_scripts_of_the_pages_are_in_the_package():
 
 
 def test_who_may_not_read_is_led_to_the_sign_in(tmp_path):
-    settings = Settings(root=tmp_path, anonymous="none", workers=0)
-    with TestClient(make_app(settings), base_url=BASE) as client:
+    with client_of(tmp_path, anonymous="none") as client:
         client.headers["Accept"] = "text/html"
         answer = client.get("/jobs", follow_redirects=False)
         assert answer.status_code == 303
@@ -218,8 +235,7 @@ def test_who_may_not_read_is_led_to_the_sign_in(tmp_path):
 
 def test_who_may_only_read_sees_what_a_build_needs(client, root):
     jobs = client.app.state.service.jobs.count()
-    settings = Settings(root=root, anonymous="reader", workers=0)
-    with TestClient(make_app(settings), base_url=BASE) as reader:
+    with client_of(root, anonymous="reader") as reader:
         assert "Sign in to build" in reader.get("/new").text
         sent = {"toml": SPEC, "toml-before": "", "do": "build"}
         answer = reader.post("/new", data=sent, follow_redirects=False)

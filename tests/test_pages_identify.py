@@ -15,16 +15,14 @@ from fastapi.testclient import TestClient
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-from shelved import DATABASE, shelve
+from shelved import DATABASE, client_of, shelve
 
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.matcher.centroids import read_frames
 from starcat.matcher.database import open_database
-from starcat.service.app import make_app
 from starcat.service.pages.centroid_text import centroid_file
 from starcat.service.pages.identify import NOISE_PX
-from starcat.service.settings import Settings
 from starcat.simulation.simulate import Noise, simulate_frames
 
 LOCAL = "http://127.0.0.1:8000"
@@ -35,8 +33,7 @@ SEED = 7
 def client(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Iterator[TestClient]:
     root = tmp_path_factory.mktemp("identify") / "service"
     shelve(root, small_artifact)
-    settings = Settings(root=root, anonymous="reader", workers=0, upload_mib=2.0)
-    with TestClient(make_app(settings), base_url=LOCAL) as client:
+    with client_of(root, anonymous="reader", upload_mib=2.0) as client:
         yield client
 
 

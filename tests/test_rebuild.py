@@ -12,7 +12,7 @@ import pytest
 from starcat.artifact import manifest as manifest_module
 from starcat.artifact.diff import Change
 from starcat.artifact.manifest import MANIFEST_NAME, manifest_digest
-from starcat.cli.terminal.artifacts import print_rebuilt
+from starcat.cli.artifacts import print_rebuilt
 from starcat.errors import ChecksumMismatch, ConfigError, ProductError, SourceMissing
 from starcat.pipeline.rebuild import FileChange, Rebuilt, rebuild
 from starcat.storage.digests import json_bytes

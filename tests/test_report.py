@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 from starcat.artifact.reader import Artifact, open_artifact
-from starcat.cli.terminal.coverage_tables import histogram_rows
+from starcat.cli.artifacts import histogram_rows
 from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars
 from starcat.pipeline.build import build
 from starcat.pipeline.report_data import artifact_coverage

@@ -21,11 +21,12 @@ from prometheus_client.parser import text_string_to_metric_families
 from starlette.testclient import TestClient
 
 from starcat.errors import ConfigError, TargetMissing
+from starcat.service import removal
 from starcat.service.access import Reader, Role, principal_of
 from starcat.service.app import make_app
-from starcat.service.security import auth, bodies, identities, retention
-from starcat.service.security.buckets import Buckets
+from starcat.service.security import auth, request_limits
 from starcat.service.security.logs import JsonFormatter
+from starcat.service.security.request_limits import Buckets
 from starcat.service.security.tokens import TokenStore
 from starcat.service.server import run_server
 from starcat.service.settings import Settings, read_settings
@@ -119,7 +120,7 @@ def test_a_wrong_token_is_refused_also_where_nobody_needs_one(client: Make, wron
 def test_expired_and_revoked_tokens_are_worth_nothing(
     client: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(identities, "KNOWN_S", 0.0)
+    monkeypatch.setattr(auth, "KNOWN_S", 0.0)
     at = client()
     store = tokens_of(at)
     _, short = store.create("short", Role.READER, expires_days=1.0)
@@ -198,7 +199,7 @@ def test_a_sign_in_is_a_cookie_that_is_not_the_token(client: Make) -> None:
 def test_a_sign_in_ends_with_its_time_and_with_its_token(
     client: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(identities, "KNOWN_S", 0.0)
+    monkeypatch.setattr(auth, "KNOWN_S", 0.0)
     at = client(session_hours=1.0)
     store = tokens_of(at)
     _, text = store.create("anna", Role.READER)
@@ -281,7 +282,7 @@ def test_a_bucket_fills_again_and_the_quietest_is_forgotten(
     now[0] = 1.0
     assert buckets.take("a") == 0.0
     assert buckets.take("a") == 1.0
-    monkeypatch.setattr("starcat.service.security.buckets.MOST", 2)
+    monkeypatch.setattr("starcat.service.security.request_limits.MOST_BUCKETS", 2)
     buckets.take("b")
     buckets.take("c")
     assert buckets.take("a") == 0.0  # full again, for it was forgotten
@@ -393,7 +394,7 @@ def test_a_body_is_too_large_by_what_it_says_and_by_what_it_is(client: Make) -> 
 
 def test_nothing_is_added_to_a_full_disk(client: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     at = client()
-    monkeypatch.setattr(bodies, "free_gib", lambda folder: 0.99)
+    monkeypatch.setattr(request_limits, "free_gib", lambda folder: 0.99)
     found = at.post("/probe/body", files={"file": b"x"})
     assert found.status_code == 507
     assert "less than 1 GiB left" in found.json()["detail"]
@@ -470,7 +471,7 @@ def test_ready_says_what_is_wrong(client: Make, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(type(app.state.slots), "is_alive", True)
     found = at.get("/readyz")
     assert (found.status_code, found.json()) == (200, {"ready": True, "reasons": []})
-    monkeypatch.setattr("starcat.service.security.health.free_gib", lambda folder: 0.2)
+    monkeypatch.setattr("starcat.service.security.metrics.free_gib", lambda folder: 0.2)
     found = at.get("/readyz")
     assert found.status_code == 503
     assert "0.2 GiB of disk are left, less than 1" in found.json()["reasons"]
@@ -505,7 +506,7 @@ def test_what_is_old_is_removed_and_databases_and_releases_stay(client: Make) ->
     for folder in (places.results, places.scratch, places.databases / ("0" * 16), places.registry):
         folder.mkdir(exist_ok=True)
         (folder / "file").write_text("x")
-    removed = retention.remove_old(service, now_s + 1.5 * 86_400.0)
+    removed = removal.remove_old(service, now_s + 1.5 * 86_400.0)
     assert (removed.jobs, removed.results, removed.scratch) == (2, 1, 1)
     assert [path.name for path in places.jobs.iterdir()] == [jobs[2].id]
     assert [job.id for job in service.jobs.all()] == [jobs[2].id]

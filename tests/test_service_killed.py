@@ -224,22 +224,6 @@ def test_a_server_that_stops_leaves_its_jobs_to_the_next(service, small_spec):
     until(lambda: service.jobs()[job_id]["state"] == "cancelled", 30.0, service)
 
 
-def test_a_worker_that_dies_is_started_again(service, small_spec):
-    service.start()
-    spec = small_spec.replace("frames = 5", "frames = 400")
-    job_id = service.post(kind="build", spec=spec)["id"]
-    until(lambda: service.jobs()[job_id]["state"] == "running", 60.0, service)
-    [worker] = [one for one in service.processes() if b"jobs.worker" in command_of(one)]
-    os.kill(worker, signal.SIGKILL)
-    until(lambda: service.jobs()[job_id]["state"] == "done", 100.0, service)
-    assert service.jobs()[job_id]["attempt"] == 2
-    assert len(assert_all_whole(service.root)) == 1
-
-
-def command_of(process: int) -> bytes:
-    return (Path("/proc") / str(process) / "cmdline").read_bytes()
-
-
 def test_the_records_are_whole_after_each_kill(service, small_spec):
     """Submissions that were answered are remembered, wherever the kill falls."""
     generator = random.Random(3)

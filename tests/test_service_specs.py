@@ -14,15 +14,14 @@ from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
+from shelved import client_of
 
 from starcat.pipeline.catalog_snapshot import CatalogSnapshot, read_snapshot
 from starcat.pipeline.estimate import choose_stars
 from starcat.pipeline.starter import starter_spec
 from starcat.service import catalogs as catalogs_module
-from starcat.service.app import make_app
 from starcat.service.catalogs import Catalogs
 from starcat.service.problems import Problem
-from starcat.service.settings import Settings
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.reading import content_of_toml, preset, preset_names, spec_from_dict
 
@@ -46,8 +45,7 @@ def small(
 
 @pytest.fixture(scope="module")
 def client(small: BuildSpec, tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
-    app = make_app(Settings(root=tmp_path_factory.mktemp("service"), workers=0))
-    with TestClient(app, base_url="http://127.0.0.1:8000") as client:
+    with client_of(tmp_path_factory.mktemp("service")) as client:
         yield client
 
 

@@ -29,7 +29,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from starcat.cli.terminal.matches import print_sky_in_time
+from starcat.cli.matches import print_sky_in_time
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import (
     matrix_from_quaternion,

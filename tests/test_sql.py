@@ -23,7 +23,7 @@ import pytest
 from astropy.table import Table
 
 from starcat.artifact.reader import open_artifact
-from starcat.cli.terminal.prompt import prompt, words
+from starcat.cli.queries import prompt, words
 from starcat.errors import ProductError, QueryError, SchemaVersionError, SourceError
 from starcat.query.gallery import gallery, guessed, named_query
 from starcat.query.names import identifier

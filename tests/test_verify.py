@@ -16,7 +16,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from starcat.artifact.database import INDICES
 from starcat.artifact.manifest import DATABASE_NAME, MANIFEST_NAME, manifest_digest
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import Finding, check_artifact, verify_artifact
@@ -25,6 +24,7 @@ from starcat.errors import ProductError
 from starcat.resources import resource_folder
 from starcat.storage.digests import file_sha256, json_bytes
 from starcat.storage.parquet import read_parquet, write_parquet
+from starcat.storage.product_table import PRODUCTS, indices_of
 
 SCHEMAS = resource_folder("schemas")
 
@@ -112,8 +112,8 @@ def test_every_index_that_is_written_is_named(small_artifact: Path) -> None:
             for column in artifact.schema(name).columns:
                 parts = ("_offsets", "_values") if column.is_list else ("",)
                 columns |= {f"{column.name}{part}" for part in parts}
-            assert set(file[name]) - columns == set(INDICES.get(name, ()))
-    assert set(INDICES) <= {path.stem.partition("-")[0] for path in SCHEMAS.glob("*.json")}
+            assert set(file[name]) - columns == set(indices_of(name))
+    assert set(PRODUCTS) <= {path.stem.partition("-")[0] for path in SCHEMAS.glob("*.json")}
 
 
 # Whole and damaged files --------------------------------------------------------------------

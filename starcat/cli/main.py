@@ -2,7 +2,7 @@
 
 Results go to stdout as tables or, with ``--json``, as JSON; messages and progress bars go to
 stderr, and so does the one object that an error is under ``--json``. The exit codes are in
-``docs/errors.md``, the commands themselves in ``starcat.cli.commands``.
+``docs/errors.md``, the commands themselves in the modules beside this one.
 """
 
 from __future__ import annotations
@@ -18,18 +18,19 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from starcat.cli.commands import (
+from starcat.cli import (
     artifacts,
+    builds,
     catalogs,
-    evaluating,
-    exchanging,
+    evaluation,
+    exchange,
     matching,
-    querying,
-    releasing,
+    releases,
     serving,
     specs,
+    sql,
 )
-from starcat.cli.commands.there import there
+from starcat.cli.remote import open_remote
 from starcat.failures import failure_of
 from starcat.version import __version__
 
@@ -56,7 +57,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["--help", "-h"]},
 )
-PARTS = (catalogs, specs, artifacts, querying, exchanging, releasing, matching, evaluating, serving)
+PARTS = (
+    *(catalogs, specs, builds, artifacts, sql, exchange),
+    *(releases, matching, evaluation, serving),
+)
 """In the order of --help."""
 
 for part in PARTS:
@@ -65,7 +69,7 @@ for part in PARTS:
 
 def _version(wanted: bool) -> None:
     if wanted:
-        from starcat.matcher.fast import library_version
+        from starcat.matcher.c_engine import library_version
 
         library = library_version()
         typer.echo(f"starcat {__version__}")
@@ -94,7 +98,7 @@ def _options(
 ) -> None:
     """Guide-star databases for star trackers, built from star catalogs."""
     if server is not None:
-        context.obj = there(server, token, context.invoked_subcommand or "")
+        context.obj = open_remote(server, token, context.invoked_subcommand or "")
 
 
 def _stop(number: int, frame: Any) -> None:

@@ -32,14 +32,11 @@ from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_
 from starcat.geometry.camera import Camera
 from starcat.geometry.proximity import pairs_within
 from starcat.geometry.sphere import directions_from_radec
-from starcat.matcher.fast import library_version
+from starcat.matcher.c_engine import library_version
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.methods.triangle_order import TriangleOrder
-from starcat.matcher.observation import MIN_SHARE
-from starcat.matcher.verification import REACH
+from starcat.matcher.settings import MIN_SHARE, REACH, TriangleOrder
 from starcat.progress import Progress, no_progress
-from starcat.simulation.simulate import Noise, simulate_frame
-from starcat.simulation.sky import Sky
+from starcat.simulation.simulate import Noise, Sky, simulate_frame
 from starcat.storage.atomic import whole_file
 
 _TYPES = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}
@@ -267,7 +264,7 @@ def catalog_of_artifact(folder: Path) -> Sky:
 
 
 def blend(sky: Sky, limit_rad: float) -> Sky:
-    """Join the points that a camera cannot tell apart."""
+    """Join points closer than a limit, in the order of each group's brightest member."""
     pairs, apart = pairs_within(sky.directions, limit_rad)
     i, j = pairs[apart < limit_rad].T
     count = len(sky)

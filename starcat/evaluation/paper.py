@@ -54,10 +54,10 @@ class Paper:
     title: str  # what it is about; who, where, when
     citation: str
     presets: tuple[str, ...]  # artifacts that it needs
-    # function that returns the rows; for a quick run (True) with fewer frames
-    rows: Callable[[bool], list[Row]]
-    # function that returns the other numbers, from the artifacts' folders by preset
-    statistics: Callable[[dict[str, Path], bool], list[Statistic]]
+    # for a quick run (True) with fewer frames
+    rows: Callable[[bool], list[Row]] = lambda quick: []
+    # from the artifacts' folders by preset
+    statistics: Callable[[dict[str, Path], bool], list[Statistic]] = lambda artifacts, quick: []
     deviations: tuple[str, ...] = ()  # what the paper leaves unsaid, and what is done instead
 
 

@@ -14,7 +14,7 @@ from typing import Any
 from starcat.artifact.reader import open_artifact
 from starcat.errors import ConfigError
 from starcat.evaluation.experiment import Attitudes, Experiment
-from starcat.evaluation.paper import Paper, Row, Statistic, tolerance_for
+from starcat.evaluation.paper import Paper, Row, tolerance_for
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import open_database, products_in
 from starcat.matcher.methods.table import METHODS, best_method, method_named
@@ -246,13 +246,10 @@ def sweep_paper(sweep: Sweep) -> Paper:
     name = sweep.artifact.resolve().name
     rows = _rows(sweep, name)
 
-    def no_statistics(artifacts: Mapping[str, Path], is_quick: bool) -> list[Statistic]:
-        return []
-
     size = f"{sweep.camera.width_px} x {sweep.camera.height_px} px"
     field_of_view = f"{sweep.camera.fov_x_deg:.3g} x {sweep.camera.fov_y_deg:.3g} deg"
     title = f"{field_of_view}, {size}, stars to {sweep.limit_mag:g} mag"
-    return Paper(name, title, "", (name,), lambda is_quick: rows, no_statistics)
+    return Paper(name, title, "", (name,), lambda is_quick: rows)
 
 
 def _rows(sweep: Sweep, preset: str) -> list[Row]:

@@ -25,24 +25,21 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from starcat.errors import SchemaError
-from starcat.exchange.columns import Label, check_names, unit_text
+from starcat.exchange.columns import Label, check_names, column_error, unit_text
 from starcat.exchange.numpy_columns import NumpyColumn, numpy_columns
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
 _CODES = {"b1": "L", "u1": "B", "i2": "I", "i4": "J", "i8": "K", "f4": "E", "f8": "D"}
-_NAME_LETTERS = 68
-"""What a card of a FITS header has room for; a quotation mark counts twice."""
-
+_NAME_LETTERS = 68  # what a card of a FITS header has room for; a quotation mark counts twice
 _HEAP_LIMIT_BYTES = 2**31 - 1
 """What a descriptor of 32 bits reaches; beyond it FITS has one of 64 bits."""
 
 _BREAKS = re.compile(r"\0|[^\S \t\n]")
 """White space that is neither blank, tab nor newline: Python ends lines at most of it."""
 
-_ENTRY_NAME_BYTES = (1 << 16) - 1
-"""What an entry of a zip file has room for."""
+_ENTRY_NAME_BYTES = (1 << 16) - 1  # what an entry of a zip file has room for
 
 
 def write_fits(batches: pa.RecordBatchReader, path: Path, label: Label) -> int:
@@ -79,9 +76,7 @@ def _check_fits_names(columns: list[NumpyColumn]) -> None:
     for column in columns:
         name = column.name
         if not (name.isascii() and name.isprintable()):
-            raise SchemaError(
-                f"column {name!r}: names are ASCII in FITS; rename it with AS", field=name
-            )
+            raise column_error(name, ": names are ASCII in FITS; rename it with AS")
         if len(name.replace("'", "''")) > _NAME_LETTERS:
             raise SchemaError(
                 f"column {name[:20]}... has a name of {len(name)} letters, and FITS has room for "
@@ -119,11 +114,11 @@ def _fits_column(column: NumpyColumn, descriptor: str) -> Any:
 def _ascii(column: NumpyColumn) -> NDArray[np.bytes_]:
     for text in column.values:
         if not text.isascii() or "\0" in text:
-            raise SchemaError(
-                f"column {column.name!r}: text is ASCII in FITS, and {text!r} is not; leave the "
+            raise column_error(
+                column.name,
+                f": text is ASCII in FITS, and {text!r} is not; leave the "
                 "column out, or export to votable",
-                field=column.name,
-                found=text,
+                text,
             )
     return column.values.astype(np.bytes_) if len(column.values) else np.empty(0, "S1")
 
@@ -194,11 +189,11 @@ def _check_ecsv_texts(columns: list[NumpyColumn]) -> None:
     for place, column in enumerate(columns):
         for text in [column.name, *(column.values if column.is_text else ())]:
             if _BREAKS.search(text) or (place == 0 and text.startswith("#")):
-                raise SchemaError(
-                    f"column {column.name!r}: readers of ECSV would misread the text {text!r} "
+                raise column_error(
+                    column.name,
+                    f": readers of ECSV would misread the text {text!r} "
                     "there; take the character out, or choose another format",
-                    field=column.name,
-                    found=text,
+                    text,
                 )
 
 
@@ -227,11 +222,11 @@ def _arrays(batches: pa.RecordBatchReader, file_format: str) -> tuple[list[Numpy
 def _fixed_texts(column: NumpyColumn) -> NDArray[np.str_]:
     for text in column.values:
         if text.endswith("\0"):
-            raise SchemaError(
-                f"column {column.name!r}: numpy would lose the end of the text {text!r}; take the "
+            raise column_error(
+                column.name,
+                f": numpy would lose the end of the text {text!r}; take the "
                 "null character out, or choose another format",
-                field=column.name,
-                found=text,
+                text,
             )
     return column.values.astype(np.str_)
 
@@ -244,10 +239,10 @@ def _add_array(archive: zipfile.ZipFile, name: str, values: NDArray[Any]) -> Non
             field=name,
         )
     if f"{name}.npy" in archive.namelist():
-        raise SchemaError(
-            f"column {name!r}: the file has an array of that name already, for a column's lists "
+        raise column_error(
+            name,
+            ": the file has an array of that name already, for a column's lists "
             "or nulls; rename the column with AS",
-            field=name,
         )
     # An entry opened by its name is dated 1980, so that the bytes are the same every time.
     with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:

@@ -74,14 +74,17 @@ class FirstRows:
         return pa.RecordBatchReader.from_batches(self._batches.schema, iter(self))
 
 
+def column_error(name: str, told: str, found: object = None) -> SchemaError:
+    """Return what is wrong with a column; `told` goes on behind its name."""
+    return SchemaError(f"column {name!r}{told}", field=name, found=found)
+
+
 def plain_schema(schema: pa.Schema) -> pa.Schema:
     """Return a schema with the plain types; SchemaError says what to cast a column to."""
     twice = [name for name, times in Counter(schema.names).items() if times > 1]
     if twice:
-        raise SchemaError(
-            f"column {twice[0]!r} is there twice; give one of them another name with AS",
-            field=twice[0],
-            found=schema.names,
+        raise column_error(
+            twice[0], " is there twice; give one of them another name with AS", schema.names
         )
     return pa.schema([f.with_type(_plain(f.type, f.name)) for f in schema], schema.metadata)
 
@@ -140,11 +143,11 @@ def unit_text(name: str, unit: str | None, standard: str) -> str | None:
     try:
         return str(units.Unit(unit).to_string(standard))
     except (ValueError, TypeError) as error:
-        raise SchemaError(
-            f"column {name!r}: unit {unit!r} is not one that {standard} knows; "
+        raise column_error(
+            name,
+            f": unit {unit!r} is not one that {standard} knows; "
             "mend the unit, or export to CSV or JSON",
-            field=name,
-            found=unit,
+            unit,
         ) from error
 
 
@@ -183,11 +186,11 @@ def _plain(kind: pa.DataType, name: str) -> pa.DataType:
         return pa.list_(item.with_type(_plain(item.type, name)))
     for word, way_out in _CASTS.items():
         if word in str(kind):
-            raise SchemaError(
-                f"column {name!r} is of type {kind}, which has no place in a file; "
+            raise column_error(
+                name,
+                f" is of type {kind}, which has no place in a file; "
                 f"select {way_out.replace('column', name)}",
-                field=name,
-                found=str(kind),
+                str(kind),
             )
     return kind
 

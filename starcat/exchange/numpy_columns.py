@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Mask
 from starcat.errors import SchemaError
-from starcat.exchange.columns import field_facts, is_list, is_number, plain_schema, time_texts
+from starcat.exchange.columns import (
+    column_error,
+    field_facts,
+    is_list,
+    is_number,
+    plain_schema,
+    time_texts,
+)
 from starcat.exchange.text import json_texts
 
 _WIDER = {
@@ -77,11 +84,11 @@ def list_items(name: str, values: pa.Array) -> tuple[NDArray[np.int64], pa.Array
     offsets = np.concatenate(([0], np.cumsum(lengths, dtype=np.int64)))
     items = values.flatten()
     if items.null_count and pa.types.is_integer(items.type):
-        raise SchemaError(
-            f"column {name!r}: a list of integers has a missing item, which only CSV, "
+        raise column_error(
+            name,
+            ": a list of integers has a missing item, which only CSV, "
             "JSON and Parquet can hold; cast the items to DOUBLE",
-            field=name,
-            found=str(values.type),
+            str(values.type),
         )
     return offsets, items
 

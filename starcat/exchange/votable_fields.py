@@ -13,10 +13,11 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from starcat.arrays import Mask
-from starcat.errors import SchemaError, quoted
+from starcat.errors import quoted
 from starcat.exchange.columns import (
     Label,
     check_names,
+    column_error,
     field_facts,
     is_list,
     is_number,
@@ -47,9 +48,7 @@ _AFTER_ROWS = {
     "tabledata": "    </TABLEDATA>\n   </DATA>\n",
 }
 _AFTER_TABLE = " </RESOURCE>\n</VOTABLE>\n"
-_ICRS = "starcat.icrs"
-"""What columns refer to the coordinate system by."""
-
+_ICRS = "starcat.icrs"  # what columns refer to the coordinate system by
 _COOSYS = f'  <COOSYS ID="{_ICRS}" system="ICRS"'
 EPOCH_PLACE = _COOSYS.encode()
 """What the attribute with the epoch stands after; it is nowhere else in a document."""
@@ -167,11 +166,11 @@ def check_xml(name: str, texts: Iterable[str | None]) -> None:
     """Refuse texts with a character that XML cannot hold."""
     for text in texts:
         if text and _NOT_XML.search(text):
-            raise SchemaError(
-                f"column {name!r}: the text {quoted(text)} has a character that XML cannot "
+            raise column_error(
+                name,
+                f": the text {quoted(text)} has a character that XML cannot "
                 "hold; take it out, or choose another format than votable",
-                field=name,
-                found=text,
+                text,
             )
 
 

@@ -42,8 +42,7 @@ _EPOCH_ROOM = 32
 _STEP_ROWS = 1 << 14
 _STEP_BYTES = 8 << 20
 _THREADS = 2
-_BASE64_BYTES = 3
-"""What base64 makes four letters of; only the end of a stream may be shorter."""
+_BASE64_BYTES = 3  # what base64 makes four letters of; only the end of a stream may be shorter
 
 
 def votable_chunks(

@@ -7,7 +7,7 @@ which the extra ``images`` brings. Trails are told and refused; blooming is not 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ from starcat.images.detection import detect, trail_px
 from starcat.images.spot_width import SIGMA_RANGE_PX, is_sharp, sigma_of_stars
 
 _NARROWEST_WINDOW_PX = 1.0  # a narrower window follows the pixel grid (docs/decisions.md)
-_APERTURE_SIGMA, _EDGE_SIGMA = 2.0, 3.0
+_APERTURE_SIGMA = 2.0
 _PLATEAU_NOISE, _PLATEAU_DEPTH, _PLATEAU_PIXELS = 6.0, 0.005, 3
 """A plateau: pixels that differ by no more than read noise, and by half a per cent."""
 
@@ -40,23 +40,11 @@ class Spots:
     centroids_px: Pixels
     flux: Array  # shape (N,): light above the background, in the units of the image
     mag: Array  # shape (N,): instrumental magnitude, -2.5 log10 flux: its zero point is unknown
-    snr: Array  # shape (N,): flux over its standard deviation, in an aperture of two sigma
-    # shape (N,): the brightest pixel is at the detector's limit: measured too faint
-    saturated: Mask
-    # shape (N,): touches another spot: each pulls at the other's centroid
-    blended: Mask
-    # shape (N,): cut by the edge of the image: the centroid is pulled inwards
-    at_edge: Mask
     psf_sigma_px: float  # standard deviation of a star's spot before the pixels sample it
 
     def __len__(self) -> int:
         """Return the number of spots."""
         return len(self.flux)
-
-    def brightest(self, count: int) -> Spots:
-        """Return the first spots."""
-        columns = {field.name: getattr(self, field.name)[:count] for field in fields(self)[:-1]}
-        return Spots(**columns, psf_sigma_px=self.psf_sigma_px)
 
 
 def find_spots(
@@ -64,27 +52,23 @@ def find_spots(
     *,
     threshold_sigma: float = 5.0,
     psf_sigma_px: float | None = None,
-    saturation: float | None = None,
-    gain_e_per_adu: float | None = None,
     most_spots: int | None = None,
 ) -> Spots:
     """Find the spots of an image and measure them.
 
     Bertin and Arnouts 1996, A&AS 117, 393. Barbary 2016, JOSS 1 (6), 58.
     """
-    _check_positive(
-        threshold_sigma=threshold_sigma,
-        psf_sigma_px=psf_sigma_px,
-        saturation=saturation,
-        gain_e_per_adu=gain_e_per_adu,
-        most_spots=most_spots,
-    )
+    given = {"threshold_sigma": threshold_sigma, "psf_sigma_px": psf_sigma_px}
+    for name, value in {**given, "most_spots": most_spots}.items():
+        if value is not None and not 0.0 < value < np.inf:
+            text = f"{name} is {value}; expected a positive number"
+            raise ConfigError(text, key=name, value=value)
     levels = subtract_background(image)
     sigma = psf_sigma_px
     if sigma is None:
         levels = repair_hot_pixels(levels, SIGMA_RANGE_PX[0])
         first = detect(levels, 1.0, threshold_sigma)
-        first = first[~_is_saturated(levels, first, saturation)]
+        first = first[~_is_saturated(levels, first)]
         _refuse_trails(first)
         sigma = sigma_of_stars(levels, np.stack([first["x"], first["y"]], axis=1), first["peak"])
     levels = repair_hot_pixels(levels, sigma)
@@ -92,16 +76,7 @@ def find_spots(
     if psf_sigma_px is None:
         places = np.stack([found["x"], found["y"]], axis=1)
         found = found[~is_sharp(levels, places, float(sigma))]
-    spots = _measured(levels, found, float(sigma), saturation, gain_e_per_adu)
-    return spots if most_spots is None else spots.brightest(most_spots)
-
-
-def _check_positive(**values: float | None) -> None:
-    for name, value in values.items():
-        if value is not None and not 0.0 < value < np.inf:
-            raise ConfigError(
-                f"{name} is {value}; expected a positive number", key=name, value=value
-            )
+    return _measured(levels, found, float(sigma), most_spots)
 
 
 def _refuse_trails(found: NDArray[Any]) -> None:
@@ -114,39 +89,15 @@ def _refuse_trails(found: NDArray[Any]) -> None:
         )
 
 
-def _measured(
-    levels: Levels,
-    found: NDArray[Any],
-    sigma: float,
-    saturation: float | None,
-    gain: float | None,
-) -> Spots:
+def _measured(levels: Levels, found: NDArray[Any], sigma: float, most: int | None) -> Spots:
     seen = float(np.sqrt(sigma**2 + PIXEL_VARIANCE))
     centroids = _windowed(levels, found, max(seen, _NARROWEST_WINDOW_PX))
     x, y = (centroids - 0.5).T
-    part, error, _ = load_sep().sum_circle(
-        levels.above,
-        x,
-        y,
-        _APERTURE_SIGMA * seen,
-        err=levels.noise,
-        mask=levels.mask,
-        gain=gain,
-        subpix=0,
-    )
+    radius = _APERTURE_SIGMA * seen
+    part, _, _ = load_sep().sum_circle(levels.above, x, y, radius, mask=levels.mask, subpix=0)
     flux = part / (1.0 - np.exp(-0.5 * _APERTURE_SIGMA**2))
-    to_edge = np.minimum(centroids, levels.raw.shape[::-1] - centroids).min(axis=1)
-    order = brightest_first(flux, centroids)[: np.count_nonzero(flux > 0.0)]
-    return Spots(
-        centroids[order],
-        flux[order],
-        -2.5 * np.log10(flux[order]),
-        part[order] / error[order],
-        _is_saturated(levels, found, saturation)[order],
-        _is_blended(found)[order],
-        to_edge[order] < _EDGE_SIGMA * seen,
-        sigma,
-    )
+    order = brightest_first(flux, centroids)[: np.count_nonzero(flux > 0.0)][:most]
+    return Spots(centroids[order], flux[order], -2.5 * np.log10(flux[order]), sigma)
 
 
 def brightest_first(flux: Array, centroids_px: Pixels) -> NDArray[np.int64]:
@@ -154,11 +105,9 @@ def brightest_first(flux: Array, centroids_px: Pixels) -> NDArray[np.int64]:
     return np.lexsort((centroids_px[:, 1], centroids_px[:, 0], -flux))
 
 
-def _is_saturated(levels: Levels, found: NDArray[Any], saturation: float | None) -> Mask:
-    """Return which spots reach the limit, given or seen as a plateau at the image's maximum."""
+def _is_saturated(levels: Levels, found: NDArray[Any]) -> Mask:
+    """Return which spots have a plateau at the image's maximum."""
     around = pixels_around(levels.raw, found["xpeak"], found["ypeak"])
-    if saturation is not None:
-        return np.asarray((around >= saturation).any(axis=(1, 2)))
     read_noise = _PLATEAU_NOISE * float(np.median(levels.noise))
     depth = min(read_noise, _PLATEAU_DEPTH * float(levels.above.max()))
     at_limit = around >= float(levels.raw[~levels.mask].max()) - depth
@@ -170,10 +119,7 @@ def _windowed(levels: Levels, found: NDArray[Any], window: float) -> Array:
     start = np.stack([found["x"], found["y"]], axis=1)
     x, y, _ = load_sep().winpos(levels.above, *start.T, window, mask=levels.mask, subpix=0)
     centroids = np.stack([x, y], axis=1)
-    drifts = _is_blended(found) & (np.hypot(*(centroids - start).T) > 0.5 * window)
+    is_blended = (found["flag"] & load_sep().OBJ_MERGED) > 0
+    drifts = is_blended & (np.hypot(*(centroids - start).T) > 0.5 * window)
     # sep counts from the centre of the first pixel.
     return np.asarray(np.where(drifts[:, None], start, centroids) + 0.5, dtype=np.float64)
-
-
-def _is_blended(found: NDArray[Any]) -> Mask:
-    return np.asarray((found["flag"] & load_sep().OBJ_MERGED) > 0)

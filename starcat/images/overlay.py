@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcat.arrays import Array, Directions, Matrix
+from starcat.arrays import Array, Matrix, Pixels
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, separation
 from starcat.images.frame_axes import LABEL_PT, LETTER_PT, SKY, FrameAxes
@@ -110,7 +110,7 @@ def _great_circle(start: Array, end: Array) -> Array:
     return np.asarray(chord / np.sqrt(np.einsum("ij,ij->i", chord, chord))[:, None])
 
 
-def _on_detector(points: Directions, camera: Camera) -> Array:
+def _on_detector(points: Pixels, camera: Camera) -> Array:
     """Return the points on the detector with those next to them, NaN for the others between."""
     inside = camera.contains(points)
     near = inside.copy()
@@ -123,7 +123,7 @@ def _on_detector(points: Directions, camera: Camera) -> Array:
 
 
 def _write_at_edge(
-    frame: FrameAxes, name: str, points: Directions, taken: list[list[float]]
+    frame: FrameAxes, name: str, points: Pixels, taken: list[list[float]]
 ) -> list[list[float]]:
     """Write the name of a line of the grid at the edge of the frame, unless another is there."""
     size = np.array(frame.size, dtype=np.float64)

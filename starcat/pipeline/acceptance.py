@@ -1,4 +1,4 @@
-"""The judgement of a self-test: whether a database passes, and what is wrong where it does not.
+"""Acceptance by the self-test: whether a database passes, and what is wrong where it does not.
 
 A rate of some hundred frames is known to a few per cent, so that an interval is judged and not
 the rate itself: with another seed a database that is good enough must not fail.

@@ -105,9 +105,14 @@ def build(
     """Build an artifact."""
     final = output / f"{spec.name}-{spec.version}"
     clock = Stopwatch()
+
+    def check_cost(cost: Cost) -> None:
+        if announce is not None:
+            announce(cost)
+        check_memory(cost, spec, max_memory_bytes)
+
     with whole_folder(final) as partial:
-        plan = _Plan(spec, inputs, workers, announce, max_memory_bytes)
-        made = _make(partial, plan, clock, progress)
+        made = _make(partial, spec, inputs, workers, check_cost, clock, progress)
         progress("verify", 0, None)
         check_artifact(partial)
         try:
@@ -120,19 +125,16 @@ def build(
     return changed(made, folder=final, outcome=outcome, times_s=clock.times_s)
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """What was asked for."""
-
-    spec: BuildSpec
-    inputs: Inputs
-    workers: int
-    announce: Callable[[Cost], None] | None
-    max_memory_bytes: int | None
-
-
-def _make(partial: Path, plan: _Plan, clock: Stopwatch, progress: Progress) -> Built:
-    spec, inputs, workers = plan.spec, plan.inputs, plan.workers
+def _make(
+    partial: Path,
+    spec: BuildSpec,
+    inputs: Inputs,
+    workers: int,
+    check_cost: Callable[[Cost], None],
+    clock: Stopwatch,
+    progress: Progress,
+) -> Built:
+    """Go through all stages up to the manifest, in a folder that has no name yet."""
     catalog, amplitudes = read_sources(spec, inputs, workers, progress)
     motions = join_motions(catalog, spec, inputs, workers, progress)
     catalog = motions.catalog
@@ -140,10 +142,7 @@ def _make(partial: Path, plan: _Plan, clock: Stopwatch, progress: Progress) -> B
     clock.lap("read")
     selected, fields = select_stars(stars, spec)
     moved = motion_product(motions, selected.guide_stars)
-    cost = estimate_cost(catalog, selected, fields, spec, moved)
-    if plan.announce is not None:
-        plan.announce(cost)
-    check_memory(cost, spec, plan.max_memory_bytes)
+    check_cost(estimate_cost(catalog, selected, fields, spec, moved))
     clock.lap("select")
     products = make_products(spec, catalog, selected, fields, progress)
     products += moved

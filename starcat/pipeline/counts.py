@@ -156,7 +156,10 @@ def _distinct(around: Array, share: Array) -> float:
 
 
 def count_triangles(fields: FieldStars, stars: int, brightest: int) -> tuple[float, float]:
-    """Return the triangles of all fields, and about how many of them are distinct."""
+    """Return the triangles of all fields, and about how many of them are distinct.
+
+    One that t fields have is counted t times, so the distinct ones are all times the mean of 1/t.
+    """
     offsets, star = fields.brightest(brightest)
     size = np.diff(offsets)
     each = size * (size - 1) * (size - 2) // 6

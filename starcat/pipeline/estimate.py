@@ -68,7 +68,7 @@ class Choice:
 
 
 def choose_stars(read: CatalogSnapshot, spec: BuildSpec) -> Choice:
-    """Choose the guide stars of a spec, as its build does."""
+    """Choose the guide stars of a spec, as its build does; a field may have too few of them."""
     order, mag = read.by_brightness
     bright = np.sort(order[: np.searchsorted(mag, _faintest(spec.selection), side="right")])
     stars = read.stars.take(pa.array(bright)).combine_chunks()

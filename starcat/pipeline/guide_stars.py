@@ -48,7 +48,7 @@ def thinned_stars(stars: pa.Table, spec: BuildSpec) -> Selected:
 
 
 def brightest_of_fields(guide_stars: pa.Table, spec: BuildSpec, most: int) -> NDArray[np.int64]:
-    """Return the stars that are among the brightest of some field of the tiling.
+    """Return the rows of stars that are among the brightest of some field, ascending.
 
     Notes
     -----

@@ -35,9 +35,7 @@ from starcat.query.messages import (
     Views,
 )
 
-OPENING_S = 60.0
-"""How long a process may take until it has opened the targets, seconds."""
-
+OPENING_S = 60.0  # how long a process may take until it has opened the targets, seconds
 _PROGRAM = "import sys; sys.path[:] = sys.argv[1:]; from starcat.query.worker import serve; serve()"
 
 

@@ -21,9 +21,7 @@ from starcat.errors import QueryError, suggest
 
 FOLDER = Path(__file__).parent / "sql"
 
-FIRST = ("cosd", "sind", "separation")
-"""Macros that others use, in the order to make them."""
-
+FIRST = ("cosd", "sind", "separation")  # macros that others use, in the order to make them
 _VALUE = re.compile(r"-- (\w+) = (.+?): (.+)")
 _TARGETS = re.compile(r"-- Targets: (\d+)")
 

@@ -9,24 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-PROGRESS = "progress"
-"""A percentage; more replies follow."""
-
-PART = "part"
-"""A part of the answer; more replies follow."""
-
-DONE = "done"
-"""The answer, or the last part of it."""
-
-REFUSED = "refused"
-"""Words: the query cannot be answered."""
-
-SHORT = "short"
-"""Words: memory or disk ran out."""
-
-BROKEN = "broken"
-"""Words: DuckDB failed, and should answer nothing more."""
-
+PROGRESS = "progress"  # a percentage; more replies follow
+PART = "part"  # a part of the answer; more replies follow
+DONE = "done"  # the answer, or the last part of it
+REFUSED = "refused"  # a message: the query cannot be answered
+SHORT = "short"  # a message: memory or disk ran out
+BROKEN = "broken"  # a message: DuckDB failed, and should answer nothing more
 ENDINGS = {DONE, REFUSED, SHORT, BROKEN}
 
 

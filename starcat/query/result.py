@@ -28,15 +28,9 @@ if TYPE_CHECKING:
 
     from starcat.query.targets import View
 
-SHOWN_ROWS = 20
-"""Rows that a notebook shows."""
-
-SHOWN_ITEMS = 6
-"""Items of a list that a cell shows."""
-
-LARGEST_WHOLE = 2**53 - 1
-"""The largest whole number that every reader of JSON keeps."""
-
+SHOWN_ROWS = 20  # rows that a notebook shows
+SHOWN_ITEMS = 6  # items of a list that a cell shows
+LARGEST_WHOLE = 2**53 - 1  # the largest whole number that every reader of JSON keeps
 _NUMERIC = re.compile(r"[UH]*(TINY|SMALL|BIG|HUGE)?INT|DOUBLE|FLOAT|DECIMAL")
 
 UNIT_SUFFIXES = {

@@ -25,12 +25,8 @@ from starcat.query.result import Facts, RunningQuery, column_facts, facts_by_nam
 from starcat.query.spatial_macros import place_macros, place_statements, places_schema, reading
 from starcat.query.targets import Target, View, open_targets
 
-PREAMBLE_GB = 1.0
-"""Memory for looking into the footers of Parquet files."""
-
-MAX_COLUMNS = 100_000
-"""How many columns a DESCRIBE tells of at most."""
-
+PREAMBLE_GB = 1.0  # memory for looking into the footers of Parquet files
+MAX_COLUMNS = 100_000  # how many columns a DESCRIBE tells of at most
 MAX_CHECKED = 200
 """Queries that are remembered as checked; those that were asked longest ago are forgotten."""
 

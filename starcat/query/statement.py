@@ -19,9 +19,7 @@ from duckdb import DuckDBPyConnection, StatementType
 from starcat.errors import QueryError
 from starcat.query.messages import Statement
 
-POINTED_CHARACTERS = 200
-"""How much of a line with an error is shown."""
-
+POINTED_CHARACTERS = 200  # how much of a line with an error is shown
 READING_NODES = {"SELECT_NODE", "SET_OPERATION_NODE", "RECURSIVE_CTE_NODE", "CTE_NODE"}
 """Nodes of DuckDB's syntax tree that read; COPY_QUERY_NODE and the like write."""
 

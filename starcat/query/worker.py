@@ -42,15 +42,9 @@ if TYPE_CHECKING:
 BATCH_ROWS = 1 << 16
 ROWS_AT_ONCE = 1 << 12
 
-WATCH_S = 0.2
-"""How often a running query is looked at."""
-
-NESTED_CALLS = 10_000
-"""How deep a syntax tree may be for Python to read it."""
-
-BESIDE_BYTES = 512 << 20
-"""What Python, Arrow and the stacks of threads may take beside DuckDB."""
-
+WATCH_S = 0.2  # how often a running query is looked at
+NESTED_CALLS = 10_000  # how deep a syntax tree may be for Python to read it
+BESIDE_BYTES = 512 << 20  # what Python, Arrow and the stacks of threads may take beside DuckDB
 SCHEMA_KEY = "starcat.schema"
 
 _ZONED = re.compile(r"TIMESTAMP\w* WITH TIME ZONE")

@@ -19,7 +19,9 @@ from starcat.storage.digests import json_bytes
 
 
 def count_magnitudes(guide_star_mag: Array, rejected_mag: Array) -> dict[str, list[Any]]:
-    """Count guide stars and rejected stars by magnitude.
+    """Count guide stars and rejected stars by magnitude; NaN is left out.
+
+    Bins are half a magnitude wide, none between is left out, and ``to_mag`` belongs to its bin.
 
     Examples
     --------

@@ -21,7 +21,7 @@ GALACTIC_POLE_DEG = (192.85948, 27.12825)
 
 
 def project(ra_deg: ArrayLike, dec_deg: ArrayLike) -> tuple[Array, Array]:
-    """Return the place of positions on the map.
+    """Return x and y of positions on the map, in which right ascension grows to the left.
 
     Examples
     --------
@@ -47,7 +47,10 @@ def _auxiliary(dec: Array) -> Array:
 
 
 def nearest_raster(boresights: Array, values: NDArray[np.int64], width: int) -> Array:
-    """Return the map as a raster of the value at the nearest boresight."""
+    """Return the map as a raster of the value at the nearest boresight.
+
+    Shape (width // 2, width), north at the top; NaN outside of the ellipse.
+    """
     height = width // 2
     x = ((np.arange(width) + 0.5) / width * 2.0 - 1.0) * HALF_WIDTH
     y = (1.0 - (np.arange(height) + 0.5) / height * 2.0) * HALF_HEIGHT
@@ -64,7 +67,7 @@ def nearest_raster(boresights: Array, values: NDArray[np.int64], width: int) -> 
 
 
 def galactic_equator(count: int = 721) -> tuple[Array, Array]:
-    """Return positions along the middle of the Milky Way."""
+    """Return ra_deg and dec_deg along the galactic equator, the first again at the end."""
     pole = directions_from_radec(*GALACTIC_POLE_DEG)
     ascending = np.cross([0.0, 0.0, 1.0], pole)
     ascending /= np.linalg.norm(ascending)

@@ -32,18 +32,10 @@ class Role(IntEnum):
 
 @dataclass(frozen=True)
 class Principal:
-    """Who asks.
+    """Who asks."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the token; ``anonymous`` without one.
-    role : Role
-        What they may do.
-    """
-
-    name: str
-    role: Role
+    name: str  # name of the token; ``anonymous`` without one
+    role: Role  # what they may do
 
 
 def principal_of(request: Request) -> Principal:

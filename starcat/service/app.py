@@ -23,17 +23,12 @@ from starcat.service.api import (
 from starcat.service.jobs.slots import JobSlots
 from starcat.service.pages.rendering import add_missing_page
 from starcat.service.problems import REFUSALS, add_problem_handlers
-from starcat.service.security import health, signing
-from starcat.service.security.auth import Who
-from starcat.service.security.bodies import Bodies
-from starcat.service.security.headers import SafeHeaders
-from starcat.service.security.identities import Identities
-from starcat.service.security.logs import Defects, RequestLog
-from starcat.service.security.metrics import Counted, Metrics
-from starcat.service.security.origin import Origin
-from starcat.service.security.request_id import RequestId
-from starcat.service.security.request_limits import Shape
-from starcat.service.security.retention import keep_removing
+from starcat.service.removal import keep_removing
+from starcat.service.security import metrics, signing
+from starcat.service.security.auth import Authentication, Identities
+from starcat.service.security.middleware import Defects, Refusals, RequestContext, SafeHeaders
+from starcat.service.security.origin import Origins
+from starcat.service.security.request_limits import BodyLimits, check_shape
 from starcat.service.service import Service
 from starcat.service.settings import Settings
 from starcat.service.vo import cone_search, tap, tap_async
@@ -54,7 +49,7 @@ RESOURCES: tuple[APIRouter, ...] = (
 
 OTHERS: tuple[APIRouter, ...] = (
     releases.registry_router,
-    health.router,
+    metrics.router,
     signing.router,
     cone_search.router,
     tap.router,
@@ -67,7 +62,8 @@ OTHERS: tuple[APIRouter, ...] = (
 def make_app(settings: Settings) -> FastAPI:
     """Make the application."""
     service = Service(settings)
-    metrics, identities = Metrics(service), Identities(service)
+    figures, identities = metrics.Metrics(service), Identities(service.records, settings)
+    checks = (check_shape, Origins(settings).check, Authentication(settings, identities).check)
     app = FastAPI(
         title="starcat",
         version=__version__,
@@ -77,18 +73,13 @@ def make_app(settings: Settings) -> FastAPI:
         docs_url=None,
         redoc_url=None,
         middleware=[  # what a request passes, from the outside to the inside
-            Middleware(RequestId),
-            Middleware(RequestLog),
-            Middleware(Counted, metrics=metrics),
+            Middleware(RequestContext, metrics=figures),
             Middleware(SafeHeaders, settings=settings),
-            Middleware(Shape),
-            Middleware(Origin, settings=settings),
-            Middleware(Who, settings=settings, identities=identities),
-            Middleware(Bodies, settings=settings),
+            Middleware(Refusals, checks=checks, limits=BodyLimits(settings)),
             Middleware(Defects),
         ],
     )
-    app.state.service, app.state.metrics, app.state.identities = service, metrics, identities
+    app.state.service, app.state.metrics, app.state.identities = service, figures, identities
     app.state.slots = JobSlots(service)
     add_problem_handlers(app)
     add_missing_page(app)

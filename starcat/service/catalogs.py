@@ -34,7 +34,7 @@ from starcat.version import __version__
 T = TypeVar("T")
 
 WAIT_S = 25.0
-"""Seconds that a request waits for a catalog to be read, or for its turn."""
+"""Seconds that a request waits for a catalog to be read, or for a free slot."""
 
 RETRY_S = 5
 """Seconds after which to ask again."""
@@ -87,7 +87,7 @@ class Catalogs:
         self._estimates: LRUCache[Any, Estimate] = LRUCache(
             ESTIMATE_BYTES, lambda found: found.fields.nbytes
         )
-        self._turns = threading.Semaphore(AT_ONCE)
+        self._slots = threading.Semaphore(AT_ONCE)
         self._lock = threading.RLock()
         self._underway: dict[str, Future[CatalogSnapshot]] = {}
         # One at a time: a catalog takes memory.
@@ -110,7 +110,7 @@ class Catalogs:
         found = self._cached(self._estimates, whole)
         if found is None:
             read = self.read(spec, key)
-            with self._turn():
+            with self._slot():
                 choice = self._choice(read, key, spec)
                 found = estimate(read, choice, spec, self._max_memory_bytes)
             self._cache(self._estimates, whole, found)
@@ -126,7 +126,7 @@ class Catalogs:
         """Return a first spec for a camera, from the embedded sky."""
         # The default preset reads what a first spec is made from.
         sky = self.read(preset(preset_names()[0])).stars
-        with self._turn():
+        with self._slot():
             return starter_spec(
                 name,
                 camera,
@@ -194,13 +194,13 @@ class Catalogs:
         return found
 
     @contextmanager
-    def _turn(self) -> Iterator[None]:
-        if not self._turns.acquire(timeout=self._wait_s):
+    def _slot(self) -> Iterator[None]:
+        if not self._slots.acquire(timeout=self._wait_s):
             raise _busy("too many estimates are being made", 1)
         try:
             yield
         finally:
-            self._turns.release()
+            self._slots.release()
 
     @staticmethod
     def _key(spec: BuildSpec) -> str:

@@ -11,26 +11,16 @@ from starcat.service.records import Records
 
 @dataclass(frozen=True)
 class Publication:
-    """That a release was published.
+    """That a release was published."""
 
-    Attributes
-    ----------
-    name, version : str
-        Which release.
-    database : str
-        Id of the database that it was.
-    note, owner : str
-        What was said about it, and who published it.
-    published_s : float
-        Seconds since 1970.
-    """
-
+    # name, version: which release
     name: str
     version: str
-    database: str
+    database: str  # id of the database that it was
+    # note, owner: what was said about it, and who published it
     note: str
     owner: str
-    published_s: float
+    published_s: float  # seconds since 1970
 
 
 class Publications:

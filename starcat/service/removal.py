@@ -1,17 +1,33 @@
-"""Removing a database."""
+"""What is removed: databases by people; jobs, results, uploads and sign-ins when they are old.
+
+Databases and releases stay until somebody removes them, and so does every file that this module
+has no rule for.
+"""
 
 from __future__ import annotations
 
+import asyncio
+import logging
 import secrets
 import shutil
+import time
+from dataclasses import dataclass
+from pathlib import Path
 
-from starcat.service.jobs.job import State
+from starcat.service.jobs.job import ENDED, QUERY, State
 from starcat.service.paths import DATABASE_ID, checked
 from starcat.service.problems import Problem
+from starcat.service.security.login_sessions import SessionStore
+from starcat.service.security.tokens import DAY_S
 from starcat.service.service import Service
 
 ACTIVE: tuple[State, ...] = ("queued", "running")
 ALL_JOBS = 1 << 31
+
+EVERY_S = 3600.0
+SCRATCH_DAYS = 1.0
+
+_logger = logging.getLogger(__name__)
 
 
 def remove_database(service: Service, database_id: str) -> None:
@@ -30,3 +46,63 @@ def remove_database(service: Service, database_id: str) -> None:
     service.paths.database(database_id).rename(gone)
     service.query_pool.forget(database.folder)
     shutil.rmtree(gone, ignore_errors=True)
+
+
+@dataclass(frozen=True)
+class Removed:
+    """How many of each were removed."""
+
+    jobs: int
+    results: int
+    scratch: int
+    sessions: int
+
+
+def remove_old(service: Service, now_s: float) -> Removed:
+    """Remove what is older than the settings say."""
+    settings, paths = service.settings, service.paths
+    removed = Removed(
+        _remove_jobs(service, now_s - settings.keep_jobs_days * DAY_S),
+        _remove_entries(paths.results, now_s - settings.keep_results_days * DAY_S),
+        _remove_entries(paths.scratch, now_s - SCRATCH_DAYS * DAY_S),
+        SessionStore(service.records, settings.session_hours).forget_expired(),
+    )
+    if removed != Removed(0, 0, 0, 0):
+        _logger.info("removed what is old", extra={"facts": {"removed": vars(removed)}})
+    return removed
+
+
+async def keep_removing(service: Service) -> None:
+    """Remove what is old now and every hour, until it is cancelled."""
+    while True:
+        try:
+            await asyncio.to_thread(remove_old, service, time.time())
+        except Exception:
+            _logger.exception("what is old could not be removed")
+        await asyncio.sleep(EVERY_S)
+
+
+def _remove_jobs(service: Service, before_s: float) -> int:
+    marks = ", ".join("?" for _ in ENDED)
+    with service.records.writing() as connection:
+        rows = connection.execute(
+            f"DELETE FROM jobs WHERE state IN ({marks}) AND ended_s < ? AND kind != ? RETURNING id",
+            (*ENDED, before_s, QUERY),
+        ).fetchall()
+    for row in rows:
+        shutil.rmtree(service.paths.job(row["id"]), ignore_errors=True)
+    return len(rows)
+
+
+def _remove_entries(folder: Path, before_s: float) -> int:
+    """Remove what lies in a folder and has not changed since."""
+    removed = 0
+    for path in folder.iterdir():
+        if path.lstat().st_mtime >= before_s:
+            continue
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+        removed += 1
+    return removed

@@ -39,7 +39,26 @@ Changes = Mapping[str, str]
 
 
 def read_spec(path: PathLike, changes: Changes | None = None) -> BuildSpec:
-    """Read a build spec from a TOML file."""
+    """Read a build spec from a TOML file.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+    changes : mapping of str to str, optional
+        Values by dotted key that take the place of the file's, as TOML writes them. A text that
+        is no TOML value is itself the value; an empty one removes the key.
+
+    Returns
+    -------
+    BuildSpec
+        Checked.
+
+    Raises
+    ------
+    ConfigError
+        If the file is missing or not TOML, or a key is unknown, missing or out of range.
+    """
     path = Path(path)
     try:
         text = path.read_text(encoding="utf-8")
@@ -113,7 +132,7 @@ def spec_from_dict(content: dict[str, Any], origin: str) -> BuildSpec:
 
 
 def what_is_wrong(error: ValidationError, origin: str) -> ConfigError:
-    """Return what to tell somebody whose spec, or part of one, was refused."""
+    """Return the error about the first wrong key; a misspelt one first, since it is missing too."""
     wrong = sorted(error.errors(), key=lambda entry: entry["type"] != "extra_forbidden")
     first = wrong[0]
     key = ".".join(_shown_key(str(part)) for part in first["loc"]) or "spec"
@@ -158,7 +177,25 @@ def preset_names() -> tuple[str, ...]:
 
 
 def preset(name: str, changes: Changes | None = None) -> BuildSpec:
-    """Return a preset."""
+    """Return a preset.
+
+    Parameters
+    ----------
+    name : str
+        As ``starcat presets`` lists them.
+    changes : mapping of str to str, optional
+        As for `read_spec`.
+
+    Returns
+    -------
+    BuildSpec
+        Checked.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such preset, or a change is no value of its key.
+    """
     if name not in preset_names():
         hint = suggest(name, preset_names())
         raise ConfigError(

@@ -38,9 +38,7 @@ from starcat.vo.adql_terms import (
     times,
 )
 
-MARGIN_DEG = 1e-9
-"""By how much the band of declinations is wider that is looked at first."""
-
+MARGIN_DEG = 1e-9  # by how much the band of declinations is wider that is looked at first
 SQUARE_DEGREES = (180.0 / math.pi) ** 2
 
 

@@ -19,12 +19,8 @@ from sqlglot.tokenizer_core import TokenType
 
 from starcat.errors import QueryError, quoted
 
-MAX_CHARACTERS = 50_000
-"""Length of the longest query that is read."""
-
-POINTED_CHARACTERS = 160
-"""How much of a line with an error is shown."""
-
+MAX_CHARACTERS = 50_000  # length of the longest query that is read
+POINTED_CHARACTERS = 160  # how much of a line with an error is shown
 _WORDS = {
     "ALL": TokenType.ALL, "AND": TokenType.AND, "AS": TokenType.ALIAS, "ASC": TokenType.ASC,
     "BETWEEN": TokenType.BETWEEN, "CROSS": TokenType.CROSS, "DESC": TokenType.DESC,

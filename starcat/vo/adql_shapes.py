@@ -14,9 +14,7 @@ from starcat.vo import adql_geometry as geometry
 from starcat.vo.adql_geometry import Circle, Point, Polygon, Shape
 from starcat.vo.adql_grammar import refuse
 
-MAX_CORNERS = 400
-"""Corners of a polygon at most."""
-
+MAX_CORNERS = 400  # corners of a polygon at most
 MAX_CHARACTERS = 1_000_000
 """Length of the arithmetic that the geometry of a query may become, roughly."""
 
@@ -264,8 +262,7 @@ _MEASURES: dict[str, Callable[[GeometryCalls, exp.Anonymous], None]] = {
     "COORDSYS": GeometryCalls._frame,
 }
 
-GEOMETRY = (*_SHAPES, *_MEASURES)
-"""The functions of geometry that there are."""
+GEOMETRY = (*_SHAPES, *_MEASURES)  # the functions of geometry that there are
 
 
 def _operand(part: exp.Expr) -> str:

@@ -6,9 +6,7 @@ import math
 import operator
 from collections.abc import Callable, Iterable
 
-Term = float | str
-"""A number, or SQL that gives one."""
-
+Term = float | str  # a number, or SQL that gives one
 Vector = tuple[Term, Term, Term]
 
 _COMPARISONS: dict[str, Callable[[float, float], bool]] = {

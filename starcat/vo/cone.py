@@ -28,12 +28,10 @@ SEPARATION = "separation_deg"
 MEDIA_TYPE = "text/xml;content=x-votable"
 """What errors and, where no format is asked for, answers are sent as."""
 
-NAMES = ("designation", "star_id")
-"""Columns that tell a star from others, the best first."""
+NAMES = ("designation", "star_id")  # columns that tell a star from others, the best first
 
 _ID, _RA, _DEC = "ID_MAIN", "POS_EQ_RA_MAIN", "POS_EQ_DEC_MAIN"
-_BESIDE = ("band",)
-"""Columns without a UCD that belong to one that has it."""
+_BESIDE = ("band",)  # columns without a UCD that belong to one that has it
 
 _BRIEF, _USUAL, _ALL = 1, 2, 3
 _RANGES = {"RA": (0.0, 360.0), "DEC": (-90.0, 90.0), "SR": (0.0, 180.0)}

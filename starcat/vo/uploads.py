@@ -23,9 +23,7 @@ from starcat.vo.tap_schema import UPLOADS
 
 MAX_COLUMNS = 1000
 
-MAX_UNPACKED = 16
-"""How many times its own size an upload may take in memory."""
-
+MAX_UNPACKED = 16  # how many times its own size an upload may take in memory
 LEAST_UNPACKED_BYTES = 64 << 20
 
 _READ_BYTES = 1 << 20

@@ -32,8 +32,7 @@ from vo_models.voresource.types import UTCTimestamp
 
 _NOT_XML = re.compile("[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
-ACTIVE = ("PENDING", "QUEUED", "EXECUTING")
-"""Phases that a job leaves again."""
+ACTIVE = ("PENDING", "QUEUED", "EXECUTING")  # phases that a job leaves again
 
 
 @dataclass(frozen=True)

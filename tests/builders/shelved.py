@@ -1,12 +1,18 @@
-"""An artifact put onto the shelf of a service, as a job does that built it."""
+"""Services in the process of a test, and the databases that they have."""
 
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from fastapi.testclient import TestClient
+
+from starcat.service.app import make_app
 from starcat.service.jobs.job_states import add_once
+from starcat.service.settings import Settings
 
 if TYPE_CHECKING:
     from starcat.service.jobs.job import Job
@@ -15,23 +21,19 @@ if TYPE_CHECKING:
 DATABASE = "0123456789abcdef"
 
 
+LOCAL = "http://127.0.0.1:8000"
+
+
+@contextmanager
+def client_of(root: Path, address: str = LOCAL, **settings: Any) -> Iterator[TestClient]:
+    """Run a service without workers, and give a client of it."""
+    app = make_app(Settings(root=root, workers=0, **settings))
+    with TestClient(app, base_url=address) as client:
+        yield client
+
+
 def shelve(root: Path, artifact: Path, database: str = DATABASE) -> Path:
-    """Copy an artifact onto the shelf.
-
-    Parameters
-    ----------
-    root : Path
-        Folder of the service.
-    artifact : Path
-        Folder of the artifact.
-    database : str
-        Sixteen hexadecimal digits.
-
-    Returns
-    -------
-    Path
-        Its folder on the shelf.
-    """
+    """Copy an artifact into the folder of a service; return where it is."""
     folder = root / "databases" / database / artifact.name
     shutil.copytree(artifact, folder, copy_function=shutil.copyfile)
     return folder

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 from starcat.evaluation.experiment import Attitudes, Experiment
-from starcat.evaluation.paper import Paper, Row, Statistic, tolerance_for
+from starcat.evaluation.paper import Paper, Row, tolerance_for
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.simulation.simulate import Noise
@@ -174,18 +173,12 @@ def _distorted(grid: Attitudes, fewer: Attitudes) -> list[Row]:
     return made
 
 
-def statistics(artifacts: dict[str, Path], quick: bool) -> list[Statistic]:
-    """Return S2's numbers that need no experiment: there are none."""
-    return []
-
-
 PAPER = Paper(
     name="S2",
     title="Dynamic-angle matching",
     citation="Sun et al. 2021, Acta Optica Sinica",
     presets=(PRESET,),
     rows=rows,
-    statistics=statistics,
     deviations=(
         "Images show the whole catalog up to the limit: doubles that the camera cannot split as "
         "one spot, variables, and with magnitude noise also stars below the limit. The paper "

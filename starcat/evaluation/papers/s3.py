@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,10 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array
 from starcat.evaluation.experiment import catalog_of_artifact
-from starcat.evaluation.paper import Paper, Row, Statistic
+from starcat.evaluation.paper import Paper, Statistic
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
-from starcat.matcher.methods.triangle_order import is_well_shaped, optimised_triangle
+from starcat.matcher.methods.order import is_well_shaped
 
 PRESET = "sao-12deg-512"
 
@@ -48,7 +49,7 @@ def field_centroids(artifact: Path, step_deg: float) -> list[Array]:
 
 
 def passes(centroids_px: Array, triples: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Return which triangles of centroids meet S3's two constraints."""
+    """Return which triangles (rows of centroids, shape (T, 3)) meet S3's two constraints."""
     u, v, w = (centroids_px[triples[:, n]] for n in range(3))
     a, b, c = (np.hypot(*(p - q).T) for p, q in ((v, w), (u, w), (u, v)))
     return is_well_shaped(a, b, c, MIN_SIDE_PX, float(np.radians(MIN_ANGLE_DEG)))
@@ -96,13 +97,53 @@ def _usable(centroids_px: Array, choice: tuple[int, int, int]) -> bool:
     return bool(passes(centroids_px, np.array([choice]))[0])
 
 
+def optimised_triangle(
+    separation_px: Array, min_side_px: float, min_angle_rad: float
+) -> tuple[int, int, int] | None:
+    """Return S3's triangle: the brightest stars that are neither a double nor in a line.
+
+    Distances between the centroids, shape (N, N), are brightest first, and both limits, S3's d_min
+    and theta_min, have to be exceeded. Rows ascend; None if no triangle passes.
+
+    Notes
+    -----
+    Start from stars N, N + 1, N + 2. Where a side is too short, its fainter star is dropped,
+    where an angle is too narrow, the faintest of the three; the next star takes its place.
+    When the stars run out, N moves on by one.
+
+    References
+    ----------
+    Li et al. 2015 (S3), the flow chart's 13 steps.
+    """
+    count = len(separation_px)
+    for start in range(count - 2):
+        chosen, following = [start, start + 1, start + 2], start + 3
+        while True:
+            dropped = _to_drop(separation_px, chosen, min_side_px, min_angle_rad)
+            if dropped is None:
+                i, j, k = chosen
+                return i, j, k
+            if following >= count:
+                break
+            chosen = [*(star for star in chosen if star != dropped), following]
+            following += 1
+    return None
+
+
+def _to_drop(
+    separation_px: Array, chosen: list[int], min_side_px: float, min_angle_rad: float
+) -> int | None:
+    for i, j in combinations(chosen, 2):
+        if separation_px[i, j] <= min_side_px:
+            return j
+    i, j, k = chosen
+    a, b, c = separation_px[[j, i, i], [k, k, j]].reshape(3, 1)
+    return None if is_well_shaped(a, b, c, min_side_px, min_angle_rad)[0] else k
+
+
 def _optimised(centroids_px: Array) -> tuple[int, int, int] | None:
     apart = np.hypot(*(centroids_px[:, None] - centroids_px[None, :]).transpose(2, 0, 1))
     return optimised_triangle(apart, MIN_SIDE_PX, float(np.radians(MIN_ANGLE_DEG)))
-
-
-def _rows(quick: bool) -> list[Row]:
-    return []
 
 
 PAPER = Paper(
@@ -110,7 +151,6 @@ PAPER = Paper(
     title="Optimised selection of observation triangles",
     citation="Li et al. 2015, Journal of Astronautics",
     presets=(PRESET,),
-    rows=_rows,
     statistics=statistics,
     deviations=(
         "The paper does not print d_min and theta_min. 10 px and 15 deg reproduce its counts to "

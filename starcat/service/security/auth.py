@@ -5,20 +5,20 @@ from __future__ import annotations
 import base64
 import binascii
 import ipaddress
+import time
+from collections import OrderedDict
 from typing import Any
 from urllib.parse import quote
 
 from starlette.datastructures import Headers
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import Scope
 
 from starcat.service.access import Principal, Role
 from starcat.service.problems import Problem
-from starcat.service.security.buckets import Buckets
-from starcat.service.security.guard import Guard
-from starcat.service.security.identities import Identities
-from starcat.service.security.login_sessions import session_in
-from starcat.service.security.refusing import address_of, later, refuse
-from starcat.service.security.tokens import Token
+from starcat.service.records import Records
+from starcat.service.security.login_sessions import SessionStore, session_in
+from starcat.service.security.request_limits import Buckets, address_of, later
+from starcat.service.security.tokens import Token, TokenStore, digest_of
 from starcat.service.settings import Settings
 
 VOSI = ("/tap/availability", "/tap/capabilities")
@@ -32,28 +32,65 @@ CHALLENGED = ("/tap", "/scs", "/registry")
 
 BEARER, BASIC = 'Bearer realm="starcat"', 'Basic realm="starcat", charset="UTF-8"'
 
+KNOWN_S = 5.0
+"""Seconds that a secret is believed without looking it up; a revoked token ends within them."""
 
-class Who(Guard):
+MOST_KNOWN = 1_000
+
+GUESSES_PER_MINUTE = 10
+"""Wrong tokens of an address. Right ones are let through all the same: who guesses 256 bits does
+not succeed, and a colleague behind the same address is not to be locked out by a stale script."""
+
+
+class Identities:
+    """Who there is: tokens and sign-ins."""
+
+    def __init__(self, records: Records, settings: Settings) -> None:
+        self.tokens = TokenStore(records)
+        self.sessions = SessionStore(records, settings.session_hours)
+        self.guessed = Buckets(GUESSES_PER_MINUTE)
+        self._known: OrderedDict[str, tuple[Token, float]] = OrderedDict()
+
+    def of_token(self, text: str) -> Token | None:
+        """Return the token of a text; None where there is no valid one."""
+        return self._lookup(self.tokens, text)
+
+    def of_session(self, secret: str) -> Token | None:
+        """Return the token that a session was begun with; None where there is no valid one."""
+        return self._lookup(self.sessions, secret)
+
+    def sign_out(self, secret: str) -> None:
+        """End a session at once."""
+        self._known.pop(f"{SessionStore.__name__} {digest_of(secret)}", None)
+        self.sessions.close(secret)
+
+    def _lookup(self, store: TokenStore | SessionStore, secret: str) -> Token | None:
+        key, now_s = f"{type(store).__name__} {digest_of(secret)}", time.monotonic()
+        known = self._known.get(key)
+        if known is not None and known[1] > now_s:
+            return known[0]
+        # One look-up by an index in a file that is in memory: less than handing it to a thread.
+        token = store.find(secret)
+        if token is None:
+            self._known.pop(key, None)
+            return None
+        self._known[key] = token, now_s + KNOWN_S
+        if len(self._known) > MOST_KNOWN:
+            self._known.popitem(last=False)
+        return token
+
+
+class Authentication:
     """Finds the principal of each request, and refuses those who may not ask, or not so often."""
 
-    def __init__(self, app: ASGIApp, settings: Settings, identities: Identities) -> None:
-        super().__init__(app)
+    def __init__(self, settings: Settings, identities: Identities) -> None:
         self._settings = settings
         self._identities = identities
         self._anonymous = Principal("anonymous", Role.named(settings.anonymous_role))
         self._asked = Buckets(settings.requests_per_minute)
 
-    async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request."""
-        try:
-            principal = self._principal(scope)
-        except Problem as problem:
-            await refuse(scope, receive, send, problem)
-            return
-        scope.setdefault("state", {})["principal"] = principal
-        await self._app(scope, receive, send)
-
-    def _principal(self, scope: Scope) -> Principal:
+    def check(self, scope: Scope) -> None:
+        """Give a request its principal, or refuse it."""
         address = network_of(address_of(scope))
         found = self._found(Headers(scope=scope), address)
         path = scope["path"]
@@ -66,11 +103,10 @@ class Who(Guard):
                     "again later, and less often",
                     headers=later(wait_s),
                 )
-        if found is not None:
-            return Principal(found.name, found.role)
-        if self._anonymous.role == Role.NONE and not path.startswith(OPEN_PATHS):
+        principal = self._anonymous if found is None else Principal(found.name, found.role)
+        if principal.role == Role.NONE and not path.startswith(OPEN_PATHS):
             raise self._unknown(scope)
-        return self._anonymous
+        scope.setdefault("state", {})["principal"] = principal
 
     def _found(self, headers: Headers, address: str) -> Token | None:
         given = headers.get("authorization")

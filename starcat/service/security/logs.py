@@ -9,22 +9,21 @@ from __future__ import annotations
 import json
 import logging
 import sys
-import time
+from contextvars import ContextVar
 from datetime import UTC, datetime
 from typing import Any
 
-from starlette.types import Message, Receive, Scope, Send
+from starlette.types import Scope
 
-from starcat.service.problems import as_json
-from starcat.service.security.guard import Guard
-from starcat.service.security.refusing import address_of
-from starcat.service.security.request_id import request_id
+from starcat.service.security.request_limits import address_of
 
 MOST = 500
 """Characters of a path that are written."""
 
 QUIET = ("/healthz", "/readyz", "/metrics")
 """Paths that machines ask for all the time: logged only where they fail."""
+
+request_id: ContextVar[str | None] = ContextVar("request_id", default=None)
 
 _logger = logging.getLogger("starcat.service.requests")
 
@@ -65,28 +64,10 @@ def log_settings(level: str = "INFO") -> dict[str, Any]:
     }
 
 
-class RequestLog(Guard):
-    """Writes a line for each request when it has been answered."""
-
-    async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request."""
-        begun_s, status, sent = time.perf_counter(), 0, 0
-
-        async def send_counted(message: Message) -> None:
-            nonlocal status, sent
-            if message["type"] == "http.response.start":
-                status = message["status"]
-            sent += len(message.get("body", b""))
-            await send(message)
-
-        try:
-            await self._app(scope, receive, send_counted)
-        finally:
-            if status >= 500 or scope["path"] not in QUIET:
-                _write(scope, status, sent, time.perf_counter() - begun_s)
-
-
-def _write(scope: Scope, status: int, sent: int, taken_s: float) -> None:
+def log_request(scope: Scope, status: int, sent: int, taken_s: float) -> None:
+    """Write the line of a request that has been answered."""
+    if status < 500 and scope["path"] in QUIET:
+        return
     principal = scope.get("state", {}).get("principal")
     facts = {
         "method": scope["method"][:20],
@@ -99,24 +80,3 @@ def _write(scope: Scope, status: int, sent: int, taken_s: float) -> None:
     }
     level = logging.ERROR if status >= 500 else logging.INFO
     _logger.log(level, "request", extra={"facts": facts})
-
-
-class Defects(Guard):
-    """Answers what no handler foresaw: the log gets the traceback, the client gets none."""
-
-    async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request."""
-        is_begun = False
-
-        async def send_noted(message: Message) -> None:
-            nonlocal is_begun
-            is_begun = True
-            await send(message)
-
-        try:
-            await self._app(scope, receive, send_noted)
-        except Exception as error:
-            _logger.exception("a defect of starcat: %s %s", scope["method"], scope["path"][:MOST])
-            if is_begun:
-                raise  # the server ends the connection, so that the client sees it is not whole
-            await as_json(error)(scope, receive, send)

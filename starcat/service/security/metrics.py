@@ -1,20 +1,33 @@
-"""Figures for Prometheus: requests, jobs, sign-ins, disk; in a registry of this service alone."""
+"""Whether the service lives, whether it can work, and its figures for Prometheus."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
+import sqlite3
+from collections.abc import Callable, Iterator
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+from fastapi import APIRouter, Request
+from fastapi.responses import JSONResponse, Response
+from prometheus_client import (
+    CONTENT_TYPE_PLAIN_0_0_4,
+    CollectorRegistry,
+    Counter,
+    Gauge,
+    Histogram,
+    generate_latest,
+)
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from pydantic import BaseModel, Field
+from starlette.types import Scope
 
-from starcat.service.security.bodies import GIB, free_gib
-from starcat.service.security.guard import Guard
+from starcat.service.access import Reader
+from starcat.service.jobs.slots import JobSlots
 from starcat.service.security.login_sessions import SessionStore
-from starcat.service.service import Service
+from starcat.service.security.request_limits import GIB, free_gib
+from starcat.service.service import Service, TheService
 from starcat.version import __version__
+
+router = APIRouter(tags=["operations"])
 
 BUCKETS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0)
 
@@ -47,6 +60,14 @@ class Metrics:
         )
         self.registry.register(_State(service))
 
+    def count(self, scope: Scope, status: int, taken_s: float | None) -> None:
+        """Count a request; streams of events, None, have no time."""
+        route = route_of(scope)
+        method = scope["method"] if scope["method"].isalpha() else "OTHER"
+        self.requests.labels(method[:10], route, str(status)).inc()
+        if taken_s is not None:
+            self.seconds.labels(route).observe(taken_s)
+
     def text(self) -> bytes:
         """Return all figures in the text format of Prometheus."""
         return generate_latest(self.registry)
@@ -69,7 +90,9 @@ class _State(Collector):
         jobs = GaugeMetricFamily("starcat_jobs", "Jobs that are remembered.", labels=["state"])
         with service.records.reading() as connection:
             counts = dict(
-                connection.execute("SELECT state, count(*) FROM jobs GROUP BY state").fetchall()
+                connection.execute(
+                    "SELECT state, count(*) FROM jobs WHERE kind != 'query' GROUP BY state"
+                ).fetchall()
             )
         for state in STATES:
             jobs.add_metric([state], counts.get(state, 0))
@@ -87,39 +110,6 @@ class _State(Collector):
         yield build
 
 
-class Counted(Guard):
-    """Counts requests and their time, by the route that answered."""
-
-    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
-        super().__init__(app)
-        self._metrics = metrics
-
-    async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request."""
-        begun_s, status, is_endless = time.perf_counter(), 0, False
-
-        async def send_noted(message: Message) -> None:
-            nonlocal status, is_endless
-            if message["type"] == "http.response.start":
-                status = message["status"]
-                is_endless = any(
-                    name == b"content-type" and value.startswith(b"text/event-stream")
-                    for name, value in message.get("headers", [])
-                )
-            await send(message)
-
-        self._metrics.running.inc()
-        try:
-            await self._app(scope, receive, send_noted)
-        finally:
-            self._metrics.running.dec()
-            route = route_of(scope)
-            method = scope["method"] if scope["method"].isalpha() else "OTHER"
-            self._metrics.requests.labels(method[:10], route, str(status)).inc()
-            if not is_endless:
-                self._metrics.seconds.labels(route).observe(time.perf_counter() - begun_s)
-
-
 def route_of(scope: Scope) -> str:
     """Return the template of the address that answered, such as ``/api/v1/jobs/{job_id}``."""
     route = scope.get("route")
@@ -133,3 +123,63 @@ def route_of(scope: Scope) -> str:
         return str(template)
     path: str = scope["path"]
     return f"{path.removesuffix(within)}{template}" if path.endswith(within) else str(template)
+
+
+class Alive(BaseModel):
+    """The service answers."""
+
+    status: str = Field("alive", description="Always this.")
+
+
+class Readiness(BaseModel):
+    """Whether the service can do all of its work."""
+
+    ready: bool = Field(description="Whether nothing is wrong.")
+    reasons: list[str] = Field(description="What is wrong.")
+
+
+@router.get("/healthz", summary="Whether the service lives")
+def alive() -> Alive:
+    """Answer, which is all that this is for."""
+    return Alive(status="alive")
+
+
+@router.get(
+    "/readyz",
+    summary="Whether the service can work",
+    responses={503: {"model": Readiness, "description": "Something is wrong."}},
+)
+def ready(request: Request, service: TheService, who: Reader) -> Response:
+    """Look at the records, the disk and the slots of jobs."""
+    reasons = [reason for check in CHECKS if (reason := check(service)) is not None]
+    slots: JobSlots = request.app.state.slots
+    if not slots.is_alive:
+        reasons.append("a slot of jobs has ended; start the service again")
+    if slots.cluster is not None and slots.cluster.problem is not None:
+        reasons.append(f"jobs wait for the cluster: {slots.cluster.problem}")
+    content = Readiness(ready=not reasons, reasons=reasons)
+    return JSONResponse(content.model_dump(), 503 if reasons else 200)
+
+
+@router.get("/metrics", summary="Figures for Prometheus", response_class=Response)
+def figures(request: Request, who: Reader) -> Response:
+    """Return all figures as text."""
+    return Response(request.app.state.metrics.text(), media_type=CONTENT_TYPE_PLAIN_0_0_4)
+
+
+def _lack_of_records(service: Service) -> str | None:
+    try:
+        with service.records.writing() as connection:
+            connection.execute("SELECT 1")
+    except sqlite3.Error as error:
+        return f"the records cannot be written: {error}"
+    return None
+
+
+def _lack_of_disk(service: Service) -> str | None:
+    free, least = free_gib(service.settings.root), service.settings.free_gib
+    return None if free >= least else f"{free:.1f} GiB of disk are left, less than {least:g}"
+
+
+CHECKS: tuple[Callable[[Service], str | None], ...] = (_lack_of_records, _lack_of_disk)
+"""Each returns what is wrong, or None."""

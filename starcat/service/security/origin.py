@@ -12,36 +12,31 @@ import re
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import Scope
 
 from starcat.service.problems import Problem
-from starcat.service.security.guard import Guard
 from starcat.service.security.login_sessions import session_in
-from starcat.service.security.refusing import refuse
 from starcat.service.settings import Settings
 
 SAFE = ("GET", "HEAD", "OPTIONS")
 HOST = re.compile(r"(?P<name>\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9._-]{1,253})(:(?P<port>\d{1,5}))?")
 
 
-class Origin(Guard):
+class Origins:
     """Refuses requests to other names, and those that other sites have made a browser send."""
 
-    def __init__(self, app: ASGIApp, settings: Settings) -> None:
-        super().__init__(app)
+    def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._names = known_names(settings)
 
-    async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request."""
+    def check(self, scope: Scope) -> None:
+        """Refuse a request that is not meant for this service, or not meant by who sends it."""
         headers = Headers(scope=scope)
         problem = self._misdirected(headers)
         if problem is None and scope["method"] not in SAFE:
             problem = self._forged(headers, scope["scheme"])
         if problem is not None:
-            await refuse(scope, receive, send, problem)
-            return
-        await self._app(scope, receive, send)
+            raise problem
 
     def _misdirected(self, headers: Headers) -> Problem | None:
         hosts = headers.getlist("host")

@@ -8,10 +8,9 @@ from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
 
 from starcat.service.pages.home import own_path, sign_in_form
-from starcat.service.security.auth import network_of
-from starcat.service.security.identities import Identities
+from starcat.service.security.auth import Identities, network_of
 from starcat.service.security.login_sessions import cookie_name, session_in
-from starcat.service.security.refusing import address_of, later
+from starcat.service.security.request_limits import address_of, later
 from starcat.service.service import TheService
 
 router = APIRouter(include_in_schema=False)

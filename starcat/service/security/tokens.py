@@ -28,23 +28,13 @@ DAY_S = 86_400.0
 
 @dataclass(frozen=True)
 class Token:
-    """What is remembered of a token.
+    """What is remembered of a token."""
 
-    Attributes
-    ----------
-    id : str
-        Eight hexadecimal digits.
-    name : str
-        Of who has it.
-    role : Role
-        What they may do.
-    created_s, expires_s, revoked_s : float
-        Seconds since 1970; the last two None where it does not expire, or was not revoked.
-    """
-
-    id: str
-    name: str
-    role: Role
+    id: str  # eight hexadecimal digits
+    name: str  # of who has it
+    role: Role  # what they may do
+    # created_s, expires_s, revoked_s: seconds since 1970; the last two None where it does not
+    # expire, or was not revoked
     created_s: float
     expires_s: float | None
     revoked_s: float | None

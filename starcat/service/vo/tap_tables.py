@@ -26,18 +26,10 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class TapState:
-    """What there is to be asked.
+    """What there is to be asked."""
 
-    Attributes
-    ----------
-    targets : tuple of Path
-        What a session has to open, TAP_SCHEMA at the end.
-    tables : Tables
-        All tables, with TAP_SCHEMA.
-    """
-
-    targets: tuple[Path, ...]
-    tables: Tables
+    targets: tuple[Path, ...]  # what a session has to open, TAP_SCHEMA at the end
+    tables: Tables  # all tables, with TAP_SCHEMA
 
 
 class TapTables:

@@ -1,0 +1,293 @@
+"""The command that builds a database, and the tables of what was built."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from starcat.cli.catalogs import print_problems, record_rows
+from starcat.cli.console import print_json, print_table, progress_bars, say
+from starcat.cli.options import (
+    Changes,
+    Input,
+    Json,
+    PresetName,
+    SpecFile,
+    chosen_spec,
+    inputs_by_source,
+)
+from starcat.cli.remote import service_of
+from starcat.errors import BuildError
+
+if TYPE_CHECKING:
+    from starcat.artifact.reader import Artifact
+    from starcat.pipeline.build import Built
+    from starcat.pipeline.cost import Cost
+    from starcat.report.coverage_report import CoverageReport
+    from starcat.simulation.selftest import Rates
+    from starcat.specs.build_spec import BuildSpec
+
+app = typer.Typer()
+
+
+@app.command()
+def build(
+    context: typer.Context,
+    spec: SpecFile = None,
+    preset: PresetName = None,
+    changes: Changes = None,
+    inputs: Input = None,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder to put <name>-<version>/ into.")
+    ] = Path("dist"),
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Replace a different artifact of that name.")
+    ] = False,
+    workers: Annotated[
+        int, typer.Option(min=1, max=64, help="Threads; the artifact is the same for any number.")
+    ] = 2,
+    max_memory: Annotated[
+        float | None,
+        typer.Option(min=0.1, help="GiB; refuse a build that takes more. Default: what is left."),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Build a guide-star database, check it, and prove that it identifies its own fields.
+
+    Example: starcat build --preset gaia-12deg -o dist
+    """
+    if context.obj is not None:
+        _build_remotely(context, chosen_spec(spec, preset, changes), output, as_json=json)
+        return
+    from starcat.pipeline.build import Built
+    from starcat.pipeline.build import build as run_build
+
+    given, chosen = inputs_by_source(inputs), chosen_spec(spec, preset, changes)
+    most = None if max_memory is None else int(max_memory * 2**30)
+    try:
+        with progress_bars() as progress:
+            built = run_build(
+                chosen, given, output, replace=replace, workers=workers, progress=progress,
+                announce=print_cost, max_memory_bytes=most,
+            )  # fmt: skip
+    except BuildError as error:
+        if isinstance(error.built, Built):
+            print_refused(error.built, as_json=json)
+        raise
+    print_built(built, as_json=json)
+
+
+def _build_remotely(
+    context: typer.Context, spec: BuildSpec, output: Path, *, as_json: bool
+) -> None:
+    """Have a database built by a service, bring it here, and print what it holds."""
+    from starcat.artifact.reader import open_artifact
+    from starcat.simulation.selftest import rates_of
+
+    client = service_of(context)
+    with progress_bars() as progress:
+        job = client.build(spec.recorded(), progress)
+        database = str(job["result"]["database"])
+        folder, outcome = client.download(database, output, progress)
+    report = client.report(database)
+    for warning in report["warnings"]:
+        say(f"warning: {warning}")
+    artifact = open_artifact(folder)
+    if as_json:
+        kept = ("filters", "coverage", "self_test", "warnings")
+        print_json(
+            {
+                "artifact": str(folder),
+                "report": str(folder / "report" / "index.html"),
+                "outcome": outcome,
+                "database": database,
+                "job": job["id"],
+                **{key: report[key] for key in kept},
+                **{key: artifact.manifest[key] for key in ("sources", "products", "files")},
+            }
+        )
+        return
+    print_artifact(artifact, as_json=False)
+    print_rates(list(map(rates_of, report["self_test"])), as_json=False)
+    say(f"{outcome}: {folder}")
+    say(f"database {database} of {client.url}")
+
+
+def print_built(built: Built, *, as_json: bool) -> None:
+    """Print what a build made."""
+    manifest, report = built.manifest, built.folder / "report" / "index.html"
+    for warning in built.warnings:
+        say(f"warning: {warning}")
+    if as_json:
+        print_json(
+            {
+                "artifact": str(built.folder),
+                "report": str(report),
+                "outcome": built.outcome,
+                "filters": [vars(step) for step in built.filters],
+                "coverage": built.coverage.as_dict(),
+                "self_test": [rates.as_dict() for rates in built.rates],
+                "warnings": list(built.warnings),
+                "times_s": built.times_s,
+                **{key: manifest[key] for key in ("sources", "products", "files")},
+            }
+        )
+        return
+    _print_contents(built)
+    seconds = [(stage, f"{taken:.2f}") for stage, taken in built.times_s.items()]
+    print_table("Times", ("stage", "seconds"), seconds, numbers=(1,))
+    print_problems(built.problems)
+    say(f"{built.outcome}: {built.folder}")
+    say(f"report: {report}")
+
+
+def print_refused(built: Built, *, as_json: bool) -> None:
+    """Print what a build made that failed its self-test, and what it warns of."""
+    for warning in built.warnings:
+        say(f"warning: {warning}")
+    if not as_json:
+        _print_contents(built)
+
+
+def _print_contents(built: Built) -> None:
+    """Print what went into a build, what it made and how that identifies."""
+    manifest = built.manifest
+    for source in manifest["sources"]:
+        print_table(
+            f"{source['source']} ({source['role']})",
+            ("records", "rows"),
+            record_rows(source),
+            numbers=(1,),
+        )
+    print_table(
+        "What each filter leaves in the fields of the tiling",
+        ("after", "stars", "median a field", "fewest", "fields below 4"),
+        [
+            (
+                step.step,
+                f"{step.stars:,}",
+                f"{step.median_per_field:g}",
+                step.min_per_field,
+                f"{step.share_below_4:.2%}",
+            )
+            for step in built.filters
+        ],
+        numbers=(1, 2, 3, 4),
+    )
+    print_products(manifest)
+    print_coverage_table(built.coverage)
+    print_rates(built.rates, as_json=False)
+
+
+def print_cost(cost: Cost) -> None:
+    """Print on stderr what a build will cost."""
+    say(cost.in_words)
+
+
+def print_products(manifest: dict[str, Any]) -> None:
+    """Print the products of an artifact."""
+    files = manifest["files"]
+    rows = [
+        (
+            name,
+            facts["schema"],
+            f"{facts['rows']:,}",
+            f"{files[facts['parquet']]['bytes']:,}",
+            f"{facts['records']:,} over all fields" if "records" in facts else "",
+        )
+        for name, facts in manifest["products"].items()
+    ]
+    rows.append(("database.h5", "", "", f"{files['database.h5']['bytes']:,}", ""))
+    print_table("Products", ("product", "schema", "rows", "bytes", ""), rows, numbers=(2, 3))
+
+
+def print_rates(rates: Sequence[Rates], *, as_json: bool) -> None:
+    """Print the rates of a self-test."""
+    if as_json:
+        print_json([rate.as_dict() for rate in rates])
+        return
+    print_table(
+        "Simulated fields, with noise of position (px) and of magnitude",
+        ("fields", "px", "mag", "dropped", "false", "tried", "4+ stars", "right", "wrong", "rate"),
+        [
+            (
+                rate.name,
+                f"{rate.noise_px:g}",
+                "" if rate.noise_mag is None else f"{rate.noise_mag:g}",
+                f"{rate.drop_probability:.0%}",
+                rate.false_stars,
+                rate.frames,
+                rate.identifiable,
+                rate.identified,
+                rate.wrong,
+                f"{rate.identified_share:.1%}",
+            )
+            for rate in rates
+            if rate.frames
+        ],
+        numbers=tuple(range(1, 10)),
+    )
+
+
+def print_artifact(artifact: Artifact, *, as_json: bool) -> None:
+    """Print what an artifact holds."""
+    from starcat.specs.build_spec import CameraSpec
+
+    manifest = artifact.manifest
+    if as_json:
+        print_json(manifest)
+        return
+    spec = manifest["spec"]
+    camera = CameraSpec.model_validate(spec["camera"]).camera()
+    selection = spec["selection"]
+    print_table(
+        f"{manifest['name']}-{manifest['version']}",
+        ("", ""),
+        [
+            ("description", spec["description"]),
+            ("frame, epoch", f"{manifest['frame']}, J{manifest['epoch_jyear']:g}"),
+            ("camera", camera.in_words),
+            ("faint limit", f"{selection['faint_limit_mag']:g} mag"),
+            ("made by", ", ".join(f"{k} {v}" for k, v in manifest["software"].items())),
+        ],
+    )
+    for source in manifest["sources"]:
+        files = ", ".join(f"{file['name']} ({file['sha256'][:12]})" for file in source["files"])
+        print_table(
+            f"{source['source']} from {files}", ("records", "rows"), record_rows(source), (1,)
+        )
+    print_products(manifest)
+
+
+def print_coverage_table(report: CoverageReport) -> None:
+    """Print the coverage in a few numbers."""
+    import numpy as np
+
+    summary, gap = report.summary, report.gap
+    spreads = {"stars": summary.stars, "pairs": summary.pairs, "triangles": summary.triangles}
+    rows = [
+        (
+            kind,
+            f"{spread.minimum:,}",
+            f"{spread.one_percent:,}",
+            f"{spread.median:,}",
+            f"{spread.mean:,.1f}",
+            f"{spread.maximum:,}",
+        )
+        for kind, spread in spreads.items()
+    ]
+    heads = ("in a field", "fewest", "1 %", "median", "mean", "most")
+    print_table(f"Coverage: {summary.fields:,} fields", heads, rows, numbers=(1, 2, 3, 4, 5))
+    worst = f"RA {summary.worst_ra_deg:.3f}, Dec {summary.worst_dec_deg:+.3f} deg"
+    covering, tile = np.degrees([gap.covering_radius_rad, gap.tile_radius_rad])
+    print_table(
+        "",
+        ("", ""),
+        [
+            ("fewest stars", f"boresight {summary.worst_boresight}, {worst}"),
+            ("farthest from all boresights", f"{covering:.3f} deg; a field reaches {tile:.3f} deg"),
+        ],
+    )

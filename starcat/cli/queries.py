@@ -1,0 +1,357 @@
+"""SQL queries of the command line: where they come from, and how results are printed."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import textwrap
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from starcat.cli.console import MAX_WIDTH, print_json, print_table, progress_bars, say
+from starcat.errors import QueryError, StarcatError
+from starcat.query.gallery import gallery, guessed, macros, named_query
+from starcat.query.session import Limits, Session, open_session, preamble_of
+
+if TYPE_CHECKING:
+    from starcat.query.result import ResultTable
+    from starcat.query.session import Session
+    from starcat.query.targets import Target, View
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What is asked, and how the answer is wanted."""
+
+    query: str | None = None  # SQL
+    named: str | None = None  # a query of the gallery instead
+    # the texts of the values of the ``$name`` in it
+    values: Mapping[str, str] = field(default_factory=dict)
+    form: str | None = None  # ``table`` or one of the formats of `starcat.exchange.formats`
+    output: Path | None = None  # file to write
+
+
+def answer(targets: Sequence[str], wish: Wish, limits: Limits, rows: int) -> None:
+    """Answer a question, or ask for questions where there is none."""
+    form = format_of_wish(wish)
+    query, values = _query(wish, len(targets))
+    with _opened(targets, limits) as session:
+        if query is not None:
+            _give(session, query, values, form, wish.output, rows)
+        elif sys.stdin.isatty():
+            prompt(session, rows)
+        else:
+            texts = session.statements(sys.stdin.read())
+            if wish.output is not None and len(texts) > 1:
+                raise QueryError(f"{len(texts)} queries for one file; give one, or leave out -o")
+            for text in texts:
+                _give(session, text, values, form, wish.output, rows)
+
+
+def show(targets: Sequence[str], limits: Limits, *, as_json: bool) -> None:
+    """Print the views of targets."""
+    with _opened(targets, limits) as session:
+        print_views(session, as_json=as_json)
+
+
+def print_preamble(targets: Sequence[str]) -> None:
+    """Print the SQL that makes the views and macros, for any DuckDB."""
+    sys.stdout.write(preamble_of(targets) + "\n")
+
+
+@contextmanager
+def _opened(targets: Sequence[str], limits: Limits) -> Iterator[Session]:
+    """Open a session, with bars while archive files are read and none afterwards."""
+    with ExitStack() as stack:
+        with progress_bars() as progress:
+            session = stack.enter_context(open_session(targets, limits, progress))
+        yield session
+
+
+def format_of_wish(wish: Wish) -> str:
+    """Return the format that an answer is wanted in."""
+    if wish.form in (None, "table") and wish.output is None:
+        return "table"
+    from starcat.exchange.formats import FILE_FORMATS, TEXT_FORMATS, format_of
+
+    form = wish.form or (format_of(wish.output) if wish.output else "table")
+    if form not in ("table", *FILE_FORMATS):
+        raise QueryError(f"--format {form!r}: choose table, {', '.join(FILE_FORMATS)}")
+    if wish.output is None and form not in ("table", *TEXT_FORMATS):
+        raise QueryError(f"--format {form} is no text for a terminal; give a file with -o")
+    if wish.output is not None and form == "table":
+        raise QueryError("--format table goes to the terminal; leave out -o, or choose csv")
+    return form
+
+
+def _query(wish: Wish, targets: int) -> tuple[str | None, Mapping[str, Any]]:
+    if not targets:
+        raise QueryError(
+            "name what the query is about: an artifact's folder, a Parquet file or an archive "
+            'file, such as: starcat sql dist/gaia-12deg-1.0.0 "SELECT count(*) FROM stars"'
+        )
+    if wish.named is None:
+        return wish.query, {name: guessed(text) for name, text in wish.values.items()}
+    query = named_query(wish.named)
+    if query.targets != targets:
+        raise QueryError(f"{query.name} is about {query.targets} targets; {targets} given")
+    return query.text, query.with_values(wish.values)
+
+
+def _give(
+    session: Session,
+    query: str,
+    values: Mapping[str, Any],
+    form: str,
+    output: Path | None,
+    rows: int,
+) -> None:
+    if form == "table":
+        print_first_rows(session, query, values, rows)
+        return
+    from starcat.exchange.writers import write_batches, write_text_batches
+
+    with progress_bars() as progress, session.ask(query, values, progress) as found:
+        if output is None:
+            write_text_batches(found.batches(), sys.stdout, form)
+            return
+        count = write_batches(found.batches(), output, form)
+    say(f"{output}: {count:,} rows")
+
+
+FOLDED_CHARACTERS = 28
+"""A column of longer texts is folded rather than given all the room it wants."""
+
+
+def print_first_rows(session: Session, query: str, values: Mapping[str, Any], rows: int) -> None:
+    """Ask a query, with a bar while it runs, and print the first rows of its answer."""
+    with progress_bars() as progress, session.ask(query, values, progress) as running:
+        found = running.table(rows)
+    print_result(found)
+
+
+def print_result(found: ResultTable) -> None:
+    """Print rows as a table, or one below the other if that is too wide."""
+    cells = found.texts
+    headings = [f"{c.name}\n[{c.unit}]" if c.unit else c.name for c in found.columns]
+    if _width(headings, cells) <= MAX_WIDTH:
+        numbers = [k for k, column in enumerate(found.columns) if column.is_number]
+        print_table("", headings, cells, numbers)
+    else:
+        for k, row in enumerate(cells):
+            facts = [(c.name, cell, c.unit) for c, cell in zip(found.columns, row, strict=True)]
+            print_table(f"row {k + 1}", ["column", "value", "unit"], facts)
+    if found.is_cut:
+        say(f"the first {len(cells)} rows; --rows N shows more, -o FILE writes all")
+
+
+def _width(headings: Sequence[str], cells: Sequence[Sequence[str]]) -> int:
+    """Return the width of a table whose long texts are folded."""
+    columns = zip(headings, *cells, strict=True)
+    widest = (max(len(line) for cell in column for line in cell.split("\n")) for column in columns)
+    heads = (max(map(len, heading.split("\n"))) for heading in headings)
+    wanted = [
+        max(head, min(most, FOLDED_CHARACTERS)) for head, most in zip(heads, widest, strict=True)
+    ]
+    return sum(wanted) + 2 * (len(wanted) - 1)
+
+
+def print_views(session: Session, *, as_json: bool) -> None:
+    """Print the views that a query can use."""
+    views = [(target, view) for target in session.targets for view in target.views]
+    if as_json:
+        print_json([_view_facts(target, view) for target, view in views])
+        return
+    names = [f"{target.name}.{view.name}" for target, view in views]
+    rows = [
+        (name, _row_count(session, name), _first_sentence(_description(view)))
+        for name, (_, view) in zip(names, views, strict=True)
+    ]
+    print_table("", ["view", "rows", "a row"], rows, (1,))
+
+
+def _view_facts(target: Target, view: View) -> dict[str, Any]:
+    columns = view.schema.columns if view.schema else ()
+    return {
+        "schema": target.name,
+        "view": view.name,
+        "description": _description(view),
+        "columns": [
+            {"name": c.name, "dtype": c.dtype, "unit": c.unit, "description": c.description}
+            for c in columns
+        ],
+    }
+
+
+def _description(view: View) -> str:
+    return view.schema.description if view.schema else ""
+
+
+def _first_sentence(text: str) -> str:
+    return re.split(r"[.:;] ", text)[0].rstrip(".")
+
+
+def _row_count(session: Session, view: str) -> int:
+    with session.ask(f"SELECT count(*) FROM {view}") as answer:
+        return int(answer.rows(1)[0][0])
+
+
+def print_macros(*, as_json: bool) -> None:
+    """Print the macros, each with an example."""
+    from starcat.query.gallery import macros
+
+    listed = sorted((m for m in macros()), key=lambda m: (m.is_table, m.name))
+    if as_json:
+        facts = ("name", "arguments", "is_table", "help", "example")
+        print_json([{fact: getattr(macro, fact) for fact in facts} for macro in listed])
+        return
+    for macro in listed:
+        after = "FROM " if macro.is_table else ""
+        _print_entry(f"{after}{macro.name}({macro.arguments})", [macro.help, macro.example])
+
+
+def _print_entry(title: str, paragraphs: Sequence[str]) -> None:
+    """Print a title, and paragraphs below it that are indented."""
+    indented = (textwrap.indent(textwrap.fill(text, MAX_WIDTH - 4), "    ") for text in paragraphs)
+    sys.stdout.write("\n".join([title, *indented, "\n"]))
+
+
+def print_gallery(*, as_json: bool) -> None:
+    """Print the named queries with their values."""
+    from starcat.query.gallery import gallery
+
+    queries = gallery().values()
+    if as_json:
+        print_json([asdict(query) for query in queries])
+        return
+    for query in queries:
+        needs = " Two targets." if query.targets == 2 else ""
+        values = [f"--set {v.name}={v.default}: {v.help}" for v in query.values]
+        _print_entry(query.name, [query.help + needs, *values])
+    say("starcat sql TARGET --named densest-fields --set count=5")
+
+
+HELP = """\
+A query ends with a semicolon. Also:
+  .views            the views      (DESCRIBE stars; tells the columns of one)
+  .macros           the macros
+  .list             the named queries
+  .named NAME [VALUE=…]   run one of them
+  .rows N           rows of a table to show
+  .quit             or Ctrl-D"""
+
+HISTORY_LINES = 2000
+
+
+def history_path() -> Path:
+    """Return the file that keeps the queries of earlier prompts."""
+    state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    return Path(state) / "starcat" / "sql_history"
+
+
+def prompt(session: Session, rows: int, read: Callable[[str], str] = input) -> None:
+    """Ask for queries and answer them, until there are no more."""
+    _complete(session)
+    say("starcat sql: .help tells more, .quit or Ctrl-D ends")
+    shell = _Shell(session, rows)
+    while True:
+        try:
+            text = _read_query(read)
+        except EOFError:
+            break
+        except KeyboardInterrupt:
+            say("")
+            continue
+        if text.split()[:1] in ([".quit"], [".exit"]):
+            break
+        try:
+            shell.run(text)
+        except StarcatError as error:
+            say(f"error: {error}")
+        except KeyboardInterrupt:
+            say("stopped")
+    _keep_history()
+
+
+def _read_query(read: Callable[[str], str]) -> str:
+    """Read lines up to a semicolon; a line that begins with a point, or an empty one, is alone."""
+    lines: list[str] = []
+    while True:
+        line = read("   ...> " if lines else "starcat> ")
+        lines.append(line)
+        text = "\n".join(lines).strip()
+        if not text or text.startswith(".") or text.endswith(";"):
+            return text
+
+
+class _Shell:
+    """What a prompt can be told."""
+
+    def __init__(self, session: Session, rows: int) -> None:
+        self.session = session
+        self.rows = rows
+
+    def run(self, text: str) -> None:
+        """Run a query or a command."""
+        word, *rest = text.split() or [""]
+        if word == ".views":
+            print_views(self.session, as_json=False)
+        elif word == ".macros":
+            print_macros(as_json=False)
+        elif word == ".list":
+            print_gallery(as_json=False)
+        elif word == ".named" and rest:
+            query = named_query(rest[0])
+            given = dict(item.split("=", 1) for item in rest[1:] if "=" in item)
+            print_first_rows(self.session, query.text, query.with_values(given), self.rows)
+        elif word == ".rows" and rest and rest[0].isdigit():
+            self.rows = max(1, int(rest[0]))
+        elif word.startswith("."):
+            say(HELP)
+        elif text:
+            print_first_rows(self.session, text, {}, self.rows)
+
+
+def words(session: Session) -> list[str]:
+    """Return what a prompt completes."""
+    known = {".help", ".views", ".macros", ".list", ".named ", ".rows ", ".quit", *gallery()}
+    known |= {f"{macro.name}(" for macro in macros() if not macro.name.startswith("_")}
+    for target in session.targets:
+        for view in target.views:
+            known |= {view.name, f"{target.name}.{view.name}"}
+            known |= {column.name for column in (view.schema.columns if view.schema else ())}
+    return sorted(known)
+
+
+def _complete(session: Session) -> None:
+    """Let the tab key complete names, and the arrows find earlier queries."""
+    try:
+        import readline
+    except ImportError:  # Windows: the prompt works without
+        return
+    known = words(session)
+
+    def complete(text: str, state: int) -> str | None:
+        fitting = [word for word in known if word.startswith(text)]
+        return fitting[state] if state < len(fitting) else None
+
+    readline.set_completer(complete)
+    readline.set_completer_delims(" \t\n,()=<>*+/;'\"")
+    readline.parse_and_bind("tab: complete")
+    with suppress(OSError):
+        readline.read_history_file(history_path())
+
+
+def _keep_history() -> None:
+    try:
+        import readline
+    except ImportError:
+        return
+    with suppress(OSError):
+        history_path().parent.mkdir(parents=True, exist_ok=True)
+        readline.set_history_length(HISTORY_LINES)
+        readline.write_history_file(history_path())

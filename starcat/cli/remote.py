@@ -1,0 +1,155 @@
+"""Commands that a service can run instead: build, sql, identify."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from starcat.cli.console import say
+from starcat.errors import ConfigError, QueryError
+
+if TYPE_CHECKING:
+    from starcat.client import Client
+
+COMMANDS = ("build", "sql", "identify")
+
+LOCAL_OPTIONS = {
+    "build": ("inputs", "replace", "workers", "max_memory"),
+    "sql": ("show_views", "preamble", "memory_limit_gb"),
+    "identify": ("dark", "mask", "time", "velocity", "orbit", "wcs", "track"),
+}
+"""Options that a service does not take."""
+
+REMOTE_IDENTIFY_OPTIONS = (
+    *("method", "tolerance_px", "noise_px", "noise_mag", "max_false_match_probability"),
+    *("min_share", "max_steps", "time_limit_s", "flip", "psf_sigma_px", "threshold"),
+    *("most_spots", "plane", "bayer", "prior_error_deg"),
+)
+"""Options of identify that a service takes under the same name."""
+
+
+def open_remote(url: str, token: str | None, command: str) -> Client:
+    """Return the service that a command line names."""
+    if not url.startswith(("http://", "https://")):
+        raise ConfigError(
+            f"--server {url!r}: expected an address such as http://127.0.0.1:8000", key="server"
+        )
+    if command not in COMMANDS:
+        raise ConfigError(
+            f"--server does not go with 'starcat {command}', which runs here; it goes with "
+            + ", ".join(COMMANDS),
+            key="server",
+        )
+    from starcat.client import Client
+
+    return Client(url, token)
+
+
+def sql_remotely(
+    context: typer.Context,
+    targets: list[str],
+    query: str | None,
+    named: str | None,
+    values: Mapping[str, str],
+    form: str | None,
+    output: Path | None,
+    rows: int,
+    time_limit_s: float,
+) -> None:
+    """Ask a service a question in SQL, and print or keep the answer."""
+    from starcat.cli.queries import Wish, format_of_wish, print_result
+    from starcat.query.gallery import guessed
+    from starcat.query.result import ResultTable
+
+    client = service_of(context)
+    if query is None and named is None:
+        raise QueryError("--server needs the query on the line, or --named; there is no prompt")
+    if not targets:
+        raise QueryError("name what the query is about: the id or the title of a database")
+    wanted = format_of_wish(Wish(query, named, values, form, output))
+    texts = dict(values) if named else {name: guessed(text) for name, text in values.items()}
+    if wanted == "table":
+        found = client.sql(
+            targets, query, texts, named=named, max_rows=rows, time_limit_s=time_limit_s
+        )
+        print_result(ResultTable.from_json(found))
+        return
+    asked = (targets, query, texts)
+    if output is not None:
+        count = client.sql_file(output, wanted, *asked, named=named, time_limit_s=time_limit_s)
+        say(f"{output}: {count:,} rows")
+        return
+    with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
+        path = Path(folder) / "answer"
+        client.sql_file(path, wanted, *asked, named=named, time_limit_s=time_limit_s)
+        sys.stdout.write(path.read_text(encoding="utf-8"))
+
+
+def identify_remotely(context: typer.Context, database: str, file: Path) -> None:
+    """Have a service identify frames, and print the answers."""
+    from starcat.cli.matches import print_contents
+
+    client, given = service_of(context), context.params
+    picture: Path | None = given["picture"]
+    if picture is not None and picture.suffix.lower() not in (".png", ".svg"):
+        raise ConfigError(f"{picture}: the picture is PNG or SVG; end its name so", key="picture")
+    options = _options_of(given)
+    with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
+        frames = file if str(file) != "-" else _of_stdin(Path(folder))
+        if not frames.is_file():
+            raise ConfigError(f"{frames}: cannot be read (No such file or directory)")
+        found = client.identify(database, frames, options)
+        if picture is not None:
+            drawn = client.picture(database, frames, options, picture.suffix.lower()[1:])
+            picture.write_bytes(drawn)
+    told = print_contents(
+        found["frames"], found["database"], as_json=given["json"], as_lines=given["ndjson"]
+    )
+    for note in found["notes"]:
+        say(note)
+    if given["fail_on_no_match"]:
+        told.expect_all_identified()
+
+
+def _options_of(given: Mapping[str, Any]) -> dict[str, Any]:
+    from starcat.cli.options import chosen_prior, share_of_percent, unknown_field
+
+    options = {name: given[name] for name in REMOTE_IDENTIFY_OPTIONS if given[name] is not None}
+    prior = chosen_prior(given["prior_q"], given["prior_error_deg"], track=False)
+    size_px, fov_deg = unknown_field(given["size"], given["fov"], given["fov_error"])
+    camera: Path | None = given["camera"]
+    try:
+        text = None if camera is None else camera.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{camera}: cannot be read ({error})", key="camera") from error
+    more = {
+        "prior_q": None if prior is None else prior[0],
+        "size_px": size_px,
+        "fov_deg": fov_deg,
+        "fov_error": share_of_percent(given["fov_error"]),
+        "camera": text,
+    }
+    return options | {name: value for name, value in more.items() if value is not None}
+
+
+def _of_stdin(folder: Path) -> Path:
+    text = sys.stdin.read()
+    path = folder / ("stdin.json" if text.lstrip()[:1] in ("{", "[") else "stdin.csv")
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def service_of(context: typer.Context) -> Client:
+    """Return the service; refuse options that it does not take."""
+    for name in LOCAL_OPTIONS[context.info_name or ""]:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name == "COMMANDLINE":
+            option = next(one for one in context.command.params if one.name == name).opts[0]
+            raise ConfigError(f"{option} does not go with --server; leave it out", key=name)
+    client: Client = context.obj
+    return client

@@ -1,0 +1,243 @@
+"""Commands about build specs: presets, estimate, init, and their tables."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from starcat.cli.console import out, print_json, print_table, progress_bars, say
+from starcat.cli.options import (
+    Changes,
+    Input,
+    Json,
+    PresetName,
+    SpecFile,
+    camera_of_options,
+    chosen_spec,
+    field_range,
+    inputs_by_source,
+)
+from starcat.errors import ConfigError
+
+if TYPE_CHECKING:
+    from starcat.pipeline.estimate import Estimate
+    from starcat.pipeline.starter import Starter
+    from starcat.specs.build_spec import BuildSpec
+
+app = typer.Typer()
+
+
+@app.command()
+def presets(
+    name: Annotated[str | None, typer.Argument(help="Only this one.")] = None,
+    toml: Annotated[
+        bool, typer.Option("--toml", help="Print the whole spec with every key explained.")
+    ] = False,
+    json: Json = False,
+) -> None:
+    """List the build specs that ship with starcat, or print one to start from.
+
+    Example: starcat presets gaia-12deg --toml
+    """
+    from starcat.specs.keys import spec_toml
+    from starcat.specs.reading import preset
+
+    if toml:
+        if name is None:
+            raise ConfigError("--toml prints one preset: name it, as 'presets sao-12deg --toml'")
+        typer.echo(spec_toml(preset(name)), nl=False)
+    elif name is not None:
+        print_preset(preset(name), as_json=json)
+    else:
+        print_presets(as_json=json)
+
+
+@app.command()
+def estimate(
+    spec: SpecFile = None,
+    preset: PresetName = None,
+    changes: Changes = None,
+    inputs: Input = None,
+    json: Json = False,
+) -> None:
+    """Say what a spec will give without building it: guide stars, fields, files, time, memory.
+
+    Example: starcat estimate --preset gaia-12deg --set selection.faint_limit_mag=5.5
+    """
+    from starcat.pipeline.estimate import estimate_spec
+
+    given, chosen = inputs_by_source(inputs), chosen_spec(spec, preset, changes)
+    with progress_bars() as progress:
+        found = estimate_spec(chosen, given, progress=progress)
+    print_estimate(found, as_json=json)
+
+
+@app.command()
+def init(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="TOML file to write.")],
+    size: Annotated[
+        str, typer.Option(metavar="WIDTHxHEIGHT", help="Size of the detector, pixels.")
+    ],
+    focal_mm: Annotated[float | None, typer.Option(help="Focal length of the lens.")] = None,
+    pixel_um: Annotated[float | None, typer.Option(help="Side of a square pixel.")] = None,
+    fov_x_deg: Annotated[
+        float | None, typer.Option(help="Field across the width, instead of lens and pixel.")
+    ] = None,
+    fov_range: Annotated[
+        str | None,
+        typer.Option(metavar="LOW:HIGH", help="Fields across the width, instead: a range."),
+    ] = None,
+    faint_limit: Annotated[
+        float | None,
+        typer.Option(min=-30, max=40, help="Magnitude G that the camera sees; default: enough."),
+    ] = None,
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Replace a file of that name.")
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Write a build spec for a camera, every key explained, and say how many stars a field has.
+
+    Example: starcat init mycam.toml --size 1280x960 --focal-mm 25 --pixel-um 5.5 --faint-limit 5.8
+    """
+    from starcat.pipeline.starter import starter_spec, write_starter
+
+    fields = field_range(fov_range)
+    if fields is not None:
+        if fov_x_deg is not None:
+            raise ConfigError("give either --fov-range or --fov-x-deg, not both")
+        fov_x_deg = fields[0]
+    camera = camera_of_options(size, focal_mm, pixel_um, fov_x_deg)
+    with progress_bars() as progress:
+        starter = starter_spec(file.stem, camera, faint_limit, progress, fields and fields[1])
+        write_starter(starter, file, replace=replace)
+    print_starter(starter, file, as_json=json)
+
+
+def print_presets(*, as_json: bool) -> None:
+    """Print the presets."""
+    from starcat.specs.reading import preset, preset_names
+
+    specs = [preset(name) for name in preset_names()]
+    if as_json:
+        print_json([spec.model_dump(mode="json") for spec in specs])
+        return
+    rows = [(spec.name, spec.version, spec.catalog.source, spec.description) for spec in specs]
+    print_table("", ("preset", "version", "source", "what it is"), rows)
+
+
+def print_preset(spec: BuildSpec, *, as_json: bool) -> None:
+    """Print one preset in a few lines."""
+    if as_json:
+        print_json(spec.model_dump(mode="json"))
+        return
+    camera, limits = spec.camera.camera(), spec.selection
+    rows = [
+        ("what it is", spec.description),
+        ("sources", ", ".join(spec.sources)),
+        ("limits", f"{limits.bright_limit_mag:g} to {limits.faint_limit_mag:g} mag"),
+        ("camera", f"{camera.width_px} x {camera.height_px} px"),
+        ("field", f"{camera.fov_x_deg:.4g} x {camera.fov_y_deg:.4g} deg"),
+        ("boresights", f"{spec.boresights.count:,}"),
+        ("epoch", f"J{spec.epoch_jyear:g}"),
+        ("every key", f"starcat presets {spec.name} --toml"),
+    ]
+    print_table(f"{spec.name} {spec.version}", ("", ""), rows)
+
+
+def print_starter(starter: Starter, path: Path, *, as_json: bool) -> None:
+    """Print what a first spec gives, and what to think of before it is kept."""
+    from starcat.pipeline.starter import ENOUGH_STARS, STARS_A_FIELD, advice
+
+    told = advice(starter)
+    if as_json:
+        print_json(
+            {
+                "file": str(path),
+                "spec": starter.spec.model_dump(mode="json"),
+                "limits": [asdict(row) for row in starter.limits],
+                "thinned": asdict(starter.thinned),
+                "estimate": asdict(starter.cost),
+                "advice": list(told),
+            }
+        )
+        return
+    camera = starter.spec.camera.camera()
+    rows = [
+        (
+            f"{row.faint_limit_mag:g}" + (" *" if row is starter.own else ""),
+            f"{row.guide_stars:,}",
+            f"{row.stars.minimum:,}",
+            f"{row.stars.one_percent:,}",
+            f"{row.stars.median:,}",
+            f"{row.stars.maximum:,}",
+        )
+        for row in starter.limits
+    ]
+    heads = ("faint limit, G", "guide stars", "fewest", "1 %", "median", "most")
+    field = f"{camera.fov_x_deg:.4g} x {camera.fov_y_deg:.4g} deg"
+    title = f"Stars in a field of {field} (* the spec's limit)"
+    print_table(title, heads, rows, numbers=(0, 1, 2, 3, 4, 5))
+    thinned = starter.thinned
+    out().print(
+        f"\nThe {STARS_A_FIELD} brightest of every field are kept: {thinned.guide_stars:,} guide "
+        f"stars, {thinned.stars.minimum:,} to\n{thinned.stars.maximum:,} a field, "
+        f"{thinned.stars.median:,} in the middle one."
+        "\nA frame needs 4 stars. A limit is good when 1 % of the fields have about "
+        f"{ENOUGH_STARS}:\nsome are left where spots are missing, and the database stays small."
+    )
+    for text in told:
+        say(f"warning: {text}")
+    say(starter.cost.in_words)
+    say(f"wrote {path}; change it as you like, then: starcat build {path}")
+
+
+def print_estimate(found: Estimate, *, as_json: bool) -> None:
+    """Print what a spec will give."""
+    cost, stars = found.cost, found.coverage.stars
+    if as_json:
+        print_json(
+            {
+                **asdict(cost),
+                "spread": asdict(stars),
+                "enough_share": found.enough_share,
+                "full_share": found.full_share,
+                "filters": dict(found.filters),
+                "rejected": dict(found.rejected),
+                "total_bytes": found.total_bytes,
+                "build_seconds": round(found.build_seconds, 2),
+                "refusals": list(found.refusals),
+                "warnings": list(found.warnings),
+            }
+        )
+        return
+    rows = {**cost.rows, "stars": cost.stars, "boresights": cost.fields}
+    rows["rejected"] = sum(found.rejected.values())
+    lines = [
+        (name, _count(rows.get(name.removesuffix(".parquet"))), f"{size:,}")
+        for name, size in cost.files.items()
+    ]
+    lines.append(("all files", "", f"{found.total_bytes:,}"))
+    title = f"{found.spec.name}-{found.spec.version}, by estimate"
+    print_table(title, ("file", "rows", "bytes"), lines, numbers=(1, 2))
+    most = found.spec.boresights.brightest
+    say(
+        f"{cost.stars:,} guide stars; {cost.fields:,} fields have {stars.minimum} to "
+        f"{stars.maximum}, {stars.median} in the middle, {found.enough_share:.2%} of them 4 or "
+        f"more, {found.full_share:.2%} {most} or more"
+    )
+    say(
+        f"{found.build_seconds:,.0f} s to build, {cost.memory_bytes / 2**30:.1f} GiB of memory; "
+        "the stars are as the build will have them"
+    )
+    for text in found.warnings:
+        say(f"warning: {text}")
+    for text in found.refusals:
+        say(f"the build will be refused: {text}")
+
+
+def _count(rows: int | None) -> str:
+    return "" if rows is None else f"{rows:,}"

@@ -1,0 +1,113 @@
+"""The command that runs SQL queries."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from starcat.cli.options import Json
+from starcat.errors import QueryError
+from starcat.exchange.formats import FILE_FORMATS
+
+app = typer.Typer()
+
+FORMATS = f"{', '.join(('table', *FILE_FORMATS[:-1]))} or {FILE_FORMATS[-1]}"
+
+
+Arguments = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="TARGET... [QUERY]",
+        help="Artifacts, catalog stores, Parquet files, archive files (or SOURCE=PATH), "
+        "sources; then SQL, or - to read it from stdin. Without a query: a prompt.",
+    ),
+]
+Values = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="NAME=VALUE", help="A value of the query. Repeatable."),
+]
+OutputFile = Annotated[
+    Path | None, typer.Option("--output", "-o", help="File; its suffix says the format.")
+]
+FormatName = Annotated[
+    str | None, typer.Option("--format", metavar="FORMAT", help=f"{FORMATS}; default: table.")
+]
+
+
+@app.command()
+def sql(
+    context: typer.Context,
+    arguments: Arguments = None,
+    named: Annotated[str | None, typer.Option(help="A query of the gallery; see --list.")] = None,
+    values: Values = None,
+    output: OutputFile = None,
+    form: FormatName = None,
+    rows: Annotated[int, typer.Option(min=1, help="Rows of a table to show.")] = 40,
+    show_list: Annotated[bool, typer.Option("--list", help="List the named queries.")] = False,
+    show_macros: Annotated[bool, typer.Option("--macros", help="List the macros.")] = False,
+    show_views: Annotated[bool, typer.Option("--views", help="List the targets' views.")] = False,
+    preamble: Annotated[
+        bool, typer.Option("--preamble", help="Print the views and macros as SQL for any DuckDB.")
+    ] = False,
+    time_limit_s: Annotated[float, typer.Option(min=0.1, help="Seconds a query may take.")] = 60.0,
+    memory_limit_gb: Annotated[float, typer.Option(min=0.1, help="Memory it may take.")] = 2.0,
+    json: Json = False,
+) -> None:
+    """Ask questions about artifacts and catalogs in SQL; nothing is written but -o FILE.
+
+    Every product is a view: stars, rejected, pairs, triangles ... With several targets each has
+    a schema of its name, and they are a, b, c ... too. The folder of a store may be any HATS
+    collection or catalog; cone, box and field read only the files that they may reach.
+
+    Example: starcat sql dist/gaia-12deg-1.0.0 "SELECT designation, mag FROM cone(37.95, 89.26, 5)"
+    """
+    if show_list or show_macros:
+        from starcat.cli.queries import print_gallery, print_macros
+
+        (print_gallery if show_list else print_macros)(as_json=json)
+        return
+    if context.obj is not None:
+        from starcat.cli.remote import sql_remotely
+
+        targets, query = _split(arguments or [], named)
+        wanted = form or ("json" if json else None)
+        there = (targets, query, named, dict(_set(values)), wanted, output, rows, time_limit_s)
+        sql_remotely(context, *there)
+        return
+    from starcat.query.engine import warm_up
+
+    warm_up()  # it starts while the rest is imported
+    from starcat.cli.queries import Wish, answer, print_preamble, show
+    from starcat.query.session import Limits
+
+    limits = Limits(time_limit_s, memory_limit_gb)
+    targets, query = _split(arguments or [], named)
+    if preamble:
+        print_preamble(targets)
+    elif show_views:
+        show(targets, limits, as_json=json)
+    else:
+        wish = Wish(query, named, dict(_set(values)), form or ("json" if json else None), output)
+        answer(targets, wish, limits, rows)
+
+
+def _split(arguments: list[str], named: str | None) -> tuple[list[str], str | None]:
+    """Return the targets, and the query where the last argument is one."""
+    last = arguments[-1] if arguments else ""
+    if last != "-" and (len(last.split()) <= 1 or os.path.exists(last)):
+        return arguments, None
+    if named:
+        raise QueryError(f"give either a query or --named {named}, not both")
+    return arguments[:-1], sys.stdin.read() if last == "-" else last
+
+
+def _set(values: list[str] | None) -> list[tuple[str, str]]:
+    given = [text.partition("=") for text in values or []]
+    for name, separator, _ in given:
+        if not separator:
+            raise QueryError(f"--set {name!r} is not NAME=VALUE, such as count=5")
+    return [(name, value) for name, _, value in given]

@@ -1,1 +1,0 @@
-"""What people see at a terminal: tables, bars, prompts; and JSON for machines."""

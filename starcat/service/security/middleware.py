@@ -1,0 +1,164 @@
+"""What every request passes, from the outside to the inside.
+
+It gets a name, a line in the log and a place in the figures (`RequestContext`); its answer gets
+headers that browsers keep to (`SafeHeaders`); it is refused where a check says so (`Refusals`); and
+what no handler foresaw is told without a traceback (`Defects`).
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import secrets
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from starcat.service.problems import Problem, as_json
+from starcat.service.security.logs import log_request, request_id
+from starcat.service.security.metrics import Metrics
+from starcat.service.security.request_limits import BodyLimits
+from starcat.service.settings import Settings
+
+ID_HEADER = "X-Request-ID"
+GIVEN_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
+"""What a proxy may call a request; anything else gets another name."""
+
+POLICY = (
+    "default-src 'self'; img-src 'self' data: blob:; object-src 'none'; base-uri 'none'; "
+    "frame-ancestors 'none'; form-action 'self'"
+)
+"""Scripts, styles and data come from the service itself; nothing that stands in a page runs."""
+
+ALWAYS = {
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), geolocation=(), microphone=(), payment=(), usb=()",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+A_YEAR = "max-age=31536000"
+
+_logger = logging.getLogger(__name__)
+
+
+class _HttpMiddleware(ABC):
+    """Middleware for requests; the server's lifespan events pass it untouched."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        await (self.answer if scope["type"] == "http" else self._app)(scope, receive, send)
+
+    @abstractmethod
+    async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request, or have what comes behind answer it."""
+
+
+class RequestContext(_HttpMiddleware):
+    """Names each request, and writes down what became of it."""
+
+    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+        super().__init__(app)
+        self._metrics = metrics
+
+    async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request."""
+        given = Headers(scope=scope).get(ID_HEADER, "")
+        name = given if GIVEN_ID.fullmatch(given) else secrets.token_hex(8)
+        begun_s, status, sent, is_endless = time.perf_counter(), 0, 0, False
+
+        async def send_counted(message: Message) -> None:
+            nonlocal status, sent, is_endless
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                headers = MutableHeaders(scope=message)
+                headers[ID_HEADER] = name
+                is_endless = headers.get("content-type", "").startswith("text/event-stream")
+            sent += len(message.get("body", b""))
+            await send(message)
+
+        before = request_id.set(name)
+        self._metrics.running.inc()
+        try:
+            await self._app(scope, receive, send_counted)
+        finally:
+            self._metrics.running.dec()
+            taken_s = time.perf_counter() - begun_s
+            self._metrics.count(scope, status, None if is_endless else taken_s)
+            log_request(scope, status, sent, taken_s)
+            request_id.reset(before)
+
+
+class SafeHeaders(_HttpMiddleware):
+    """Adds what browsers keep to. A handler's own policy stays as it is."""
+
+    def __init__(self, app: ASGIApp, settings: Settings) -> None:
+        super().__init__(app)
+        self._headers = dict(ALWAYS)
+        if settings.is_secure:
+            self._headers["Strict-Transport-Security"] = A_YEAR
+
+    async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request."""
+
+        async def send_safe(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                headers.update(self._headers)
+                headers.setdefault("Content-Security-Policy", POLICY)
+                if not scope["path"].startswith("/static/"):
+                    headers.setdefault("Cache-Control", "private, no-cache")
+            await send(message)
+
+        await self._app(scope, receive, send_safe)
+
+
+Check = Callable[[Scope], None]
+"""Raises `Problem` where a request is to be refused."""
+
+
+class Refusals(_HttpMiddleware):
+    """Refuses requests that do not pass some checks, in their order, or whose body is too much."""
+
+    def __init__(self, app: ASGIApp, checks: Sequence[Check], limits: BodyLimits) -> None:
+        super().__init__(app)
+        self._checks = checks
+        self._limits = limits
+
+    async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request."""
+        try:
+            for check in self._checks:
+                check(scope)
+            limited = self._limits.limited(scope, receive)
+        except Problem as problem:
+            await as_json(problem)(scope, receive, send)
+            return
+        await self._app(scope, limited, send)
+
+
+class Defects(_HttpMiddleware):
+    """Answers what no handler foresaw: the log gets the traceback, the client gets none."""
+
+    async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request."""
+        is_begun = False
+
+        async def send_noted(message: Message) -> None:
+            nonlocal is_begun
+            is_begun = True
+            await send(message)
+
+        try:
+            await self._app(scope, receive, send_noted)
+        except Exception as error:
+            _logger.exception("a defect of starcat: %s %s", scope["method"], scope["path"][:500])
+            if is_begun:
+                raise  # the server ends the connection, so that the client sees it is not whole
+            await as_json(error)(scope, receive, send)
