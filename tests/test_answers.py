@@ -22,17 +22,16 @@ from starcat.geometry.attitude import (
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.geometry.sphere import directions_from_radec
-from starcat.matcher import fast, sky_objects
+from starcat.matcher import c_engine, sky_objects
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.refusal import ADVICE, WORDS, Refusal
-from starcat.matcher.result import MatchResult
-from starcat.matcher.searching import searched
+from starcat.matcher.numpy_engine import solve
+from starcat.matcher.result import HINTS, MESSAGES, MatchResult, Refusal
 from starcat.matcher.stars import MatchedStars, attitude_covariance
 from starcat.simulation.simulate import Frame, Noise, simulate_frames
 
 needs_c = pytest.mark.skipif(
-    not fast.is_compiled(), reason="starcat was installed without a C compiler"
+    not c_engine.is_compiled(), reason="starcat was installed without a C compiler"
 )
 
 ARCSEC = 3600.0 * math.degrees(1.0)
@@ -82,12 +81,7 @@ def answer(sky: Database, **stated: object) -> tuple[Frame, MatchResult]:
 
 
 def found_by_hand(camera: Camera, matrix: np.ndarray) -> MatchResult:
-    none = np.empty(0)
-    return MatchResult(
-        *("identified", none.astype(np.int64), none.astype(np.int32)),
-        *(quaternion_from_matrix(matrix), 0.0, 0.0, 0.0, 0, 0.0, 0.0),
-        camera=camera,
-    )
+    return MatchResult("identified", np.empty(0, np.int32), matrix, 0.0, 0.0, camera=camera)
 
 
 # --- World coordinates
@@ -330,14 +324,17 @@ def test_stars_at_one_place_determine_no_attitude(sky):
 # --- Why not
 
 
-def test_every_reason_has_words_and_advice():
-    assert WORDS.keys() == ADVICE.keys()
-    for reason in WORDS:
+def test_every_reason_has_a_message_and_a_hint():
+    assert MESSAGES.keys() == HINTS.keys()
+    for reason in MESSAGES:
         for told in (Refusal(reason), Refusal(reason, 5, 3e-4, 0.25)):
-            assert len(told.advice) > 20
+            assert len(told.hint) > 20
             assert "\n" not in repr(told)
             assert len(repr(told)) < 200
-    assert "5 spots, chance 3.0e-04, 25% of the frame" in Refusal("chance", 5, 3e-4, 0.25).words
+    assert (
+        "5 of 9 spots, chance 3.0e-04, 25% of the frame"
+        in Refusal("chance", 5, 3e-4, 0.25, 9).message
+    )
 
 
 @pytest.mark.parametrize("engine", ["numpy", pytest.param("c", marks=needs_c)])
@@ -352,7 +349,8 @@ def test_too_few_spots_are_the_reason(sky, engine):
 def test_the_library_s_no_is_explained_when_somebody_asks(sky, monkeypatch):
     searches = []
     monkeypatch.setattr(
-        "starcat.matcher.matcher.searched", lambda *asked: searches.append(1) or searched(*asked)
+        "starcat.matcher.matcher.solve",
+        lambda *asked, **more: searches.append(1) or solve(*asked, **more),
     )
     px = np.random.default_rng(3).random((8, 2)) * 1024.0
     found = Matcher(sky, engine="c").identify(px)
@@ -364,7 +362,7 @@ def test_the_library_s_no_is_explained_when_somebody_asks(sky, monkeypatch):
     assert why is found.refusal is not None
     assert len(searches) == 2  # this matcher's, once, and that of numpy
     assert repr(found) == f"<MatchResult no_match: 8 spots, {why.reason}>"
-    assert why.advice.split(",")[0] in found._repr_html_()
+    assert why.hint.split(",")[0] in found._repr_html_()
 
 
 @needs_c

@@ -12,14 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from starcat.geometry.attitude import (
     after_turn,
-    determinant,
-    inverse,
     matrix_from_quaternion,
     matrix_from_radec_roll,
     quaternion_from_matrix,
     radec_roll_from_matrix,
     random_attitudes,
-    solve_wahba_near,
     solve_wahba_svd,
     turn_between,
 )
@@ -59,14 +56,6 @@ def test_matrix_is_that_of_scipy(q):
 
 
 @given(quaternions())
-def test_quaternion_round_trip(q):
-    back = quaternion_from_matrix(matrix_from_quaternion(q))
-    assert back[3] >= 0.0
-    assert np.linalg.norm(back) == pytest.approx(1.0, abs=ROUNDING)
-    assert min(np.abs(back - q).max(), np.abs(back + q).max()) < ROUNDING
-
-
-@given(quaternions())
 def test_quaternion_of_a_matrix_is_that_of_scipy(q):
     matrix = matrix_from_quaternion(q)
     expected = Rotation.from_matrix(matrix).inv().as_quat(canonical=True)
@@ -98,13 +87,6 @@ def test_half_turns_about_the_axes(axis, zero):
 def test_quaternion_is_normalised():
     q = np.array([1.0, 2.0, 3.0, 4.0])
     assert np.allclose(matrix_from_quaternion(q), matrix_from_quaternion(q / 7.0), atol=ROUNDING)
-
-
-def test_matrix_turns_icrs_into_body(random_directions):
-    icrs = random_directions(20, 1)
-    q = np.array([0.1, -0.2, 0.3, 0.9])
-    body = Rotation.from_quat(q).inv().apply(icrs)
-    assert np.abs(icrs @ matrix_from_quaternion(q).T - body).max() < ROUNDING
 
 
 @given(angles)
@@ -332,15 +314,6 @@ def test_no_problems_at_once():
     assert solve_wahba_svd(np.empty((0, 3, 3)), np.empty((0, 3, 3))).shape == (0, 3, 3)
 
 
-def test_determinant_is_that_of_numpy():
-    for matrix in np.random.default_rng(17).normal(size=(50, 3, 3)):
-        assert determinant(matrix) == pytest.approx(np.linalg.det(matrix), rel=1e-9, abs=1e-12)
-    assert determinant(np.arange(9.0).reshape(3, 3)) == 0.0
-    # One row after the other, so that a wrong sign or a swapped pair would show.
-    assert determinant(np.array([[0.0, 2.0, 0.0], [0.0, 0.0, 3.0], [5.0, 0.0, 0.0]])) == 30.0
-    assert determinant(np.array([[2.0, 0.0, 0.0], [0.0, 0.0, 3.0], [0.0, 5.0, 0.0]])) == -30.0
-
-
 def test_random_attitudes_are_rotations_spread_evenly():
     matrices = random_attitudes(4000, np.random.default_rng(10))
     assert np.allclose(np.linalg.det(matrices), 1.0)
@@ -351,27 +324,6 @@ def test_random_attitudes_are_rotations_spread_evenly():
 
 def test_no_random_attitudes():
     assert random_attitudes(0, np.random.default_rng(0)).shape == (0, 3, 3)
-
-
-@pytest.mark.parametrize("field", [0.01, 0.1, 0.8])
-@pytest.mark.parametrize("angle_rad", [0.0, 1e-7, 1e-3, 0.03, 0.3, 3.0])
-def test_newton_s_steps_end_where_the_svd_does(field, angle_rad):
-    generator = np.random.default_rng(5)
-    for matrix in random_attitudes(20, generator):
-        body = np.column_stack([generator.uniform(-field, field, (8, 2)), np.ones(8)])
-        body /= np.linalg.norm(body, axis=1)[:, None]
-        icrs = body @ matrix + 1e-4 * field * generator.normal(size=(8, 3))
-        icrs /= np.linalg.norm(icrs, axis=1)[:, None]
-        x, y, z = generator.normal(size=3)
-        scale = angle_rad / math.hypot(x, y, z)
-        near = after_turn(
-            quaternion_from_matrix(matrix).tolist(), (x * scale, y * scale, z * scale)
-        )
-        found = solve_wahba_near(body, icrs, matrix_from_quaternion(np.array(near)))
-        expected = solve_wahba_svd(body, icrs)
-        # Rounding turns a narrow field about its axis by as much more as it is narrow.
-        np.testing.assert_allclose(found, expected, atol=1e-14 / field**2)
-        np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-14)
 
 
 @pytest.mark.parametrize("angle_rad", [0.0, 1e-12, 1e-3, 2.0, 3.1])
@@ -391,12 +343,3 @@ def test_a_turn_is_what_leads_from_one_attitude_to_another(angle_rad):
         # A turn about the boresight leaves the boresight where it is.
         rolled = matrix_from_quaternion(np.array(after_turn(q, (0.0, 0.0, 0.3))))
         np.testing.assert_allclose(rolled[2], matrix[2], atol=1e-15)
-
-
-def test_the_inverse_in_plain_numbers_is_that_of_numpy():
-    generator = np.random.default_rng(7)
-    for root in generator.normal(size=(50, 3, 3)):
-        matrix = root @ root.T
-        np.testing.assert_allclose(inverse(matrix), np.linalg.inv(matrix), rtol=1e-6)
-    with pytest.raises(np.linalg.LinAlgError):
-        inverse(np.zeros((3, 3)))

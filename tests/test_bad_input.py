@@ -39,8 +39,8 @@ from starcat.exchange.formats import format_of
 from starcat.geometry.camera import Camera
 from starcat.images.image_file import write_image
 from starcat.matcher.matcher import Matcher
-from starcat.onboard.blocks import check_blocks
 from starcat.onboard.image import Contents, make_image
+from starcat.onboard.layout import check_blocks
 from starcat.onboard.reading import read_image
 from starcat.releases.publishing import publish_artifact
 from starcat.service.access import Role

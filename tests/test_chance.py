@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from frames import observe
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -15,16 +16,18 @@ from scipy.spatial.transform import Rotation
 from starcat.geometry.attitude import matrix_from_quaternion, random_attitudes, solve_wahba_svd
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
-from starcat.matcher.chance import false_match_probability
+from starcat.matcher.chance import (
+    false_match_probability,
+    log_assignments,
+    log_compatible_assignments,
+)
 from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.observation import observe
+from starcat.matcher.observation import compatible_pairs
 from starcat.matcher.pose import pose_at
 from starcat.matcher.verification import agree
-from starcat.matcher.ways import compatible_pairs, log_compatible_ways, log_ways
 from starcat.products.pairs_and_triangles import find_pairs
-from starcat.simulation.simulate import Frame, Noise, simulate_frame
-from starcat.simulation.sky import Sky
+from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame
 
 CAMERA = Camera(1024, 1024, fov_x_deg=30.0)
 
@@ -176,7 +179,7 @@ def test_magnitudes_divide_the_bound_by_the_ways_they_leave(n, more, others, see
         false_match_probability(*frame),
         false_match_probability(*frame, compatible=compatible),
     )
-    ways = log_compatible_ways(n, compatible)[n] - log_ways(n, n + more, n + others)
+    ways = log_compatible_assignments(n, compatible)[n] - log_assignments(n, n + more, n + others)
     if without < 1.0:
         assert found == pytest.approx(without * math.exp(ways), rel=1e-9)
     assert found <= without * (1.0 + 1e-12)

@@ -19,7 +19,7 @@ from every_command import every_command
 import starcat as package
 from starcat.artifact.writer import content_sha256
 from starcat.catalog.source import source_names
-from starcat.matcher.fast import library_version
+from starcat.matcher.c_engine import library_version
 from starcat.matcher.methods.table import METHODS
 from starcat.specs.reading import preset_names
 from starcat.storage.schema import product_schema

@@ -15,17 +15,16 @@ from starcat.exchange.onboard import export_image
 from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
-from starcat.matcher import fast
+from starcat.matcher import c_engine
+from starcat.matcher.batch import BatchResult
 from starcat.matcher.database import Database
-from starcat.matcher.many import MatchResults
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.methods.triangle_order import TriangleOrder
 from starcat.matcher.result import MatchResult
-from starcat.simulation.simulate import Frame, Noise, simulate_frame, simulate_frames
-from starcat.simulation.sky import Sky
+from starcat.matcher.settings import TriangleOrder
+from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame, simulate_frames
 
 needs_c = pytest.mark.skipif(
-    not fast.is_compiled(), reason="starcat was installed without a C compiler"
+    not c_engine.is_compiled(), reason="starcat was installed without a C compiler"
 )
 
 CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
@@ -71,7 +70,7 @@ def assert_same(found: MatchResult, expected: MatchResult) -> None:
 
 
 @needs_c
-@pytest.mark.parametrize("method", fast.FEATURES)
+@pytest.mark.parametrize("method", c_engine.FEATURES)
 @pytest.mark.parametrize("stated", [{}, {"noise_px": 0.7, "noise_mag": 0.3}, {"noise_mag": 0.5}])
 @pytest.mark.parametrize("magnitudes", [False, True], ids=["places only", "magnitudes"])
 def test_hard_frames_get_the_same_stars(sky, method, stated, magnitudes):
@@ -184,8 +183,8 @@ def test_answers_do_not_depend_on_threads_or_on_company(sky):
     px, mags = [frame.centroids_px for frame in some], [frame.mag for frame in some]
     one = matcher.identify_many(px, magnitudes=mags, threads=1)
     four = matcher.identify_many(px, magnitudes=mags, threads=4)
-    assert isinstance(one, MatchResults)
-    assert isinstance(four, MatchResults)
+    assert isinstance(one, BatchResult)
+    assert isinstance(four, BatchResult)
     assert one.status == four.status
     np.testing.assert_array_equal(one.q_body_from_icrs, four.q_body_from_icrs)
     assert (one.seconds > 0.0).all()
@@ -202,7 +201,7 @@ def test_answers_do_not_depend_on_threads_or_on_company(sky):
 
 
 def test_many_frames_are_answered_without_c(sky, monkeypatch):
-    monkeypatch.setattr(fast, "_onboard", None)
+    monkeypatch.setattr(c_engine, "_onboard", None)
     matcher = Matcher(sky)
     some = frames(sky, 3)
     found = matcher.identify_many([frame.centroids_px for frame in some])
@@ -224,9 +223,9 @@ def test_many_frames_need_as_many_magnitudes(sky):
 def test_engines_that_cannot_serve_say_why(sky, monkeypatch):
     with pytest.raises(ConfigError, match="choose one of auto, c, numpy"):
         Matcher(sky, engine="rust")
-    monkeypatch.setattr(fast, "_onboard", None)
-    assert not fast.is_compiled()
-    assert fast.library_version() is None
+    monkeypatch.setattr(c_engine, "_onboard", None)
+    assert not c_engine.is_compiled()
+    assert c_engine.library_version() is None
     with pytest.raises(ConfigError, match="without a C compiler"):
         Matcher(sky, engine="c")
 
@@ -256,7 +255,7 @@ def test_a_matcher_goes_to_another_process(sky):
 
 @needs_c
 def test_an_image_is_matched_as_its_artifact(small_artifact, tmp_path):
-    for method in fast.FEATURES:
+    for method in c_engine.FEATURES:
         path = tmp_path / f"{method}.img"
         export_image(small_artifact, "onboard", path, method=method)
         ground, flight = Matcher.open(small_artifact, method), Matcher.open(path)
@@ -293,8 +292,8 @@ def test_an_image_for_another_machine_is_refused(small_artifact, tmp_path):
 @needs_c
 def test_an_image_is_not_opened_where_a_field_is_too_full(sky, monkeypatch):
     crowded = replace(sky, camera=Camera(1024, 1024, fov_x_deg=110.0))
-    monkeypatch.setattr(fast, "most_stars", lambda: 10)
-    assert fast.fast_matcher(crowded, "triangle") is None
+    monkeypatch.setattr(c_engine, "most_stars", lambda: 10)
+    assert c_engine.c_engine(crowded, "triangle") is None
     with pytest.raises(ConfigError, match="too many stars"):
         Matcher(crowded, engine="c")
 

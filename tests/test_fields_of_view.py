@@ -30,8 +30,7 @@ from starcat.pipeline.starter import STARS_A_FIELD, Starter, advice, starter_spe
 from starcat.products.boresights import stars_in_fields, tile_sphere
 from starcat.products.coverage import TilingGap
 from starcat.products.pairs_and_triangles import find_triangles
-from starcat.simulation.interval import wilson_interval
-from starcat.simulation.selftest import Rates
+from starcat.simulation.selftest import Rates, wilson_interval
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.reading import preset
 
@@ -253,7 +252,7 @@ def test_triangles_of_90_deg_have_great_circle_sides():
 
 
 def test_the_sides_of_an_observed_triangle_are_those_of_its_stars_at_90_deg():
-    from starcat.matcher.observation import observe
+    from frames import observe
 
     camera = Camera(1280, 960, fov_x_deg=90.0)
     places = np.array([[0.5, 0.5], [1279.5, 0.5], [1279.5, 959.5], [640.0, 480.0]])

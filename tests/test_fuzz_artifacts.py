@@ -20,11 +20,11 @@ from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import verify_artifact
 from starcat.errors import ProductError, StarcatError
 from starcat.matcher.database import open_database
-from starcat.matcher.layout import LAYOUT
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
 from starcat.simulation.simulate import Noise, simulate_frames
 from starcat.storage.digests import file_sha256, json_bytes
+from starcat.storage.product_table import PRODUCTS
 
 FEW = settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 MANY = settings(FEW, max_examples=1000)
@@ -206,7 +206,7 @@ STRUCTURES: dict[str, Structure] = {
     "other numbers": holding(np.linspace(0.0, 1.0, 10)),
 }
 
-DATASETS = [(product, name) for product, layout in LAYOUT.items() for name in layout.datasets]
+DATASETS = [(product, name) for product, layout in PRODUCTS.items() for name in layout.datasets]
 USED = sorted({name for method in METHODS.values() for name in ("stars", *method.products)})
 
 
@@ -259,8 +259,8 @@ def put(product: str, name: str, structure: str, other: Path) -> Callable[[h5py.
     [("stars", "mag"), ("pairs", "i"), ("pairs", "kvector_counts"), ("pairs", "")],
 )
 def test_a_structure_that_no_build_writes_is_refused(
-    structure: str, product: str, name: str, copy: Path, small_artifact: Path
-) -> None:
+    structure, product, name, copy, small_artifact
+):
     other = small_artifact / "database.h5"
     before = spoil_database(copy, put(product, name, structure, other))
     try:
@@ -296,9 +296,7 @@ def test_made_up_databases_hurt_nobody(copy: Path, frame: Any, small_artifact: P
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_a_thousand_made_up_databases_hurt_nobody(
-    copy: Path, frame: Any, small_artifact: Path
-) -> None:
+def test_a_thousand_made_up_databases_hurt_nobody(copy, frame, small_artifact):
     run_structures(MANY, copy, frame, small_artifact / "database.h5")
 
 
@@ -319,7 +317,7 @@ def run_structures(some: settings, copy: Path, frame: Any, other: Path) -> None:
     @given(data=st.data())
     def run(data: st.DataObject) -> None:
         product = data.draw(st.sampled_from(USED))
-        names = LAYOUT[product].datasets
+        names = PRODUCTS[product].datasets
         kind = data.draw(st.sampled_from(["structure", "values", "values", "attribute"]))
         if kind == "structure":
             name = data.draw(st.sampled_from(names))

@@ -33,11 +33,12 @@ SINGLE_MODULES = {
 }
 
 GEOMETRY = ("attitude", "camera", "distortion", "kvector", "patterns", "sphere")
-ONBOARD = ("blocks", "grid", "image", "layout", "reading", "structure")
+ONBOARD = ("grid", "image", "layout", "reading")
 LIGHT = {
     "starcat.arrays",
     "starcat.errors",
     "starcat.storage.hdf5",
+    "starcat.storage.product_table",
     *(f"starcat.geometry.{name}" for name in GEOMETRY),
     *(f"starcat.onboard.{name}" for name in ONBOARD),
 }

@@ -18,9 +18,8 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import saff_kuijlaars, tangent_axes
 from starcat.images.image_file import write_image
 from starcat.images.render import Optics, render_image
-from starcat.matcher.blind import BEYOND, parts_of_range
+from starcat.matcher.blind import BEYOND, levels, parts_of_range
 from starcat.matcher.database import ProductArrays
-from starcat.matcher.levels import levels
 from starcat.matcher.matcher import Matcher
 from starcat.products.boresights import NominalField
 from starcat.products.levels import FEWEST_BORESIGHTS, find_levels, level_fields

@@ -2,15 +2,15 @@
 
 import numpy as np
 import pytest
+from frames import observe
 from hostile_frames import hostile_frame
 
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
-from starcat.matcher.budget import Budget, BudgetSpentError
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
-from starcat.matcher.observation import observe
 from starcat.matcher.pose import pose_at
+from starcat.matcher.settings import Budget, BudgetSpentError
 from starcat.matcher.verification import agree
 from starcat.simulation.simulate import Noise, simulate_frames
 
@@ -85,7 +85,7 @@ def test_no_more_steps_are_taken_than_there_are(sky):
     seen = observe(
         np.random.default_rng(0).uniform(0.0, 1024.0, (40, 2)), sky.camera, 2.0, budget=budget
     )
-    proposals = METHODS["triangle"].propose(seen, sky, Matcher(sky).selection)
+    proposals = METHODS["triangle"].propose(seen, sky)
     with pytest.raises(BudgetSpentError, match="steps"):
         list(proposals)
     assert budget.steps <= 700
@@ -120,6 +120,6 @@ def test_frames_that_no_answer_belongs_to_get_none(sky):
 def test_a_wide_tolerance_is_for_the_matcher_that_tries_smaller_reaches(sky):
     for frame in hard_frames(sky, 6, 60, 0.2):
         narrow, wide = Matcher(sky, tolerance_px=1.0), Matcher(sky, tolerance_px=6.0)
-        assert wide._fast is None
+        assert wide._c_engine is None
         if narrow.identify(frame.centroids_px, magnitudes=frame.mag).ok:
             assert wide.identify(frame.centroids_px, magnitudes=frame.mag).ok

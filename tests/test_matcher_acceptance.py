@@ -22,8 +22,7 @@ from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
 from starcat.matcher.result import MatchResult
 from starcat.pipeline.build import build
-from starcat.simulation.simulate import Frame, Noise, simulate_frame, simulate_frames
-from starcat.simulation.sky import Sky
+from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame, simulate_frames
 from starcat.specs.reading import preset
 
 pytestmark = pytest.mark.timeout(600)

@@ -17,14 +17,22 @@ from starcat.errors import ConfigError, OnboardImageError, OnboardSizeError, Sch
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
 from starcat.onboard import image as image_module
-from starcat.onboard.blocks import check_blocks, data_blocks, scrub
 from starcat.onboard.c_source import c_header, c_source, c_symbol
 from starcat.onboard.checking import artifact_problems, capacity_problems, value_problems
-from starcat.onboard.fit import LEAST_SHARE, fit
 from starcat.onboard.grid import Grid, grid_for, most_near
 from starcat.onboard.image import Contents, longest_pair_rad, make_image
-from starcat.onboard.layout import BYTE_ORDERS, HEADER, Sizes, check_bytes, in_order
+from starcat.onboard.layout import (
+    BYTE_ORDERS,
+    HEADER,
+    Sizes,
+    check_blocks,
+    check_bytes,
+    data_blocks,
+    in_order,
+    scrub,
+)
 from starcat.onboard.reading import read_image
+from starcat.onboard.shrink import LEAST_SHARE, shrink
 from starcat.products.boresights import tile_sphere
 from starcat.products.pairs_and_triangles import find_pairs, find_triangles
 
@@ -391,7 +399,7 @@ def test_an_image_is_made_to_fit_by_as_little_as_it_takes(real, method, share):
         contents, seen = replace(contents, method=method, features=pairs), None
     whole = len(make_image(contents).data)
     limit = int(share * whole)
-    fitted = fit(contents, seen, fields_of(contents), limit)
+    fitted = shrink(contents, seen, fields_of(contents), limit)
     made = make_image(fitted.contents)
     assert len(made.data) <= limit
     assert len(made.data) > limit - 8192
@@ -418,21 +426,21 @@ def test_an_image_is_made_to_fit_by_as_little_as_it_takes(real, method, share):
 def test_an_image_that_cannot_be_so_small_is_refused_with_what_it_takes(real):
     contents, seen = real
     with pytest.raises(OnboardSizeError, match="9,000 bytes are too few") as refused:
-        fit(contents, seen, fields_of(contents), 9_000)
+        shrink(contents, seen, fields_of(contents), 9_000)
     smallest = refused.value.smallest_bytes
     assert f"the smallest that is of use has {smallest:,} bytes" in str(refused.value)
-    fitted = fit(contents, seen, fields_of(contents), smallest)
+    fitted = shrink(contents, seen, fields_of(contents), smallest)
     assert len(make_image(fitted.contents).data) == smallest
     with pytest.raises(OnboardSizeError):
-        fit(contents, seen, fields_of(contents), smallest - 1)
+        shrink(contents, seen, fields_of(contents), smallest - 1)
 
 
 def test_nothing_can_be_fitted_too():
     contents = sky(0, 1)
-    fitted = fit(contents, np.empty(0, np.int32), fields_of(contents), 8192)
+    fitted = shrink(contents, np.empty(0, np.int32), fields_of(contents), 8192)
     assert (fitted.stars, fitted.features) == (0, 0)
     with pytest.raises(OnboardSizeError):
-        fit(contents, np.empty(0, np.int32), fields_of(contents), 8191)
+        shrink(contents, np.empty(0, np.int32), fields_of(contents), 8191)
 
 
 def test_an_image_knows_its_size_before_it_is_made(real):

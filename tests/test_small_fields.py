@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from frames import observe
 from pattern_skies import CAMERA, database, frames, is_right
 
 from starcat.geometry.sphere import separation
-from starcat.matcher.budget import Budget, BudgetSpentError
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.methods import dynamic_angle, small_fields
-from starcat.matcher.methods.pairs import side_tolerance_rad
-from starcat.matcher.methods.small_fields import bases
-from starcat.matcher.observation import observe
+from starcat.matcher.methods import dynamic_angle, pair_voting
+from starcat.matcher.methods.pair_voting import bases
+from starcat.matcher.settings import Budget, BudgetSpentError
 from starcat.simulation.simulate import Frame
 
 MIN_SHARE = 0.01
@@ -63,7 +62,7 @@ def test_three_centroids_are_as_far_apart_as_their_stars(sky):
             for one, other in ((0, 1), (0, 2), (1, 2)):
                 apart = seen[batch.centroids[:, one], batch.centroids[:, other]]
                 error = separation(u[:, one], u[:, other]) - apart
-                assert np.abs(error).max() <= side_tolerance_rad(observation)
+                assert np.abs(error).max() <= observation.side_tolerance_rad
             proposed += len(batch)
     assert proposed > 20
 
@@ -85,7 +84,7 @@ def test_a_sky_without_neighbours_has_no_base():
 def test_the_search_has_an_end_and_a_budget(sky, monkeypatch):
     frame = frames(sky, 1)[0]
     whole = sum(len(batch) for batch in bases(observe(frame.centroids_px, CAMERA, 2.0), sky))
-    monkeypatch.setattr(small_fields, "MOST_PLACES", 20_000)
+    monkeypatch.setattr(pair_voting, "MOST_PLACES", 20_000)
     assert 0 < sum(len(b) for b in bases(observe(frame.centroids_px, CAMERA, 2.0), sky)) < whole
     limited = observe(frame.centroids_px, CAMERA, 2.0, budget=Budget(max_steps=100))
     with pytest.raises(BudgetSpentError):

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from frames import observe
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from starcat.geometry.attitude import solve_wahba_svd
 from starcat.geometry.camera import Camera
-from starcat.matcher.observation import Observation, observe
-from starcat.matcher.spread import (
+from starcat.matcher.observation import Observation
+from starcat.matcher.pose import (
     corner_deviation,
-    explained_share,
+    explained_fraction,
     information,
     is_scaled,
-    share_of_frame,
+    weighted_share,
 )
 
 CAMERA = Camera(1024, 768, fov_x_deg=20.0)
@@ -79,7 +80,7 @@ def test_the_worst_corner_scatters_as_predicted(count, spread_px):
 def test_all_stars_are_the_whole_share():
     for count in (3, 5, 40):
         centroids_px = places(count, count)
-        share = explained_share(covariance_of(centroids_px), rays(centroids_px))
+        share = weighted_share(covariance_of(centroids_px), rays(centroids_px))
         assert share == pytest.approx(1.0, abs=1e-9)
 
 
@@ -90,7 +91,7 @@ def test_of_stars_that_are_spread_alike_the_share_is_that_of_their_number():
     ring /= np.linalg.norm(ring, axis=1)[:, None]
     covariance = np.linalg.inv(information(ring))
     twice = np.concatenate([ring, ring @ quarter.T])
-    assert explained_share(covariance, twice) == pytest.approx(0.5, rel=1e-9)
+    assert weighted_share(covariance, twice) == pytest.approx(0.5, rel=1e-9)
 
 
 def test_the_weights_are_the_variances_of_the_places():
@@ -102,7 +103,7 @@ def test_the_weights_are_the_variances_of_the_places():
         slopes = np.array([(Rotation.from_rotvec(step * a).apply(ray) - ray) / step for a in axes])
         weights.append(np.trace(slopes.T @ covariance @ slopes))
     assert sum(weights[:6]) == pytest.approx(3.0, rel=1e-5)
-    found = explained_share(covariance, rays(np.concatenate([matched_px, others_px])))
+    found = weighted_share(covariance, rays(np.concatenate([matched_px, others_px])))
     assert found == pytest.approx(3.0 / sum(weights), rel=1e-5)
 
 
@@ -112,7 +113,7 @@ def test_ten_stars_50_px_around_leave_one_at_500_px_a_weight_of_ten():
     ring_px = [512.0, 384.0] + 50.0 * np.column_stack([np.cos(angle), np.sin(angle)])
     every = rays(np.vstack([ring_px, [1012.0, 384.0]]))
     # At 10 degrees off the axis pixels are 3 % smaller across the radius.
-    assert explained_share(covariance_of(ring_px), every) == pytest.approx(3.0 / 13.2, rel=0.03)
+    assert weighted_share(covariance_of(ring_px), every) == pytest.approx(3.0 / 13.2, rel=0.03)
 
 
 @given(st.integers(4, 12), st.integers(0, 99), st.floats(0.0, 6.0))
@@ -120,8 +121,8 @@ def test_the_share_does_not_depend_on_the_axes(count, seed, angle):
     turn = Rotation.from_rotvec(angle * np.array([0.6, 0.0, 0.8])).as_matrix()
     matched, others = rays(places(count, seed, 600.0)), rays(places(count, seed + 100))
     every = np.concatenate([matched, others])
-    one = explained_share(np.linalg.inv(information(matched)), every)
-    other = explained_share(np.linalg.inv(information(matched @ turn.T)), every @ turn.T)
+    one = weighted_share(np.linalg.inv(information(matched)), every)
+    other = weighted_share(np.linalg.inv(information(matched @ turn.T)), every @ turn.T)
     assert one == pytest.approx(other, rel=1e-6)
 
 
@@ -131,7 +132,7 @@ def test_a_missed_star_counts_the_more_the_farther_it_is(seed, angle, distance_p
     covariance = covariance_of(matched_px)
     along = np.array([np.cos(angle), np.sin(angle)])
     shares = [
-        explained_share(
+        weighted_share(
             covariance,
             rays(np.vstack([matched_px, matched_px.mean(axis=0) + r * along])),
         )
@@ -151,10 +152,12 @@ def test_fewer_stars_or_fewer_centroids_in_the_frame_are_no_fault():
     matched_px, others_px = places(8, 6), places(12, 7)
     all_px = np.concatenate([matched_px, others_px])
     matched, all_rays, residual_rad = rays(matched_px), rays(all_px), 0.5 / CAMERA.focal_length_px
-    assert share_of_frame(matched, all_rays, residual_rad, seen(matched_px)) == pytest.approx(1.0)
-    assert share_of_frame(matched, matched, residual_rad, seen(all_px)) == pytest.approx(1.0)
-    both = share_of_frame(matched, all_rays, residual_rad, seen(all_px))
-    assert both == pytest.approx(explained_share(covariance_of(matched_px), all_rays))
+    assert explained_fraction(matched, all_rays, residual_rad, seen(matched_px)) == pytest.approx(
+        1.0
+    )
+    assert explained_fraction(matched, matched, residual_rad, seen(all_px)) == pytest.approx(1.0)
+    both = explained_fraction(matched, all_rays, residual_rad, seen(all_px))
+    assert both == pytest.approx(weighted_share(covariance_of(matched_px), all_rays))
     assert 0.2 < both < 0.5
 
 
@@ -163,7 +166,7 @@ def test_a_cluster_alone_does_not_explain_the_frame():
     stars = rays(np.concatenate([cluster_px, outside_px]))
     residual_rad = 0.5 / CAMERA.focal_length_px
     observation = seen(np.concatenate([cluster_px, outside_px]))
-    assert share_of_frame(rays(cluster_px), stars, residual_rad, observation) < 0.05
+    assert explained_fraction(rays(cluster_px), stars, residual_rad, observation) < 0.05
 
 
 @pytest.mark.parametrize(("residual_px", "is_held"), [(0.1, True), (1.0, False)])
@@ -173,13 +176,13 @@ def test_that_nothing_else_was_seen_counts_if_the_corners_are_held(residual_px, 
     residual_rad = residual_px / CAMERA.focal_length_px
     # About 20 px from the middle of the cluster, ten stars: 640 / (20 sqrt(10)) = 10 times.
     assert 5.0 < corner_deviation(covariance_of(cluster_px), CAMERA) < 15.0
-    found = share_of_frame(rays(cluster_px), stars, residual_rad, seen(cluster_px))
+    found = explained_fraction(rays(cluster_px), stars, residual_rad, seen(cluster_px))
     assert found == pytest.approx(1.0) if is_held else found < 0.05
 
 
 def test_stars_in_one_place_explain_nothing():
     same = np.tile([0.0, 0.0, 1.0], (5, 1))
-    assert share_of_frame(same, same, 0.0, seen(places(5, 10))) == 0.0
+    assert explained_fraction(same, same, 0.0, seen(places(5, 10))) == 0.0
 
 
 # --- Scale

@@ -17,14 +17,13 @@ from starcat.geometry.attitude import (
     turn_between,
 )
 from starcat.geometry.camera import Camera
-from starcat.matcher import fast
+from starcat.matcher import c_engine
+from starcat.matcher import prior as prior_search
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.methods import nearby
 from starcat.matcher.result import MatchResult
 from starcat.matcher.tracking import MOST_STEPS, Tracker
-from starcat.simulation.simulate import Frame, Noise, simulate_frame, simulate_frames
-from starcat.simulation.sky import Sky
+from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame, simulate_frames
 
 HARD = Noise(0.5, drop_probability=0.1, false_stars=3)
 
@@ -32,7 +31,9 @@ both_engines = pytest.mark.parametrize(
     "engine",
     [
         "numpy",
-        pytest.param("c", marks=pytest.mark.skipif(not fast.is_compiled(), reason="no C library")),
+        pytest.param(
+            "c", marks=pytest.mark.skipif(not c_engine.is_compiled(), reason="no C library")
+        ),
     ],
 )
 
@@ -98,9 +99,11 @@ def test_magnitudes_and_stated_noises_hold_near_a_prior_too(sky, engine):
     assert same >= 38
 
 
-@pytest.mark.parametrize("most_stars", [nearby.MOST_STARS, 0], ids=["few stars", "many stars"])
+@pytest.mark.parametrize(
+    "most_stars", [prior_search.MOST_STARS, 0], ids=["few stars", "many stars"]
+)
 def test_what_is_near_the_prior_takes_few_steps(sky, monkeypatch, most_stars):
-    monkeypatch.setattr(nearby, "MOST_STARS", most_stars)
+    monkeypatch.setattr(prior_search, "MOST_STARS", most_stars)
     budget = 2_500 if most_stars else 1_000_000
     matcher = Matcher(sky, engine="numpy", max_steps=budget)
     found = [

@@ -7,17 +7,14 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from frames import observe, with_selection
 from hypothesis import given
 from hypothesis import strategies as st
 
+from starcat.evaluation.papers.s3 import optimised_triangle
 from starcat.geometry.camera import Camera
-from starcat.matcher.methods.triangle_order import (
-    TriangleOrder,
-    is_well_shaped,
-    optimised_triangle,
-    select_triangles,
-)
-from starcat.matcher.observation import Observation, observe
+from starcat.matcher.methods.order import is_well_shaped, select_triangles
+from starcat.matcher.observation import Observation
 
 CAMERA = Camera(1024, 1024, fov_x_deg=12.0)
 
@@ -26,6 +23,10 @@ def frame(count: int, seed: int, magnitudes: bool = False) -> Observation:
     generator = np.random.default_rng(seed)
     points = generator.random((count, 2)) * 1024.0
     return observe(points, CAMERA, 2.0, generator.random(count) if magnitudes else None)
+
+
+def ordered(seen: Observation, **order: object) -> np.ndarray:
+    return select_triangles(with_selection(seen, **order))
 
 
 def angles_of(a: float, b: float, c: float) -> list[float]:
@@ -168,8 +169,8 @@ def pixels_apart(observation: Observation, triangle: tuple[int, int, int]) -> li
 @pytest.mark.parametrize("order", ["auto", "brightness", "inradius", "compact"])
 def test_every_well_shaped_triangle_once(order, magnitudes):
     observation = frame(12, 22, magnitudes)
-    selection = TriangleOrder(order, min_side_px=150.0, min_angle_deg=25.0, few_centroids=0)
-    found = select_triangles(observation, selection).tolist()
+    strict = {"min_side_px": 150.0, "min_angle_deg": 25.0, "few_centroids": 0}
+    found = ordered(observation, order=order, **strict).tolist()
     expected = [
         list(triangle)
         for triangle in combinations(range(12), 3)
@@ -183,8 +184,8 @@ def test_every_well_shaped_triangle_once(order, magnitudes):
 def test_few_centroids_try_the_poor_triangles_last():
     observation = frame(10, 22)
     strict = {"order": "brightness", "min_side_px": 150.0, "min_angle_deg": 25.0}
-    good = select_triangles(observation, TriangleOrder(**strict, few_centroids=9)).tolist()
-    both = select_triangles(observation, TriangleOrder(**strict, few_centroids=10)).tolist()
+    good = ordered(observation, **strict, few_centroids=9).tolist()
+    both = ordered(observation, **strict, few_centroids=10).tolist()
     assert both[: len(good)] == good
     poor = [
         list(triangle)
@@ -199,9 +200,7 @@ def test_few_centroids_try_the_poor_triangles_last():
 
 @pytest.mark.parametrize(("order", "magnitudes"), [("brightness", False), ("auto", True)])
 def test_order_of_brightness_is_that_of_the_faintest(order, magnitudes):
-    found = select_triangles(
-        frame(9, 23, magnitudes), TriangleOrder(order, few_centroids=0)
-    ).tolist()
+    found = ordered(frame(9, 23, magnitudes), order=order, few_centroids=0).tolist()
     assert found == sorted(found, key=lambda triangle: triangle[::-1])
     assert len(found) > 20
 
@@ -209,7 +208,7 @@ def test_order_of_brightness_is_that_of_the_faintest(order, magnitudes):
 @pytest.mark.parametrize(("order", "magnitudes"), [("compact", True), ("auto", False)])
 def test_compact_is_by_the_longest_side(order, magnitudes):
     observation = frame(9, 24, magnitudes)
-    found = select_triangles(observation, TriangleOrder(order, few_centroids=0))
+    found = ordered(observation, order=order, few_centroids=0)
     longest = [max(pixels_apart(observation, tuple(triangle))) for triangle in found]
     assert (np.diff(longest) >= 0.0).all()
 
@@ -218,7 +217,7 @@ def test_compact_is_by_the_longest_side(order, magnitudes):
 def test_inradius_is_largest_first(magnitudes):
     observation = frame(9, 25, magnitudes)
     inradius = []
-    for triangle in select_triangles(observation, TriangleOrder("inradius", few_centroids=0)):
+    for triangle in ordered(observation, order="inradius", few_centroids=0):
         a, b, c = pixels_apart(observation, tuple(triangle))
         area = 0.5 * b * c * math.sin(angles_of(a, b, c)[0])
         inradius.append(2.0 * area / (a + b + c))
@@ -229,15 +228,13 @@ def test_inradius_is_largest_first(magnitudes):
 def test_equal_keys_keep_the_order_of_the_centroids():
     square = [[300.0, 300.0], [300.0, 700.0], [700.0, 300.0], [700.0, 700.0]]
     observation = observe(square, CAMERA, 2.0)
-    found = select_triangles(observation, TriangleOrder("brightness", few_centroids=0)).tolist()
+    found = ordered(observation, order="brightness", few_centroids=0).tolist()
     assert found == [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]
 
 
 @pytest.mark.parametrize("most", [4, 7, 40])
 def test_only_the_first_centroids_take_part(most):
-    found = select_triangles(
-        frame(40, 26), TriangleOrder("compact", min_angle_deg=1.0, most_centroids=most)
-    )
+    found = ordered(frame(40, 26), order="compact", min_angle_deg=1.0, most_centroids=most)
     assert found.max() == most - 1
     assert (np.diff(found, axis=1) > 0).all()
 
@@ -255,7 +252,7 @@ def test_every_centroid_of_a_crowded_frame_has_its_turn():
     found = select_triangles(seen)
     # Every triangle has one turn, that of its owner: after 120 of them nearly all have been in one.
     assert len(set(found[:120].ravel().tolist())) > 100
-    before = select_triangles(seen, TriangleOrder(order="compact"))
+    before = ordered(seen, order="compact")
     assert set(before.ravel().tolist()) == set(range(32))
     assert len({tuple(row) for row in found.tolist()}) == len(found)
     assert (np.diff(found, axis=1) > 0).all()
@@ -272,11 +269,11 @@ def test_triangles_of_a_crowded_frame_are_of_near_centroids():
 @pytest.mark.parametrize(("count", "magnitudes"), [(32, False), (60, True)])
 def test_other_frames_are_as_they_were(count, magnitudes):
     seen = frame(count, 6, magnitudes)
-    order = TriangleOrder(order="brightness" if magnitudes else "compact")
-    assert select_triangles(seen).tolist() == select_triangles(seen, order).tolist()
+    order = "brightness" if magnitudes else "compact"
+    assert select_triangles(seen).tolist() == ordered(seen, order=order).tolist()
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3, 4])
 def test_few_centroids_can_be_spread(count):
-    found = select_triangles(frame(count, 1), TriangleOrder(order="spread", min_angle_deg=0.0))
+    found = ordered(frame(count, 1), order="spread", min_angle_deg=0.0)
     assert len(found) == math.comb(count, 3)

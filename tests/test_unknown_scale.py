@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from frames import observe
 
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import matrix_from_quaternion, random_attitudes
@@ -11,9 +12,8 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.matcher.chance import false_match_probability
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.methods.triangle_shape import scale_free
-from starcat.matcher.observation import observe
-from starcat.matcher.pose import focal_length_error_px, pose_at, refitted
+from starcat.matcher.methods.triangle import scale_free
+from starcat.matcher.pose import fit, focal_length_error_px, pose_at
 from starcat.simulation.simulate import Noise, simulate_frames
 
 CAMERA = Camera(1024, 1024, fov_x_deg=12.0)
@@ -71,7 +71,7 @@ def test_the_fit_finds_attitude_and_focal_length_exactly():
         seen = observe(px, told(0.97, camera), 2.0, fov_error=0.05)
         pose, rows = pose_at(matrix, 1.0, seen), np.arange(9)
         for _ in range(6):
-            pose = refitted(pose, rows, stars[seen.rows], seen)
+            pose = fit(pose, rows, stars[seen.rows], seen)
         assert pose.camera.focal_length_px == pytest.approx(camera.focal_length_px, rel=1e-9)
         assert np.abs(pose.matrix - matrix).max() < 1e-9
 
@@ -85,7 +85,7 @@ def test_three_standard_errors_of_the_focal_length_hold_the_truth(n):
         seen = observe(px + generator.normal(scale=0.5, size=(n, 2)), CAMERA, 2.0, fov_error=0.05)
         pose, rows = pose_at(np.eye(3), 1.0, seen), np.arange(len(seen))
         for _ in range(2):
-            pose = refitted(pose, rows, stars[seen.rows], seen)
+            pose = fit(pose, rows, stars[seen.rows], seen)
         left = pose.body - stars[seen.rows] @ pose.matrix.T
         residual_rad = math.sqrt(np.vdot(left, left) / len(left))
         error_px = focal_length_error_px(pose, rows, residual_rad, seen)

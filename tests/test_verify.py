@@ -16,7 +16,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from starcat.artifact.database import INDICES
 from starcat.artifact.manifest import DATABASE_NAME, MANIFEST_NAME, manifest_digest
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import Finding, check_artifact, verify_artifact
@@ -25,6 +24,7 @@ from starcat.errors import ProductError
 from starcat.resources import resource_folder
 from starcat.storage.digests import file_sha256, json_bytes
 from starcat.storage.parquet import read_parquet, write_parquet
+from starcat.storage.product_table import PRODUCTS, indices_of
 
 SCHEMAS = resource_folder("schemas")
 
@@ -112,8 +112,8 @@ def test_every_index_that_is_written_is_named(small_artifact: Path) -> None:
             for column in artifact.schema(name).columns:
                 parts = ("_offsets", "_values") if column.is_list else ("",)
                 columns |= {f"{column.name}{part}" for part in parts}
-            assert set(file[name]) - columns == set(INDICES.get(name, ()))
-    assert set(INDICES) <= {path.stem.partition("-")[0] for path in SCHEMAS.glob("*.json")}
+            assert set(file[name]) - columns == set(indices_of(name))
+    assert set(PRODUCTS) <= {path.stem.partition("-")[0] for path in SCHEMAS.glob("*.json")}
 
 
 # Whole and damaged files --------------------------------------------------------------------
@@ -274,9 +274,7 @@ def test_a_manifest_of_something_else_is_found(data: bytes, copy: Path) -> None:
 
 @pytest.mark.parametrize("key", ["files", "products", "sources", "spec", "name"])
 @pytest.mark.parametrize("value", [None, [], {"x": None}], ids=str)
-def test_a_senseless_manifest_with_a_right_digest_is_found(
-    key: str, value: object, copy: Path
-) -> None:
+def test_a_senseless_manifest_with_a_right_digest_is_found(key, value, copy):
     seal(copy, lambda manifest: manifest.update({key: value}))
     assert MANIFEST_NAME in {f.file for f in verify_artifact(copy).findings} or key == "files"
     assert verify_artifact(copy).findings
@@ -425,9 +423,7 @@ def test_values_that_are_not_those_of_the_content_digest(copy: Path) -> None:
             1, pa.field("catalog", pa.string()), pa.nulls(len(t), pa.string()))),
     ],
 )  # fmt: skip
-def test_columns_that_break_the_schema(
-    words: str, change: Callable[[pa.Table], pa.Table], copy: Path
-) -> None:
+def test_columns_that_break_the_schema(words, change, copy):
     path = copy / "stars.parquet"
     write_parquet(change(read_parquet(path)), path)
     seal(copy, lambda manifest: None) if words == "columns differ" else seal_file(copy, path)
@@ -513,9 +509,7 @@ def remove(place: str) -> Callable[[h5py.File], object]:
         ("grid", "cells_values differs", put("grid/cells_values", 0, 0)),
     ],
 )  # fmt: skip
-def test_a_wrong_database(
-    product: str, words: str, change: Callable[[h5py.File], object], copy: Path
-) -> None:
+def test_a_wrong_database(product, words, change, copy):
     edit_database(copy, change)
     expect(copy, DATABASE_NAME, product, words)
 

@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from starcat.matcher.ways import compatible_pairs, log_compatible_ways, log_ways
+from starcat.matcher.chance import log_assignments, log_compatible_assignments
+from starcat.matcher.observation import compatible_pairs
 
 GRAPHS = arrays(bool, array_shapes(min_dims=2, max_dims=2, max_side=6))
 
@@ -42,7 +43,7 @@ def bounds_by_hand(compatible: np.ndarray, n: int) -> list[float]:
 @given(GRAPHS)
 def test_the_bound_is_the_least_of_five_and_above_the_number_of_matchings(compatible):
     most = min(compatible.shape)
-    found = np.exp(log_compatible_ways(most, compatible))
+    found = np.exp(log_compatible_assignments(most, compatible))
     for n in range(most + 1):
         number, bounds = matchings(compatible, n), bounds_by_hand(compatible, n)
         assert all(number <= bound * (1.0 + 1e-12) for bound in bounds)
@@ -54,7 +55,7 @@ def test_the_bound_is_the_least_of_five_and_above_the_number_of_matchings(compat
 @given(GRAPHS)
 def test_centroids_and_stars_may_change_places(compatible):
     most = min(compatible.shape)
-    one, other = (np.exp(log_compatible_ways(most, g)) for g in (compatible, compatible.T))
+    one, other = (np.exp(log_compatible_assignments(most, g)) for g in (compatible, compatible.T))
     np.testing.assert_allclose(one, other, rtol=1e-12)
 
 
@@ -62,28 +63,28 @@ def test_centroids_and_stars_may_change_places(compatible):
 def test_groups_that_keep_to_themselves_are_counted_exactly(sizes):
     count = sum(sizes)
     group = np.repeat(np.arange(len(sizes)), sizes)
-    found = log_compatible_ways(count, group[:, None] == group)[count]
+    found = log_compatible_assignments(count, group[:, None] == group)[count]
     assert math.exp(found) == pytest.approx(math.prod(map(math.factorial, sizes)), rel=1e-12)
 
 
 def test_one_centroid_without_a_star_leaves_no_way_for_all():
     compatible = np.ones((4, 6), dtype=bool)
     compatible[2] = False
-    found = log_compatible_ways(4, compatible)
+    found = log_compatible_assignments(4, compatible)
     assert found[4] == -np.inf
     assert math.exp(found[3]) == pytest.approx(math.perm(6, 3))
 
 
 @pytest.mark.parametrize(("count", "stars"), [(900, 1100), (64, 2000)])
 def test_large_numbers_do_not_overflow(count, stars):
-    found = log_compatible_ways(count, np.ones((count, stars), dtype=bool))
-    assert found[-1] == pytest.approx(log_ways(count, count, stars), rel=1e-12)
+    found = log_compatible_assignments(count, np.ones((count, stars), dtype=bool))
+    assert found[-1] == pytest.approx(log_assignments(count, count, stars), rel=1e-12)
     assert np.isfinite(found).all()
 
 
 @given(st.integers(0, 9), st.integers(0, 9), st.integers(0, 9))
 def test_the_number_without_magnitudes(n, more, others):
-    found = math.exp(log_ways(n, n + more, n + others))
+    found = math.exp(log_assignments(n, n + more, n + others))
     assert found == pytest.approx(math.comb(n + more, n) * math.perm(n + others, n), rel=1e-11)
 
 

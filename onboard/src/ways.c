@@ -1,5 +1,5 @@
 /* The number of ways to assign centroids to stars, which stated magnitudes make smaller. The same
- * bounds as the ground's starcat/matcher/ways.py, where they are derived.
+ * bounds as the ground's starcat/matcher/chance.py, where they are derived.
  *
  * SPDX-License-Identifier: MIT
  */

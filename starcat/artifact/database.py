@@ -21,21 +21,11 @@ from numpy.typing import NDArray
 
 from starcat.errors import SchemaError
 from starcat.products.index import Index
+from starcat.storage.product_table import indices_of
 from starcat.storage.schema import ProductSchema, SchemaColumn
 
 LAYOUT_VERSION = "1.0.0"
 """The version of the arrangement of groups, datasets and attributes described above."""
-
-INDICES: dict[str, tuple[str, ...]] = {
-    "pairs": ("kvector_counts",),
-    "triangles": ("kvector_counts",),
-    "neighbours": ("star_offsets", "lookup_offsets", "lookup_rows"),
-    "hausdorff_angular": ("star_offsets",),
-    "hausdorff_l2": ("star_offsets", "smallest_distance"),
-    "grid": ("cell_offsets", "cell_rows"),
-    "radial": ("ring_offsets", "ring_rows"),
-}
-"""The datasets that stand beside the columns of a product; a product that is not here has none."""
 
 
 def write_root(file: h5py.File, facts: Mapping[str, str | float]) -> None:
@@ -53,7 +43,7 @@ def write_product(
     star_count: int,
 ) -> None:
     """Write a product as a group of contiguous datasets."""
-    expected = INDICES.get(schema.product, ())
+    expected = indices_of(schema.product)
     if set(index.datasets) != set(expected):
         raise SchemaError(
             f"{schema.product}: indices {', '.join(index.datasets) or 'none'} found; expected "

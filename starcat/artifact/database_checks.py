@@ -13,9 +13,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from starcat.artifact.database import INDICES, LAYOUT_VERSION, column_datasets, dataset_attributes
+from starcat.artifact.database import LAYOUT_VERSION, column_datasets, dataset_attributes
 from starcat.products.index import row_offsets
 from starcat.storage.hdf5 import own_dataset
+from starcat.storage.product_table import indices_of
 from starcat.storage.schema import ProductSchema
 
 
@@ -72,7 +73,7 @@ def index_problems(
     group: h5py.Group, table: pa.Table, schema: ProductSchema, star_count: int
 ) -> Iterator[str]:
     """Yield where the indices of a product do not fit its rows."""
-    for name in INDICES.get(schema.product, ()):
+    for name in indices_of(schema.product):
         if name not in group:
             yield f"{group.name}/{name} is missing"
         elif name == "kvector_counts":

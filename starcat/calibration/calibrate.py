@@ -220,5 +220,5 @@ def _too_few(
 
 
 def _why(frame: MeasuredFrame, result: MatchResult) -> str:
-    words = result.refusal.words if result.refusal else result.status.replace("_", " ")
+    words = result.refusal.message if result.refusal else result.status.replace("_", " ")
     return f"{len(frame.centroids_px)} centroids: {words}"

@@ -33,8 +33,9 @@ from starcat.geometry.attitude import matrix_from_quaternion
 from starcat.geometry.camera import Camera
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.chance import MIN_STARS
-from starcat.matcher.matcher import NOISE_DEVIATIONS, Matcher
+from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
+from starcat.matcher.settings import NOISE_DEVIATIONS
 from starcat.progress import Progress
 
 WIDE_PX = 6.0
@@ -226,7 +227,7 @@ def _focal_lengths(shortest: float, longest: float, step: float) -> list[float]:
 
 def _of_all(result: MatchResult, rows: NDArray[np.int64], count: int) -> MatchResult:
     """Return the answer about some centroids as one about all of them."""
-    ids, index = np.full(count, -1, dtype=np.int64), np.full(count, -1, dtype=np.int32)
-    ids[rows], index[rows] = result.star_ids, result.star_index
+    index = np.full(count, -1, dtype=np.int32)
+    index[rows] = result.star_index
     dropped = tuple((int(rows[row]), reason) for row, reason in result.dropped)
-    return replace(result, star_ids=ids, star_index=index, dropped=dropped)
+    return replace(result, star_index=index, dropped=dropped)

@@ -69,7 +69,7 @@ for part in PARTS:
 
 def _version(wanted: bool) -> None:
     if wanted:
-        from starcat.matcher.fast import library_version
+        from starcat.matcher.c_engine import library_version
 
         library = library_version()
         typer.echo(f"starcat {__version__}")

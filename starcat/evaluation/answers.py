@@ -8,13 +8,18 @@ from dataclasses import replace
 import numpy as np
 
 from starcat.arrays import Array, Rows
+from starcat.evaluation.bare_methods import (
+    name_by_points,
+    name_by_separations,
+    rank_by_ratios,
+)
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.methods import hausdorff_angular, hausdorff_l1, hausdorff_l2
+from starcat.matcher.methods.hausdorff import rank_by_points
 from starcat.matcher.methods.reference import references
-from starcat.matcher.observation import Observation, observe
-from starcat.matcher.result import MatchResult, unidentified
+from starcat.matcher.observation import Observation, as_frame, observe
+from starcat.matcher.result import MatchResult, no_match
 
 Name = Callable[[Observation, Database], Rows]
 Answerer = Callable[[Matcher, Array, Camera, "Array | None"], MatchResult]
@@ -36,41 +41,40 @@ def bare(name: Name) -> Answerer:
     def answer(
         matcher: Matcher, centroids_px: Array, camera: Camera, mag: Array | None
     ) -> MatchResult:
-        observation = observe(centroids_px, camera, matcher.tolerance_px, mag)
-        none = unidentified("no_match", observation)
+        observation = observe(as_frame(centroids_px, camera, mag), matcher.settings)
+        none = no_match(len(centroids_px), observation.dropped)
         if len(observation) < 2:
             return none
-        index = none.star_index.copy()
-        index[observation.rows] = name(observation, matcher.database)
-        return replace(none, star_index=index, n_matched=int((index >= 0).sum()))
+        named = name(observation, matcher.database).astype(np.int32)
+        return replace(none, star_index=observation.in_frame(named))
 
     return answer
 
 
 def _angular(observation: Observation, database: Database) -> Rows:
-    return hausdorff_angular.identify_bare(observation, database)
+    return name_by_separations(observation, database)
 
 
 def _angular_capped(observation: Observation, database: Database) -> Rows:
     cap_rad = CAP_PX / observation.camera.focal_length_px
-    return hausdorff_angular.identify_bare(observation, database, cap_rad)
+    return name_by_separations(observation, database, cap_rad)
 
 
 def _l2(observation: Observation, database: Database) -> Rows:
     # This is the circle inside the frame, whatever the scale may be.
     reach = 0.5 * min(observation.camera.width_px, observation.camera.height_px)
     radius_rad = float(np.arctan(reach / observation.camera.focal_length_px))
-    stars, _ = hausdorff_l2.rank_stars(observation, database, count=1, radius_rad=radius_rad)
+    stars, _ = rank_by_ratios(observation, database, count=1, radius_rad=radius_rad)
     return _reference_alone(observation, stars)
 
 
 def _l1(observation: Observation, database: Database) -> Rows:
-    stars, _ = hausdorff_l1.rank_stars(observation, database, count=1)
+    stars, _ = rank_by_points(observation, database, count=1)
     return _reference_alone(observation, stars)
 
 
 def _l1_limited(observation: Observation, database: Database) -> Rows:
-    named = hausdorff_l1.identify_bare(observation, database)
+    named = name_by_points(observation, database)
     return _reference_alone(observation, np.array([named], dtype=np.intp))
 
 

@@ -19,10 +19,10 @@ from starcat.catalog.stars import directions_of, floats_of
 from starcat.errors import ConfigError, OnboardImageError, OutputError
 from starcat.onboard.c_source import c_header, c_source
 from starcat.onboard.checking import artifact_problems, capacity_problems, value_problems
-from starcat.onboard.fit import Fitted, fit
 from starcat.onboard.image import Contents, MadeImage, check_method, make_image
 from starcat.onboard.layout import BLOCK_BYTES, BYTE_ORDERS, FEATURES, ByteOrder
 from starcat.onboard.reading import bytes_of_file, read_image
+from starcat.onboard.shrink import Shrunk, shrink
 from starcat.pipeline.recipes import tile_guide_stars
 from starcat.products.boresights import FieldStars
 from starcat.specs.reading import spec_from_dict
@@ -34,7 +34,7 @@ class ExportedImage:
     """An onboard image as it was written."""
 
     made: MadeImage
-    fitted: Fitted  # what is in it, and what was left out
+    fitted: Shrunk  # what is in it, and what was left out
     file_format: str
     byte_order: str
     files: tuple[Path, ...]  # the image, or source and header
@@ -86,7 +86,7 @@ def export_image(
         raise OutputError(f"{target}: is a folder; choose a file with --output", path=target)
     _check_product(opened, method)
     contents = contents_of(check_artifact(artifact), method)
-    fitted = fit(contents, _times_seen(opened, method), partial(_fields, opened), max_bytes)
+    fitted = shrink(contents, _times_seen(opened, method), partial(_fields, opened), max_bytes)
     made = make_image(fitted.contents, order)
     files = {target: made.data}
     if file_format == "c":

@@ -142,102 +142,11 @@ def solve_wahba_svd(body: Directions, icrs: Directions, weights: Array | None = 
     weighted = body if weights is None else body * weights[:, None]
     u, _, vt = np.linalg.svd(np.swapaxes(weighted, -1, -2) @ icrs)
     matrix = u @ vt
-    if matrix.ndim == 2:
-        if determinant(matrix) < 0.0:
-            u[:, 2] *= -1.0
-            matrix = u @ vt
-        return np.asarray(matrix)
     mirrored = np.linalg.det(matrix) < 0.0
-    u[mirrored, :, 2] *= -1.0
+    if not mirrored.any():
+        return np.asarray(matrix)
+    u[..., 2] *= np.where(mirrored, -1.0, 1.0)[..., None]
     return np.asarray(u @ vt)
-
-
-NEAR_RAD = 0.05
-"""Largest turn that `solve_wahba_near` makes in one step; a larger one is left to the SVD."""
-
-CONVERGED_RAD = 1e-6
-"""Turn after which there is no further one: the error that is left is of the order of its square.
-"""
-
-
-def solve_wahba_near(body: Directions, icrs: Directions, matrix: Matrix) -> Array:
-    """Return the rotation that best turns reference directions into observed ones.
-
-    As `solve_wahba_svd`, to rounding, from a rotation that is near.
-
-    Steps of Newton's method on Wahba's loss, in plain numbers. With ``B = sum(body predicted^T)``
-    the gradient by a small turn of the predicted directions is the vector of its antisymmetric
-    part, and ``tr(B) I - (B + B^T) / 2`` the second derivative. Where a turn is not small, the
-    SVD answers.
-
-    >>> icrs = np.array([[0.1, 0.0, 0.995], [0.0, 0.1, 0.995], [-0.1, -0.1, 0.99]])
-    >>> turned = matrix_from_quaternion(np.array([0.001, 0.002, -0.003, 1.0]))
-    >>> found = solve_wahba_near(icrs @ turned.T, icrs, np.eye(3))
-    >>> bool(np.abs(found - turned).max() < 1e-12)
-    True
-    """
-    (a, b, c), (d, e, f), (g, h, i) = (body.T @ icrs @ matrix.T).tolist()
-    whole = (0.0, 0.0, 0.0, 1.0)
-    for _ in range(4):
-        # The symmetric matrix of the second derivative: p, q, r; s, t; u above its diagonal.
-        p, q, r = e + i, -0.5 * (b + d), -0.5 * (c + g)
-        s, t, u = a + i, -0.5 * (f + h), a + e
-        k, m, n = s * u - t * t, r * t - q * u, q * t - r * s
-        size = p * k + q * m + r * n
-        if not size > 0.0:
-            break
-        v, w = p * u - r * r, q * r - p * t
-        tx, ty, tz = h - f, c - g, d - b
-        x, y, z = (
-            0.5 * (k * tx + m * ty + n * tz) / size,
-            0.5 * (m * tx + v * ty + w * tz) / size,
-            0.5 * (n * tx + w * ty + (p * s - q * q) * tz) / size,
-        )
-        half = math.hypot(x, y, z)
-        if not half < 0.5 * NEAR_RAD:
-            break
-        whole = _quaternion_product(whole, (-x, -y, -z, 1.0))
-        if half < 0.5 * CONVERGED_RAD:
-            return np.asarray(matrix_from_quaternion(np.array(whole)) @ matrix)
-        # B is of the observed directions by those that are predicted after the turn, which is
-        # v + scale ((x, y, z) x (v + (x, y, z) x v)) for a direction v.
-        scale = 2.0 / (1.0 + x * x + y * y + z * z)
-        a, b, c = _turned_by(x, y, z, scale, a, b, c)
-        d, e, f = _turned_by(x, y, z, scale, d, e, f)
-        g, h, i = _turned_by(x, y, z, scale, g, h, i)
-    return solve_wahba_svd(body, icrs)
-
-
-def _turned_by(
-    x: float, y: float, z: float, scale: float, a: float, b: float, c: float
-) -> tuple[float, float, float]:
-    d, e, f = a + y * c - z * b, b + z * a - x * c, c + x * b - y * a
-    return a + scale * (y * f - z * e), b + scale * (z * d - x * f), c + scale * (x * e - y * d)
-
-
-def determinant(matrix: Matrix) -> float:
-    """Return the determinant of one 3 x 3 matrix, in plain numbers: ten times as fast as numpy.
-
-    >>> determinant(np.diag([1.0, 2.0, 3.0]))
-    6.0
-    """
-    (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
-    return float(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
-
-
-def inverse(matrix: Matrix) -> Array:
-    """Return the inverse of one symmetric 3 x 3 matrix, in plain numbers; LinAlgError without one.
-
-    >>> inverse(np.diag([1.0, 2.0, 4.0])).diagonal().tolist()
-    [1.0, 0.5, 0.25]
-    """
-    (a, b, c), (_, d, e), (_, _, f) = matrix.tolist()
-    p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
-    size = a * p + b * q + c * r
-    if size == 0.0:
-        raise np.linalg.LinAlgError("the matrix has no inverse")
-    s, t, u = a * f - c * c, b * c - a * e, a * d - b * b
-    return np.asarray(np.array([[p, q, r], [q, s, t], [r, t, u]]) / size)
 
 
 def random_attitudes(count: int, generator: np.random.Generator) -> Array:

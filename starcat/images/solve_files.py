@@ -19,7 +19,6 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
-from starcat.matcher.asking import SCALE_FREE
 from starcat.matcher.centroids import (
     MeasuredFrame,
     read_frames,
@@ -29,6 +28,7 @@ from starcat.matcher.centroids import (
 )
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
+from starcat.matcher.settings import SCALE_FREE
 from starcat.matcher.tracking import Tracker
 from starcat.specs.camera_file import parse_camera
 
@@ -149,13 +149,13 @@ class FrameAnswer:
     @cached_property
     def sky(self) -> SkyInTime | None:
         """The attitude without aberration, and planets; None without an observer or an answer."""
-        camera, asked = self.result.camera, self.result.asked
-        if self.observer is None or asked is None or camera is None:
+        camera, database = self.result.camera, self.result.database
+        if self.observer is None or database is None or camera is None:
             return None
         from starcat.sky.in_time import sky_in_time
 
         centroids_px = self.frame.centroids_px
-        return sky_in_time(self.result, asked.database, centroids_px, camera, self.observer)
+        return sky_in_time(self.result, database, centroids_px, camera, self.observer)
 
     def content(self) -> Content:
         """Return the answer as ``starcat identify --json`` prints it."""
@@ -208,8 +208,8 @@ def facts(result: MatchResult) -> Content:
         why = result.refusal
         found["refusal"] = {
             "reason": why.reason,
-            "words": why.words,
-            "advice": why.advice,
+            "words": why.message,
+            "advice": why.hint,
             "n_matched": why.n_matched,
             "false_match_probability": why.false_match_probability,
             "share": why.share,
@@ -307,8 +307,8 @@ class FileAnswers:
         """Draw a frame with its stars circled and named, as PNG or SVG."""
         from starcat.images.picture import draw
 
-        if answer.result.asked is not None:
-            database, image = answer.result.asked.database, self.measured.image
+        if answer.result.database is not None:
+            database, image = answer.result.database, self.measured.image
             camera = answer.result.camera or self.camera
             draw(path, answer.frame, image, answer.result, database, camera, answer.sky)
 

@@ -1,8 +1,9 @@
 """Frames of a camera of which only a range of fields of view is known.
 
-Each level of the database serves a part of the range, with its own stars and triangles; within
-that part the focal length is found with the attitude. All levels are searched together, a batch
-of candidates from each in turn, until one agreement is certain.
+Each level of the database serves a part of the range: it is a database of its own, with the stars
+and the triangles of that level alone, for frames of about one field of view; within that part the
+focal length is found with the attitude. All levels are searched together, a batch of candidates
+from each in turn, until one agreement is certain.
 """
 
 from __future__ import annotations
@@ -10,26 +11,28 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice, pairwise
-from typing import Literal
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Array
-from starcat.errors import ConfigError
+from starcat.errors import ConfigError, ProductError
 from starcat.geometry.camera import Camera
-from starcat.matcher.asking import Asking, as_asked, check_scale_free
-from starcat.matcher.budget import Budget, BudgetSpentError
+from starcat.geometry.patterns import triangle_area
 from starcat.matcher.chance import MIN_STARS
-from starcat.matcher.levels import Level, levels
-from starcat.matcher.methods.candidates import Candidates
-from starcat.matcher.methods.table import METHODS
-from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder
-from starcat.matcher.observation import WIDEST_FOV_ERROR, Observation
+from starcat.matcher.database import Database, ProductArrays
+from starcat.matcher.numpy_engine import answer_of, proposals
+from starcat.matcher.observation import (
+    WIDEST_FOV_ERROR,
+    Candidates,
+    Frame,
+    Observation,
+    observe,
+)
 from starcat.matcher.pose import first_poses, pose_at
-from starcat.matcher.result import MatchResult, identified, unidentified
-from starcat.matcher.searching import certainty, refusal_of
+from starcat.matcher.result import MatchResult
+from starcat.matcher.settings import Budget, BudgetSpentError, Limit, Settings, TriangleOrder
 from starcat.matcher.verification import AT_ONCE, Agreement, BestOf, agree, agreeing_centroids
 
 MOST_CENTROIDS = 40
@@ -51,18 +54,102 @@ frame of other proportions than the camera's has another width for the same area
 
 
 @dataclass(frozen=True)
+class Level:
+    """One level."""
+
+    # Tangent of half the field of view: the geometric mean of those across width and height, so
+    # that it does not depend on which of the two is longer.
+    half_width: float
+    # Its stars, and triangles with the rows of these.
+    database: Database
+    # Rows of its stars in the artifact; shape (N,).
+    rows: NDArray[np.int64]
+
+    def focal_length_px(self, camera: Camera) -> float:
+        """Return the focal length with which a detector has the level's field of view."""
+        return 0.5 * math.sqrt(camera.width_px * camera.height_px) / self.half_width
+
+
+def levels(database: Database) -> tuple[Level, ...]:
+    """Return the levels of a database, made once."""
+    return database.cached(_levels)
+
+
+def _levels(database: Database) -> tuple[Level, ...]:
+    for name in ("levels", "triangles"):
+        if name not in database.products:
+            raise ProductError(
+                f"{database.name}: has no product {name!r}, so that it serves one field of view; "
+                f"set 'products.{name}.enabled = true' in its spec and build it again",
+                product=name,
+            )
+    camera, product = database.camera, database.products["levels"]
+    if not len(product["level"]):
+        raise _damaged("there are none")
+    own = Level(
+        0.5 * math.sqrt(camera.width_px * camera.height_px) / camera.focal_length_px,
+        database,
+        np.arange(len(database.mag)),
+    )
+    return own, *(_level(database, product, n) for n in range(len(product["level"])))
+
+
+def _level(database: Database, product: ProductArrays, row: int) -> Level:
+    stars = _list(product, "stars", row)
+    lists = [_list(product, name, row) for name in "ijk"]
+    is_sound = len({len(one) for one in lists}) == 1 and bool((stars[1:] > stars[:-1]).all())
+    if not is_sound or not all(np.isin(one, stars).all() for one in lists):
+        raise _damaged(f"the triangles of level {row + 1} are not of its stars")
+    place = np.searchsorted(stars, np.stack(lists))
+    half = [math.tan(math.radians(0.5 * product[f"fov_{axis}_deg"][row])) for axis in "xy"]
+    part = replace(
+        database,
+        star_id=database.star_id[stars],
+        directions=database.directions[stars],
+        mag=database.mag[stars],
+        designation=database.designation[stars],
+        products={"triangles": _triangles(place, database.directions[stars])},
+    )
+    return Level(math.sqrt(half[0] * half[1]), part, stars)
+
+
+def _damaged(what: str) -> ProductError:
+    return ProductError(
+        f"levels: {what}; the database is damaged. Build the artifact again, or fetch it again",
+        product="levels",
+    )
+
+
+def _list(product: ProductArrays, name: str, row: int) -> NDArray[np.int64]:
+    offsets = product[f"{name}_offsets"]
+    values = product[f"{name}_values"][offsets[row] : offsets[row + 1]]
+    return np.asarray(values, dtype=np.int64)
+
+
+def _triangles(corners: NDArray[np.int64], directions: NDArray[np.float64]) -> ProductArrays:
+    """Return the columns that triangles of an unknown scale are looked up by."""
+    u, v, w = (directions[rows] for rows in corners)
+    a, b, c = (
+        2.0 * np.arcsin(0.5 * np.linalg.norm(one - other, axis=1))
+        for one, other in ((v, w), (u, w), (u, v))
+    )
+    area = triangle_area(a, b, c)
+    radius = np.divide(a * b * c, 4.0 * area, out=np.full(len(a), np.inf), where=area > 0.0)
+    columns: dict[str, NDArray[Any]] = dict(zip("ijk", corners, strict=True))
+    columns |= {
+        "area_rad2": area.astype(np.float32),
+        "circumradius_rad": radius.astype(np.float32),
+    }
+    return ProductArrays(columns)
+
+
+@dataclass(frozen=True)
 class Part:
-    """A part of a range of focal lengths, and the level that serves it.
+    """A part of a range of focal lengths, and the level that serves it."""
 
-    Attributes
-    ----------
-    level : Level
-        Stars and triangles.
-    low_px, high_px : float
-        Ends, pixels.
-    """
-
+    # Stars and triangles.
     level: Level
+    # Ends, pixels.
     low_px: float
     high_px: float
 
@@ -124,11 +211,7 @@ def _focal_px(camera: Camera, fov_x_deg: float) -> float:
 
 
 def identify_blind(
-    matcher: Asking,
-    centroids_px: Array,
-    camera: Camera,
-    mag: Array | None,
-    fov_deg: tuple[float, float],
+    settings: Settings, database: Database, frame: Frame, fov_deg: tuple[float, float]
 ) -> MatchResult:
     """Identify a frame of a camera of which only a range of fields of view is known.
 
@@ -143,66 +226,40 @@ def identify_blind(
     which these are does not depend on where in the frame they lie, so that the bound holds for
     them as for a frame that has no others.
     """
-    parts = _checked_parts(matcher, camera, fov_deg)
-    budget = Budget(matcher.max_steps, matcher.time_limit_s)
-    searches = [
-        _begun(part, matcher, camera, centroids_px, mag, budget, certainty(matcher) / len(parts))
-        for part in parts
-    ]
-    whole = searches[0].whole
-    if len(whole) < MIN_STARS:
-        return unidentified("too_few_stars", whole)
-    limit = _run(searches, matcher)
-    done = [search for search in searches if search.best.found is not None]
-    if not done:
-        return unidentified("no_match", whole, refusal_of(None, limit))
-    first = done[0]
-    for other in done[1:]:
-        if other.best.found is not None and other.best.found.is_better_than(first.best.found):
-            first = other
-    found = _of_the_artifact(first, len(parts))
-    if found.false_match_probability > matcher.max_false_match_probability:
-        return unidentified("no_match", whole, refusal_of(found, limit))
-    return identified(found, first.whole, matcher.database.star_id)
-
-
-def _checked_parts(matcher: Asking, camera: Camera, fov_deg: tuple[float, float]) -> list[Part]:
-    if matcher.database.image is not None:
+    if database.image is not None:
         raise ConfigError(
             "an onboard image serves one field of view; open the artifact that it is of", key="fov"
         )
-    check_scale_free(matcher)
-    return parts_of_range(levels(matcher.database), camera, fov_deg)
+    settings.check_scale_free()
+    parts = parts_of_range(levels(database), frame.camera, fov_deg)
+    budget, certain = settings.budget(), settings.certainty / len(parts)
+    searches = [_begun(part, settings, frame, budget, certain) for part in parts]
+    if len(searches[0].whole) < MIN_STARS:
+        return answer_of(None, searches[0].whole)
+    limit = _run(searches)
+    best = searches[0]
+    for other in searches[1:]:
+        if other.best.found is not None and other.best.found.is_better_than(best.best.found):
+            best = other
+    found = None if best.best.found is None else _of_the_artifact(best, len(parts))
+    return answer_of(found, best.whole, limit)
 
 
-def _begun(
-    part: Part,
-    matcher: Asking,
-    camera: Camera,
-    centroids_px: Array,
-    mag: Array | None,
-    budget: Budget,
-    certain: float,
-) -> _Search:
+def _begun(part: Part, settings: Settings, frame: Frame, budget: Budget, certain: float) -> _Search:
     """Return the search of one part before its first candidate."""
-    eye = Camera(camera.width_px, camera.height_px, part.focal_length_px)
+    eye = Camera(frame.camera.width_px, frame.camera.height_px, part.focal_length_px)
     error = min(part.fov_error, WIDEST_FOV_ERROR)
-    whole = as_asked(matcher, centroids_px, eye, mag, error, budget)
-    used = whole
-    if whole.mag is not None and len(whole) > MOST_CENTROIDS:
-        used = replace(
-            whole,
-            rows=whole.rows[:MOST_CENTROIDS],
-            centroids_px=whole.centroids_px[:MOST_CENTROIDS],
-            body=whole.body[:MOST_CENTROIDS],
-            mag=whole.mag[:MOST_CENTROIDS],
-        )
+    whole = used = observe(replace(frame, camera=eye), settings, fov_error=error, budget=budget)
+    if whole.mag is not None:
+        used = whole.first(MOST_CENTROIDS)
+        if settings.selection == TriangleOrder():
+            used = replace(used, settings=replace(settings, selection=BRIGHTEST))
     return _Search(part, whole, used, BestOf(certain))
 
 
-def _run(searches: Sequence[_Search], matcher: Asking) -> Literal["time", "steps"] | None:
+def _run(searches: Sequence[_Search]) -> Limit | None:
     """Search a batch of each part in turn, and return the limit that ended it."""
-    waiting = [(search, _steps(search, matcher)) for search in searches]
+    waiting = [(search, _steps(search)) for search in searches]
     try:
         while waiting:
             left = []
@@ -218,14 +275,9 @@ def _run(searches: Sequence[_Search], matcher: Asking) -> Literal["time", "steps
     return None
 
 
-def _steps(search: _Search, matcher: Asking) -> Iterator[bool]:
+def _steps(search: _Search) -> Iterator[bool]:
     """Verify a batch of candidates each time that the next value is asked for."""
-    selection = matcher.selection
-    if selection == DEFAULT and search.used.mag is not None:
-        selection = BRIGHTEST
-    propose, database = METHODS[matcher.method].propose, search.part.level.database
-    proposals = propose(search.used, database, selection)
-    for candidates in islice(proposals, matcher.max_batches):
+    for candidates in proposals(search.used, search.part.level.database):
         _verify(candidates, search)
         yield True
 

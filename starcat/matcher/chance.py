@@ -3,6 +3,34 @@
 It is bounded by an expected number: that of the attitudes, over the whole sky, which put as many
 stars as near to centroids that lie anywhere on the detector. This number does not depend on how
 many candidates a method has tried.
+
+There are ``C(N, n) M! / (M - n)!`` ways to assign n of N centroids to n of M stars. In each
+of them, the frames whose squared residuals sum to less than Q in some attitude fill the
+volume ``8 pi^2 f^3 sqrt(det H)`` times that of a ball of radius sqrt(Q) in the 2n - 3
+dimensions that the fit leaves free, out of A^n for all frames. The first factor is that of
+all attitudes, in pixels; H is the sum, over the n places, of the squared derivatives by the
+three angles. The product is the expected number. Its sum over the N - 3 possible values of
+n bounds the probability. M is counted around the field, so the bound is higher in a crowded
+field, and where most of the field is left unexplained.
+
+Focal length. Where it is fitted, the frames that agree are those of a manifold with a fourth
+dimension: the volume is ``8 pi^2 f^3 L sqrt(det H)`` times that of a ball in 2n - 4
+dimensions, L being the logarithm of the range and H having a fourth row for the derivatives
+by the logarithm of f. The two ends of the range add that of the known focal length once.
+
+Magnitudes. Assignments of centroids to stars that they are not compatible with are never
+agreements, so they are not counted (`log_compatible_assignments`). The hypothesis is that the
+places of the centroids are random; it says nothing of their magnitudes. So the expected
+number is that of random places with the magnitudes that the frame has, whatever they are:
+it holds also where the magnitudes of false spots are those of the stars, and where the
+stated error is wrong (then true frames may be missed).
+
+Noise. Where nothing is stated, each of the N - 3 values of n is allotted the same share of
+the probability: the expected number is divided by 1 / (N - 3). Any other shares do as well,
+if they add up to 1 at every attitude and do not depend on where the centroids are. A stated
+noise tells, before any residual is seen, which n will matter: with one star fewer than n*
+an agreement of true stars is typically not certain, with one more it is so many times over.
+So n* has the largest share and every further n a tenth of the one before (`_log_share`).
 """
 
 from __future__ import annotations
@@ -13,10 +41,8 @@ from functools import partial
 
 import numpy as np
 
-from starcat.arrays import Array
-from starcat.geometry.attitude import determinant
+from starcat.arrays import Array, Mask
 from starcat.geometry.camera import Camera
-from starcat.matcher.ways import Compatible, log_compatible_ways, log_ways
 
 _ALL_ATTITUDES = 8.0 * math.pi**2
 """Volume of the rotations, cubic radians."""
@@ -39,40 +65,10 @@ def false_match_probability(
     camera: Camera,
     *,
     noise_px: float | None = None,
-    compatible: Compatible | None = None,
+    compatible: Mask | None = None,
     log_scales: float = 0.0,
 ) -> float:
     """Bound the probability that random centroids agree as well with any attitude.
-
-    Notes
-    -----
-    There are ``C(N, n) M! / (M - n)!`` ways to assign n of N centroids to n of M stars. In each
-    of them, the frames whose squared residuals sum to less than Q in some attitude fill the
-    volume ``8 pi^2 f^3 sqrt(det H)`` times that of a ball of radius sqrt(Q) in the 2n - 3
-    dimensions that the fit leaves free, out of A^n for all frames. The first factor is that of
-    all attitudes, in pixels; H is the sum, over the n places, of the squared derivatives by the
-    three angles. The product is the expected number. Its sum over the N - 3 possible values of
-    n bounds the probability. M is counted around the field, so the bound is higher in a crowded
-    field, and where most of the field is left unexplained.
-
-    Focal length. Where it is fitted, the frames that agree are those of a manifold with a fourth
-    dimension: the volume is ``8 pi^2 f^3 L sqrt(det H)`` times that of a ball in 2n - 4
-    dimensions, L being the logarithm of the range and H having a fourth row for the derivatives
-    by the logarithm of f. The two ends of the range add that of the known focal length once.
-
-    Magnitudes. Assignments of centroids to stars that they are not compatible with are never
-    agreements, so they are not counted (`log_compatible_ways`). The hypothesis is that the
-    places of the centroids are random; it says nothing of their magnitudes. So the expected
-    number is that of random places with the magnitudes that the frame has, whatever they are:
-    it holds also where the magnitudes of false spots are those of the stars, and where the
-    stated error is wrong (then true frames may be missed).
-
-    Noise. Where nothing is stated, each of the N - 3 values of n is allotted the same share of
-    the probability: the expected number is divided by 1 / (N - 3). Any other shares do as well,
-    if they add up to 1 at every attitude and do not depend on where the centroids are. A stated
-    noise tells, before any residual is seen, which n will matter: with one star fewer than n*
-    an agreement of true stars is typically not certain, with one more it is so many times over.
-    So n* has the largest share and every further n a tenth of the one before (`_log_share`).
 
     Examples
     --------
@@ -86,23 +82,25 @@ def false_match_probability(
     n, stars = len(body), max(len(body), stars_in_frame)
     sums = _sums(body)
     gram = _gram(sums)
-    information = determinant(gram)
+    information = float(np.linalg.det(gram))
     if not information > 0.0 or (noise_px is not None and n < MIN_STARS):
         return 1.0
     most = n if noise_px is None else min(n_centroids, stars)
-    ways: Callable[[int], float] = partial(log_ways, n_centroids=n_centroids, stars=stars)
+    assignments: Callable[[int], float] = partial(
+        log_assignments, n_centroids=n_centroids, stars=stars
+    )
     if compatible is not None:
-        ways = log_compatible_ways(most, compatible).item
+        assignments = log_compatible_assignments(most, compatible).item
     if noise_px is None:
         log_values = math.log(max(1, n_centroids - 3))
     else:
-        log_values = -_log_share(n, most, ways, noise_px, camera)
-    expected = _log_expected(ways(n), n, square_px, information, camera)
+        log_values = -_log_share(n, most, assignments, noise_px, camera)
+    expected = _log_expected(assignments(n), n, square_px, information, camera)
     if log_scales > 0.0:
         # The determinant with a fourth row, by Schur's complement.
         along, cross = _by_scale(sums)
         left = along - float(cross @ np.linalg.solve(gram, cross))
-        scaled = _log_expected(ways(n), n, square_px, information * left, camera, unknowns=4)
+        scaled = _log_expected(assignments(n), n, square_px, information * left, camera, unknowns=4)
         expected = float(np.logaddexp(expected, scaled + math.log(log_scales)))
     return math.exp(min(0.0, expected + log_values))
 
@@ -140,7 +138,7 @@ def _by_scale(sums: list[list[float]]) -> tuple[float, Array]:
 
 
 def _log_expected(
-    ways: float,
+    log_assignments_of_n: float,
     n: int,
     square_px: float,
     information: float,
@@ -154,11 +152,11 @@ def _log_expected(
     unit_ball = 0.5 * left * math.log(math.pi) - math.lgamma(0.5 * left + 1.0)
     ball = unit_ball + 0.5 * left * math.log(max(square_px, 1e-30))
     frames = n * math.log(camera.width_px * camera.height_px)
-    return ways + attitudes + ball - frames
+    return log_assignments_of_n + attitudes + ball - frames
 
 
 def _log_share(
-    n: int, most: int, ways: Callable[[int], float], noise_px: float, camera: Camera
+    n: int, most: int, assignments: Callable[[int], float], noise_px: float, camera: Camera
 ) -> float:
     """Return the logarithm of the share of n, which is ``most`` at the most.
 
@@ -172,9 +170,71 @@ def _log_share(
     typical = numbers[-1]
     for number in numbers:
         square_px = (2 * number - 3) * noise_px**2
-        expected = _log_expected(ways(number), number, square_px, number**3 * spread, camera)
+        expected = _log_expected(assignments(number), number, square_px, number**3 * spread, camera)
         if expected <= math.log(NEARLY_CERTAIN):
             typical = number
             break
     total = sum(NEXT_SHARE ** abs(number - typical) for number in numbers)
     return abs(n - typical) * math.log(NEXT_SHARE) - math.log(total)
+
+
+def log_assignments(n: int, n_centroids: int, stars: int) -> float:
+    """Return the logarithm of the number of assignments of n centroids to n stars.
+
+    Examples
+    --------
+    >>> round(math.exp(log_assignments(2, 3, 4)), 9)
+    36.0
+    """
+    return (
+        math.lgamma(n_centroids + 1) - math.lgamma(n + 1) - math.lgamma(n_centroids - n + 1)
+    ) + (math.lgamma(stars + 1) - math.lgamma(stars - n + 1))
+
+
+def log_compatible_assignments(most: int, compatible: Mask) -> Array:
+    """Bound the logarithms of the numbers of assignments of 0 to ``most`` compatible stars.
+
+    Notes
+    -----
+    Two bounds are taken from the centroids, two from the stars, and the least is returned. Let
+    centroid i have c_i compatible stars. If each centroid of a choice took any of its stars, even
+    one that is taken, the product of their c_i would count the ways; its sum over all choices of n
+    is the elementary symmetric polynomial e_n(c_1, ..., c_N).
+
+    The theorem of Bregman counts stars once: a square matrix of zeros and ones has a permanent of
+    at most the product of ``(r!)^(1/r)`` over its rows, r being their sums. The n rows of a
+    choice, with M - n rows of ones below them, are such a matrix, and each assignment of the
+    choice occurs ``(M - n)!`` times in its permanent. The sum over the choices is therefore
+    ``e_n(g_1, ..., g_N) (M!)^((M - n)/M) / (M - n)!`` at the most, with ``g_i = (c_i!)^(1/c_i)``
+    (0 where c_i is). If all are compatible, this is the number of `log_assignments`.
+
+    References
+    ----------
+    Bregman 1973, "Some properties of nonnegative matrices and their permanents".
+
+    Examples
+    --------
+    >>> log_compatible_assignments(2, np.eye(2, dtype=bool)).round(9).tolist()
+    [0.0, 0.693147181, 0.0]
+    """
+    count, stars = compatible.shape
+    bounds = [np.array([log_assignments(n, count, stars) for n in range(most + 1)])]
+    for degrees, others in ((compatible.sum(axis=1), stars), (compatible.sum(axis=0), count)):
+        degree = degrees[degrees > 0].astype(np.float64)
+        log_factorial = np.array([math.lgamma(d + 1.0) for d in degree])
+        whole = math.lgamma(others + 1)
+        filled = np.array(
+            [(others - n) / others * whole - math.lgamma(others - n + 1) for n in range(most + 1)]
+        )
+        bounds.append(_log_symmetric(np.log(degree), most))
+        bounds.append(_log_symmetric(log_factorial / degree, most) + filled)
+    return np.asarray(np.min(bounds, axis=0))
+
+
+def _log_symmetric(logs: Array, most: int) -> Array:
+    """Return the logarithms of the elementary symmetric polynomials up to a degree."""
+    found = np.full(most + 1, -np.inf)
+    found[0] = 0.0
+    for log in logs:
+        found[1:] = np.logaddexp(found[1:], found[:-1] + log)
+    return found

@@ -1,8 +1,9 @@
 """The products of an artifact as the matcher holds them: arrays mapped from its HDF5 file.
 
-Only what a method needs is opened. Datasets are not read but mapped; every index is checked
-against its table once, when the database is opened (`starcat.matcher.layout`). A database may
-come from anywhere, so nothing that leads out of its file is followed (`starcat.storage.hdf5`).
+Only what a method needs is opened. Datasets are not read but mapped; every one is checked against
+the product table when the database is opened, because an index that leads out of its table would
+end in an error far from its cause. A database may come from anywhere, so nothing that leads out of
+its file is followed (`starcat.storage.hdf5`).
 """
 
 from __future__ import annotations
@@ -20,11 +21,12 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Array, Directions
 from starcat.errors import ArtifactMissing, ProductError, SchemaVersionError, StarcatError
 from starcat.geometry.camera import Camera
-from starcat.matcher.layout import LAYOUT, check_product
 from starcat.onboard.reading import OnboardImage, read_image
 from starcat.storage.hdf5 import own_dataset, own_group
+from starcat.storage.product_table import LARGEST, MAY_BE_UNKNOWN, PRODUCTS, RANGES, Numbers
 
 Made = TypeVar("Made")
 
@@ -37,18 +39,10 @@ READABLE_SCHEMAS = 1
 
 @dataclass(frozen=True)
 class ProductArrays:
-    """One product: its columns and indices, and the numbers beside them.
-
-    Attributes
-    ----------
-    arrays : mapping of str to ndarray
-        By name of the dataset, as the product's schema says.
-    numbers : mapping of str to float
-        By name of the attribute.
-    """
+    """One product: its columns and indices by dataset, and the numbers beside them."""
 
     arrays: Mapping[str, NDArray[Any]]
-    numbers: Mapping[str, float] = field(default_factory=dict)
+    numbers: Numbers = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """Return an array by its name."""
@@ -57,40 +51,22 @@ class ProductArrays:
 
 @dataclass(frozen=True)
 class Database:
-    """What a matcher needs of an artifact.
+    """What a matcher needs of an artifact."""
 
-    Attributes
-    ----------
-    name : str
-        ``<name>-<version>``.
-    camera : Camera
-        The camera that the database was built for.
-    epoch_jyear : float
-        Epoch of the directions, Julian year.
-    star_id : ndarray of int64, shape (N,)
-        Permanent star numbers.
-    directions : ndarray of float64, shape (N, 3)
-        ICRS unit vectors.
-    mag : ndarray of float64, shape (N,)
-        Magnitudes.
-    designation : ndarray of bytes, shape (N,)
-        Names.
-    products : mapping of str to ProductArrays
-        The products that were opened.
-    image : OnboardImage or None
-        The onboard image that all this was read from, which has no products.
-    """
-
+    # ``<name>-<version>``
     name: str
+    # The camera that the database was built for.
     camera: Camera
+    # Epoch of the directions.
     epoch_jyear: float
     star_id: NDArray[np.int64]
-    directions: NDArray[np.float64]
-    mag: NDArray[np.float64]
+    directions: Directions
+    mag: Array
     designation: NDArray[np.bytes_]
     products: Mapping[str, ProductArrays] = field(default_factory=dict)
+    # The onboard image that all this was read from, which has no products.
     image: OnboardImage | None = None
-    _derived: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _cache: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __repr__(self) -> str:
         """Return name, stars and products in one line."""
@@ -99,51 +75,23 @@ class Database:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what goes to another process: all but what can be made again there."""
-        return {**vars(self), "_derived": {}}
+        return {**vars(self), "_cache": {}}
 
-    def derived(self, make: Callable[..., Made], *arguments: float) -> Made:
-        """Return what a method makes of the database before it can use it, made once.
-
-        Parameters
-        ----------
-        make : callable
-            A function of the database and the arguments.
-        *arguments : float
-            For ``make``; for other ones it is called again.
-
-        Returns
-        -------
-        object
-            The same one every time.
-        """
+    def cached(self, make: Callable[..., Made], *arguments: float) -> Made:
+        """Return ``make(self, *arguments)``, which is called once for the same arguments."""
         key = make, arguments
-        if key not in self._derived:
-            self._derived[key] = make(self, *arguments)
-        found: Made = self._derived[key]
+        if key not in self._cache:
+            self._cache[key] = make(self, *arguments)
+        found: Made = self._cache[key]
         return found
 
 
 def open_database(artifact: Path, products: Iterable[str] = ()) -> Database:
-    """Open the database of an artifact.
+    """Open the database of an artifact, given its folder or ``database.h5``, and some products.
 
-    Parameters
-    ----------
-    artifact : Path
-        The artifact's folder, or its ``database.h5``.
-    products : iterable of str
-        Names of the products to open beside the stars.
-
-    Returns
-    -------
-    Database
-        Its arrays are read-only views of the file, which has to stay in place.
-
-    Raises
-    ------
-    ProductError
-        If there is no database, it lacks a product, or a part of it is not what a build writes.
-    SchemaVersionError
-        If its layout or a product's schema is of another major version.
+    The arrays are read-only views of the file, which has to stay in place. `ProductError` if there
+    is no database, it lacks a product, or a part of it is not what a build writes;
+    `SchemaVersionError` if its layout or a product's schema is of another major version.
     """
     path = _database_file(artifact)
     with _readable(path) as file, path.open("rb") as raw:
@@ -152,23 +100,7 @@ def open_database(artifact: Path, products: Iterable[str] = ()) -> Database:
 
 
 def open_image(path: Path) -> Database:
-    """Open an onboard image as a database, for the C library.
-
-    Parameters
-    ----------
-    path : Path
-        The image.
-
-    Returns
-    -------
-    Database
-        Stars in the order of the image, without names and products.
-
-    Raises
-    ------
-    OnboardImageError, SchemaVersionError
-        If the image cannot be read.
-    """
+    """Open an onboard image as a database for the C library, without names and products."""
     image = read_image(path)
     header, stars = image.header, image.star_id
     return Database(
@@ -184,25 +116,9 @@ def open_image(path: Path) -> Database:
 
 
 def products_in(artifact: Path) -> tuple[str, ...]:
-    """Return the names of the products that an artifact's database holds.
-
-    Parameters
-    ----------
-    artifact : Path
-        The artifact's folder, or its ``database.h5``.
-
-    Returns
-    -------
-    tuple of str
-        In alphabetical order.
-
-    Raises
-    ------
-    ProductError
-        If there is no readable database.
-    """
+    """Return the names of the products that an artifact's database holds, sorted."""
     with _readable(_database_file(artifact)) as file:
-        return tuple(sorted(name for name in file if name in LAYOUT))
+        return tuple(sorted(name for name in file if name in PRODUCTS))
 
 
 def _database_file(artifact: Path) -> Path:
@@ -273,7 +189,7 @@ def _product(
     file: h5py.File, mapped: mmap.mmap, name: str, path: Path, star_count: int | None = None
 ) -> ProductArrays:
     """Return a product, its indices checked against its rows and the stars."""
-    if name not in file or name not in LAYOUT:
+    if name not in file or name not in PRODUCTS:
         raise ProductError(
             f"{path}: has no product {name!r}; set 'products.{name}.enabled = true' in its spec "
             f"and build it again, or choose a method that works with {', '.join(sorted(file))}",
@@ -292,14 +208,15 @@ def _product(
         for key, value in group.attrs.items()
         if isinstance(value, (int, float, np.number))
     }
+    layout = PRODUCTS[name]
     arrays: dict[str, NDArray[Any]] = {}
-    for key in LAYOUT[name].datasets:
+    for key in layout.datasets:
         if key not in group:
             raise ProductError(
                 f"{path}: {name}/{key} is missing; build it again", product=name, path=path
             )
         arrays[key] = _map(own_dataset(group, key, len(mapped)), mapped)
-    rows = len(arrays[LAYOUT[name].columns[0]])
+    rows = len(arrays[layout.columns[0]])
     check_product(name, arrays, numbers, rows if star_count is None else star_count)
     return ProductArrays(arrays, numbers)
 
@@ -319,3 +236,110 @@ def _check_version(found: str, readable: int, product: str, path: Path) -> None:
             found=found,
             expected=f"{readable}.x",
         )
+
+
+def check_product(
+    name: str, arrays: Mapping[str, NDArray[Any]], numbers: Numbers, star_count: int
+) -> None:
+    """Check that a product is as the product table says; `ProductError` names what is not."""
+    layout = PRODUCTS[name]
+    checks = _Checks(name, arrays, star_count)
+    rows = len(arrays[layout.columns[0]])
+    for attribute in (*layout.numbers, *(("kvector_intercept", "kvector_slope") * layout.kvector)):
+        if not math.isfinite(numbers[attribute]) or abs(numbers[attribute]) > LARGEST:
+            raise _damaged(name, f"attribute {attribute}", f"is {numbers[attribute]}")
+    for attribute in layout.numbers:
+        if numbers[attribute] <= 0.0:
+            raise _damaged(name, f"attribute {attribute}", f"is {numbers[attribute]}")
+    for column in layout.texts:
+        checks.shape(column, "S", rows)
+    for column in layout.wholes:
+        checks.shape(column, "iu", rows)
+    for column in layout.reals:
+        checks.reals(column, rows)
+    for column in layout.per_star:
+        checks.reals(column, star_count)
+    for column in layout.stars:
+        checks.shape(column, "iu", rows)
+        checks.below(column, star_count)
+    for column, limit in layout.lists.items():
+        checks.offsets(f"{column}_offsets", rows, len(arrays[f"{column}_values"]))
+        checks.below(f"{column}_values", limit(numbers, star_count))
+    if layout.by_star:
+        checks.offsets("star_offsets", star_count, rows)
+    for table, bins in layout.bins.items():
+        checks.offsets(f"{table}_offsets", bins(numbers), len(arrays[f"{table}_rows"]))
+        checks.below(f"{table}_rows", rows)
+    if layout.kvector:
+        checks.counts("kvector_counts", rows)
+        if numbers["kvector_slope"] < 0.0:
+            raise _damaged(name, "attribute kvector_slope", "is negative")
+    if name == "stars":
+        checks.directions()
+
+
+@dataclass(frozen=True)
+class _Checks:
+    """The checks of one product's datasets; each raises if the dataset is not so."""
+
+    product: str
+    arrays: Mapping[str, NDArray[Any]]
+    star_count: int
+
+    def shape(self, name: str, kinds: str, length: float) -> None:
+        array = self.arrays[name]
+        if array.dtype.kind not in kinds:
+            raise _damaged(self.product, name, f"holds {array.dtype}")
+        if len(array) != length:
+            raise _damaged(self.product, name, f"has {len(array)} entries; expected {length:g}")
+
+    def reals(self, name: str, length: int) -> None:
+        self.shape(name, "f", length)
+        array = self.arrays[name]
+        low, high = RANGES.get(name, (-LARGEST, LARGEST))
+        if name in MAY_BE_UNKNOWN:
+            array = array[~np.isnan(array)]
+        # NaN is neither above nor below anything.
+        if len(array) and not (array.min() >= low and array.max() <= high):
+            raise _damaged(self.product, name, f"holds numbers outside {low:g} to {high:g}, or NaN")
+
+    def below(self, name: str, limit: float) -> None:
+        """Check that all entries lie in [0, limit)."""
+        array = self.arrays[name]
+        self.shape(name, "iu", len(array))
+        if len(array) and not (array.min() >= 0 and array.max() < limit):
+            raise _damaged(
+                self.product,
+                name,
+                f"refers to {array.min()} to {array.max()}; there are {limit:g}",
+            )
+
+    def offsets(self, name: str, entries: float, end: int) -> None:
+        """Check that entries + 1 offsets ascend from 0 to the end of their table."""
+        self.shape(name, "iu", entries + 1)
+        array = self.arrays[name]
+        if array[0] != 0 or array[-1] != end or np.any(array[1:] < array[:-1]):
+            raise _damaged(self.product, name, f"does not ascend from 0 to {end}")
+
+    def counts(self, name: str, rows: int) -> None:
+        """Check that counts of rows ascend, and that none is above the number of rows."""
+        self.shape(name, "iu", rows)
+        array = self.arrays[name]
+        ends = rows == 0 or (array[0] >= 0 and array[-1] <= rows)
+        if not ends or np.any(array[1:] < array[:-1]):
+            raise _damaged(self.product, name, f"does not ascend within 0 to {rows}")
+
+    def directions(self) -> None:
+        squares = sum(self.arrays[axis] ** 2 for axis in ("x", "y", "z"))
+        off = np.abs(squares - 1.0)
+        if len(off) and not off.max() < 1e-9:
+            row = int(np.argmax(~(off < 1e-9)))
+            raise _damaged(self.product, "x, y, z", f"is no unit vector in row {row}")
+
+
+def _damaged(product: str, what: str, found: str) -> ProductError:
+    return ProductError(
+        f"{product}/{what} {found}; the database is damaged. Build the artifact again, or fetch "
+        "it again",
+        product=product,
+    )

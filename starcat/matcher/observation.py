@@ -1,40 +1,55 @@
-"""One frame as the methods see it: its usable centroids, their directions and their order."""
+"""One frame as it was given, as the methods see it, and the candidates that they make of it."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Directions, Mask, Pixels, Rows
 from starcat.geometry.camera import Camera
-from starcat.matcher.budget import Budget
-
-MIN_SHARE = 1.0 / 3.0
-"""Smallest share of a frame that the attitude of an answer explains.
-
-The share is that of the centroids or that of the stars, whichever is larger. Every one of them
-is weighted by the uncertainty that the matched stars leave in its position (`explained_share`).
-Without weights, the many stars of one cluster would accept an attitude that is right in the
-cluster and wrong in the rest of the frame.
-"""
+from starcat.matcher.settings import Budget, Settings
 
 WIDEST_FOV_ERROR = 0.5
 """Largest relative error of a focal length that is found with the attitude."""
 
+Dropped = tuple[tuple[int, str], ...]
+"""Row and reason of every centroid that is not used: ``not_finite``, ``out_of_frame`` or
+``duplicate``."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The centroids of a frame as they were given, and the camera that they were given with."""
+
+    centroids_px: Pixels
+    magnitudes: Array | None
+    camera: Camera
+
+    def __len__(self) -> int:
+        """Return the number of centroids."""
+        return len(self.centroids_px)
+
+
+def as_frame(centroids_px: ArrayLike, camera: Camera, magnitudes: ArrayLike | None = None) -> Frame:
+    """Return what a caller gives as a frame; ``ValueError`` unless shapes are as expected."""
+    given = np.asarray(centroids_px, dtype=np.float64)
+    given = given.reshape(0, 2) if given.size == 0 else given
+    if given.ndim != 2 or given.shape[1] != 2:
+        raise ValueError(f"centroids_px has shape {given.shape}; expected (N, 2)")
+    mag = None if magnitudes is None else np.asarray(magnitudes, dtype=np.float64)
+    if mag is not None and mag.shape != (len(given),):
+        raise ValueError(f"magnitudes have shape {mag.shape}; expected ({len(given)},)")
+    return Frame(given, mag, camera)
+
 
 @dataclass(frozen=True)
 class FocalRange:
-    """Focal lengths that a frame may have, over the one that was given.
-
-    Attributes
-    ----------
-    low, high : float
-        Ends, 0 < low <= 1 <= high.
-    """
+    """Focal lengths that a frame may have, over the one that was given: 0 < low <= 1 <= high."""
 
     low: float = 1.0
     high: float = 1.0
@@ -53,47 +68,22 @@ class FocalRange:
 class Observation:
     """The usable centroids of a frame.
 
-    Attributes
-    ----------
-    rows : ndarray of int64, shape (N,)
-        Row of each centroid in the frame as it was given.
-    centroids_px : ndarray of float64, shape (N, 2)
-        Pixels. Brightest first where magnitudes are known, else nearest to the centre first,
-        so that nothing depends on the order in which they were given.
-    body : ndarray of float64, shape (N, 3)
-        Directions in the camera frame.
-    mag : ndarray of float64, shape (N,), or None
-        Magnitudes, NaN for a centroid without one; None where none is known.
-    camera : Camera
-        The camera.
-    tolerance_px : float
-        Largest error of a centroid, as a radius.
-    dropped : tuple of (int, str)
-        Row and reason of every centroid that is not used: ``not_finite``, ``out_of_frame`` or
-        ``duplicate``.
-    noise_px : float or None
-        Standard deviation of a centroid on each axis, where it was stated.
-    noise_mag : float or None
-        Standard deviation of a magnitude in the band of the database, where it was stated.
-    fov_error : float
-        Largest relative error of the focal length, 0 where it is known.
-    min_share : float
-        Smallest share of the frame that the attitude of an answer explains.
-    budget : Budget
-        What the search may take.
+    They are in order of brightness where magnitudes are known, else the nearest to the centre
+    first, so that nothing depends on the order in which they were given.
     """
 
-    rows: NDArray[np.int64]
-    centroids_px: Array
-    body: Array
+    # Row of each centroid in the frame as it was given.
+    rows: Rows
+    centroids_px: Pixels
+    # Directions in the camera frame.
+    body: Directions
+    # NaN for a centroid without one; None where none is known.
     mag: Array | None
     camera: Camera
-    tolerance_px: float
-    dropped: tuple[tuple[int, str], ...] = ()
-    noise_px: float | None = None
-    noise_mag: float | None = None
+    settings: Settings
+    dropped: Dropped = ()
+    # Largest relative error of the focal length, 0 where it is known.
     fov_error: float = 0.0
-    min_share: float = MIN_SHARE
     budget: Budget = field(default_factory=Budget, compare=False, repr=False)
 
     def __len__(self) -> int:
@@ -101,9 +91,23 @@ class Observation:
         return len(self.rows)
 
     @property
+    def tolerance_px(self) -> float:
+        """Largest error of a centroid, as a radius."""
+        return self.settings.tolerance_px
+
+    @property
     def tolerance_rad(self) -> float:
-        """Largest error of a direction, radians."""
-        return self.tolerance_px / self.camera.focal_length_px
+        """Largest error of a direction."""
+        return self.settings.tolerance_px / self.camera.focal_length_px
+
+    @property
+    def side_tolerance_rad(self) -> float:
+        """Largest error of a separation.
+
+        It is less than twice the error of a centroid, because both ends rarely err by the most
+        and in opposite directions.
+        """
+        return 1.5 * self.tolerance_rad
 
     @cached_property
     def focal_range(self) -> FocalRange:
@@ -118,21 +122,34 @@ class Observation:
         # The chord loses no digits at small angles, where the cosine would.
         return np.asarray(2.0 * np.arcsin(0.5 * np.sqrt(dx * dx + dy * dy + dz * dz)))
 
+    def compatible(self, star_mag: Array) -> Mask | None:
+        """Return which centroids may be which stars by their magnitudes; None if all may be."""
+        if self.mag is None or self.settings.noise_mag is None:
+            return None
+        return compatible_pairs(self.mag, star_mag, self.settings.noise_mag)
+
+    def in_frame(self, star_index: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Return the stars of usable centroids as those of the frame, -1 for all others."""
+        index = np.full(len(self) + len(self.dropped), -1, dtype=np.int32)
+        index[self.rows] = star_index
+        return index
+
+    def first(self, count: int) -> Observation:
+        """Return the observation of the first centroids alone."""
+        return replace(
+            self,
+            rows=self.rows[:count],
+            centroids_px=self.centroids_px[:count],
+            body=self.body[:count],
+            mag=None if self.mag is None else self.mag[:count],
+        )
+
 
 def observe(
-    centroids_px: ArrayLike,
-    camera: Camera,
-    tolerance_px: float,
-    magnitudes: ArrayLike | None = None,
-    *,
-    noise_px: float | None = None,
-    noise_mag: float | None = None,
-    fov_error: float = 0.0,
-    min_share: float = MIN_SHARE,
-    budget: Budget | None = None,
+    frame: Frame, settings: Settings, *, fov_error: float = 0.0, budget: Budget | None = None
 ) -> Observation:
-    """Prepare a frame for identification."""
-    given, mag = as_frame(centroids_px, magnitudes)
+    """Return the usable centroids of a frame, in order."""
+    given, mag, camera = frame.centroids_px, frame.magnitudes, frame.camera
     usable = camera.contains(given)
     if usable.all():
         dropped, rows = [], _own_order(given, mag, camera)
@@ -141,39 +158,20 @@ def observe(
         rows = rows[_own_order(given[rows], None if mag is None else mag[rows], camera)]
     rows, repeats = _without_repeats(rows, given)
     kept = given[rows]
-    known = None if mag is None or not np.isfinite(mag[rows]).any() else mag[rows]
-    body = camera.directions_from_pixels(kept)
     return Observation(
         rows,
         kept,
-        body,
-        known,
+        camera.directions_from_pixels(kept),
+        None if mag is None or not np.isfinite(mag[rows]).any() else mag[rows],
         camera,
-        tolerance_px,
+        settings,
         (*dropped, *repeats),
-        noise_px,
-        noise_mag,
         fov_error,
-        min_share,
         budget or Budget(),
     )
 
 
-def as_frame(
-    centroids_px: ArrayLike, magnitudes: ArrayLike | None = None
-) -> tuple[Array, Array | None]:
-    """Return what a caller gives as arrays."""
-    given = np.asarray(centroids_px, dtype=np.float64)
-    given = given.reshape(0, 2) if given.size == 0 else given
-    if given.ndim != 2 or given.shape[1] != 2:
-        raise ValueError(f"centroids_px has shape {given.shape}; expected (N, 2)")
-    mag = None if magnitudes is None else np.asarray(magnitudes, dtype=np.float64)
-    if mag is not None and mag.shape != (len(given),):
-        raise ValueError(f"magnitudes have shape {mag.shape}; expected ({len(given)},)")
-    return given, mag
-
-
-def _unusable(given: Array, usable: NDArray[np.bool_]) -> list[tuple[int, str]]:
+def _unusable(given: Pixels, usable: Mask) -> list[tuple[int, str]]:
     finite = np.asarray(np.isfinite(given).all(axis=1))
     return [
         (int(row), "out_of_frame" if finite[row] else "not_finite")
@@ -181,16 +179,14 @@ def _unusable(given: Array, usable: NDArray[np.bool_]) -> list[tuple[int, str]]:
     ]
 
 
-def _own_order(centroids_px: Array, mag: Array | None, camera: Camera) -> NDArray[np.int64]:
+def _own_order(centroids_px: Pixels, mag: Array | None, camera: Camera) -> Rows:
     """Return the brightest first (unknown ones last), or the nearest to the centre."""
     x, y = (centroids_px - camera.middle_px).T
     distance = x * x + y * y
     return np.lexsort((y, x, distance) if mag is None else (y, x, distance, mag))
 
 
-def _without_repeats(
-    rows: NDArray[np.int64], given: Array
-) -> tuple[NDArray[np.int64], list[tuple[int, str]]]:
+def _without_repeats(rows: Rows, given: Pixels) -> tuple[Rows, list[tuple[int, str]]]:
     x = np.sort(given[rows, 0])
     if not (x[1:] == x[:-1]).any():
         return rows, []
@@ -201,3 +197,37 @@ def _without_repeats(
         return rows, []
     repeats = order[1:][same]
     return np.delete(rows, repeats), [(int(row), "duplicate") for row in np.sort(rows[repeats])]
+
+
+MAG_DEVIATIONS = 3.5
+"""Largest difference of the magnitudes of a centroid and its star, in standard deviations."""
+
+
+def compatible_pairs(mag: Array, star_mag: Array, noise_mag: float) -> Mask:
+    """Return which centroids may be which stars by their magnitudes.
+
+    Examples
+    --------
+    >>> compatible_pairs(np.array([3.0, np.nan]), np.array([3.5, 5.0, np.nan]), 0.2)
+    array([[ True, False,  True],
+           [ True,  True,  True]])
+    """
+    return np.asarray(~(np.abs(mag[:, None] - star_mag) > MAG_DEVIATIONS * noise_mag))
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Correspondences of m >= 2 centroids and stars, one a row, the most promising first."""
+
+    # Rows of the observation, shape (K, m).
+    centroids: NDArray[np.integer[Any]]
+    # Rows of the database's stars, in the same order.
+    stars: NDArray[np.integer[Any]]
+
+    def __len__(self) -> int:
+        """Return the number of correspondences."""
+        return len(self.stars)
+
+    def __getitem__(self, rows: slice | NDArray[Any]) -> Candidates:
+        """Return some of the correspondences."""
+        return Candidates(self.centroids[rows], self.stars[rows])

@@ -1,7 +1,12 @@
-"""Poses: an attitude, and the camera that it is tried with.
+"""Poses: an attitude and the camera that it is tried with, their fit, and how far that reaches.
 
 Where the focal length is known, the camera is the caller's and only the attitude is fitted. Where
 it is known to some per cent, it is fitted with the attitude.
+
+Ten stars within 100 px hardly determine how the camera is turned about their middle. An attitude
+that only they agree with is not due to chance, and yet it may be wrong at the edge of the frame.
+So the accuracy that the matched stars give is compared with the one that all stars of the frame
+would give.
 """
 
 from __future__ import annotations
@@ -10,39 +15,34 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Directions, Matrix, Pixels, Rows
 from starcat.errors import ConfigError
-from starcat.geometry.attitude import solve_wahba_near, solve_wahba_svd
+from starcat.geometry.attitude import solve_wahba_svd
 from starcat.geometry.camera import Camera
-from starcat.matcher.methods.candidates import Candidates
-from starcat.matcher.observation import Observation
-from starcat.matcher.spread import information
+from starcat.matcher.observation import Candidates, Observation
 
 _SCALINGS = 2
 """Rounds that find the scale of a few stars; a second one, because angles are no tangents."""
 
 _THREE_SIGMA = 3.0
 
+SCALE_DEVIATIONS = 3.0
+"""Standard deviations above which a difference of scale is not taken for chance."""
+
+_UNIT = np.eye(3)
+
 
 @dataclass(frozen=True)
 class Pose:
-    """An attitude and a camera.
+    """An attitude and a camera."""
 
-    Attributes
-    ----------
-    matrix : ndarray of float64, shape (3, 3)
-        Attitude, ``body = matrix @ icrs``.
-    camera : Camera
-        The camera, with the focal length that goes with the attitude.
-    body : ndarray of float64, shape (N, 3)
-        Directions of all centroids of a frame with that camera.
-    """
-
-    matrix: Array
+    # Attitude, ``body = matrix @ icrs``; shape (3, 3).
+    matrix: Matrix
+    # The camera, with the focal length that goes with the attitude.
     camera: Camera
-    body: Array
+    # Directions of all centroids of a frame with that camera; shape (N, 3).
+    body: Directions
 
 
 def first_poses(
@@ -87,13 +87,10 @@ def pose_at(matrix: Array, factor: float, observation: Observation) -> Pose:
     return Pose(matrix, camera, camera.directions_from_pixels(observation.centroids_px))
 
 
-def refitted(
-    pose: Pose, matched: NDArray[np.int64], stars: Array, observation: Observation
-) -> Pose:
+def fit(pose: Pose, matched: Rows, stars: Array, observation: Observation) -> Pose:
     """Return the pose that fits centroids and their stars best."""
     if not observation.fov_error:
-        near = solve_wahba_near(pose.body[matched], stars, pose.matrix)
-        return Pose(near, pose.camera, pose.body)
+        return Pose(solve_wahba_svd(pose.body[matched], stars), pose.camera, pose.body)
     seen = pose.body[matched]
     predicted = stars @ pose.matrix.T
     left = seen - predicted
@@ -121,7 +118,7 @@ def _by_scale(body: Array) -> Array:
 
 
 def focal_length_error_px(
-    pose: Pose, matched: NDArray[np.int64], residual_rad: float, observation: Observation
+    pose: Pose, matched: Rows, residual_rad: float, observation: Observation
 ) -> float:
     """Return the standard error of a focal length that was fitted with an attitude."""
     focal_px, n = pose.camera.focal_length_px, len(matched)
@@ -129,8 +126,8 @@ def focal_length_error_px(
         covariance = np.linalg.inv(information(pose.body[matched], with_scale=True))
     except np.linalg.LinAlgError:
         return math.inf
-    if observation.noise_px is not None:
-        sigma_rad = observation.noise_px / focal_px
+    if observation.settings.noise_px is not None:
+        sigma_rad = observation.settings.noise_px / focal_px
     else:
         free = 2 * n - 4
         sigma_rad = residual_rad * math.sqrt(n / free) * _student(free) / _THREE_SIGMA
@@ -151,3 +148,113 @@ def _student(free: int) -> float:
         + (5.0 * z**5 + 16.0 * z**3 + 3.0 * z) / (96.0 * free**2)
         + (3.0 * z**7 + 19.0 * z**5 + 17.0 * z**3 - 15.0 * z) / (384.0 * free**3)
     )
+
+
+def explained_fraction(
+    matched: Directions,
+    stars: Directions,
+    residual_rad: float,
+    observation: Observation,
+    enough: float = 1.0,
+) -> float:
+    """Return which share of a frame an attitude explains, by weight."""
+    try:
+        normal = information(matched, with_scale=observation.fov_error > 0.0)
+        covariance: Array = np.linalg.inv(normal).astype(np.float64)
+    except np.linalg.LinAlgError:
+        return 0.0
+    of_stars = weighted_share(covariance, stars)
+    if of_stars >= enough:
+        return of_stars
+    of_centroids = weighted_share(covariance, observation.body)
+    if of_centroids <= of_stars:
+        return of_stars
+    # Three of the 2n components went into the attitude, a fourth into the scale.
+    deviation_rad = residual_rad * math.sqrt(len(matched) / (2 * len(matched) - len(covariance)))
+    corner_rad = deviation_rad * corner_deviation(covariance, observation.camera)
+    return of_stars if corner_rad > observation.tolerance_rad else of_centroids
+
+
+def information(directions: Array, *, with_scale: bool = False) -> Array:
+    """Return the information matrix of an attitude that the centroids of stars determine.
+
+    References
+    ----------
+    Shuster and Oh 1981, "Three-axis attitude determination from vector observations".
+    """
+    of_angles = len(directions) * _UNIT - directions.T @ directions
+    if not with_scale:
+        return np.asarray(of_angles)
+    x, y, z = directions.T
+    found = np.empty((4, 4))
+    found[:3, :3] = of_angles
+    # A turn d moves the direction u of a star by d x u; a longer focal length moves that of its
+    # centroid by u_z e_z - u_z^2 u, towards the axis.
+    found[:3, 3] = found[3, :3] = -float(np.vdot(y, z)), float(np.vdot(x, z)), 0.0
+    found[3, 3] = float(np.vdot(z * z, 1.0 - z * z))
+    return found
+
+
+def weighted_share(covariance: Array, directions: Array) -> float:
+    """Return which share of the stars of a frame an attitude explains, by their weight.
+
+    Notes
+    -----
+    The weight of a star is the variance of its position, given the matched stars. The weights
+    of the matched stars themselves add up to three, the number of angles, wherever they are, or
+    to four where the scale is free.
+    Outside of them the weight grows with the square of the distance: with ten matched stars
+    at 50 px from their middle, a star at 500 px has a weight of ten.
+
+    Examples
+    --------
+    >>> place = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    >>> near = np.column_stack([0.01 * place, np.ones(4)])
+    >>> near /= np.linalg.norm(near, axis=1)[:, None]
+    >>> far = np.array([[0.1, 0.1, 1.0], [-0.1, 0.0, 1.0]]) / np.sqrt([[1.02], [1.01]])
+    >>> covariance = np.linalg.inv(information(near))
+    >>> round(weighted_share(covariance, near), 6)
+    1.0
+    >>> round(weighted_share(covariance, np.concatenate([near, far])), 3)
+    0.02
+    """
+    unknowns = len(covariance)
+    weights = np.vdot(covariance, information(directions, with_scale=unknowns == 4))
+    return unknowns / float(weights)
+
+
+def corner_deviation(covariance: Array, camera: Camera) -> float:
+    """Return the error of the worst corner of a frame under an attitude."""
+    corners = camera.corner_directions
+    if len(covariance) == 3:
+        along = np.einsum("ni,ij,nj->n", corners, covariance, corners)
+        variance = float(np.trace(covariance) - along.min())
+    else:
+        variance = max(
+            float(np.vdot(covariance, information(corner[None], with_scale=True)))
+            for corner in corners
+        )
+    # Rounding may make it negative where the stars nearly coincide.
+    return math.sqrt(max(0.0, variance))
+
+
+def is_scaled(predicted_px: Pixels, centroids_px: Pixels, observation: Observation) -> bool:
+    """Return whether a frame differs in scale from the stars that it matches.
+
+    Notes
+    -----
+    A frame of another scale means that the camera's focal length is wrong. The attitude may be
+    right, but towards the edge of the frame stars are taken for their neighbours.
+    """
+    camera = observation.camera
+    inner = predicted_px - predicted_px.sum(axis=0) / len(predicted_px)
+    extent = float(np.vdot(inner, inner))
+    offset = centroids_px - predicted_px
+    excess = float(np.vdot(inner, offset)) / extent
+    corner_px = 0.5 * math.hypot(camera.width_px, camera.height_px)
+    if abs(excess) * corner_px <= observation.tolerance_px:
+        return False
+    left = offset - excess * inner
+    left -= left.sum(axis=0) / len(left)
+    variance = float(np.vdot(left, left)) / (2 * len(left) - 4) / extent
+    return excess * excess > SCALE_DEVIATIONS**2 * variance

@@ -1,31 +1,30 @@
 """A prior attitude: what is known of an attitude before the frame is looked at.
 
-Only the stars near the prediction are compared with the frame. The verification of what they
-propose is that of any other method.
+Only the stars near the prediction are compared with the frame: a centroid, the anchor, may be any
+star near where it is predicted, and with another centroid each of them makes a candidate. The
+verification of what that proposes is that of any other method.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Directions, Rows
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import matrix_from_quaternion, turn_between
 from starcat.geometry.camera import Camera
-from starcat.matcher.around import stars_around
 from starcat.matcher.database import Database
-from starcat.matcher.methods import nearby
-from starcat.matcher.methods.candidates import Candidates
-from starcat.matcher.observation import Observation
+from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.pose import Pose
-from starcat.matcher.refusal import Refusal
-from starcat.matcher.result import MatchResult, withheld
-from starcat.matcher.verification import REACH, BestOf, agree, verify
+from starcat.matcher.result import MatchResult, Refusal, no_match
+from starcat.matcher.settings import LOOKUP, REACH
+from starcat.matcher.star_cells import stars_in_cap
+from starcat.matcher.verification import BestOf, agree, verify
 
 WIDEST_PRIOR_DEG = 20.0
 """Largest error of a prior attitude."""
@@ -34,21 +33,31 @@ CLOSE = 8.0
 """Error of a prior up to which each centroid is taken for the star predicted nearest to it, in
 units of the largest error of a centroid."""
 
+MOST_ANCHORS = 8
+"""Centroids that are compared with the stars near where they are predicted."""
+
+MOST_STARS = 1500
+"""Stars around a prior attitude; where there are more, looking up patterns is quicker."""
+
 
 @dataclass(frozen=True)
 class Prior:
-    """A prior attitude.
-
-    Attributes
-    ----------
-    q_body_from_icrs : ndarray of float64, shape (4,)
-        Attitude, unit, scalar last.
-    error_rad : float
-        Largest error, as an angle of rotation.
-    """
+    """A prior attitude, unit, and its largest error as an angle of rotation."""
 
     q_body_from_icrs: Array
     error_rad: float
+
+    def checked(self, answer: MatchResult, camera: Camera, tolerance_px: float) -> MatchResult:
+        """Return an answer if its attitude is as near to the prior as that says."""
+        if not answer.ok:
+            return answer
+        prior_q, found_q = self.q_body_from_icrs.tolist(), answer.q_body_from_icrs.tolist()
+        slack_rad = turn_of_noise_rad(camera, tolerance_px)
+        if math.hypot(*turn_between(prior_q, found_q)) <= self.error_rad + slack_rad:
+            return answer
+        refused = no_match(len(answer.star_index), answer.dropped, Refusal("prior"))
+        facts = {name: getattr(answer, name) for name in ("time_s", "frame", "database")}
+        return replace(refused, origin="tracking", noise_px=answer.noise_px, **facts)
 
 
 def prior_of(quaternion: ArrayLike | None, error_deg: float | None) -> Prior | None:
@@ -83,10 +92,7 @@ def search_near(
 ) -> None:
     """Work out the agreements near a prior attitude until one is certain."""
     matrix = matrix_from_quaternion(prior.q_body_from_icrs)
-    camera, tolerance_rad = observation.camera, observation.tolerance_rad
-    # A tracked camera is near its last place, where the stars are at hand.
-    sky = stars_around(database)
-    sky.keep(matrix[2], camera.radius_rad)
+    camera = observation.camera
     error_px = prior.error_rad * camera.focal_length_px
     if error_px <= CLOSE * observation.tolerance_px and not observation.fov_error:
         wide = 1.0 + error_px / (REACH * observation.tolerance_px)
@@ -94,15 +100,14 @@ def search_near(
         best.found = agree(pose, observation, database, best.certain, (wide,))
         if best.is_certain:
             return
-    reach_rad = prior.error_rad + REACH * tolerance_rad
+    reach_rad = prior.error_rad + REACH * observation.tolerance_rad
     # A wrong focal length moves directions along their distance from the axis.
     reach_rad += observation.fov_error / (1.0 - observation.fov_error) * camera.radius_rad
-    near, _ = sky.near(matrix[2], min(math.pi, camera.radius_rad + reach_rad))
+    near = stars_in_cap(database, matrix[2], min(math.pi, camera.radius_rad + reach_rad))
     predicted = observation.body @ matrix
-    if observation.fov_error or len(near) > nearby.MOST_STARS:
-        found = whole_sky
-    else:
-        found = nearby.candidates(observation, database, predicted, near, reach_rad)
+    found = whole_sky
+    if not observation.fov_error and len(near) <= MOST_STARS:
+        found = anchored_pairs(observation, database, predicted, near, reach_rad)
     for candidates in found:
         stars = database.directions[candidates.stars]
         along = np.einsum("kni,kni->kn", predicted[candidates.centroids], stars)
@@ -112,16 +117,51 @@ def search_near(
             return
 
 
-def expected_near(
-    prior: Prior, answer: MatchResult, camera: Camera, tolerance_px: float
-) -> MatchResult:
-    """Return an answer if its attitude is as near to the prior as that says."""
-    if answer.ok:
-        prior_q, found_q = prior.q_body_from_icrs.tolist(), answer.q_body_from_icrs.tolist()
-        slack_rad = turn_of_noise_rad(camera, tolerance_px)
-        if math.hypot(*turn_between(prior_q, found_q)) > prior.error_rad + slack_rad:
-            return withheld(answer, Refusal("prior"))
-    return answer
+def anchored_pairs(
+    observation: Observation,
+    database: Database,
+    predicted: Directions,
+    near: Rows,
+    reach_rad: float,
+) -> Iterator[Candidates]:
+    """Propose what two centroids are, as the C library does, a batch for each two.
+
+    The anchor may be any star up to ``reach_rad`` from its predicted direction, the nearest first;
+    the other centroid is the star nearest to where it then has to be, of those as far from the
+    anchor's. It is the centroid farthest from the anchor, which determines the attitude best; as
+    that may be a false spot, the next one in order serves too.
+    """
+    stars, count = database.directions[near], len(observation)
+    cosine = predicted @ stars.T
+    compatible = observation.compatible(database.mag[near])
+    if compatible is not None:
+        cosine[~compatible] = -math.inf
+    least, tolerance_rad = math.cos(min(math.pi, reach_rad)), observation.side_tolerance_rad
+    for anchor in range(min(count, MOST_ANCHORS)):
+        first = np.flatnonzero(cosine[anchor] >= least)
+        first = first[np.argsort(-cosine[anchor, first], kind="stable")]
+        apart_rad = observation.separation_rad[anchor]
+        square = 2.0 - 2.0 * (stars[first] @ stars.T)
+        for other in dict.fromkeys((int(apart_rad.argmax()), (anchor + 1) % count)):
+            observation.budget.spend(LOOKUP)
+            low, high = _squared_chords(float(apart_rad[other]), tolerance_rad)
+            place = stars[first] + (predicted[other] - predicted[anchor])
+            along = np.where((square >= low) & (square <= high), place @ stars.T, -math.inf)
+            second = along.argmax(axis=1)
+            # A wrong attitude turns the two against each other by no more than their distance.
+            slack_rad = 2.0 * (
+                reach_rad * float(apart_rad[other]) + REACH * observation.tolerance_rad
+            )
+            least_along = 0.5 * (np.einsum("ij,ij->i", place, place) + 1.0 - slack_rad**2)
+            fits = np.flatnonzero(along[np.arange(len(first)), second] >= least_along)
+            if len(fits):
+                pairs = near[np.column_stack([first[fits], second[fits]])]
+                yield Candidates(np.broadcast_to([anchor, other], pairs.shape), pairs)
+
+
+def _squared_chords(apart_rad: float, tolerance_rad: float) -> tuple[float, float]:
+    low, high = max(0.0, apart_rad - tolerance_rad), min(math.pi, apart_rad + tolerance_rad)
+    return 4.0 * math.sin(0.5 * low) ** 2, 4.0 * math.sin(0.5 * high) ** 2
 
 
 def turn_of_noise_rad(camera: Camera, tolerance_px: float) -> float:

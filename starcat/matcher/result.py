@@ -1,10 +1,10 @@
-"""What an identification returns."""
+"""The answer to a frame: attitude, stars, and why there are none."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from html import escape
 from typing import TYPE_CHECKING, Any, Literal
@@ -12,25 +12,15 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Matrix
 from starcat.errors import NotIdentifiedError
-from starcat.geometry.attitude import (
-    matrix_from_quaternion,
-    quaternion_from_matrix,
-    radec_roll_from_matrix,
-)
+from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.matcher import sky_objects
-from starcat.matcher.observation import Observation
-from starcat.matcher.pose import focal_length_error_px
-from starcat.matcher.refusal import Refusal
-from starcat.matcher.stars import (
-    NO_STARS,
-    Asked,
-    MatchedStars,
-    attitude_covariance,
-    matched_stars,
-)
-from starcat.matcher.verification import Agreement
+from starcat.matcher.chance import MIN_STARS
+from starcat.matcher.database import Database
+from starcat.matcher.observation import Dropped, Frame
+from starcat.matcher.stars import NO_STARS, MatchedStars, attitude_covariance, matched_stars
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
@@ -41,6 +31,100 @@ Status = Literal["identified", "no_match", "too_few_stars"]
 
 Origin = Literal["lost_in_space", "tracking"]
 
+Reason = Literal[
+    "too_few_stars", "no_candidate", "prior", "chance", "share_of_frame", "scale", "time", "steps"
+]
+
+MESSAGES: dict[Reason, str] = {
+    "too_few_stars": f"fewer than {MIN_STARS} spots of the frame are usable",
+    "no_candidate": "no pattern of the frame is one of the database",
+    "prior": "no attitude as near to the prior as its error says explains the frame",
+    "chance": "no attitude fits better than chance",
+    "share_of_frame": "the best agreement explains too little of the frame",
+    "scale": "the frame is of another scale than the camera",
+    "time": "the time limit ended the search",
+    "steps": "the limit of steps ended the search",
+}
+"""Each reason in words."""
+
+HINTS: dict[Reason, str] = {
+    "too_few_stars": (
+        "find more spots, with a longer exposure or a lower threshold, and look at 'dropped' for "
+        "those that were not used"
+    ),
+    "no_candidate": (
+        "check the field of view of the camera, try the image flipped, allow a wider tolerance "
+        "of centroids, or use a database of fainter stars"
+    ),
+    "prior": "state a larger error of the prior (prior_error_deg), or identify without a prior",
+    "chance": (
+        "give brightnesses of the spots, state their noise (noise_px, noise_mag) in place of a "
+        "tolerance, or find more spots; check the field of view, and try the image flipped"
+    ),
+    "share_of_frame": (
+        "leave out spots that are no stars, give the camera its distortion, use a database that "
+        "is as deep as the frame, or ask for a smaller share (min_share, --min-share)"
+    ),
+    "scale": (
+        "give the camera its true focal length, or allow an error of it (fov_error, --fov-error)"
+    ),
+    "time": "allow more time, give brightnesses of the spots, or leave out spots that are no stars",
+    "steps": (
+        "allow more steps, give brightnesses of the spots, or leave out spots that are no stars"
+    ),
+}
+"""What to try, by reason."""
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Why a frame was not identified.
+
+    Attributes
+    ----------
+    reason : str
+        ``too_few_stars``, ``no_candidate`` (no pattern of the frame is in the database),
+        ``prior`` (no attitude near the prior explains the frame), ``chance``,
+        ``share_of_frame`` and ``scale`` (why the best agreement was withheld), or
+        ``time`` and ``steps`` (the limit that ended the search).
+    n_matched : int
+        Centroids with a star in the best agreement; 0 where there was none.
+    false_match_probability : float
+        Bound on the probability that chance agrees as well as it; 1 where there was none.
+    share : float
+        Share of the frame that it explains, by weight; 0 where there was none.
+    n_spots : int
+        Usable centroids of the frame; 0 where that is not known.
+    """
+
+    reason: Reason
+    n_matched: int = 0
+    false_match_probability: float = 1.0
+    share: float = 0.0
+    n_spots: int = 0
+
+    @property
+    def message(self) -> str:
+        """The reason as a sentence begins, with the numbers of the best agreement."""
+        text = MESSAGES[self.reason]
+        if self.n_matched == 0:
+            return text
+        spots = f"{self.n_matched} of {self.n_spots}" if self.n_spots else str(self.n_matched)
+        best = f"best: {spots} spots"
+        if self.false_match_probability < 1.0:
+            best += f", chance {self.false_match_probability:.1e}"
+            best += f", {self.share:.0%} of the frame" if self.share else ""
+        return f"{text} ({best})"
+
+    @property
+    def hint(self) -> str:
+        """What to try."""
+        return HINTS[self.reason]
+
+    def __repr__(self) -> str:
+        """Return the reason in one line."""
+        return f"<Refusal {self.reason}: {self.message}>"
+
 
 @dataclass(frozen=True)
 class MatchResult:
@@ -50,16 +134,8 @@ class MatchResult:
     ----------
     status : {"identified", "no_match", "too_few_stars"}
         Only ``identified`` comes with stars and an attitude.
-    star_ids : ndarray of int64, shape (N,)
-        Permanent star number of each centroid, -1 where none.
     star_index : ndarray of int32, shape (N,)
         Row of the database, -1 where none.
-    q_body_from_icrs : ndarray of float64, shape (4,)
-        Scalar-last attitude; NaN unless identified.
-    boresight_ra_deg, boresight_dec_deg, roll_deg : float
-        The same attitude as angles; NaN unless identified.
-    n_matched : int
-        Centroids with a star.
     residual_arcsec : float
         Root mean square angle between matched centroids and their stars.
     false_match_probability : float
@@ -79,22 +155,21 @@ class MatchResult:
     """
 
     status: Status
-    star_ids: NDArray[np.int64]
     star_index: NDArray[np.int32]
-    q_body_from_icrs: NDArray[np.float64]
-    boresight_ra_deg: float
-    boresight_dec_deg: float
-    roll_deg: float
-    n_matched: int
+    # Attitude, ``body = matrix @ icrs``; NaN unless identified.
+    matrix: Matrix
     residual_arcsec: float
     false_match_probability: float
-    dropped: tuple[tuple[int, str], ...] = ()
+    dropped: Dropped = ()
     camera: Camera | None = None
     focal_length_error_px: float | None = None
     origin: Origin = "lost_in_space"
     time_s: float = field(default=math.nan, compare=False)
-    # What follows is what the properties are made of, when they are asked for.
-    asked: Asked | None = field(default=None, repr=False, compare=False)
+    # The frame as it was given, the stars, and the noise of a centroid where it was stated: what
+    # the properties are made of when they are asked for.
+    frame: Frame | None = field(default=None, repr=False, compare=False)
+    database: Database | None = field(default=None, repr=False, compare=False)
+    noise_px: float | None = field(default=None, repr=False, compare=False)
     why: Refusal | Callable[[], Refusal | None] | None = field(
         default=None, repr=False, compare=False
     )
@@ -103,6 +178,44 @@ class MatchResult:
     def ok(self) -> bool:
         """Whether the frame was identified."""
         return self.status == "identified"
+
+    @property
+    def n_matched(self) -> int:
+        """Centroids with a star."""
+        return int(np.count_nonzero(self.star_index >= 0))
+
+    @cached_property
+    def star_ids(self) -> NDArray[np.int64]:
+        """Permanent star number of each centroid, shape (N,), -1 where none."""
+        if self.database is None or not self.ok:
+            return np.full(len(self.star_index), -1, dtype=np.int64)
+        ids = np.take(self.database.star_id, self.star_index, mode="wrap")
+        ids[self.star_index < 0] = -1
+        return ids
+
+    @cached_property
+    def q_body_from_icrs(self) -> NDArray[np.float64]:
+        """Scalar-last attitude, shape (4,); NaN unless identified."""
+        return quaternion_from_matrix(self.matrix)
+
+    @cached_property
+    def _angles(self) -> tuple[float, float, float]:
+        return radec_roll_from_matrix(self.matrix)
+
+    @property
+    def boresight_ra_deg(self) -> float:
+        """Right ascension of the boresight; NaN unless identified."""
+        return self._angles[0]
+
+    @property
+    def boresight_dec_deg(self) -> float:
+        """Declination of the boresight; NaN unless identified."""
+        return self._angles[1]
+
+    @property
+    def roll_deg(self) -> float:
+        """Roll, as `matrix_from_radec_roll` has it; NaN unless identified."""
+        return self._angles[2]
 
     @cached_property
     def refusal(self) -> Refusal | None:
@@ -118,9 +231,9 @@ class MatchResult:
         """The centroids that are stars, one row each; empty unless identified."""
         if not self.ok:
             return NO_STARS
-        if self.asked is None or self.camera is None:
+        if self.frame is None or self.database is None or self.camera is None:
             raise ValueError("this MatchResult does not hold the frame that was asked about")
-        return matched_stars(self.star_index, self._matrix, self.camera, self.asked)
+        return matched_stars(self.star_index, self.matrix, self.camera, self.frame, self.database)
 
     @cached_property
     def covariance_arcsec2(self) -> NDArray[np.float64]:
@@ -131,9 +244,9 @@ class MatchResult:
         else with that of the residuals. The camera is taken as exact.
         """
         stars = self.stars
-        if self.asked is None or self.camera is None:
+        if self.frame is None or self.camera is None:
             return np.full((3, 3), np.nan)
-        return attitude_covariance(stars, self.camera, self.asked.noise_px)
+        return attitude_covariance(stars, self.camera, self.noise_px)
 
     def table(self) -> QTable:
         """Return the stars as an astropy table.
@@ -150,9 +263,8 @@ class MatchResult:
             If astropy is not installed.
         """
         facts: dict[str, Any] = {"status": self.status}
-        if self.asked is not None:
-            database = self.asked.database
-            facts |= {"database": database.name, "epoch_jyear": database.epoch_jyear}
+        if self.database is not None:
+            facts |= {"database": self.database.name, "epoch_jyear": self.database.epoch_jyear}
         if self.ok:
             facts["q_body_from_icrs"] = self.q_body_from_icrs.tolist()
             facts["covariance_arcsec2"] = self.covariance_arcsec2.tolist()
@@ -195,11 +307,7 @@ class MatchResult:
         self._expect_ok("WCS")
         if self.camera is None:
             raise ValueError("this MatchResult does not hold the camera that it was found with")
-        return sky_objects.wcs(self.camera, self._matrix, bottom_up)
-
-    @property
-    def _matrix(self) -> NDArray[np.float64]:
-        return matrix_from_quaternion(self.q_body_from_icrs)
+        return sky_objects.wcs(self.camera, self.matrix, bottom_up)
 
     def _expect_ok(self, what: str) -> None:
         if not self.ok:
@@ -210,11 +318,14 @@ class MatchResult:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what goes to another process: the stars, not the database they are of."""
-        if self.asked is None or self.camera is None:
-            return {**vars(self), "asked": None, "why": None}
-        made = {"stars": self.stars, "covariance_arcsec2": self.covariance_arcsec2}
         known = vars(self).get("refusal", None if callable(self.why) else self.why)
-        return {**vars(self), **made, "asked": None, "why": known}
+        content = {**vars(self), "frame": None, "database": None, "why": known}
+        if self.database is not None:
+            content["star_ids"] = self.star_ids
+            if self.frame is not None and self.camera is not None:
+                content["stars"] = self.stars
+                content["covariance_arcsec2"] = self.covariance_arcsec2
+        return content
 
     def __repr__(self) -> str:
         """Return the answer in one line."""
@@ -236,7 +347,7 @@ class MatchResult:
         head = f"<p>{escape(repr(self)[1:-1])}</p>"
         if not self.ok:
             why = self.refusal
-            return head + (f"<p>{escape(f'{why.words}. Try: {why.advice}')}</p>" if why else "")
+            return head + (f"<p>{escape(f'{why.message}. Try: {why.hint}')}</p>" if why else "")
         stars = self.stars
         columns = {
             "spot": stars.spot.tolist(),
@@ -255,136 +366,28 @@ class MatchResult:
         return f"{head}<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>"
 
 
-def unidentified(
-    status: Status,
-    observation: Observation,
-    refusal: Refusal | None = None,
-    origin: Origin = "lost_in_space",
+NO_MATRIX = np.full((3, 3), np.nan)
+NO_MATRIX.flags.writeable = False
+
+
+def no_match(
+    count: int,
+    dropped: Dropped = (),
+    why: Refusal | Callable[[], Refusal | None] | None = None,
+    **facts: Any,
 ) -> MatchResult:
-    """Return the answer to a frame that was not identified.
+    """Return the answer to a frame of so many centroids that was not identified.
 
-    Parameters
-    ----------
-    status : {"no_match", "too_few_stars"}
-        Why.
-    observation : Observation
-        The frame.
-    refusal : Refusal, optional
-        The best agreement that was withheld, and why; that there were too few stars is said
-        without it.
-    origin : {"lost_in_space", "tracking"}
-        Where the stars were looked for.
-
-    Returns
-    -------
-    MatchResult
-        An answer without stars and attitude.
+    ``facts`` are further fields of the answer.
     """
-    if refusal is None and status == "too_few_stars":
-        refusal = Refusal("too_few_stars")
-    none = np.full(len(observation) + len(observation.dropped), -1)
-    nan = float("nan")
+    is_too_few = isinstance(why, Refusal) and why.reason == "too_few_stars"
     return MatchResult(
-        status,
-        none.astype(np.int64),
-        none.astype(np.int32),
-        np.full(4, nan),
-        nan,
-        nan,
-        nan,
-        0,
-        nan,
+        "too_few_stars" if is_too_few else "no_match",
+        np.full(count, -1, dtype=np.int32),
+        NO_MATRIX,
+        math.nan,
         1.0,
-        observation.dropped,
-        origin=origin,
-        why=refusal,
-    )
-
-
-def identified(
-    found: Agreement,
-    observation: Observation,
-    star_id: NDArray[np.int64],
-    origin: Origin = "lost_in_space",
-) -> MatchResult:
-    """Return the answer to an identified frame.
-
-    Parameters
-    ----------
-    found : Agreement
-        Attitude and stars.
-    observation : Observation
-        The frame.
-    star_id : ndarray of int64, shape (S,)
-        Permanent numbers of the database's stars.
-    origin : {"lost_in_space", "tracking"}
-        Where the stars were looked for.
-
-    Returns
-    -------
-    MatchResult
-        An answer whose quaternion and angles are the same attitude.
-    """
-    count = len(observation) + len(observation.dropped)
-    index, ids = np.empty(count, dtype=np.int32), np.empty(count, dtype=np.int64)
-    index.fill(-1)
-    index[observation.rows] = found.star_index
-    np.take(star_id, index, out=ids, mode="wrap")
-    ids[index < 0] = -1
-    pose = found.pose
-    ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(pose.matrix)
-    return MatchResult(
-        "identified",
-        ids,
-        index,
-        quaternion_from_matrix(pose.matrix),
-        ra_deg,
-        dec_deg,
-        roll_deg,
-        found.n_matched,
-        math.degrees(found.residual_rad) * 3600.0,
-        found.false_match_probability,
-        observation.dropped,
-        pose.camera,
-        _focal_length_error_px(found, observation) if observation.fov_error else None,
-        origin,
-    )
-
-
-def _focal_length_error_px(found: Agreement, observation: Observation) -> float:
-    matched = np.flatnonzero(found.star_index >= 0)
-    return focal_length_error_px(found.pose, matched, found.residual_rad, observation)
-
-
-def withheld(answer: MatchResult, refusal: Refusal) -> MatchResult:
-    """Return the answer to a frame whose stars and attitude are not given away.
-
-    Parameters
-    ----------
-    answer : MatchResult
-        An identified frame.
-    refusal : Refusal
-        Why it is withheld.
-
-    Returns
-    -------
-    MatchResult
-        ``no_match``.
-    """
-    nan, count = math.nan, len(answer.star_ids)
-    return replace(
-        answer,
-        status="no_match",
-        star_ids=np.full(count, -1, dtype=np.int64),
-        star_index=np.full(count, -1, dtype=np.int32),
-        q_body_from_icrs=np.full(4, nan),
-        boresight_ra_deg=nan,
-        boresight_dec_deg=nan,
-        roll_deg=nan,
-        n_matched=0,
-        residual_arcsec=nan,
-        false_match_probability=1.0,
-        camera=None,
-        focal_length_error_px=None,
-        why=refusal,
+        dropped,
+        why=why,
+        **facts,
     )

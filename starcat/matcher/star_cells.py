@@ -1,4 +1,4 @@
-"""Cells of the sky that list the stars in them, to find out which directions have a star nearby.
+"""Stars of a database near directions: in a cap, and by cells of the sky.
 
 Most of the many candidates of a frame are wrong. The cells tell quickly how many centroids each
 candidate explains. They are made when a database first needs them.
@@ -13,7 +13,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Directions, Mask, Rows
+from starcat.geometry.sphere import Zones, zones_of
 from starcat.matcher.database import Database
 
 MIN_SIDE = 0.02
@@ -22,35 +23,38 @@ MIN_SIDE = 0.02
 SMALLEST_REACH = 0.25 * MIN_SIDE
 """Cells of the smallest side serve all reaches up to this."""
 
+MANY_STARS = 15_000
+"""So many stars are searched by zones; a product of all is faster for fewer."""
+
+
+def stars_in_cap(database: Database, axis: Array, radius_rad: float) -> Rows:
+    """Return the rows of the stars up to an angle from a direction, ascending."""
+    if len(database.mag) >= MANY_STARS:
+        return database.cached(_zones).near(axis, radius_rad)
+    return (database.directions @ axis >= math.cos(radius_rad)).nonzero()[0]
+
+
+def _zones(database: Database) -> Zones:
+    return zones_of(database.directions)
+
 
 @dataclass(frozen=True)
 class StarCells:
-    """Stars by the cells of a cubic grid that they lie in or near.
+    """Stars by the cells of a cubic grid that they lie in or near."""
 
-    Attributes
-    ----------
-    directions : ndarray of float64, shape (N, 3)
-        Unit vectors of the stars.
-    side : float
-        Side of a cell, in units of the sphere's radius.
-    margin : float
-        A star is listed in every cell that it is this near to.
-    keys : ndarray of int64, shape (C,)
-        Cells with stars, ascending.
-    offsets : ndarray of int64, shape (C + 1,)
-        The stars of cell c are ``rows[offsets[c]:offsets[c + 1]]``.
-    rows : ndarray of int64
-        Rows of the stars.
-    """
-
+    # Unit vectors of the stars; shape (N, 3).
     directions: Array
+    # Side of a cell, in units of the sphere's radius.
     side: float
+    # A star is listed in every cell that it is this near to.
     margin: float
+    # Cells with stars, ascending; shape (C,).
     keys: NDArray[np.int64]
+    # The stars of cell c are ``rows[offsets[c]:offsets[c + 1]]``; shape (C + 1,).
     offsets: NDArray[np.int64]
     rows: NDArray[np.int64]
 
-    def has_star(self, directions: Array, reach_rad: float) -> NDArray[np.bool_]:
+    def has_star(self, directions: Directions, reach_rad: float) -> Mask:
         """Return which directions have a star within reach."""
         if reach_rad > self.margin:
             raise ValueError(f"reach_rad is {reach_rad}; these cells allow {self.margin}")
@@ -72,14 +76,14 @@ class StarCells:
 def cells_for(database: Database, reach_rad: float) -> StarCells:
     """Return the cells of a database's stars for a reach, which are made once."""
     margin_rad = max(SMALLEST_REACH, 2.0 ** math.ceil(math.log2(reach_rad)))
-    return database.derived(_of_database, margin_rad)
+    return database.cached(_of_database, margin_rad)
 
 
 def _of_database(database: Database, reach_rad: float) -> StarCells:
     return star_cells(database.directions, reach_rad)
 
 
-def star_cells(directions: Array, reach_rad: float) -> StarCells:
+def star_cells(directions: Directions, reach_rad: float) -> StarCells:
     """Sort stars into cells."""
     side = max(MIN_SIDE, 4.0 * reach_rad)
     margin = 0.25 * side

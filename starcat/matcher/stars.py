@@ -8,39 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Matrix
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import radec_from_directions, separation
 from starcat.matcher.database import Database
-from starcat.matcher.spread import information
+from starcat.matcher.observation import Frame
+from starcat.matcher.pose import information
 
 ARCSEC = math.degrees(1.0) * 3600.0
 """Arcseconds in a radian."""
 
 STEP_PX = 0.01
 """Step of the differences that say how a direction moves with its pixel."""
-
-
-@dataclass(frozen=True)
-class Asked:
-    """What a matcher was asked of one frame.
-
-    Attributes
-    ----------
-    centroids_px : ndarray of float64, shape (N, 2)
-        Pixels, as they were given.
-    magnitudes : ndarray of float64, shape (N,), or None
-        As they were given.
-    database : Database
-        The stars.
-    noise_px : float or None
-        Standard deviation of a centroid on each axis, where it was stated.
-    """
-
-    centroids_px: Array
-    magnitudes: Array | None
-    database: Database
-    noise_px: float | None = None
 
 
 @dataclass(frozen=True)
@@ -108,35 +87,18 @@ NO_STARS = _no_stars()
 
 
 def matched_stars(
-    star_index: NDArray[np.int32], matrix: Array, camera: Camera, asked: Asked
+    star_index: NDArray[np.int32], matrix: Matrix, camera: Camera, frame: Frame, database: Database
 ) -> MatchedStars:
-    """Return the stars that centroids were found to be.
-
-    Parameters
-    ----------
-    star_index : ndarray of int32, shape (N,)
-        Row of the database for each centroid, -1 where none.
-    matrix : ndarray of float64, shape (3, 3)
-        Attitude, ``body = matrix @ icrs``.
-    camera : Camera
-        The camera that the attitude holds for.
-    asked : Asked
-        Centroids and database.
-
-    Returns
-    -------
-    MatchedStars
-        A row for each centroid with a star.
-    """
+    """Return the stars that centroids were found to be, -1 where none, a row for each star."""
     spot = np.flatnonzero(star_index >= 0)
-    row, database = star_index[spot], asked.database
-    seen_px = asked.centroids_px[spot]
+    row = star_index[spot]
+    seen_px = frame.centroids_px[spot]
     u = database.directions[row]
     offset = seen_px - camera.pixels_from_directions(u @ matrix.T)
     seen = camera.directions_from_pixels(seen_px) @ matrix
     ra_deg, dec_deg = radec_from_directions(u)
     mag = np.asarray(database.mag[row], dtype=np.float64)
-    given = np.full(len(spot), np.nan) if asked.magnitudes is None else asked.magnitudes[spot]
+    given = np.full(len(spot), np.nan) if frame.magnitudes is None else frame.magnitudes[spot]
     ids = database.star_id[row]
     names = zip(database.designation[row].tolist(), ids.tolist(), strict=True)
     return MatchedStars(
@@ -160,23 +122,11 @@ def matched_stars(
 def attitude_covariance(
     stars: MatchedStars, camera: Camera, noise_px: float | None = None
 ) -> Array:
-    """Return the covariance of an attitude that the centroids of stars determine.
+    """Return the covariance of an attitude that the centroids of stars determine, shape (3, 3).
 
-    Parameters
-    ----------
-    stars : MatchedStars
-        The stars of the answer, at least 2.
-    camera : Camera
-        The camera that the attitude holds for.
-    noise_px : float, optional
-        Standard deviation of a centroid on each axis; that of the residuals by default, of whose
-        2n numbers three went into the attitude.
-
-    Returns
-    -------
-    ndarray of float64, shape (3, 3)
-        Of the small rotations about the axes of the camera (x right, y down, z along the
-        boresight), square arcseconds; NaN where the stars determine no attitude.
+    Of the small rotations about the axes of the camera (x right, y down, z along the boresight),
+    square arcseconds; NaN where the stars determine no attitude. The noise of a centroid, where it
+    is not stated, is that of the residuals, of whose 2n numbers three went into the attitude.
 
     Notes
     -----

@@ -15,17 +15,21 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Array
-from starcat.matcher.around import stars_around
-from starcat.matcher.budget import AGREEMENT
+from starcat.arrays import Array, Directions, Mask, Pixels, Rows
 from starcat.matcher.chance import MIN_STARS, false_match_probability
 from starcat.matcher.database import Database
-from starcat.matcher.methods.candidates import Candidates
-from starcat.matcher.observation import Observation
-from starcat.matcher.pose import Pose, first_poses, pose_at, refitted, scaled_directions
-from starcat.matcher.spread import is_scaled, share_of_frame
-from starcat.matcher.star_cells import cells_for
-from starcat.matcher.ways import Compatible, compatible_pairs
+from starcat.matcher.observation import Candidates, Observation
+from starcat.matcher.pose import (
+    Pose,
+    explained_fraction,
+    first_poses,
+    fit,
+    is_scaled,
+    pose_at,
+    scaled_directions,
+)
+from starcat.matcher.settings import AGREEMENT, REACH
+from starcat.matcher.star_cells import cells_for, stars_in_cap
 
 Withheld = Literal["share_of_frame", "scale"] | None
 
@@ -46,12 +50,6 @@ RIVAL_REACH = 4.0
 """A centroid without a star that is this near to one that another centroid has may have more right
 to it; in units of the final reach."""
 
-REACH = 1.5
-"""Largest distance between a centroid and its star, in units of the tolerance.
-
-It is larger than 1 because an attitude that was computed from a few stars has an error too.
-"""
-
 ROUGH = (2.0,)
 """Reach of a first refinement where the focal length is fitted too, in units of the final reach:
 three stars leave more of an error in it than in the attitude."""
@@ -68,32 +66,21 @@ AT_ONCE = 256
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well an attitude explains a frame.
+    """How well an attitude explains a frame."""
 
-    Attributes
-    ----------
-    pose : Pose
-        Attitude refined on all matched stars, and the camera with the focal length that goes
-        with it.
-    star_index : ndarray of int32, shape (N,)
-        Row of each centroid's star, -1 where none.
-    residual_rad : float
-        Root mean square separation of the matched centroids from their stars; NaN where fewer
-        than `MIN_STARS` match.
-    chance : float
-        Bound on the probability that chance agrees as well; 1 where fewer than `MIN_STARS`
-        match.
-    share : float
-        Share of the frame that it explains; 1 where chance explains it, as it is of no use there.
-    withheld : {"share_of_frame", "scale"}, optional
-        Why it is no answer, however unlikely chance is.
-    """
-
+    # Attitude refined on all matched stars, and the camera with the focal length that goes with
+    # it.
     pose: Pose
+    # Row of each centroid's star, -1 where none; shape (N,).
     star_index: NDArray[np.int32]
+    # Root mean square separation of the matched centroids from their stars; NaN where fewer than
+    # `MIN_STARS` match.
     residual_rad: float
+    # Bound on the probability that chance agrees as well; 1 where fewer than `MIN_STARS` match.
     chance: float
+    # Share of the frame that it explains; 1 where chance explains it, as it is of no use there.
     share: float = 1.0
+    # Why it is no answer, however unlikely chance is.
     withheld: Withheld = None
 
     @property
@@ -109,24 +96,23 @@ class Agreement:
         return own < (other.false_match_probability, other.chance)
 
     @property
+    def matched(self) -> Rows:
+        """Rows of the centroids with a star."""
+        return np.flatnonzero(self.star_index >= 0)
+
+    @property
     def n_matched(self) -> int:
         """Number of centroids with a star."""
-        return int((self.star_index >= 0).sum())
+        return int(np.count_nonzero(self.star_index >= 0))
 
 
 @dataclass
 class BestOf:
-    """The best of the agreements that a search has come to.
+    """The best of the agreements that a search has come to."""
 
-    Attributes
-    ----------
-    certain : float
-        A false-match probability as low as this ends the search.
-    found : Agreement or None
-        The agreement that chance explains least.
-    """
-
+    # A false-match probability as low as this ends the search.
     certain: float
+    # The agreement that chance explains least.
     found: Agreement | None = None
 
     @property
@@ -176,7 +162,7 @@ def _worth_trying(
 
 def agreeing_centroids(
     matrices: Array, observation: Observation, database: Database, factors: Array | None = None
-) -> NDArray[np.int64]:
+) -> Rows:
     """Count the centroids that attitudes put near a star, on the detector or just off it."""
     reach_rad = REACH * observation.tolerance_rad
     body = observation.body
@@ -198,30 +184,30 @@ def agree(
     """Match the centroids of a frame with the stars that an attitude predicts."""
     observation.budget.spend(AGREEMENT)
     rough = ROUGH if observation.fov_error and not first else first
-    fit = _refined(pose, observation, database, rough)
-    found = _judged(fit, observation)
+    refined = _refine(pose, observation, database, rough)
+    found = _agreement_of(refined, observation)
     if found.false_match_probability < 1.0:
         # A false spot beside a star far from the others can turn the attitude so that it is the
         # nearest to the star itself. The star's own spot then has no star, and fits better.
-        for rival, centroid in _rivals(fit, observation):
+        for rival, centroid in _rivals(refined, observation):
             other = _with_rival(found, rival, centroid, observation, database)
             if other.false_match_probability < found.false_match_probability:
                 found = other
                 break
     if found.false_match_probability > certain:
-        found = _within_less(found, fit, observation, database)
+        found = _within_less(found, refined, observation, database)
     if found.share < SURE_SHARE:
         # This agreement is not due to chance, although much of the frame is unexplained. One or
         # two wrong stars at the edge of a cluster may have spoilt an attitude that is nearly
         # right, and a search within wider reaches replaces them.
-        wider = _judged(_refined(found.pose, observation, database, WIDER), observation)
+        wider = _agreement_of(_refine(found.pose, observation, database, WIDER), observation)
         if wider.false_match_probability < found.false_match_probability:
             return wider
     return found
 
 
 def _within_less(
-    found: Agreement, fit: _Fit, observation: Observation, database: Database
+    found: Agreement, refined: _Fit, observation: Observation, database: Database
 ) -> Agreement:
     """Return the best agreement within smaller reaches.
 
@@ -230,33 +216,33 @@ def _within_less(
     true stars of a crowded frame are outnumbered by those that chance puts within its reach. The
     bound holds for every number of matched stars, so that it may be taken at the best one.
     """
-    square_px, count = fit.square_px[fit.matched], len(fit.matched)
+    square_px, count = refined.square_px[refined.matched], len(refined.matched)
     for k, factor in enumerate(NARROWER):
         near = int(np.sum(square_px <= (factor * REACH * observation.tolerance_px) ** 2))
         if near < MIN_STARS or near < OVER_CHANCE * factor * factor * count:
             continue
         observation.budget.spend(AGREEMENT)
-        narrow = _refined(found.pose, observation, database, NARROWER[:k], factor)
-        other = _judged(narrow, observation)
+        narrow = _refine(found.pose, observation, database, NARROWER[:k], factor)
+        other = _agreement_of(narrow, observation)
         if other.is_better_than(found):
             found = other
     return found
 
 
-def _rivals(fit: _Fit, observation: Observation) -> list[tuple[int, int]]:
+def _rivals(refined: _Fit, observation: Observation) -> list[tuple[int, int]]:
     """Return centroids without a star, each with the one that has the star nearest to it."""
-    loose, matched = (fit.star < 0).nonzero()[0], fit.matched
+    loose, matched = (refined.star < 0).nonzero()[0], refined.matched
     reach_px = RIVAL_REACH * REACH * observation.tolerance_px
-    if not len(loose) or not len(matched) or fit.square_px[loose].min() >= reach_px * reach_px:
+    if not len(loose) or not len(matched) or refined.square_px[loose].min() >= reach_px * reach_px:
         return []
-    star = fit.star[matched]
-    offset = observation.centroids_px[loose][:, None] - fit.predicted_px[star]
+    star = refined.star[matched]
+    offset = observation.centroids_px[loose][:, None] - refined.predicted_px[star]
     offset *= offset
     square = offset[..., 0] + offset[..., 1]
     nearest = square.argmin(axis=1)
     near = square[np.arange(len(loose)), nearest] < reach_px * reach_px
-    if fit.compatible is not None:
-        near &= fit.compatible[loose, star[nearest]]
+    if refined.compatible is not None:
+        near &= refined.compatible[loose, star[nearest]]
     return list(zip(loose[near].tolist(), matched[nearest[near]].tolist(), strict=True))
 
 
@@ -267,8 +253,8 @@ def _with_rival(
     index = found.star_index.copy()
     index[rival], index[centroid] = index[centroid], -1
     matched = np.flatnonzero(index >= 0)
-    pose = refitted(found.pose, matched, database.directions[index[matched]], observation)
-    return _judged(_refined(pose, observation, database), observation)
+    pose = fit(found.pose, matched, database.directions[index[matched]], observation)
+    return _agreement_of(_refine(pose, observation, database), observation)
 
 
 @dataclass(frozen=True)
@@ -276,16 +262,20 @@ class _Fit:
     """A pose, the stars around its field and which of them the centroids are."""
 
     pose: Pose
-    near: NDArray[np.int64]
-    icrs: Array
-    compatible: Compatible | None
-    predicted_px: Array
-    star: NDArray[np.int64]
-    matched: NDArray[np.int64]
+    # Rows of the stars around the field, and their directions.
+    near: Rows
+    icrs: Directions
+    compatible: Mask | None
+    # Where the pose puts those stars.
+    predicted_px: Pixels
+    # Of each centroid a row of ``near``, -1 where none.
+    star: Rows
+    # Centroids with a star.
+    matched: Rows
     square_px: Array
 
 
-def _refined(
+def _refine(
     pose: Pose,
     observation: Observation,
     database: Database,
@@ -296,10 +286,9 @@ def _refined(
     radius_rad = pose.camera.radius_rad
     if observation.fov_error:
         radius_rad *= 1.0 + FOCAL_MARGIN
-    near, u = stars_around(database).near(pose.matrix[2], radius_rad)
-    compatible = None
-    if observation.mag is not None and observation.noise_mag is not None:
-        compatible = compatible_pairs(observation.mag, database.mag[near], observation.noise_mag)
+    near = stars_in_cap(database, pose.matrix[2], radius_rad)
+    u = database.directions[near]
+    compatible = observation.compatible(database.mag[near])
     before: list[int] = []
     for step, factor in enumerate((*wider, *MAX_REFINEMENTS * (last,))):
         predicted = pose.camera.pixels_from_directions(u @ pose.matrix.T)
@@ -309,49 +298,49 @@ def _refined(
         if len(matched) < MIN_STARS or (step >= len(wider) and after == before):
             break
         before = after
-        pose = refitted(pose, matched, u[star[matched]], observation)
+        pose = fit(pose, matched, u[star[matched]], observation)
     return _Fit(pose, near, u, compatible, predicted, star, matched, square_px)
 
 
-def _judged(fit: _Fit, observation: Observation) -> Agreement:
+def _agreement_of(refined: _Fit, observation: Observation) -> Agreement:
     """Return the agreement of a fit, and whether it is withheld."""
-    pose, matched, star = fit.pose, fit.matched, fit.star[fit.matched]
+    pose, matched, star = refined.pose, refined.matched, refined.star[refined.matched]
     index = np.empty(len(observation), dtype=np.int32)
     index.fill(-1)
-    index[matched] = fit.near[star]
+    index[matched] = refined.near[star]
     if len(matched) < MIN_STARS:
         return Agreement(pose, index, math.nan, 1.0)
     seen = pose.body[matched]
-    difference = seen - fit.icrs[star] @ pose.matrix.T
+    difference = seen - refined.icrs[star] @ pose.matrix.T
     residual_rad = math.sqrt(float(np.vdot(difference, difference)) / len(matched))
-    within = _within_reach_of_frame(fit.predicted_px, observation)
-    square_px = math.fsum(fit.square_px[matched].tolist())
+    within = _within_reach_of_frame(refined.predicted_px, observation)
+    square_px = math.fsum(refined.square_px[matched].tolist())
     chance = false_match_probability(
         square_px,
         seen,
         len(observation),
         len(within),
         pose.camera,
-        noise_px=observation.noise_px,
-        compatible=None if fit.compatible is None else fit.compatible[:, within],
+        noise_px=observation.settings.noise_px,
+        compatible=None if refined.compatible is None else refined.compatible[:, within],
         log_scales=observation.focal_range.log_width if observation.fov_error else 0.0,
     )
     share = 1.0
     if chance < 1.0 and len(matched) < len(within):
-        stars = fit.icrs[within] @ pose.matrix.T
-        enough = max(SURE_SHARE, observation.min_share)
-        share = share_of_frame(seen, stars, residual_rad, observation, enough)
+        stars = refined.icrs[within] @ pose.matrix.T
+        enough = max(SURE_SHARE, observation.settings.min_share)
+        share = explained_fraction(seen, stars, residual_rad, observation, enough)
     withheld: Withheld = None
-    if share < observation.min_share:
+    if share < observation.settings.min_share:
         withheld = "share_of_frame"
     elif chance < 1.0 and is_scaled(
-        fit.predicted_px[star], observation.centroids_px[matched], observation
+        refined.predicted_px[star], observation.centroids_px[matched], observation
     ):
         withheld = "scale"
     return Agreement(pose, index, residual_rad, chance, share, withheld)
 
 
-def _within_reach_of_frame(predicted_px: Array, observation: Observation) -> NDArray[np.int64]:
+def _within_reach_of_frame(predicted_px: Array, observation: Observation) -> Rows:
     """Return which stars some centroid of the frame could agree with."""
     camera, reach_px = observation.camera, REACH * observation.tolerance_px
     near = np.abs(predicted_px - camera.middle_px) <= camera.middle_px + reach_px
@@ -362,8 +351,8 @@ def _mutually_nearest(
     predicted_px: Array,
     observation: Observation,
     reach_px: float,
-    compatible: Compatible | None,
-) -> tuple[NDArray[np.int64], Array]:
+    compatible: Mask | None,
+) -> tuple[Rows, Array]:
     """Return the star of each centroid, -1 where it has none, and the squared distances.
 
     A centroid has a star if each of the two is the nearest to the other, within reach, among

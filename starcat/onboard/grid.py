@@ -39,14 +39,9 @@ _FACES = [sign * np.roll(np.eye(3), axis, axis=0) for axis, sign in product(rang
 
 @dataclass(frozen=True)
 class Grid:
-    """Numbers of bands and of the sectors of each.
+    """Numbers of bands and of the sectors of each."""
 
-    Attributes
-    ----------
-    bands, sectors : int
-        1 or more.
-    """
-
+    # 1 or more.
     bands: int
     sectors: int
 

@@ -18,7 +18,6 @@ from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.geometry.patterns import triangle_area
 from starcat.geometry.sphere import separation
-from starcat.onboard.blocks import check_blocks
 from starcat.onboard.grid import grid_for, most_near
 from starcat.onboard.layout import (
     BLOCK_BYTES,
@@ -41,6 +40,7 @@ from starcat.onboard.layout import (
     VERSION,
     ByteOrder,
     Sizes,
+    check_blocks,
     in_order,
 )
 
@@ -55,60 +55,39 @@ SMALLEST_MARGIN = 1e-12
 
 @dataclass(frozen=True)
 class Contents:
-    """What an image is made of.
+    """What an image is made of."""
 
-    Attributes
-    ----------
-    name : str
-        ``<name>-<version>`` of the artifact.
-    epoch_jyear : float
-        Epoch of the directions, Julian year.
-    camera : Camera
-        Size of the detector and focal length are used.
-    star_id : ndarray of int64, shape (N,)
-        Permanent star numbers.
-    directions : ndarray of float64, shape (N, 3)
-        ICRS unit vectors.
-    mag : ndarray of float64, shape (N,)
-        Magnitudes; NaN where unknown.
-    method : {"triangle", "pyramid"}
-        What the features are.
-    features : ndarray of int, shape (M, 3) or (M, 2)
-        Rows of the stars of each triangle or pair, in any order.
-    manifest_sha256 : bytes
-        32 bytes; zeros where there is no manifest.
-    """
-
+    # ``<name>-<version>`` of the artifact.
     name: str
+    # Epoch of the directions, Julian year.
     epoch_jyear: float
+    # Size of the detector and focal length are used.
     camera: Camera
+    # Permanent star numbers; shape (N,).
     star_id: NDArray[np.int64]
+    # ICRS unit vectors; shape (N, 3).
     directions: Array
+    # Magnitudes; NaN where unknown; shape (N,).
     mag: Array
+    # What the features are.
     method: str
+    # Rows of the stars of each triangle or pair, in any order.
     features: Rows
+    # 32 bytes; zeros where there is no manifest.
     manifest_sha256: bytes = bytes(32)
 
 
 @dataclass(frozen=True)
 class MadeImage:
-    """An image and where its stars are from.
+    """An image and where its stars are from."""
 
-    Attributes
-    ----------
-    data : bytes
-        The image.
-    star_rows : ndarray of int64, shape (N,)
-        The row in the contents of each star of the image.
-    n_features : int
-        Triangles or pairs of the image.
-    most_near : int
-        Upper bound of the stars in the camera's circle.
-    """
-
+    # The image.
     data: bytes
+    # The row in the contents of each star of the image; shape (N,).
     star_rows: NDArray[np.int64]
+    # Triangles or pairs of the image.
     n_features: int
+    # Upper bound of the stars in the camera's circle.
     most_near: int
 
 

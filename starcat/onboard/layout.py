@@ -1,11 +1,13 @@
-"""The layout of an onboard image: header, section table, kinds of sections, sizes.
+"""The layout of an onboard image: header, section table, kinds of sections, sizes, check blocks.
 
 ``docs/onboard-format.md`` says the same in words. All types are here for one byte order, and
-`in_order` gives them for another.
+`in_order` gives them for another. Which bytes are check blocks follows from the size of the image
+alone, so that a damaged header does not lead astray.
 """
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -97,17 +99,11 @@ SECTION = np.dtype([("kind", "u4"), ("offset", "u4"), ("bytes", "u4"), ("element
 
 @dataclass(frozen=True)
 class Sizes:
-    """What the size of an image depends on.
+    """What the size of an image depends on."""
 
-    Attributes
-    ----------
-    method : {"triangle", "pyramid"}
-        What the features are.
-    n_stars, n_features, n_cells : int
-        Stars, triangles or pairs, and cells of the grid.
-    """
-
+    # What the features are.
     method: str
+    # Stars, triangles or pairs, and cells of the grid.
     n_stars: int
     n_features: int
     n_cells: int
@@ -184,3 +180,81 @@ def rounded_up(value: int, step: int) -> int:
 def in_order(dtype: np.dtype[Any] | str, byte_order: ByteOrder) -> np.dtype[Any]:
     """Return a type in a byte order."""
     return np.dtype(dtype).newbyteorder(byte_order)
+
+
+_AT_WHOLE = 4 * CRCS_PER_BLOCK
+_AT_ITSELF = _AT_WHOLE + 4
+
+
+def check_blocks(data: bytes, byte_order: ByteOrder) -> bytes:
+    """Return the check blocks of data."""
+    word = in_order("u4", byte_order)
+    whole = np.array(zlib.crc32(data), dtype=word).tobytes()
+    crcs = np.zeros(check_bytes(len(data)) // BLOCK_BYTES * CRCS_PER_BLOCK, dtype=word)
+    crcs[: len(data) // BLOCK_BYTES] = _block_crcs(data)
+    blocks = []
+    for of_blocks in crcs.reshape(-1, CRCS_PER_BLOCK):
+        block = of_blocks.tobytes() + whole
+        blocks.append(block + np.array(zlib.crc32(block), dtype=word).tobytes())
+    return b"".join(blocks)
+
+
+def data_blocks(size_bytes: int) -> int:
+    """Return how many of an image's blocks are data.
+
+    Examples
+    --------
+    >>> [data_blocks(4096 * blocks) for blocks in (2, 1023, 1025)]
+    [1, 1022, 1023]
+    """
+    blocks = size_bytes // BLOCK_BYTES
+    return blocks - -(-blocks // (CRCS_PER_BLOCK + 1))
+
+
+def has_check_blocks(image: bytes) -> bool:
+    """Return whether bytes end with at least one check block that is whole."""
+    return len(image) % BLOCK_BYTES == 0 and any(_sound_checks(image).values())
+
+
+def scrub(image: bytes) -> list[int]:
+    """Return the damaged blocks of an image.
+
+    Examples
+    --------
+    >>> sound = bytes(8192)
+    >>> sound += check_blocks(sound, "little")
+    >>> scrub(sound), scrub(sound[:5000] + b"x" + sound[5001:])
+    ([], [1])
+    """
+    if not image or len(image) % BLOCK_BYTES:
+        return [len(image) // BLOCK_BYTES]
+    n_data = data_blocks(len(image))
+    found = _block_crcs(image[: n_data * BLOCK_BYTES])
+    bad: list[int] = []
+    for block, byte_order in _sound_checks(image).items():
+        if byte_order is None:
+            bad.append(block)
+            continue
+        start = block * BLOCK_BYTES
+        first = (block - n_data) * CRCS_PER_BLOCK
+        stored = np.frombuffer(image, in_order("u4", byte_order), CRCS_PER_BLOCK, start)
+        own = found[first : first + CRCS_PER_BLOCK]
+        bad += (first + np.flatnonzero(own != stored[: len(own)])).tolist()
+    return sorted(bad)
+
+
+def _block_crcs(data: bytes) -> NDArray[np.uint32]:
+    view = memoryview(data)
+    starts = range(0, len(data), BLOCK_BYTES)
+    return np.array([zlib.crc32(view[n : n + BLOCK_BYTES]) for n in starts], dtype=np.uint32)
+
+
+def _sound_checks(image: bytes) -> dict[int, ByteOrder | None]:
+    """Return the byte order of each check block, None where its own CRC does not fit."""
+    checks: dict[int, ByteOrder | None] = {}
+    for block in range(data_blocks(len(image)), len(image) // BLOCK_BYTES):
+        part = image[block * BLOCK_BYTES : (block + 1) * BLOCK_BYTES]
+        crc, stored = zlib.crc32(part[:_AT_ITSELF]), part[_AT_ITSELF:]
+        fits = (order for order in BYTE_ORDERS if int.from_bytes(stored, order) == crc)
+        checks[block] = next(fits, None)
+    return checks

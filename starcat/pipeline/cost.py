@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from starcat.artifact.database import INDICES, stored_dtype
+from starcat.artifact.database import stored_dtype
 from starcat.artifact.writer import Product
 from starcat.catalog.ingest import Ingested
 from starcat.catalog.selection import Selected
@@ -29,6 +29,7 @@ from starcat.pipeline.recipes import ProductInputs, boresight_product
 from starcat.products.boresights import FieldStars
 from starcat.specs.build_spec import BuildSpec
 from starcat.storage.parquet import ROW_GROUP_ROWS, parquet_bytes
+from starcat.storage.product_table import indices_of
 from starcat.storage.schema import product_schema
 
 GIB = 2**30
@@ -342,7 +343,7 @@ def database_bytes(
             total += values * width if column.is_list else 0.0
             datasets += 2 if column.is_list else 1
         total += _index_bytes(name, extent, stars, spec)
-        datasets += len(INDICES.get(name, ()))
+        datasets += len(indices_of(name))
     return round(total + DATASET_BYTES * datasets)
 
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from starcat.arrays import Array
 from starcat.artifact.writer import Product
@@ -150,11 +150,17 @@ def table_from_result(result: Any, schema: ProductSchema) -> pa.Table:
 def boresight_product(fields: FieldStars, brightest: int) -> Product:
     """Return the boresights as a product."""
     ra_deg, dec_deg = radec_from_directions(fields.boresights)
-    u = np.ascontiguousarray(fields.boresights.T)
     rows = np.arange(len(ra_deg), dtype=np.int32)
-    count = fields.count.astype(np.int32)
-    result = _Boresights(
-        rows, ra_deg, dec_deg, u[0], u[1], u[2], count, Ragged(*fields.brightest(brightest))
+    x, y, z = np.ascontiguousarray(fields.boresights.T)
+    result = SimpleNamespace(
+        boresight=rows,
+        ra_deg=ra_deg,
+        dec_deg=dec_deg,
+        x=x,
+        y=y,
+        z=z,
+        star_count=fields.count.astype(np.int32),
+        brightest=Ragged(*fields.brightest(brightest)),
     )
     return Product("boresights", table_from_result(result, product_schema("boresights")), Index())
 
@@ -172,15 +178,3 @@ def level_product(guide_stars: pa.Table, spec: BuildSpec) -> Product:
         brightest=spec.boresights.brightest,
     )
     return Product("levels", table_from_result(result, product_schema("levels")), result.index)
-
-
-@dataclass(frozen=True)
-class _Boresights:
-    boresight: NDArray[np.int32]
-    ra_deg: Array
-    dec_deg: Array
-    x: Array
-    y: Array
-    z: Array
-    star_count: NDArray[np.int32]
-    brightest: Ragged

@@ -13,7 +13,6 @@ from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.progress import Progress, no_progress
-from starcat.simulation.interval import wilson_interval
 from starcat.simulation.simulate import Frame, Noise, simulate_frames
 
 NOISE_MAG = 0.2
@@ -26,38 +25,26 @@ HARD = {"drop_probability": 0.1, "false_stars": 3}
 
 @dataclass(frozen=True)
 class Rates:
-    """How a number of frames fared.
+    """How a number of frames fared."""
 
-    Attributes
-    ----------
-    name : str
-        Which frames: ``clean`` or ``hard``, and ``, no magnitudes`` where none were given.
-    noise_px, drop_probability : float
-        What they suffered.
-    false_stars : int
-        The same.
-    noise_mag : float or None
-        Standard deviation of the magnitudes; None where none were given.
-    frames, identifiable : int
-        All, and those with at least 4 stars.
-    identified, wrong : int
-        Identified rightly; answered with a wrong star or attitude.
-    median_residual_arcsec : float
-        Median over the identified frames; 0 where there are none.
-    missed : tuple of int
-        Stars in each of the identifiable frames that were not identified rightly.
-    """
-
+    # Which frames: ``clean`` or ``hard``, and ``, no magnitudes`` where none were given.
     name: str
+    # What they suffered.
     noise_px: float
     drop_probability: float
+    # The same.
     false_stars: int
+    # Standard deviation of the magnitudes; None where none were given.
     noise_mag: float | None
+    # All, and those with at least 4 stars.
     frames: int
     identifiable: int
+    # Identified rightly; answered with a wrong star or attitude.
     identified: int
     wrong: int
+    # Median over the identified frames; 0 where there are none.
     median_residual_arcsec: float
+    # Stars in each of the identifiable frames that were not identified rightly.
     missed: tuple[int, ...] = ()
 
     @property
@@ -173,3 +160,27 @@ def answers_rightly(result: MatchResult, frame: Frame, matcher: Matcher) -> bool
     truth = camera.pixels_from_directions(database.directions[star] @ frame.matrix.T)
     found = camera.pixels_from_directions(database.directions[star] @ matrix_from_quaternion(q).T)
     return bool(np.all(np.hypot(*(truth - found).T) <= matcher.tolerance_px))
+
+
+Z95 = 1.959963984540054
+"""Standard deviations of a two-sided interval of 95 %."""
+
+
+def wilson_interval(hits: int, count: int) -> tuple[float, float]:
+    """Return Wilson's interval of 95 % of a share.
+
+    References
+    ----------
+    Wilson 1927, Journal of the American Statistical Association 22, 209.
+
+    Examples
+    --------
+    >>> [round(end, 3) for end in wilson_interval(88, 100)]
+    [0.802, 0.93]
+    """
+    if not count:
+        return 0.0, 1.0
+    p, n, z2 = hits / count, count, Z95 * Z95
+    middle = (p + 0.5 * z2 / n) / (1.0 + z2 / n)
+    half = Z95 / (1.0 + z2 / n) * (p * (1.0 - p) / n + 0.25 * z2 / (n * n)) ** 0.5
+    return max(0.0, middle - half), min(1.0, middle + half)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,31 +12,22 @@ from numpy.typing import NDArray
 from starcat.arrays import Array
 from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
-from starcat.simulation.sky import Sky
+from starcat.geometry.sphere import Zones, zones_of
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One simulated frame.
+    """One simulated frame."""
 
-    Attributes
-    ----------
-    matrix : ndarray of float64, shape (3, 3)
-        True attitude, ``body = matrix @ icrs``.
-    centroids_px : ndarray of float64, shape (N, 2)
-        Measured centroids, in random order.
-    star_index : ndarray of int64, shape (N,)
-        Row of each centroid's guide star; -1 for another star and for a false one.
-    mag : ndarray of float64, shape (N,)
-        Measured magnitudes.
-    is_false : ndarray of bool, shape (N,)
-        Which centroids are no stars at all.
-    """
-
+    # True attitude, ``body = matrix @ icrs``; shape (3, 3).
     matrix: Array
+    # Measured centroids, in random order; shape (N, 2).
     centroids_px: Array
+    # Row of each centroid's guide star; -1 for another star and for a false one; shape (N,).
     star_index: NDArray[np.int64]
+    # Measured magnitudes; shape (N,).
     mag: Array
+    # Which centroids are no stars at all; shape (N,).
     is_false: NDArray[np.bool_]
 
     @property
@@ -46,33 +38,22 @@ class Frame:
 
 @dataclass(frozen=True)
 class Noise:
-    """What a frame suffers.
+    """What a frame suffers."""
 
-    Attributes
-    ----------
-    noise_px : float
-        Standard deviation of a centroid, each axis.
-    drop_probability : float
-        Chance of a star to be missing.
-    false_stars : int
-        Spots at random places, with the magnitudes of stars drawn from the sky.
-    false_share : float
-        Further such spots, so many that they are this share of all centroids; below 1.
-    noise_mag : float
-        Standard deviation of a magnitude, before the limit decides what is seen.
-    limit_mag : float
-        Fainter ones are not seen.
-    is_limit_true : bool
-        Whether the true magnitude decides what is seen, not the measured one: then the noise of
-        magnitudes neither hides a star nor lifts a fainter one over the limit.
-    """
-
+    # Standard deviation of a centroid, each axis.
     noise_px: float = 0.0
+    # Chance of a star to be missing.
     drop_probability: float = 0.0
+    # Spots at random places, with the magnitudes of stars drawn from the sky.
     false_stars: int = 0
+    # Further such spots, so many that they are this share of all centroids; below 1.
     false_share: float = 0.0
+    # Standard deviation of a magnitude, before the limit decides what is seen.
     noise_mag: float = 0.0
+    # Fainter ones are not seen.
     limit_mag: float = float("inf")
+    # Whether the true magnitude decides what is seen, not the measured one: then the noise of
+    # magnitudes neither hides a star nor lifts a fainter one over the limit.
     is_limit_true: bool = False
 
 
@@ -128,3 +109,29 @@ def _visible(
     """Draw stars up to a magnitude."""
     bright = np.flatnonzero(sky.mag <= limit_mag)
     return bright[generator.integers(0, max(1, len(bright)), count)] if len(bright) else bright
+
+
+@dataclass(frozen=True)
+class Sky:
+    """Points of light."""
+
+    # ICRS unit vectors; shape (N, 3).
+    directions: Array
+    # Magnitudes; shape (N,).
+    mag: Array
+    # Row of the guide star in the database, -1 for what is none; shape (N,).
+    star_index: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.mag)
+
+    @cached_property
+    def zones(self) -> Zones:
+        """The points in order of declination."""
+        return zones_of(self.directions)
+
+    def brighter(self, limit_mag: float) -> Sky:
+        """Return the points up to a magnitude."""
+        seen = self.mag <= limit_mag
+        return Sky(self.directions[seen], self.mag[seen], self.star_index[seen])

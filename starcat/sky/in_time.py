@@ -137,7 +137,7 @@ def sky_in_time(
     """
     if result.status != "identified":
         return None
-    frame, _ = as_frame(centroids_px)
+    frame = as_frame(centroids_px, camera).centroids_px
     rows = np.flatnonzero(result.star_index >= 0)
     stars = result.star_index[rows]
     parallax = None if parallax_mas is None else parallax_mas[stars]

@@ -17,10 +17,9 @@ from starcat.arrays import Array, Matrix, Pixels
 from starcat.geometry.attitude import matrix_from_quaternion, solve_wahba_svd
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
-from starcat.matcher.matcher import TOLERANCE_PX
 from starcat.matcher.observation import as_frame
 from starcat.matcher.result import MatchResult
-from starcat.matcher.searching import CERTAIN
+from starcat.matcher.settings import CERTAIN, TOLERANCE_PX
 from starcat.sky.bodies import Bodies, bodies_seen
 from starcat.sky.observer import Observer
 
@@ -68,7 +67,8 @@ def identify_in_time(
         brightest spots; such an answer counts if a planet is at each of them, with the
         probability of all these questions.
     """
-    frame, mag = as_frame(centroids_px, magnitudes)
+    given = as_frame(centroids_px, camera, magnitudes)
+    frame, mag = given.centroids_px, given.magnitudes
     found = identify(frame, magnitudes=mag)
 
     def rows_of(result: MatchResult) -> dict[int, str]:

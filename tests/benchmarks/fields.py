@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from starcat.matcher.fast import is_compiled
+from starcat.matcher.c_engine import is_compiled
 from starcat.matcher.matcher import Matcher
 from starcat.pipeline.build import build
 from starcat.pipeline.log import peak_memory_bytes

@@ -99,8 +99,10 @@ def drive_starcat(
     Where the focal length is told wrong by up to ``off``, as much is allowed.
     """
     from starcat.geometry.attitude import matrix_from_quaternion
-    from starcat.matcher.fast import Limits, fast_matcher
+    from starcat.matcher.c_engine import c_engine
     from starcat.matcher.matcher import Matcher
+    from starcat.matcher.observation import as_frame
+    from starcat.matcher.prior import prior_of
 
     of_kind = {
         kind: Matcher.open(Path(artifact), method, engine=engine, **(stated or {}).get(kind, {}))
@@ -133,15 +135,13 @@ def drive_starcat(
         return px, mag if magnitudes else None, prior, camera
 
     def inside_s(given: Any) -> float:
-        fast = fast_matcher(matcher.database, method) if engine == "c" else None
-        if fast is None:
+        library = c_engine(matcher.database, method) if engine == "c" else None
+        if library is None:
             return math.nan
         px, mag, prior, _ = given
-        noises = matcher.noise_px or 0.0, matcher.noise_mag or 0.0
-        limits = Limits(matcher.tolerance_px, *noises, matcher.max_false_match_probability)
-        mags = None if mag is None else [mag]
-        priors = (prior[None], math.radians(PRIOR_DEG)) if track else None
-        found = fast.identify([px], matcher.database.camera, limits, mags, priors)
+        near = prior_of(prior, PRIOR_DEG) if track else None
+        frame = as_frame(px, matcher.database.camera, mag)
+        found = library.identify([frame], matcher.settings, near)
         return float(found.frames["seconds"][0])
 
     return Driver(prepare, solve, attitude, begin=begin, inside_s=inside_s)

@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "builders"))
 from slew import slew
 
 from starcat.geometry.attitude import after_turn, quaternion_from_matrix, turn_between
-from starcat.matcher.fast import is_compiled
+from starcat.matcher.c_engine import is_compiled
 from starcat.matcher.matcher import Engine, Matcher
 from starcat.matcher.result import MatchResult
 from starcat.matcher.tracking import Tracker

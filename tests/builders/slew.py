@@ -8,8 +8,7 @@ import numpy as np
 
 from starcat.geometry.attitude import after_turn, matrix_from_quaternion
 from starcat.matcher.database import Database
-from starcat.simulation.simulate import Frame, Noise, simulate_frame
-from starcat.simulation.sky import Sky
+from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame
 
 JUMP_RAD = 0.7
 """Angle of a jump, 40 deg."""

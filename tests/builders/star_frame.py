@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from frames import observe
 from numpy.typing import NDArray
 from star_story import Story, arcsec, link, table
 
@@ -19,13 +20,10 @@ from starcat.geometry.kvector import KVector
 from starcat.geometry.sphere import radec_from_directions, tangent_axes
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods import triangle
-from starcat.matcher.methods.pairs import side_tolerance_rad
-from starcat.matcher.methods.triangle_order import select_triangles
-from starcat.matcher.observation import observe
-from starcat.matcher.searching import CERTAIN
+from starcat.matcher.methods.order import select_triangles
+from starcat.matcher.settings import CERTAIN
 from starcat.simulation.selftest import HARD, answers_rightly
-from starcat.simulation.simulate import Frame, Noise, simulate_frame, simulate_frames
-from starcat.simulation.sky import Sky
+from starcat.simulation.simulate import Frame, Noise, Sky, simulate_frame, simulate_frames
 
 Array = NDArray[np.float64]
 
@@ -70,7 +68,7 @@ def _triangle_rows(shot: Shot) -> tuple[int, list[tuple[str, object]]]:
     rank = int(np.flatnonzero((chosen == polaris).any(axis=1))[0])
     i, j, k = (int(n) for n in chosen[rank])
     sides = seen.separation_rad[[j, i, i], [k, k, j]]
-    tolerance_rad = side_tolerance_rad(seen)
+    tolerance_rad = seen.side_tolerance_rad
     area, area_error, radius, radius_error = triangle.features(*sides.tolist(), tolerance_rad)
     product = matcher.database.products["triangles"]
     line = product.numbers["kvector_intercept"], product.numbers["kvector_slope"]

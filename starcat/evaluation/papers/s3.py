@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from starcat.evaluation.experiment import catalog_of_artifact
 from starcat.evaluation.paper import Paper, Statistic
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
-from starcat.matcher.methods.triangle_order import is_well_shaped, optimised_triangle
+from starcat.matcher.methods.order import is_well_shaped
 
 PRESET = "sao-12deg-512"
 
@@ -94,6 +95,50 @@ def _usable(centroids_px: Array, choice: tuple[int, int, int]) -> bool:
     if len(centroids_px) <= max(choice):
         return False
     return bool(passes(centroids_px, np.array([choice]))[0])
+
+
+def optimised_triangle(
+    separation_px: Array, min_side_px: float, min_angle_rad: float
+) -> tuple[int, int, int] | None:
+    """Return S3's triangle: the brightest stars that are neither a double nor in a line.
+
+    Distances between the centroids, shape (N, N), are brightest first, and both limits, S3's d_min
+    and theta_min, have to be exceeded. Rows ascend; None if no triangle passes.
+
+    Notes
+    -----
+    Start from stars N, N + 1, N + 2. Where a side is too short, its fainter star is dropped,
+    where an angle is too narrow, the faintest of the three; the next star takes its place.
+    When the stars run out, N moves on by one.
+
+    References
+    ----------
+    Li et al. 2015 (S3), the flow chart's 13 steps.
+    """
+    count = len(separation_px)
+    for start in range(count - 2):
+        chosen, following = [start, start + 1, start + 2], start + 3
+        while True:
+            dropped = _to_drop(separation_px, chosen, min_side_px, min_angle_rad)
+            if dropped is None:
+                i, j, k = chosen
+                return i, j, k
+            if following >= count:
+                break
+            chosen = [*(star for star in chosen if star != dropped), following]
+            following += 1
+    return None
+
+
+def _to_drop(
+    separation_px: Array, chosen: list[int], min_side_px: float, min_angle_rad: float
+) -> int | None:
+    for i, j in combinations(chosen, 2):
+        if separation_px[i, j] <= min_side_px:
+            return j
+    i, j, k = chosen
+    a, b, c = separation_px[[j, i, i], [k, k, j]].reshape(3, 1)
+    return None if is_well_shaped(a, b, c, min_side_px, min_angle_rad)[0] else k
 
 
 def _optimised(centroids_px: Array) -> tuple[int, int, int] | None:

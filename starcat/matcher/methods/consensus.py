@@ -15,10 +15,8 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Mask, Rows
 from starcat.geometry.sphere import separation
 from starcat.matcher.database import Database, ProductArrays
-from starcat.matcher.methods.candidates import Candidates
-from starcat.matcher.methods.pairs import side_tolerance_rad
 from starcat.matcher.methods.reference import rows_between
-from starcat.matcher.observation import Observation
+from starcat.matcher.observation import Candidates, Observation
 
 BATCHES = (4, 16, 64)
 """Sizes of the first batches of pairs; all later batches have the last size."""
@@ -30,26 +28,12 @@ MOST_NAMES = 2048
 def consistent_candidates(
     ranked: NDArray[np.integer], observation: Observation, database: Database, most: int = 1000
 ) -> Iterator[Candidates]:
-    """Propose the names of centroids that agree with each other.
+    """Propose the names of centroids that agree with each other, at most ``most`` pairs.
 
-    Parameters
-    ----------
-    ranked : ndarray of int, shape (N, K)
-        Rows of the database's stars, for every centroid the best first; -1 where there is
-        none.
-    observation : Observation
-        The frame, of N centroids.
-    database : Database
-        The stars.
-    most : int, default 1000
-        Largest number of pairs proposed.
-
-    Yields
-    ------
-    Candidates
-        The first is one correspondence: the pair with the highest support and all names that
-        agree with both and with each other. Then every pair follows by falling support, and
-        among equal ones by falling separation.
+    ``ranked`` has rows of the database's stars for every centroid, shape (N, K), the best first;
+    -1 where there is none. The first candidate is one correspondence: the pair with the highest
+    support and all names that agree with both and with each other. Then every pair follows by
+    falling support, and among equal ones by falling separation.
 
     Notes
     -----
@@ -78,23 +62,9 @@ def consistent_candidates(
 
 
 def consistent(centroid: Rows, star: Rows, observation: Observation, database: Database) -> Mask:
-    """Return which names are as far apart as their centroids.
+    """Return which names are as far apart as their centroids, symmetric, shape (L, L).
 
-    Parameters
-    ----------
-    centroid : ndarray of int, shape (L,)
-        Rows of the observation.
-    star : ndarray of int, shape (L,)
-        Row of the database's star that each name stands for.
-    observation : Observation
-        The frame.
-    database : Database
-        The stars.
-
-    Returns
-    -------
-    ndarray of bool, shape (L, L)
-        Symmetric. False for two names of one centroid and for one star at two centroids.
+    False for two names of one centroid and for one star at two centroids.
 
     Notes
     -----
@@ -111,22 +81,7 @@ def consistent(centroid: Rows, star: Rows, observation: Observation, database: D
 
 
 def support(fits: Mask, centroid: Rows, count: int) -> NDArray[np.int64]:
-    """Count for each name the other centroids with a name that agrees with it.
-
-    Parameters
-    ----------
-    fits : ndarray of bool, shape (L, L)
-        True where two names agree.
-    centroid : ndarray of int, shape (L,)
-        Row of each name's centroid.
-    count : int
-        Number of centroids.
-
-    Returns
-    -------
-    ndarray of int64, shape (L,)
-        0 to ``count - 1``.
-    """
+    """Count for each name the other centroids with a name that agrees with it, shape (L,)."""
     agrees = np.zeros((len(centroid), count), dtype=bool)
     name, other = np.nonzero(fits)
     agrees[name, centroid[other]] = True
@@ -161,25 +116,10 @@ def neighbour_candidates(
 ) -> Candidates:
     """Return the stars that a reference star may be, with two neighbours that agree.
 
-    Parameters
-    ----------
-    reference : int
-        Row of the observation.
-    stars : ndarray of int, shape (K,)
-        Rows of the database's stars, none twice: what the reference star may be.
-    product : ProductArrays
-        A product that lists the neighbours of every star in ``star_offsets`` and ``neighbour``.
-    observation : Observation
-        The frame.
-    database : Database
-        The stars.
-
-    Returns
-    -------
-    Candidates
-        At most one candidate for each star, the best supported first. It names three centroids:
-        the reference star, and two whose stars are neighbours of the star at the same
-        separations from it and from each other.
+    ``stars`` are what the reference star may be, none twice, and ``product`` lists the neighbours
+    of every star in ``star_offsets`` and ``neighbour``. There is at most one candidate for each
+    star, the best supported first. It names three centroids: the reference star, and two whose
+    stars are neighbours of the star at the same separations from it and from each other.
     """
     owner, star, centroid = _named_by_neighbours(reference, stars, product, observation, database)
     first, second = _agreeing_pairs(owner, star, centroid, observation, database)
@@ -214,7 +154,7 @@ def _agreeing_pairs(
 
 def _squared_chords(observation: Observation) -> tuple[Array, Array]:
     """Return the bounds on the squared chord of centroids' stars; none fit one centroid."""
-    apart, tolerance_rad = observation.separation_rad, side_tolerance_rad(observation)
+    apart, tolerance_rad = observation.separation_rad, observation.side_tolerance_rad
     low = 4.0 * np.sin(0.5 * np.maximum(apart - tolerance_rad, 0.0)) ** 2
     high = 4.0 * np.sin(0.5 * np.minimum(apart + tolerance_rad, np.pi)) ** 2
     np.fill_diagonal(low, np.inf)
@@ -236,7 +176,7 @@ def _named_by_neighbours(
     observed = observation.separation_rad[reference]
     nearest = np.argsort(observed, kind="stable")
     nearest = nearest[nearest != reference]
-    tolerance_rad = side_tolerance_rad(observation)
+    tolerance_rad = observation.side_tolerance_rad
     low = np.searchsorted(observed[nearest], apart - tolerance_rad, side="left")
     high = np.searchsorted(observed[nearest], apart + tolerance_rad, side="right")
     name, place = rows_between(low, high)

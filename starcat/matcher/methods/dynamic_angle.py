@@ -3,7 +3,7 @@
 The angle from one neighbour of a reference star to the next, and that neighbour's separation,
 lead to stars that have the same. With the two neighbours laid upon each other, the neighbours
 that agree in angle and separation are counted. Where no reference star leads to an answer, every
-pair of the frame is a base (`small_fields`). Needs the product ``neighbours``.
+pair of the frame is a base (`pair_voting`). Needs the product ``neighbours``.
 """
 
 from __future__ import annotations
@@ -16,14 +16,9 @@ import numpy as np
 from starcat.arrays import Array, Rows
 from starcat.geometry.patterns import bin_of
 from starcat.matcher.database import Database, ProductArrays
-from starcat.matcher.methods.candidates import Candidates
-from starcat.matcher.methods.pairs import side_tolerance_rad
+from starcat.matcher.methods.pair_voting import bases
 from starcat.matcher.methods.reference import Surroundings, by_reference, rows_between, surroundings
-from starcat.matcher.methods.small_fields import bases
-from starcat.matcher.methods.triangle_order import TriangleOrder
-from starcat.matcher.observation import Observation
-
-PRODUCTS = ("neighbours",)
+from starcat.matcher.observation import Candidates, Observation
 
 _TURN = 2.0 * np.pi
 
@@ -34,17 +29,11 @@ centroids between, some may be no guide stars."""
 
 @dataclass(frozen=True)
 class Tolerance:
-    """How far angles and separations may be off.
+    """How far angles and separations may be off."""
 
-    Attributes
-    ----------
-    separation_rad : float
-        S2's eps_dis, radians.
-    angle_rad : float or None
-        S2's eps_ang, radians; None for what ``separation_rad`` across makes of the angle.
-    """
-
+    # S2's eps_dis.
     separation_rad: float
+    # S2's eps_ang; None for what ``separation_rad`` across makes of the angle.
     angle_rad: float | None = None
 
     def between(self, one: Array, other: Array) -> Array:
@@ -56,31 +45,16 @@ class Tolerance:
         return self.separation_rad * np.hypot(1.0 / one, 1.0 / other)
 
 
-def candidates(
-    observation: Observation, database: Database, selection: TriangleOrder
-) -> Iterator[Candidates]:
+def candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
     """Propose what a reference star and the farthest neighbour that agrees are.
 
-    Parameters
-    ----------
-    observation : Observation
-        The frame.
-    database : Database
-        With the product ``neighbours``.
-    selection : TriangleOrder
-        Without effect: no triangles are chosen.
-
-    Yields
-    ------
-    Candidates
-        Two stars each, the reference star nearest to the centre of the frame first; at the end
-        three each, of all pairs of the frame.
+    At the end three stars each are proposed, of all pairs of the frame.
 
     References
     ----------
     Sun et al. 2021 (S2).
     """
-    tolerance = Tolerance(side_tolerance_rad(observation))
+    tolerance = Tolerance(observation.side_tolerance_rad)
 
     def propose(steps: tuple[int, ...]) -> Callable[[int], Candidates]:
         return lambda reference: _ranked(observation, database, reference, tolerance, steps)[0]
@@ -98,17 +72,6 @@ def rank_stars(
 ) -> tuple[Rows, Array]:
     """Rank the stars that a reference star may be by the neighbours that agree.
 
-    Parameters
-    ----------
-    observation : Observation
-        The frame.
-    database : Database
-        With the product ``neighbours``.
-    reference : int
-        Row of the observation.
-    tolerance : Tolerance, optional
-        S2's thresholds; by default what follows from the error of centroids.
-
     Returns
     -------
     stars : ndarray of int, shape (K,)
@@ -121,7 +84,7 @@ def rank_stars(
     ----------
     Sun et al. 2021 (S2), whose answer is the best star of the first of `references`.
     """
-    tolerance = tolerance or Tolerance(side_tolerance_rad(observation))
+    tolerance = tolerance or Tolerance(observation.side_tolerance_rad)
     found, scores = _ranked(observation, database, reference, tolerance)
     return found.stars[:, 0].astype(np.intp), scores
 

@@ -1,8 +1,9 @@
-"""Identification by star pairs: the improved triangle method (Zhang 2006).
+"""Identification by star pairs (Zhang 2006) and by pyramids (Mortari et al. 2004).
 
 For an observed triangle the pairs that fit two of its sides, found by the K-vector over the
 separations, are joined at their common star; the third side and the handedness leave few
-triangles of stars, each of which is a candidate. The method needs the product ``pairs``.
+triangles of stars, each of which is a candidate. A pyramid is such a triangle with a fourth star
+whose separations from all three agree. Both need the product ``pairs``.
 """
 
 from __future__ import annotations
@@ -14,64 +15,56 @@ import numpy as np
 from starcat.arrays import Rows
 from starcat.geometry.kvector import KVector
 from starcat.geometry.sphere import separation
-from starcat.matcher.budget import LOOKUP
 from starcat.matcher.database import Database
-from starcat.matcher.methods.candidates import Candidates
-from starcat.matcher.methods.triangle_order import TriangleOrder, select_triangles
-from starcat.matcher.observation import Observation
-
-PRODUCTS = ("pairs",)
+from starcat.matcher.methods.order import select_triangles
+from starcat.matcher.observation import Candidates, Observation
+from starcat.matcher.settings import LOOKUP
 
 
-def candidates(
-    observation: Observation, database: Database, selection: TriangleOrder
-) -> Iterator[Candidates]:
-    """Propose the triangles of stars that observed triangles may be.
-
-    Parameters
-    ----------
-    observation : Observation
-        The frame.
-    database : Database
-        With the product ``pairs``.
-    selection : TriangleOrder
-        Order and limits of the observed triangles.
-
-    Yields
-    ------
-    Candidates
-        Three stars each, one batch an observed triangle.
+def pair_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
+    """Propose triangles of stars, one batch an observed triangle.
 
     References
     ----------
     Zhang, Jiang et al. 2006, the improved triangle algorithm, a baseline of S2 and S4.
     """
-    for triangle in select_triangles(observation, selection):
+    for triangle, stars in _triangles(observation, database):
+        yield Candidates(np.broadcast_to(triangle, stars.shape), stars)
+
+
+def pyramid_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
+    """Propose pyramids, four stars each, with the first centroid that makes one of a triangle.
+
+    References
+    ----------
+    Mortari, Samaan, Bruccoleri and Junkins 2004, "The pyramid star identification technique",
+    Navigation 51, 171.
+    """
+    for triangle, stars in _triangles(observation, database):
+        for apex in np.setdiff1d(np.arange(len(observation)), triangle):
+            found = _with_apex(stars, triangle, int(apex), observation, database)
+            if len(found):
+                centroids = np.append(triangle, apex)
+                yield Candidates(np.broadcast_to(centroids, found.shape), found)
+                break
+
+
+def _triangles(observation: Observation, database: Database) -> Iterator[tuple[Rows, Rows]]:
+    """Yield observed triangles, with the triangles of stars that they may be, shape (C, 3)."""
+    for triangle in select_triangles(observation):
         observation.budget.spend(LOOKUP)
         stars = triangles_of_stars(triangle, observation, database)
         if len(stars):
-            yield Candidates(np.broadcast_to(triangle, stars.shape), stars)
+            yield triangle, stars
 
 
 def triangles_of_stars(triangle: Rows, observation: Observation, database: Database) -> Rows:
-    """Return the triangles of stars that an observed triangle may be.
+    """Return the triangles of stars that an observed triangle may be, shape (C, 3).
 
-    Parameters
-    ----------
-    triangle : ndarray of int, shape (3,)
-        Rows of the observation.
-    observation : Observation
-        The frame.
-    database : Database
-        With the product ``pairs``.
-
-    Returns
-    -------
-    ndarray of int, shape (C, 3)
-        Rows of the stars, in the order of ``triangle``; the same handedness.
+    Stars are in the order of the centroids, with the same handedness.
     """
     a, b, c = triangle
-    apart, tolerance_rad = observation.separation_rad, side_tolerance_rad(observation)
+    apart, tolerance_rad = observation.separation_rad, observation.side_tolerance_rad
     first_b, star_b = directed_pairs(database, apart[a, b], tolerance_rad)
     first_c, star_c = directed_pairs(database, apart[a, c], tolerance_rad)
     order = np.argsort(first_c, kind="stable")
@@ -90,40 +83,10 @@ def triangles_of_stars(triangle: Rows, observation: Observation, database: Datab
     return np.stack([first_b[left], star_b[left], star_c[right]], axis=-1).astype(np.intp)
 
 
-def side_tolerance_rad(observation: Observation) -> float:
-    """Return the largest error of a separation.
-
-    Parameters
-    ----------
-    observation : Observation
-        The frame.
-
-    Returns
-    -------
-    float
-        Radians. It is less than twice the error of a centroid, because both ends rarely err by
-        the most and in opposite directions.
-    """
-    return 1.5 * observation.tolerance_rad
-
-
 def directed_pairs(
     database: Database, separation_rad: float, tolerance_rad: float
 ) -> tuple[Rows, Rows]:
-    """Return the pairs of about a separation, each in both directions.
-
-    Parameters
-    ----------
-    database : Database
-        With the product ``pairs``.
-    separation_rad, tolerance_rad : float
-        Radians.
-
-    Returns
-    -------
-    first, second : ndarray of int, shape (P,)
-        Rows of the stars.
-    """
+    """Return the first and second stars of the pairs of about a separation, in both directions."""
     product = database.products["pairs"]
     index = KVector(
         product["separation_rad"],
@@ -134,3 +97,19 @@ def directed_pairs(
     rows = index.exact(separation_rad - tolerance_rad, separation_rad + tolerance_rad)
     i, j = product["i"][rows], product["j"][rows]
     return np.concatenate([i, j]), np.concatenate([j, i])
+
+
+def _with_apex(
+    stars: Rows, triangle: Rows, apex: int, observation: Observation, database: Database
+) -> Rows:
+    """Return the triangles that some star makes a pyramid of, with that star."""
+    wanted = observation.separation_rad[triangle, apex]
+    tolerance_rad = observation.side_tolerance_rad
+    first, fourth = directed_pairs(database, float(wanted[0]), tolerance_rad)
+    row, pair = np.nonzero(stars[:, :1] == first)
+    u = database.directions
+    fits = np.ones(len(row), dtype=bool)
+    for corner in (1, 2):
+        apart = separation(u[stars[row, corner]], u[fourth[pair]])
+        fits &= np.abs(apart - wanted[corner]) <= tolerance_rad
+    return np.column_stack([stars[row[fits]], fourth[pair[fits]]])

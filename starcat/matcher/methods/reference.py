@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Rows
-from starcat.matcher.budget import LOOKUP
-from starcat.matcher.methods.candidates import Candidates
-from starcat.matcher.observation import Observation
+from starcat.matcher.observation import Candidates, Observation
+from starcat.matcher.settings import LOOKUP
 
 RANKS = (1, 5, 20)
 """Number of candidates of each reference star that have been tried after each round."""
@@ -26,21 +25,14 @@ RANKS = (1, 5, 20)
 
 @dataclass(frozen=True)
 class Surroundings:
-    """The centroids around one of them, the nearest first.
+    """The centroids around one of them, the nearest first."""
 
-    Attributes
-    ----------
-    centroids : ndarray of int, shape (n,)
-        Rows of the observation.
-    separation_rad : ndarray of float64, shape (n,)
-        Separation from the reference star, radians.
-    position_angle_rad : ndarray of float64, shape (n,)
-        Position angle at the reference star, radians, -pi to pi. It runs counter-clockwise on
-        the sky as seen, from an arbitrary axis: only differences have a meaning.
-    """
-
+    # Rows of the observation.
     centroids: Rows
+    # Separation from the reference star, radians; shape (n,).
     separation_rad: Array
+    # Position angle at the reference star, radians, -pi to pi. It runs counter-clockwise on the
+    # sky as seen, from an arbitrary axis: only differences have a meaning; shape (n,).
     position_angle_rad: Array
 
     def __len__(self) -> int:
@@ -49,40 +41,14 @@ class Surroundings:
 
 
 def references(observation: Observation) -> Rows:
-    """Return the centroids in the order in which they serve as reference stars.
-
-    Parameters
-    ----------
-    observation : Observation
-        The frame.
-
-    Returns
-    -------
-    ndarray of int, shape (N,)
-        Rows of the observation, the nearest to the centre of the frame first.
-    """
+    """Return the centroids in the order in which they serve as reference stars: from the centre."""
     camera = observation.camera
     x, y = (observation.centroids_px - [0.5 * camera.width_px, 0.5 * camera.height_px]).T
     return np.lexsort((y, x, x * x + y * y))
 
 
 def surroundings(observation: Observation, reference: int, radius_rad: float) -> Surroundings:
-    """Return the centroids around one of them.
-
-    Parameters
-    ----------
-    observation : Observation
-        The frame.
-    reference : int
-        Row of the observation.
-    radius_rad : float
-        Largest separation, radians, itself included.
-
-    Returns
-    -------
-    Surroundings
-        The other centroids, the nearest first; equally near ones by position angle.
-    """
+    """Return the other centroids up to a separation, itself included, the nearest first."""
     apart, u = observation.separation_rad[reference], observation.body[reference]
     inside = apart <= radius_rad
     inside[reference] = False
@@ -101,26 +67,12 @@ def surroundings(observation: Observation, reference: int, radius_rad: float) ->
 def by_reference(
     observation: Observation, *proposals: Callable[[int], Candidates]
 ) -> Iterator[Candidates]:
-    """Propose the best of every reference star, then more of all.
+    """Propose the best of every reference star, then the next ranks of all of them together.
 
-    Parameters
-    ----------
-    observation : Observation
-        The frame.
-    *proposals : callable
-        Each returns the candidates of a reference star, given its row, the best first; the
-        second is asked when all reference stars have been asked the first.
-
-    Yields
-    ------
-    Candidates
-        The best one of a reference star at a time, then those of the next ranks of all
-        reference stars together.
-
-    Notes
-    -----
-    The papers stop at the best star of the reference star nearest to the centre. Here another
-    reference star decides where that one is a false star, or has lost its neighbours.
+    Each of ``proposals`` returns the candidates of a reference star, given its row, the best first;
+    the second is asked when all reference stars have been asked the first. The papers stop at the
+    best star of the reference star nearest to the centre. Here another reference star decides where
+    that one is a false star, or has lost its neighbours.
     """
     found: list[Candidates] = []
     for propose in proposals:
@@ -141,17 +93,7 @@ def by_reference(
 def rows_between(
     start: NDArray[np.integer[Any]], stop: NDArray[np.integer[Any]]
 ) -> tuple[Rows, Rows]:
-    """Return all rows of several runs of rows.
-
-    Parameters
-    ----------
-    start, stop : ndarray of int, shape (K,)
-        First row of each run, and the row after its last.
-
-    Returns
-    -------
-    run, row : ndarray of int, shape (M,)
-        Run and row of each entry, run after run.
+    """Return run and row of each entry of several runs of rows, given their starts and stops.
 
     Examples
     --------

@@ -1,6 +1,6 @@
 """The table of methods: the function that proposes candidates, and the products it needs.
 
-A new method is a module with a function that yields candidates, and one line in `METHODS`.
+A new method is a function that yields candidates, and one line in `METHODS`.
 """
 
 from __future__ import annotations
@@ -9,93 +9,54 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 from starcat.errors import ConfigError, ProductError
-from starcat.matcher import levels
 from starcat.matcher.database import Database
-from starcat.matcher.methods import (
-    dynamic_angle,
-    grid,
-    hausdorff_angular,
-    hausdorff_l1,
-    hausdorff_l2,
-    pairs,
-    pyramid,
-    radial,
-    triangle,
-)
-from starcat.matcher.methods.candidates import Candidates
-from starcat.matcher.methods.triangle_order import TriangleOrder
-from starcat.matcher.observation import Observation
-
-Propose = Callable[[Observation, Database, TriangleOrder], Iterator[Candidates]]
+from starcat.matcher.methods import dynamic_angle, hausdorff, pairs, patterns, triangle
+from starcat.matcher.observation import Candidates, Observation
 
 
 @dataclass(frozen=True)
 class Method:
-    """A way to identify stars.
+    """A way to identify stars."""
 
-    Attributes
-    ----------
-    propose : callable
-        Yields batches of candidates for an observation, the most promising first.
-    products : tuple of str
-        Names of the products that it needs beside the stars.
-    description : str
-        Description in a few words.
-    optional : tuple of str
-        Names of products that it can use where they are there.
-    """
-
-    propose: Propose
+    # Yields batches of candidates for an observation, the most promising first. What a method is
+    # told beside the frame are the settings of the observation.
+    propose: Callable[[Observation, Database], Iterator[Candidates]]
+    # Products that it needs beside the stars.
     products: tuple[str, ...]
     description: str = ""
+    # Products that it can use where they are there.
     optional: tuple[str, ...] = ()
 
 
 METHODS: dict[str, Method] = {
     "triangle": Method(
         triangle.candidates,
-        triangle.PRODUCTS,
+        ("triangles",),
         "area and circumradius of triangles (S4)",
-        (levels.PRODUCT,),
+        ("levels",),
     ),
-    "pairs": Method(pairs.candidates, pairs.PRODUCTS, "triangles joined from star pairs"),
-    "pyramid": Method(pyramid.candidates, pyramid.PRODUCTS, "such triangles with a fourth star"),
+    "pairs": Method(pairs.pair_candidates, ("pairs",), "triangles joined from star pairs"),
+    "pyramid": Method(pairs.pyramid_candidates, ("pairs",), "such triangles with a fourth star"),
     "hausdorff_angular": Method(
-        hausdorff_angular.candidates, hausdorff_angular.PRODUCTS, "sets of separations (S5)"
+        hausdorff.angular_candidates, ("hausdorff_angular",), "sets of separations (S5)"
     ),
     "hausdorff_l2": Method(
-        hausdorff_l2.candidates, hausdorff_l2.PRODUCTS, "sets of ratios of distances (S1)"
+        hausdorff.ratio_candidates, ("hausdorff_l2",), "sets of ratios of distances (S1)"
     ),
     "hausdorff_l1": Method(
-        hausdorff_l1.candidates, hausdorff_l1.PRODUCTS, "planar sets of an upright camera (S1)"
+        hausdorff.point_candidates, ("hausdorff_l2",), "planar sets of an upright camera (S1)"
     ),
     "dynamic_angle": Method(
-        dynamic_angle.candidates, dynamic_angle.PRODUCTS, "neighbours by angle and distance (S2)"
+        dynamic_angle.candidates, ("neighbours",), "neighbours by angle and distance (S2)"
     ),
-    "grid": Method(grid.candidates, grid.PRODUCTS, "cells around a star in common"),
-    "radial": Method(radial.candidates, radial.PRODUCTS, "rings and sectors in common"),
+    "grid": Method(patterns.grid_candidates, ("grid",), "cells around a star in common"),
+    "radial": Method(patterns.radial_candidates, ("radial",), "rings and sectors in common"),
 }
 """Every method by name, the best one first."""
 
 
 def method_named(name: str) -> Method:
-    """Return a method.
-
-    Parameters
-    ----------
-    name : str
-        Name of the method, a key of `METHODS`.
-
-    Returns
-    -------
-    Method
-        The one of that name.
-
-    Raises
-    ------
-    ConfigError
-        If there is none, listing those there are.
-    """
+    """Return a method; `ConfigError` lists those there are."""
     try:
         return METHODS[name]
     except KeyError:
@@ -105,23 +66,7 @@ def method_named(name: str) -> Method:
 
 
 def best_method(products: Iterable[str]) -> str:
-    """Return the best method that some products allow.
-
-    Parameters
-    ----------
-    products : iterable of str
-        Names of the products that a database holds.
-
-    Returns
-    -------
-    str
-        The first of `METHODS` whose products are there.
-
-    Raises
-    ------
-    ProductError
-        If no method can work with them.
-    """
+    """Return the first of `METHODS` that some products allow; `ProductError` if none does."""
     there = set(products)
     for name, method in METHODS.items():
         if there.issuperset(method.products):

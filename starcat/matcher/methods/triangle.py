@@ -1,35 +1,28 @@
 """Identification by triangles (S4): area in the K-vector, circumradius as the filter.
 
-The method needs the product ``triangles``. The first batches of observed triangles are small,
-because the first few triangles decide most frames; later batches are larger.
+Where the focal length is not known, triangles are looked up by shape, the area over the squared
+circumradius, which is the same for similar triangles, and then by a range of areas. The method
+needs the product ``triangles``, in order of area; that of shape is made when first needed. The
+first batches of observed triangles are small, because the first few triangles decide most frames.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import permutations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Mask, Rows
 from starcat.geometry.kvector import KVector
-from starcat.matcher.budget import LOOKUP
 from starcat.matcher.database import Database, ProductArrays
-from starcat.matcher.methods.candidates import Candidates
-from starcat.matcher.methods.pairs import side_tolerance_rad
-from starcat.matcher.methods.triangle_order import DEFAULT, TriangleOrder, select_triangles
-from starcat.matcher.methods.triangle_shape import (
-    are_similar,
-    area_and_slopes,
-    sides_by_length,
-    similar_triangles,
-)
-from starcat.matcher.observation import Observation
-
-PRODUCTS = ("triangles",)
+from starcat.matcher.methods.order import select_triangles
+from starcat.matcher.observation import Candidates, Observation
+from starcat.matcher.settings import LOOKUP
 
 BATCHES = (2, 8, 32)
 """Sizes of the first batches of observed triangles; all later batches have the last size."""
@@ -41,55 +34,45 @@ into the order of the observed ones."""
 ROUNDING_RAD = 1e-7
 """More than the sides of all triangles lose where they are kept as 32 bits, radians."""
 
+CURVATURE = 2.0 / 3.0
+"""How much less than the focal length the angle theta off the axis scales, over theta squared:
+``theta = atan(r / f)`` shrinks by ``sin(theta) cos(theta)`` of a relative change of f."""
+
+AT_ONCE = 2**16
+"""Triangles whose sides are worked out together."""
+
+ANY_ORDER = 1.1
+"""Tolerance of sides in order of their length, in units of that of the true order: the scale that
+fits best differs a little between the two."""
+
 _ORDERS = np.array(list(permutations(range(3))), dtype=np.intp)
 
 
-def candidates(
-    observation: Observation, database: Database, selection: TriangleOrder = DEFAULT
-) -> Iterator[Candidates]:
-    """Propose the triangles of stars that observed triangles may be.
-
-    Parameters
-    ----------
-    observation : Observation
-        The frame.
-    database : Database
-        With the product ``triangles``.
-    selection : TriangleOrder
-        Order and limits of the observed triangles.
-
-    Yields
-    ------
-    Candidates
-        Three stars each, of the same handedness as the centroids.
+def candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
+    """Propose triangles of stars of the same handedness as the centroids.
 
     References
     ----------
     Liao and Zhang 2024 (S4), sections 2 and 3.
     """
-    triangles = select_triangles(observation, selection)
-    product = database.products["triangles"]
+    triangles = select_triangles(observation)
     done = step = 0
     while done < len(triangles):
         size = BATCHES[min(step, len(BATCHES) - 1)]
         observation.budget.spend(LOOKUP * size)
-        found = _look_up(triangles[done : done + size], observation, database, product)
+        found = _look_up(triangles[done : done + size], observation, database)
         if len(found):
             yield found
         done, step = done + size, step + 1
 
 
-def _look_up(
-    triangles: NDArray[np.intp],
-    observation: Observation,
-    database: Database,
-    product: ProductArrays,
-) -> Candidates:
+def _look_up(triangles: Rows, observation: Observation, database: Database) -> Candidates:
     """Return the triangles of stars with the area and circumradius of observed ones."""
+    product = database.products["triangles"]
     i, j, k = triangles.T
     apart = observation.separation_rad
     sides = np.stack([apart[j, k], apart[i, k], apart[i, j]], axis=-1)
-    tolerance_rad = side_tolerance_rad(observation)
+    tolerance_rad = observation.side_tolerance_rad
     if observation.fov_error:
         found = similar_triangles(sides, tolerance_rad, observation, database)
     else:
@@ -104,9 +87,7 @@ def _look_up(
     )
 
 
-def _same_triangles(
-    sides: Array, tolerance_rad: float, product: ProductArrays
-) -> list[NDArray[np.intp]]:
+def _same_triangles(sides: Array, tolerance_rad: float, product: ProductArrays) -> list[Rows]:
     """Return the rows of the triangles with the area and circumradius of observed ones."""
     by_area = KVector(
         product["area_rad2"],
@@ -124,17 +105,17 @@ def _same_triangles(
 
 
 def _with_sides(
-    rows: NDArray[np.intp],
-    observed: NDArray[np.intp],
+    rows: Rows,
+    observed: Rows,
     sides: Array,
     tolerance_rad: float,
     database: Database,
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+) -> tuple[Rows, Rows]:
     """Return the triangles of stars whose sides, by length, are as long as those observed.
 
     Where they are not by length, they are not in any other order.
     """
-    known, seen = database.derived(sides_by_length), np.sort(sides, axis=1).T
+    known, seen = database.cached(sides_by_length), np.sort(sides, axis=1).T
     for length in (2, 1, 0):
         error = np.abs(known[length, rows] - seen[length, observed])
         close = np.flatnonzero(error <= tolerance_rad + ROUNDING_RAD)
@@ -142,32 +123,8 @@ def _with_sides(
     return rows, observed
 
 
-def features(
-    a: float, b: float, c: float, tolerance_rad: float
-) -> tuple[float, float, float, float]:
-    """Return area and circumradius of a plane triangle and the errors that its sides cause.
-
-    Parameters
-    ----------
-    a, b, c : float
-        Sides, radians, of a triangle that is not flat.
-    tolerance_rad : float
-        Error of each side.
-
-    Returns
-    -------
-    area_rad2, area_error_rad2, circumradius_rad, circumradius_error_rad : float
-        The errors are of first order and treat those of the three sides as independent.
-    """
-    area, slopes = area_and_slopes(a, b, c)
-    radius = a * b * c / (4.0 * area)
-    area_error = tolerance_rad * math.hypot(*slopes)
-    turns = (1.0 / side - slope / area for side, slope in zip((a, b, c), slopes, strict=True))
-    return area, area_error, radius, tolerance_rad * radius * math.hypot(*turns)
-
-
 def _in_order(
-    centroids: NDArray[np.intp],
+    centroids: Rows,
     stars: NDArray[np.integer[Any]],
     sides: Array,
     tolerance_rad: float,
@@ -192,3 +149,131 @@ def _in_order(
     turned = database.directions[stars] @ np.swapaxes(observation.body[centroids], 1, 2)
     handed = np.linalg.det(turned) > 0.0
     return Candidates(centroids[handed], stars[handed])
+
+
+def features(
+    a: float, b: float, c: float, tolerance_rad: float
+) -> tuple[float, float, float, float]:
+    """Return area, its error, circumradius and its error of a plane triangle that is not flat.
+
+    Sides and their common error in radians. The errors are of first order and treat those of the
+    three sides as independent.
+    """
+    area, slopes = area_and_slopes(a, b, c)
+    radius = a * b * c / (4.0 * area)
+    area_error = tolerance_rad * math.hypot(*slopes)
+    turns = (1.0 / side - slope / area for side, slope in zip((a, b, c), slopes, strict=True))
+    return area, area_error, radius, tolerance_rad * radius * math.hypot(*turns)
+
+
+def area_and_slopes(a: float, b: float, c: float) -> tuple[float, tuple[float, float, float]]:
+    """Return the area of a plane triangle that is not flat, and its derivatives by the sides.
+
+    Examples
+    --------
+    >>> area_and_slopes(3.0, 4.0, 5.0)
+    (6.0, (2.0, 1.5, 0.0))
+    """
+    a2, b2, c2 = a * a, b * b, c * c
+    u, v, w = b2 + c2 - a2, a2 + c2 - b2, a2 + b2 - c2
+    area = 0.25 * math.sqrt(max(a2 * u + b2 * v + c2 * w, 1e-300))
+    return area, (a * u / (8.0 * area), b * v / (8.0 * area), c * w / (8.0 * area))
+
+
+def scale_free(
+    a: float, b: float, c: float, tolerance_rad: float
+) -> tuple[float, float, float, float]:
+    """Return shape, its error, area and its error of a plane triangle that is not flat.
+
+    Sides and their common error in radians. The errors treat those of the three sides as
+    independent. That of the shape has a term of second order, since the shape is largest, and
+    stationary, where the sides are equal.
+
+    Examples
+    --------
+    >>> round(scale_free(1.0, 1.0, 1.0, 0.0)[0], 3)
+    1.299
+    """
+    area, slopes = area_and_slopes(a, b, c)
+    shape = 16.0 * area**3 / (a * b * c) ** 2
+    turns = (3.0 * s / area - 2.0 / side for side, s in zip((a, b, c), slopes, strict=True))
+    part = tolerance_rad / min(a, b, c)
+    shape_error = shape * (tolerance_rad * math.hypot(*turns) + 3.0 * part * part)
+    return shape, shape_error, area, tolerance_rad * math.hypot(*slopes)
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """Triangles of stars in order of their shape."""
+
+    # Area over squared circumradius, ascending: 0 in a line, 1.299 with equal sides.
+    shape: Array
+    area_rad2: NDArray[np.float32]
+    # The shortest first, shape (3, M).
+    sides_rad: NDArray[np.float32]
+    # Rows of the product.
+    rows: Rows
+
+
+def sides_by_length(database: Database) -> NDArray[np.float32]:
+    """Return the sides of all triangles of stars, the shortest first, shape (3, M), radians."""
+    product = database.products["triangles"]
+    found = np.empty((3, len(product["i"])), dtype=np.float32)
+    for start in range(0, found.shape[1], AT_ONCE):
+        part = slice(start, start + AT_ONCE)
+        u, v, w = (database.directions[product[name][part]] for name in "ijk")
+        chords = np.stack([np.linalg.norm(x - y, axis=1) for x, y in ((u, v), (v, w), (w, u))])
+        found[:, part] = 2.0 * np.arcsin(0.5 * np.sort(chords, axis=0))
+    return found
+
+
+def shapes(database: Database) -> Shapes:
+    """Return the triangles of a database in order of their shape."""
+    product = database.products["triangles"]
+    radius = product["circumradius_rad"].astype(np.float64)
+    shape = product["area_rad2"] / (radius * radius)
+    order = np.argsort(shape, kind="stable")
+    sides = database.cached(sides_by_length)[:, order]
+    return Shapes(shape[order], product["area_rad2"][order], sides, order)
+
+
+def similar_triangles(
+    sides: Array, tolerance_rad: float, observation: Observation, database: Database
+) -> list[Rows]:
+    """Return the triangles of stars, as rows of the product, that each observed one is similar to.
+
+    Sides, shape (T, 3), are those with the focal length that was given, radians.
+    """
+    known, scales, found = database.cached(shapes), observation.focal_range, []
+    for a, b, c in sides.tolist():
+        shape, shape_error, area, area_error = scale_free(a, b, c, tolerance_rad)
+        first, last = np.searchsorted(known.shape, (shape - shape_error, shape + shape_error))
+        part = known.area_rad2[first:last]
+        smallest = (area - area_error) / scales.high**2
+        largest = (area + area_error) / scales.low**2
+        near = first + np.flatnonzero((part >= smallest) & (part <= largest))
+        # The order in which both are by length fits best; what fails so, fails in every order.
+        apart = known.sides_rad[:, near]
+        close = are_similar(sorted((a, b, c)), apart, ANY_ORDER * tolerance_rad, observation)
+        found.append(known.rows[near[close]])
+    return found
+
+
+def are_similar(
+    sides: Sequence[Array | float],
+    apart: Sequence[Array] | NDArray[Any],
+    tolerance_rad: float,
+    observation: Observation,
+) -> Mask:
+    """Return which sides of stars are those of observed triangles at some allowed scale.
+
+    Three arrays each, of any shape, or observed numbers; the scale is that of least squares.
+    """
+    (a, b, c), (u, v, w) = sides, apart
+    scale = (a * u + b * v + c * w) / (u * u + v * v + w * w)
+    bend = CURVATURE * observation.fov_error * observation.camera.radius_rad**2
+    allowed, slack = observation.focal_range, tolerance_rad / np.minimum(np.minimum(a, b), c)
+    good = (scale >= allowed.low - slack) & (scale <= allowed.high + slack)
+    for side, true in ((a, u), (b, v), (c, w)):
+        good &= np.abs(true * scale - side) <= tolerance_rad + bend * side
+    return np.asarray(good)

@@ -9,57 +9,15 @@ centroids in a line, identify little.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
 from starcat.matcher.observation import Observation
-
-Triple = tuple[int, int, int]
-
-
-@dataclass(frozen=True)
-class TriangleOrder:
-    """Order and limits of the triangles of a frame.
-
-    Attributes
-    ----------
-    order : {"auto", "brightness", "inradius", "compact", "spread"}
-        ``brightness`` is S3's, ``inradius`` S4's, the largest first; ``compact`` has the
-        triangles with the shortest long side first, which the most fields hold whole. ``spread``
-        takes the most compact triangle at every centroid, then the second of each, and so on.
-        ``auto`` is ``brightness`` where magnitudes are known, else ``spread`` in frames with more
-        than ``most_centroids``, else ``compact``.
-    min_side_px : float
-        Triangles with a shorter side are left out, as those of double stars (d_min of S3).
-    min_angle_deg : float
-        Triangles with a narrower angle are left out, as three stars in a line (theta_min of S3).
-    most_centroids : int
-        Number of centroids that take part: the first ones in the observation's order. With
-        ``spread`` all of them do.
-    few_centroids : int
-        In frames with at most this many centroids, the triangles that are left out are tried
-        at the end.
-
-    References
-    ----------
-    Li et al. 2015 (S3), whose thresholds are unstated: the defaults reproduce its counts.
-    Liao and Zhang 2024 (S4), eq. 7.
-    """
-
-    order: Literal["auto", "brightness", "inradius", "compact", "spread"] = "auto"
-    min_side_px: float = 10.0
-    min_angle_deg: float = 15.0
-    most_centroids: int = 32
-    few_centroids: int = 12
-
-
-DEFAULT = TriangleOrder()
+from starcat.matcher.settings import TriangleOrder
 
 LEAST_ANGLE_DEG = 4.0
 """Smallest angle of a triangle that is tried at all."""
@@ -71,23 +29,12 @@ SPREAD_CENTROIDS = 400
 """Largest number of centroids of that order; more would take seconds to put in order."""
 
 
-def select_triangles(
-    observation: Observation, selection: TriangleOrder = DEFAULT
-) -> NDArray[np.intp]:
+def select_triangles(observation: Observation) -> NDArray[np.intp]:
     """Return the triangles of a frame in the order in which they are to be looked up.
 
-    Parameters
-    ----------
-    observation : Observation
-        The frame.
-    selection : TriangleOrder
-        Thresholds and order.
-
-    Returns
-    -------
-    ndarray of int, shape (T, 3)
-        Rows of the observation, ascending within a triangle.
+    Rows of the observation, shape (T, 3), ascending within a triangle.
     """
+    selection = observation.settings.selection
     count = min(len(observation), selection.most_centroids)
     is_crowded = count < len(observation) and observation.mag is None
     if selection.order == "spread" or (selection.order == "auto" and is_crowded):
@@ -140,52 +87,10 @@ def _spread(observation: Observation, selection: TriangleOrder) -> NDArray[np.in
     return np.asarray(stars[order][np.lexsort((longest[order], turn))])
 
 
-def optimised_triangle(
-    separation_px: Array, min_side_px: float, min_angle_rad: float
-) -> Triple | None:
-    """Return S3's triangle: the brightest stars that are neither a double nor in a line.
-
-    Parameters
-    ----------
-    separation_px : ndarray of float64, shape (N, N)
-        Distances between the centroids, brightest first.
-    min_side_px, min_angle_rad : float
-        S3's d_min and theta_min; both have to be exceeded.
-
-    Returns
-    -------
-    tuple of int, or None
-        Rows, ascending; None if no triangle passes.
-
-    Notes
-    -----
-    Start from stars N, N + 1, N + 2. Where a side is too short, its fainter star is dropped,
-    where an angle is too narrow, the faintest of the three; the next star takes its place.
-    When the stars run out, N moves on by one.
-
-    References
-    ----------
-    Li et al. 2015 (S3), the flow chart's 13 steps.
-    """
-    count = len(separation_px)
-    for start in range(count - 2):
-        chosen, following = [start, start + 1, start + 2], start + 3
-        while True:
-            dropped = _to_drop(separation_px, chosen, min_side_px, min_angle_rad)
-            if dropped is None:
-                i, j, k = chosen
-                return i, j, k
-            if following >= count:
-                break
-            chosen = [*(star for star in chosen if star != dropped), following]
-            following += 1
-    return None
-
-
 def is_well_shaped(
     a: Array, b: Array, c: Array, min_side: float, min_angle_rad: float
 ) -> NDArray[np.bool_]:
-    """Return which triangles have no short side and no narrow angle.
+    """Return which triangles have no short side and no narrow angle, shape (T,).
 
     Parameters
     ----------
@@ -194,12 +99,7 @@ def is_well_shaped(
     min_side : float
         Every side has to be longer.
     min_angle_rad : float
-        Every angle has to be wider, radians; below pi / 3.
-
-    Returns
-    -------
-    ndarray of bool, shape (T,)
-        S3's two constraints. The narrowest angle is opposite the shortest side.
+        Every angle has to be wider; below pi / 3. The narrowest is opposite the shortest side.
 
     Examples
     --------
@@ -213,17 +113,6 @@ def is_well_shaped(
     cosine = middle * middle + longest * longest - shortest * shortest
     wide = cosine < 2.0 * np.cos(min_angle_rad) * middle * longest
     return np.asarray((shortest > min_side) & wide)
-
-
-def _to_drop(
-    separation_px: Array, chosen: list[int], min_side_px: float, min_angle_rad: float
-) -> int | None:
-    for i, j in combinations(chosen, 2):
-        if separation_px[i, j] <= min_side_px:
-            return j
-    i, j, k = chosen
-    a, b, c = separation_px[[j, i, i], [k, k, j]].reshape(3, 1)
-    return None if is_well_shaped(a, b, c, min_side_px, min_angle_rad)[0] else k
 
 
 def _sides(separation_rad: Array, stars: NDArray[np.intp]) -> tuple[Array, Array, Array]:

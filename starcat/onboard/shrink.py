@@ -29,51 +29,43 @@ LEAST_STARS = 4
 
 
 @dataclass(frozen=True)
-class Fitted:
-    """Contents that fit, and what it took.
+class Shrunk:
+    """Contents that fit, and what it took."""
 
-    Attributes
-    ----------
-    contents : Contents
-        What is left.
-    stars_before, stars : int
-        Of the artifact, and left.
-    features_before, features : int
-        Of the image without a limit, and left.
-    stars_per_field : int, optional
-        The stars left are among so many brightest of a field; None where all are left.
-    """
-
+    # What is left.
     contents: Contents
+    # Of the artifact, and left.
     stars_before: int
     stars: int
+    # Of the image without a limit, and left.
     features_before: int
     features: int
+    # The stars left are among so many brightest of a field; None where all are left.
     stars_per_field: int | None = None
 
 
-def fit(
+def shrink(
     contents: Contents,
     times_seen: NDArray[np.int32] | None,
     fields: Callable[[], FieldStars],
     max_bytes: int | None,
-) -> Fitted:
+) -> Shrunk:
     """Leave out as little as makes an image fit."""
     kept, weight = _by_use(contents, times_seen)
     n_stars, n_features = len(contents.star_id), len(kept.features)
     if max_bytes is None:
-        return Fitted(kept, n_stars, n_stars, n_features, n_features)
+        return Shrunk(kept, n_stars, n_stars, n_features, n_features)
     smallest = _sizes(kept, _least(weight, kept.method)).total_bytes
     if smallest <= max_bytes:
         fewer = _fewer_features(kept, max_bytes)
-        return Fitted(fewer, n_stars, n_stars, n_features, len(fewer.features))
+        return Shrunk(fewer, n_stars, n_stars, n_features, len(fewer.features))
     for most, thinner, left in _thinned(kept, weight, fields()):
         size = _sizes(thinner, _least(left, kept.method)).total_bytes
         smallest = min(smallest, size)
         if size <= max_bytes:
             fewer = _fewer_features(thinner, max_bytes)
             left_over = (n_features, len(fewer.features))
-            return Fitted(fewer, n_stars, len(fewer.star_id), *left_over, most)
+            return Shrunk(fewer, n_stars, len(fewer.star_id), *left_over, most)
     raise OnboardSizeError(
         f"{contents.name}: {max_bytes:,} bytes are too few for an onboard image for the method "
         f"{contents.method}; the smallest that is of use has {smallest:,} bytes. Raise "

@@ -1,4 +1,4 @@
-"""Small fields: every pair of centroids as a base, from which all others are looked up.
+"""Pair voting: every pair of centroids as a base, from which all others are looked up.
 
 Methods that compare neighbourhoods need a star whose neighbours are mostly in the frame and mostly
 guide stars. Where a camera misses stars and sees others, few fields have one. Here two centroids
@@ -15,11 +15,9 @@ import numpy as np
 
 from starcat.arrays import Array, Rows
 from starcat.geometry.sphere import separation
-from starcat.matcher.budget import LOOKUP
 from starcat.matcher.database import Database
-from starcat.matcher.methods.candidates import Candidates
-from starcat.matcher.methods.pairs import side_tolerance_rad
-from starcat.matcher.observation import Observation
+from starcat.matcher.observation import Candidates, Observation
+from starcat.matcher.settings import LOOKUP
 from starcat.matcher.star_cells import cells_for
 
 LEAST_OTHERS = 2
@@ -34,29 +32,16 @@ MOST_PLACES = 2**20
 
 
 def bases(observation: Observation, database: Database) -> Iterator[Candidates]:
-    """Propose what two centroids and a third one are, for all pairs of a frame.
+    """Propose what two centroids and a third one are, a batch for each pair of the frame.
 
-    Parameters
-    ----------
-    observation : Observation
-        The frame.
-    database : Database
-        With the product ``neighbours``.
-
-    Yields
-    ------
-    Candidates
-        Three stars each, which at least one further centroid is near a star with; a batch a pair.
-
-    Notes
-    -----
-    The pairs are those up to the radius of the product, of the first centroids of the observation
-    first: these are the brightest ones where magnitudes are known.
+    At least one further centroid is near a star then. The pairs are those up to the radius of the
+    product ``neighbours``, of the first centroids of the observation first: these are the brightest
+    ones where magnitudes are known.
     """
-    order, apart_rad = database.derived(_by_separation)
+    order, apart_rad = database.cached(_by_separation)
     if not len(order):
         return
-    tolerance_rad = side_tolerance_rad(observation)
+    tolerance_rad = observation.side_tolerance_rad
     second, first = np.tril_indices(len(observation), -1)
     separation_rad = observation.separation_rad[first, second]
     low = np.searchsorted(apart_rad, separation_rad - tolerance_rad, side="left")
@@ -91,7 +76,7 @@ def _on_base(
     error = (
         separation(u[:, :2], u[:, 2:]) - observation.separation_rad[found.centroids[:, 2:], ends]
     )
-    return found[np.all(np.abs(error) <= side_tolerance_rad(observation), axis=1)]
+    return found[np.all(np.abs(error) <= observation.side_tolerance_rad, axis=1)]
 
 
 def _axes(one: Array, other: Array) -> Array:

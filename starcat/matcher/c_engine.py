@@ -1,4 +1,4 @@
-"""The matcher's fast path: the C library that flies (``onboard/``), called with an onboard image.
+"""The C library that flies (``onboard/``), called with an onboard image.
 
 It is compiled when a wheel is built. Where it is missing, or cannot take a frame, the matcher of
 numpy serves, with the same rules and the same stars.
@@ -23,9 +23,12 @@ from starcat.arrays import Array
 from starcat.errors import ConfigError, ProductError
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
+from starcat.matcher.observation import Frame
+from starcat.matcher.prior import Prior
 from starcat.matcher.result import Status
+from starcat.matcher.settings import Settings
 from starcat.onboard.image import Contents, make_image
-from starcat.onboard.layout import FEATURES
+from starcat.onboard.layout import FEATURES, METHODS
 
 try:
     _onboard: Any = import_module("starcat.matcher._onboard")
@@ -34,7 +37,7 @@ except ImportError:  # the wheel was built without a compiler
 
 
 MAX_STEPS = 2_000_000_000
-"""Steps for one frame: on the ground the limit is the matcher's patience, not a clock."""
+"""Steps for one frame: on the ground the limit is the caller's patience, not a clock."""
 
 CHUNK = 256
 """Frames that one thread takes at a time."""
@@ -42,12 +45,12 @@ CHUNK = 256
 OUT_OF_STEPS = -14
 """What the library returns where a budget was used up."""
 
-WORDS: dict[int, Status] = {
+STATUSES: dict[int, Status] = {
     0: "identified", 1: "no_match", 2: "too_few_stars", OUT_OF_STEPS: "no_match",
 }  # fmt: skip
 """What a frame came to, by the number that the library returns."""
 
-REFUSED = {
+NOT_OPENED = {
     -4: "it is of a version of the format that the library does not read",
     -5: "it was written for the other byte order",
     -9: "a field of it has more stars than the library has room for",
@@ -70,52 +73,26 @@ ANSWER = np.dtype(
         ("seconds", np.float64),
     ]
 )
-"""A frame's answer as the library writes it: a key of `WORDS`, the attitude, the natural
+"""A frame's answer as the library writes it: a key of `STATUSES`, the attitude, the natural
 logarithm of the false-match probability, and the time that the library took."""
 
 
 @dataclass(frozen=True)
-class Limits:
-    """What the caller states, as `Matcher` has it.
-
-    Attributes
-    ----------
-    tolerance_px : float
-        Largest error of a centroid, as a radius.
-    noise_px, noise_mag : float
-        Standard deviations of a centroid on each axis and of a magnitude; 0 where not stated.
-    max_false_match_probability : float
-        Answers that chance would give more often than this are withheld.
-    """
-
-    tolerance_px: float
-    noise_px: float
-    noise_mag: float
-    max_false_match_probability: float
-
-
-@dataclass(frozen=True)
 class Answers:
-    """What the library found in N frames with K centroids in all.
+    """What the library found in N frames with K centroids in all."""
 
-    Attributes
-    ----------
-    starts : ndarray of int64, shape (N + 1,)
-        The centroids of frame n are rows ``starts[n]`` to ``starts[n + 1]``.
-    frames : ndarray of `ANSWER`, shape (N,)
-        A record a frame; attitudes are zeros unless it is identified.
-    star_index : ndarray of int32, shape (K,)
-        Row of the database; -1 where none; a key of `DROPPED` where the centroid was not used.
-    """
-
+    # The centroids of frame n are rows ``starts[n]`` to ``starts[n + 1]``; shape (N + 1,).
     starts: NDArray[np.int64]
+    # A record a frame; attitudes are zeros unless it is identified; shape (N,).
     frames: NDArray[np.void]
+    # Row of the database; -1 where none; a key of `DROPPED` where the centroid was not used;
+    # shape (K,).
     star_index: NDArray[np.int32]
 
     @property
     def is_whole(self) -> bool:
         """Whether the library took all frames; a camera or limit may be beyond it."""
-        return all(code in WORDS for code in self.frames["status"].tolist())
+        return all(code in STATUSES for code in self.frames["status"].tolist())
 
 
 def is_compiled() -> bool:
@@ -135,7 +112,7 @@ def most_stars() -> int:
     return int(_onboard.lib.STARCAT_MAX_STARS)
 
 
-class FastMatcher:
+class CEngine:
     """An onboard image in memory, and the C library that reads it."""
 
     def __init__(
@@ -153,7 +130,7 @@ class FastMatcher:
         if status != 0:
             raise ProductError(
                 f"an onboard image of {len(data):,} bytes is not opened by the C library: "
-                f"{REFUSED.get(status, f'error {status}')}; export the artifact for this machine"
+                f"{NOT_OPENED.get(status, f'error {status}')}; export the artifact for this machine"
             )
         count = int(self._image.n_stars)
         own = np.arange(count) if rows is None else rows
@@ -161,30 +138,37 @@ class FastMatcher:
         # Numbers below 0 say why a centroid has no star; they index this table from its end.
         self._rows = np.concatenate([own, [-4, -3, -2, -1]]).astype(np.int32)
 
-    def takes(self, count: int) -> bool:
+    def accepts(self, count: int) -> bool:
         """Return whether a frame of so many centroids is small enough."""
         return count <= int(_onboard.lib.STARCAT_MAX_CENTROIDS)
 
     def identify(
         self,
-        frames: Sequence[Array],
-        camera: Camera,
-        limits: Limits,
-        magnitudes: Sequence[Array] | None = None,
-        priors: tuple[Array, float] | None = None,
+        frames: Sequence[Frame],
+        settings: Settings,
+        prior: Prior | None = None,
         threads: int = 1,
     ) -> Answers:
-        """Identify the stars of many frames."""
+        """Identify the stars of frames of one camera, with a prior of one frame near it."""
         starts = np.zeros(len(frames) + 1, dtype=np.int64)
+        if not frames:
+            return Answers(starts, np.zeros(0, ANSWER), np.zeros(0, np.int32))
         if len(frames) == 1:  # by far the most frequent call
-            starts[1], px = len(frames[0]), frames[0]
-            mag = None if magnitudes is None else np.ascontiguousarray(magnitudes[0])
+            starts[1], px, mag = len(frames[0]), frames[0].centroids_px, frames[0].magnitudes
         else:
             np.cumsum([len(frame) for frame in frames], out=starts[1:])
-            px = np.concatenate([*frames, np.empty((0, 2))])
-            mag = None if magnitudes is None else np.concatenate([*magnitudes, np.empty(0)])
+            px = np.concatenate([*(frame.centroids_px for frame in frames), np.empty((0, 2))])
+            given = [frame.magnitudes for frame in frames if frame.magnitudes is not None]
+            mag = np.concatenate(given) if given else None
         x, y = np.ascontiguousarray(px.T)
-        work = _Work(self._image, self._directions, camera, limits, x, y, mag, priors)
+        work = _Work(
+            self._image,
+            self._directions,
+            _camera(frames[0].camera),
+            _options(settings),
+            (x, y, None if mag is None else np.ascontiguousarray(mag)),
+            prior,
+        )
         answers = Answers(starts, np.zeros(len(frames), ANSWER), np.full(len(px), -1, np.int32))
         if threads <= 1 or len(frames) <= CHUNK:
             work.run(range(len(frames)), answers)
@@ -201,33 +185,31 @@ class _Work:
 
     image: Any
     directions: Array | None
-    camera: Camera
-    limits: Limits
-    x: Array
-    y: Array
-    mag: Array | None
-    priors: tuple[Array, float] | None
+    camera: Any
+    options: Any
+    # x, y and, where they are known, magnitudes of all centroids.
+    columns: tuple[Array, Array, Array | None]
+    prior: Prior | None
 
     def run(self, part: range, answers: Answers) -> None:
         """Let the library answer some of the frames, in memory of its own."""
         ffi, lib = _onboard.ffi, _onboard.lib
-        prior, uncertainty_rad = self.priors or (None, 0.0)
+        prior = self.prior
         arrays = (
             ("int64_t[]", answers.starts[part.start :]),
-            ("double[]", self.x),
-            ("double[]", self.y),
-            ("double[]", self.mag),
-            ("double[]", None if prior is None else prior[part.start :]),
+            *(("double[]", column) for column in self.columns),
+            ("double[]", None if prior is None else prior.q_body_from_icrs),
             ("double[]", self.directions),
         )
         *pointers, directions = (
             ffi.NULL if array is None else ffi.from_buffer(kind, array) for kind, array in arrays
         )
+        error_rad = 0.0 if prior is None else prior.error_rad
         lib.starcat_many(
             self.image,
-            _camera(self.camera),
-            _options(self.limits),
-            ffi.new("starcat_frames *", [len(part), *pointers, uncertainty_rad, directions]),
+            self.camera,
+            self.options,
+            ffi.new("starcat_frames *", [len(part), *pointers, error_rad, directions]),
             ffi.from_buffer("starcat_answer[]", answers.frames[part.start :]),
             ffi.from_buffer("int32_t[]", answers.star_index),
             *_memory(),
@@ -264,10 +246,11 @@ def _camera(camera: Camera) -> Any:
 
 
 @lru_cache(maxsize=16)
-def _options(limits: Limits) -> Any:
-    chance = math.log(max(limits.max_false_match_probability, 1e-300))
-    stated = limits.noise_px, limits.noise_mag
-    options = [limits.tolerance_px, *stated, chance, MAX_STEPS]
+def _options(settings: Settings) -> Any:
+    chance = math.log(max(settings.max_false_match_probability, 1e-300))
+    # The library takes 0 for a noise that is not stated.
+    stated = settings.noise_px or 0.0, settings.noise_mag or 0.0
+    options = [settings.tolerance_px, *stated, chance, MAX_STEPS]
     return _onboard.ffi.new("starcat_options *", options)
 
 
@@ -275,31 +258,29 @@ MOST_FEATURES = 4_000_000
 """Triangles or pairs of a database that are made an image unasked: that takes a second."""
 
 
-def fast_matcher(database: Database, method: str, always: bool = True) -> FastMatcher | None:
-    """Return the fast path of a database, made once."""
+def c_engine(database: Database, method: str, always: bool = True) -> CEngine | None:
+    """Return the engine of a database, made once; None where the library does not serve it.
+
+    Unless it is wanted ``always``, no image is made of more than `MOST_FEATURES`.
+    """
     if _onboard is None or method not in FEATURES:
         return None
-    if database.image is not None:
-        return database.derived(_of_image) if database.image.method == method else None
-    product, columns = FEATURES[method]
-    if not always and len(database.products[product][columns[0]]) > MOST_FEATURES:
+    if database.image is not None and database.image.method != method:
         return None
-    return database.derived(_of_triangles if method == "triangle" else _of_pairs)
+    if not always and database.image is None and _count(database, method) > MOST_FEATURES:
+        return None
+    return database.cached(_made, METHODS.index(method))
 
 
-def _of_image(database: Database) -> FastMatcher | None:
-    return None if database.image is None else FastMatcher(database.image.data)
+def _count(database: Database, method: str) -> int:
+    product, columns = FEATURES[method]
+    return len(database.products[product][columns[0]])
 
 
-def _of_triangles(database: Database) -> FastMatcher | None:
-    return _made(database, "triangle")
-
-
-def _of_pairs(database: Database) -> FastMatcher | None:
-    return _made(database, "pyramid")
-
-
-def _made(database: Database, method: str) -> FastMatcher | None:
+def _made(database: Database, method_number: int) -> CEngine | None:
+    if database.image is not None:
+        return CEngine(database.image.data)
+    method = METHODS[method_number]
     product, columns = FEATURES[method]
     arrays = database.products[product]
     features = np.stack([arrays[column] for column in columns], axis=-1)
@@ -320,4 +301,4 @@ def _made(database: Database, method: str) -> FastMatcher | None:
     if made.most_near > most_stars():
         return None
     exact = np.ascontiguousarray(database.directions[made.star_rows])
-    return FastMatcher(made.data, made.star_rows, exact)
+    return CEngine(made.data, made.star_rows, exact)

@@ -1,0 +1,306 @@
+"""Identification by sets of distances under a Hausdorff distance (S5, S1 and S1's baseline).
+
+Angular (S5): a centroid's feature is the set of its separations from the others, a star's the set
+of its separations from its neighbours, product ``hausdorff_angular``. Every centroid is named
+after the stars whose sets are nearest in the mean; `consensus` finds the names that agree.
+
+Ratios (S1): a reference star's feature is the set of its gnomonic distances from the centroids
+around it, over the smallest of them; a star's comes from the product ``hausdorff_l2``. Ratios
+depend neither on the camera's roll nor on its scale, but inherit the relative error of the
+divisor, and all are wrong where the nearest neighbour is missing or false.
+
+Points (S1's baseline): the centroids around a reference star are compared, as points of its
+tangent plane, with the neighbours of every star, product ``hausdorff_l2``, by the L1 norm. Points
+turn and stretch with the image, so the camera has to be upright, with a roll of 0, and of the
+nominal scale.
+
+The papers' answers without a verification are in `starcat.evaluation.bare_methods`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from starcat.arrays import Array, Rows
+from starcat.geometry.sphere import radec_from_directions, tangent_axes
+from starcat.matcher.database import Database
+from starcat.matcher.methods.consensus import consistent_candidates, neighbour_candidates
+from starcat.matcher.methods.reference import by_reference, references, surroundings
+from starcat.matcher.methods.reference_sets import (
+    ReferenceSets,
+    lowest,
+    means_of_minima,
+    reference_sets,
+    within_reach,
+)
+from starcat.matcher.observation import Candidates, Observation
+from starcat.matcher.settings import LOOKUP
+
+FIRST_ROUND = (16, 5)
+"""Number of the first centroids that take part, and number of names that each of them gets."""
+
+SECOND_ROUND = (64, 100)
+"""The same two numbers of a second round, where the names of the first one do not agree."""
+
+DIVISOR_ROUNDS = ((1, 30), (2, 30), (3, 400))
+"""How many of the nearest, of the frame and of a star, are tried as divisors, and how many of
+the best stars of each pair of divisors become candidates, one round after the other."""
+
+STARS_BY_POINTS = 30
+"""Number of the best stars of a reference star that become candidates."""
+
+_AT_ONCE = 1 << 22
+"""Numbers held at the same time while observed separations are compared with all stars."""
+
+_UP = np.array([0.0, -1.0, 0.0])
+
+
+def angular_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
+    """Propose names of several centroids that agree with each other.
+
+    Then follow, for each centroid and many more names, those whose neighbours agree.
+
+    Notes
+    -----
+    The paper counts every difference in full, so that one false or missing star outweighs all
+    that agree. Here a difference counts as ``side_tolerance_rad`` at the most.
+
+    References
+    ----------
+    Rotation-invariant feature with modified Hausdorff distance (S5).
+    """
+    cap_rad = observation.side_tolerance_rad
+    first, count = FIRST_ROUND
+    stars, _ = rank_by_separations(observation, database, cap_rad=cap_rad, count=count, first=first)
+    yield from consistent_candidates(stars, observation, database)
+    first, count = SECOND_ROUND
+    stars, _ = rank_by_separations(observation, database, cap_rad=cap_rad, count=count, first=first)
+    product = database.products["hausdorff_angular"]
+
+    def propose(reference: int) -> Candidates:
+        named = stars[reference] if reference < first else stars[0, :0]
+        return neighbour_candidates(reference, named[named >= 0], product, observation, database)
+
+    yield from by_reference(observation, propose)
+
+
+def rank_by_separations(
+    observation: Observation,
+    database: Database,
+    *,
+    cap_rad: float,
+    count: int,
+    first: int | None = None,
+) -> tuple[Rows, Array]:
+    """Rank the stars for every centroid by the directed, averaged Hausdorff distance.
+
+    Parameters
+    ----------
+    observation : Observation
+        The frame.
+    database : Database
+        With the product ``hausdorff_angular``.
+    cap_rad : float
+        Largest value that a difference counts as.
+    count : int
+        Number of stars to return for each centroid.
+    first : int, optional
+        Number of the first centroids to use; all by default.
+
+    Returns
+    -------
+    stars : ndarray of int, shape (N, count)
+        Rows of the database's stars, the nearest set first; -1 where there are no more.
+    scores : ndarray of float64, shape (N, count)
+        Mean of the smallest differences from a member of the set, over those separations of the
+        centroid from others that lie within the radius of the reference sets; radians, ``inf``
+        where there are no more. A centroid without such separations has no stars.
+    """
+    product = database.products["hausdorff_angular"]
+    sets = database.cached(_separation_sets)
+    apart = observation.separation_rad[:first, :first]
+    near = np.triu(apart <= product.numbers["radius_rad"], 1)
+    a, b = np.nonzero(near)
+    total = np.zeros((len(apart), len(sets)))
+    at_once = max(1, _AT_ONCE // max(1, len(sets)))
+    for start in range(0, len(a), at_once):
+        pairs = slice(start, start + at_once)
+        observation.budget.spend(LOOKUP * len(a[pairs]))
+        _add_differences(total, sets, apart, a[pairs], b[pairs], cap_rad)
+    used = near.sum(axis=0) + near.sum(axis=1)
+    with np.errstate(invalid="ignore"):
+        return lowest(total / used[:, None], count)
+
+
+def _add_differences(
+    total: Array, sets: ReferenceSets, apart: Array, a: Rows, b: Rows, cap_rad: float
+) -> None:
+    """Add the smallest differences of pairs of centroids to both centroids' totals."""
+    number, star, gain = within_reach(sets, apart[a, b], np.full(len(a), cap_rad))
+    for end in (a, b):
+        place = end[number] * len(sets) + star
+        total -= np.bincount(place, gain, total.size).reshape(total.shape)
+        total += cap_rad * np.bincount(end, minlength=len(total))[:, None]
+
+
+def _separation_sets(database: Database) -> ReferenceSets:
+    product = database.products["hausdorff_angular"]
+    return reference_sets(product["separation_rad"], product["star_offsets"])
+
+
+def ratio_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
+    """Propose what a reference star and two of its neighbours are.
+
+    Notes
+    -----
+    The paper divides by the smallest distance and takes the best star. Here the best of
+    many become candidates, and later rounds divide by the second and third smallest too, of
+    the frame as of the star, so that the nearest may err, be false or be missing. Differences
+    of ratios count in units of what they may err, and 1 at the most.
+
+    References
+    ----------
+    Wang et al. 2020 (S1).
+    """
+    product = database.products["hausdorff_l2"]
+
+    for divisors, count in DIVISOR_ROUNDS:
+
+        def propose(reference: int, divisors: int = divisors, count: int = count) -> Candidates:
+            stars = likely_stars(observation, database, reference, divisors, count)
+            return neighbour_candidates(reference, stars, product, observation, database)
+
+        yield from by_reference(observation, propose)
+
+
+def likely_stars(
+    observation: Observation, database: Database, reference: int, divisors: int, count: int
+) -> Rows:
+    """Return the stars that a reference star is likely to be, ascending.
+
+    ``divisors`` says how many of the nearest, of the frame and of each star, are divided by, 3 at
+    the most; ``count`` how many stars there are for each pair of divisors.
+
+    Notes
+    -----
+    Distances d err by e each, so d/d' errs by ``e/d' sqrt(1 + (d/d')^2)``: that is where a
+    difference ceases to count for more.
+    """
+    _, distance = distances_around(observation, database, reference)
+    error = observation.side_tolerance_rad
+    best = [np.empty(0, dtype=np.intp)]
+    for divisor in range(min(divisors, len(distance) - 1)):
+        ratio = np.delete(distance, divisor) / distance[divisor]
+        reach = error / distance[divisor] * np.sqrt(1.0 + ratio * ratio)
+        for sets in database.cached(_ratio_sets)[:divisors]:
+            number, star, gain = within_reach(sets, ratio, reach)
+            share = gain / reach[number]
+            # One less the squared difference over the reach.
+            agreement = np.bincount(star, share * (2.0 - share), len(sets))
+            score = np.where(agreement > 0.0, -agreement, np.inf)
+            best.append(lowest(score[None, :], count)[0][0])
+    found = np.unique(np.concatenate(best))
+    return found[found >= 0]
+
+
+def distances_around(
+    observation: Observation, database: Database, reference: int, radius_rad: float | None = None
+) -> tuple[Rows, Array]:
+    """Return centroids around one and their distances, if not 0, in focal lengths, ascending."""
+    if radius_rad is None:
+        radius_rad = database.products["hausdorff_l2"].numbers["radius_rad"]
+    around = surroundings(observation, reference, radius_rad)
+    apart = around.separation_rad > 0.0
+    return around.centroids[apart], np.tan(around.separation_rad[apart])
+
+
+def _ratio_sets(database: Database) -> tuple[ReferenceSets, ...]:
+    """Return the stars' distances over the smallest, the second and the third smallest."""
+    product = database.products["hausdorff_l2"]
+    ratio, offsets = product["ratio"], product["star_offsets"]
+    count = np.diff(offsets)
+    found = []
+    for divisor in range(max(divisors for divisors, _ in DIVISOR_ROUNDS)):
+        has = count > divisor
+        members = np.repeat(has, count)
+        smallest = ratio[offsets[:-1][has] + divisor]
+        kept = np.where(has, count, 0)
+        over = ratio[members] / np.repeat(smallest, count[has])
+        found.append(reference_sets(over, np.concatenate([[0], np.cumsum(kept)])))
+    return tuple(found)
+
+
+def point_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
+    """Propose what a reference star and two of its neighbours are, if the roll is 0.
+
+    References
+    ----------
+    Wang et al. 2020 (S1), whose baseline it is.
+    """
+    product = database.products["hausdorff_l2"]
+
+    def propose(reference: int) -> Candidates:
+        stars, _ = rank_by_points(observation, database, reference, count=STARS_BY_POINTS)
+        return neighbour_candidates(reference, stars[stars >= 0], product, observation, database)
+
+    yield from by_reference(observation, propose)
+
+
+def rank_by_points(
+    observation: Observation, database: Database, reference: int | None = None, *, count: int
+) -> tuple[Rows, Array]:
+    """Rank the stars for a reference star, the nearest to the centre of the frame by default.
+
+    Returns
+    -------
+    stars : ndarray of int, shape (count,)
+        Rows of the database's stars, the best first; -1 where there are no more.
+    scores : ndarray of float64, shape (count,)
+        Mean over the centroids around the reference star, within the radius of the reference
+        sets, of the smallest L1 distance to a neighbour of the star, in units of the focal
+        length; ``inf`` where there are no more.
+
+    Notes
+    -----
+    The image's up is taken for north at the reference star. That is exact in its centre;
+    elsewhere the meridians converge, the more the nearer to a pole. Every centroid is compared
+    with the neighbours of all stars, so the time grows with the product of the two numbers.
+
+    References
+    ----------
+    Wang et al. 2020 (S1), eq. 6; Dubuisson and Jain 1994, "A modified Hausdorff distance for
+    object matching", whose directed distance is averaged.
+    """
+    product = database.products["hausdorff_l2"]
+    reference = int(references(observation)[0]) if reference is None else reference
+    rows = surroundings(observation, reference, product.numbers["radius_rad"]).centroids
+    x, y = _observed_points(observation, reference, rows)
+    star_x, star_y = database.cached(_neighbour_points)
+    distances = (
+        np.abs(star_x - one_x) + np.abs(star_y - one_y) for one_x, one_y in zip(x, y, strict=True)
+    )
+    scores = means_of_minima(distances, product["star_offsets"])
+    stars, best = lowest(scores[None, :], count)
+    return stars[0], best[0]
+
+
+def _observed_points(observation: Observation, reference: int, rows: Rows) -> tuple[Array, Array]:
+    """Return centroids on the tangent plane at one of them: to the left and up."""
+    u, body = observation.body[reference], observation.body[rows]
+    up = _UP - (_UP @ u) * u
+    up /= np.sqrt(up @ up)
+    depth = body @ u
+    return body @ np.cross(up, u) / depth, body @ up / depth
+
+
+def _neighbour_points(database: Database) -> tuple[Array, Array]:
+    """Return all neighbours on the tangent planes at their stars: to the east and north."""
+    product = database.products["hausdorff_l2"]
+    star = product["star"]
+    u = database.directions[product["neighbour"]]
+    east, north = tangent_axes(*radec_from_directions(database.directions))
+    depth = np.einsum("ij,ij->i", u, database.directions[star])
+    x, y = (np.einsum("ij,ij->i", u, axis[star]) / depth for axis in (east, north))
+    return x, y

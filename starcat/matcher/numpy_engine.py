@@ -1,0 +1,108 @@
+"""The readable reference in numpy: one frame through a method and the verification."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import islice
+
+from starcat.errors import ConfigError
+from starcat.matcher.chance import MIN_STARS
+from starcat.matcher.database import Database
+from starcat.matcher.methods.table import METHODS
+from starcat.matcher.observation import Candidates, Frame, Observation, observe
+from starcat.matcher.pose import focal_length_error_px
+from starcat.matcher.prior import Prior, search_near
+from starcat.matcher.result import MatchResult, Origin, Refusal, no_match
+from starcat.matcher.settings import BudgetSpentError, Limit, Settings
+from starcat.matcher.stars import ARCSEC
+from starcat.matcher.verification import Agreement, BestOf, verify
+
+
+def solve(
+    settings: Settings,
+    database: Database,
+    frame: Frame,
+    fov_error: float = 0.0,
+    prior: Prior | None = None,
+) -> MatchResult:
+    """Identify the stars of a frame, with a prior near it."""
+    if database.image is not None:
+        raise ConfigError(
+            f"a frame of {len(frame)} centroids and this camera are beyond the C library, and "
+            "an onboard image holds nothing for numpy; open the artifact that it is of"
+        )
+    observation = observe(frame, settings, fov_error=fov_error, budget=settings.budget())
+    best, limit = BestOf(settings.certainty), None
+    if len(observation) >= MIN_STARS:
+        limit = _search(observation, database, prior, best)
+    answer = answer_of(best.found, observation, limit, prior)
+    return answer if prior is None else prior.checked(answer, frame.camera, settings.tolerance_px)
+
+
+def proposals(observation: Observation, database: Database) -> Iterator[Candidates]:
+    """Return the batches of candidates of the method of an observation's settings."""
+    settings = observation.settings
+    return islice(METHODS[settings.method].propose(observation, database), settings.max_batches)
+
+
+def _search(
+    observation: Observation, database: Database, prior: Prior | None, best: BestOf
+) -> Limit | None:
+    """Work out agreements until one is certain, and return the limit that ended the search."""
+    whole_sky = proposals(observation, database)
+    try:
+        if prior is not None:
+            search_near(prior, observation, database, best, whole_sky)
+            return None
+        for candidates in whole_sky:
+            verify(candidates, observation, database, best)
+            if best.is_certain:
+                break
+    except BudgetSpentError as spent:
+        return spent.limit
+    return None
+
+
+def answer_of(
+    found: Agreement | None,
+    observation: Observation,
+    limit: Limit | None = None,
+    prior: Prior | None = None,
+) -> MatchResult:
+    """Return the answer that the best agreement of a search stands for, or why it is none."""
+    count = len(observation) + len(observation.dropped)
+    origin: Origin = "lost_in_space" if prior is None else "tracking"
+    most = observation.settings.max_false_match_probability
+    if found is None or found.false_match_probability > most:
+        why = _refusal_of(found, observation, limit, prior)
+        return no_match(count, observation.dropped, why, origin=origin)
+    error_px = None
+    if observation.fov_error:
+        error_px = focal_length_error_px(found.pose, found.matched, found.residual_rad, observation)
+    return MatchResult(
+        "identified",
+        observation.in_frame(found.star_index),
+        found.pose.matrix,
+        found.residual_rad * ARCSEC,
+        found.false_match_probability,
+        observation.dropped,
+        found.pose.camera,
+        error_px,
+        origin,
+    )
+
+
+def _refusal_of(
+    found: Agreement | None, observation: Observation, limit: Limit | None, prior: Prior | None
+) -> Refusal:
+    if len(observation) < MIN_STARS:
+        return Refusal("too_few_stars")
+    if found is None or (prior is not None and found.chance >= 1.0):
+        return Refusal(limit or ("no_candidate" if prior is None else "prior"))
+    return Refusal(
+        limit or found.withheld or "chance",
+        found.n_matched,
+        found.chance,
+        found.share,
+        len(observation),
+    )

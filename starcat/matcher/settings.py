@@ -1,0 +1,230 @@
+"""Settings of an identification, and the budget of one search."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+from starcat.errors import ConfigError
+from starcat.geometry.distortion import checked_number
+
+Engine = Literal["auto", "c", "numpy"]
+
+Limit = Literal["time", "steps"]
+
+TOLERANCE_PX = 2.0
+"""Tolerance where neither it nor the noise of a centroid is stated."""
+
+NOISE_DEVIATIONS = 3.0
+"""Tolerance in standard deviations of a centroid on one axis, where that is stated.
+
+A centroid farther than `REACH` times as many from its star, 4.5, is one of 25,000.
+"""
+
+REACH = 1.5
+"""Largest distance between a centroid and its star, in units of the tolerance.
+
+It is larger than 1 because an attitude that was computed from a few stars has an error too.
+"""
+
+CERTAIN = 1e-9
+"""Largest false-match probability of an answer, unless another one is asked for.
+
+Where more is allowed, a hundredth of it ends the search; else the best answer is taken.
+"""
+
+MAX_BATCHES = 200
+"""Batches of candidates that are tried before giving up."""
+
+MIN_SHARE = 1.0 / 3.0
+"""Smallest share of a frame that the attitude of an answer explains.
+
+The share is that of the centroids or that of the stars, whichever is larger. Every one of them
+is weighted by the uncertainty that the matched stars leave in its position (`weighted_share`).
+Without weights, the many stars of one cluster would accept an attitude that is right in the
+cluster and wrong in the rest of the frame.
+"""
+
+SCALE_FREE = ("triangle",)
+"""Methods that find the focal length with the attitude."""
+
+LOOKUP = 10
+"""Steps of looking up one pattern of a frame."""
+
+AGREEMENT = 50
+"""Steps of working out one agreement."""
+
+
+@dataclass(frozen=True)
+class TriangleOrder:
+    """Order and limits of the triangles of a frame.
+
+    Attributes
+    ----------
+    order : {"auto", "brightness", "inradius", "compact", "spread"}
+        ``brightness`` is S3's, ``inradius`` S4's, the largest first; ``compact`` has the
+        triangles with the shortest long side first, which the most fields hold whole. ``spread``
+        takes the most compact triangle at every centroid, then the second of each, and so on.
+        ``auto`` is ``brightness`` where magnitudes are known, else ``spread`` in frames with more
+        than ``most_centroids``, else ``compact``.
+    min_side_px : float
+        Triangles with a shorter side are left out, as those of double stars (d_min of S3).
+    min_angle_deg : float
+        Triangles with a narrower angle are left out, as three stars in a line (theta_min of S3).
+    most_centroids : int
+        Number of centroids that take part: the first ones in the observation's order. With
+        ``spread`` all of them do.
+    few_centroids : int
+        In frames with at most this many centroids, the triangles that are left out are tried
+        at the end.
+
+    References
+    ----------
+    Li et al. 2015 (S3), whose thresholds are unstated: the defaults reproduce its counts.
+    Liao and Zhang 2024 (S4), eq. 7.
+    """
+
+    order: Literal["auto", "brightness", "inradius", "compact", "spread"] = "auto"
+    min_side_px: float = 10.0
+    min_angle_deg: float = 15.0
+    most_centroids: int = 32
+    few_centroids: int = 12
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The method and the limits of an identification.
+
+    Attributes
+    ----------
+    method : str
+        A key of `METHODS`.
+    tolerance_px : float
+        Largest error of a centroid, as a radius: 2 px, or three times ``noise_px`` where that is
+        stated.
+    max_false_match_probability : float
+        Answers that chance would give more often than this are withheld.
+    selection : TriangleOrder
+        Order and limits of the triangles of centroids, for the methods that use triangles.
+    max_batches : int
+        Batches of candidates tried before giving up.
+    noise_px : float, optional
+        Standard deviation of a centroid on each axis. Stating it, instead of a tolerance, makes
+        frames of few stars certain that would be withheld.
+    noise_mag : float, optional
+        Standard deviation of the magnitudes of centroids in the band of the database, its zero
+        point included. Where it is stated, a centroid is no star whose magnitude differs by
+        more than 3.5 of it, and agreements of magnitudes count as evidence.
+    engine : {"auto", "c", "numpy"}
+        ``numpy`` is the reference. ``c`` is the library that flies, for the methods ``triangle``
+        and ``pyramid`` with the default selection: with triangles twenty times as fast from
+        Python, and a hundred times in itself. Both name the same stars. ``auto`` is ``c`` where
+        it can serve.
+    min_share : float
+        Smallest share of the frame, by weight, that the attitude of an answer explains; a third.
+    max_steps : float
+        Steps that a frame may take (`Budget`), then the best answer so far is given, or none. The
+        same steps give the same answer. Infinite by default.
+    time_limit_s : float
+        Seconds that a frame may take. Infinite by default. Where this, ``min_share``,
+        ``max_steps`` or a tolerance above 4 px is given, ``auto`` is ``numpy``.
+    """
+
+    method: str = "triangle"
+    # None stands for what is not given, which __post_init__ replaces.
+    tolerance_px: float = None  # type: ignore[assignment]
+    max_false_match_probability: float = CERTAIN
+    selection: TriangleOrder = TriangleOrder()
+    max_batches: int = MAX_BATCHES
+    noise_px: float | None = None
+    noise_mag: float | None = None
+    engine: Engine = "auto"
+    min_share: float = MIN_SHARE
+    max_steps: float = math.inf
+    time_limit_s: float = math.inf
+
+    def __post_init__(self) -> None:
+        """Check what was stated, and find the tolerance where it was not given."""
+        for name in ("noise_px", "noise_mag"):
+            if getattr(self, name) is not None:
+                checked_number(name, getattr(self, name), 0.0)
+        if not 0.0 <= self.min_share <= 1.0:
+            raise self._error("min_share", "0 to 1")
+        for name in ("max_steps", "time_limit_s"):
+            if not getattr(self, name) > 0.0:
+                raise self._error(name, "a number above 0")
+        of_noise = None if self.noise_px is None else NOISE_DEVIATIONS * self.noise_px
+        if self.tolerance_px is None:
+            object.__setattr__(self, "tolerance_px", of_noise or TOLERANCE_PX)
+        elif of_noise not in (None, self.tolerance_px):
+            text = (
+                f"both tolerance_px, {self.tolerance_px!r}, and noise_px, {self.noise_px!r}, are "
+                f"given; give one of them (the tolerance of a noise is {NOISE_DEVIATIONS:g} times "
+                "as large)"
+            )
+            raise ConfigError(text, key="noise_px", value=self.noise_px)
+        if self.engine not in get_args(Engine):
+            choices = ", ".join(get_args(Engine))
+            text = f"engine is {self.engine!r}; choose one of {choices}"
+            raise ConfigError(text, key="engine", value=self.engine)
+
+    def _error(self, name: str, expected: str) -> ConfigError:
+        value = getattr(self, name)
+        return ConfigError(f"{name} is {value!r}; expected {expected}", key=name, value=value)
+
+    @property
+    def has_default_search(self) -> bool:
+        """Whether what only numpy can be told is as by default."""
+        own = self.selection, self.max_batches, self.min_share, self.max_steps, self.time_limit_s
+        return own == (TriangleOrder(), MAX_BATCHES, MIN_SHARE, math.inf, math.inf)
+
+    @property
+    def certainty(self) -> float:
+        """False-match probability that ends a search."""
+        limit = self.max_false_match_probability
+        return limit if limit <= CERTAIN else max(CERTAIN, 0.01 * limit)
+
+    def budget(self) -> Budget:
+        """Return the budget of a search that begins now."""
+        return Budget(self.max_steps, self.time_limit_s)
+
+    def check_scale_free(self) -> None:
+        """Check that the method can do without the focal length."""
+        if self.method not in SCALE_FREE:
+            text = f"method {self.method!r} needs the focal length; only 'triangle' can find it"
+            raise ConfigError(text, key="method", value=self.method)
+
+
+class BudgetSpentError(Exception):
+    """A search is over before it has come to its end."""
+
+    def __init__(self, limit: Limit) -> None:
+        super().__init__(f"the {limit} of a search are used up")
+        self.limit: Limit = limit
+
+
+@dataclass
+class Budget:
+    """What is left of a search.
+
+    A step is a candidate that is compared with the frame, and takes some microseconds. Looking up
+    a pattern of the frame counts as `LOOKUP` steps, working out an agreement as `AGREEMENT`. The
+    same budget in steps gives the same answer everywhere; a limit of time does not.
+    """
+
+    max_steps: float = math.inf
+    time_limit_s: float = math.inf
+    # Steps that were taken.
+    steps: int = 0
+    _start_s: float = field(default_factory=time.perf_counter, repr=False)
+
+    def spend(self, steps: int) -> None:
+        """Take steps; `BudgetSpentError` where none are left."""
+        if self.steps + steps > self.max_steps:
+            raise BudgetSpentError("steps")
+        self.steps += steps
+        limit_s = self.time_limit_s
+        if limit_s != math.inf and time.perf_counter() - self._start_s > limit_s:
+            raise BudgetSpentError("time")
