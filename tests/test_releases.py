@@ -40,8 +40,7 @@ from starcat.errors import (
     SourceMissing,
 )
 from starcat.releases import publishing
-from starcat.releases.lockfile import read_pins
-from starcat.releases.project import pull_pinned, pull_wanted
+from starcat.releases.lockfile import pull_pinned, pull_wanted, read_pins
 from starcat.releases.publishing import publish_artifact
 from starcat.releases.pulling import Pulled
 from starcat.releases.registry import HttpRegistry, open_registry

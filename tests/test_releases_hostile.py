@@ -21,7 +21,7 @@ import pytest
 
 from starcat.errors import ConfigError, DownloadError, OutputError, ProductError, StarcatError
 from starcat.releases import files
-from starcat.releases.project import pull_pinned, pull_wanted
+from starcat.releases.lockfile import pull_pinned, pull_wanted
 from starcat.releases.publishing import publish_artifact
 from starcat.releases.registry import FolderRegistry, open_registry
 from starcat.releases.tree import MAX_INDEX_BYTES, MAX_MANIFEST_BYTES, Blob, parse_wanted
@@ -296,7 +296,7 @@ sys.modules["fcntl"] = sys.modules["resource"] = None
 for name in ("O_NOFOLLOW", "O_NONBLOCK", "pread", "pwrite"):
     delattr(os, name)
 from pathlib import Path
-from starcat.releases.project import pull_wanted
+from starcat.releases.lockfile import pull_wanted
 from starcat.releases.publishing import publish_artifact
 from starcat.releases import files
 from starcat.storage import locks

@@ -36,7 +36,7 @@ WORKERS = """
 import errno, fcntl, json, os, signal, sys, time, traceback
 from pathlib import Path
 import starcat.artifact.verify
-from starcat.releases.project import pull_wanted
+from starcat.releases.lockfile import pull_wanted
 from starcat.releases.publishing import publish_artifact
 
 def refuse(*_):

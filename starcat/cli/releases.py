@@ -67,7 +67,7 @@ def pull(
 
     Example: starcat pull gaia-12deg@latest --registry registry -o onboard
     """
-    from starcat.releases.project import pull_pinned, pull_wanted
+    from starcat.releases.lockfile import pull_pinned, pull_wanted
     from starcat.storage.download import DownloadOptions
 
     options = DownloadOptions(retries)

@@ -18,28 +18,34 @@ app = typer.Typer()
 FORMATS = f"{', '.join(('table', *FILE_FORMATS[:-1]))} or {FILE_FORMATS[-1]}"
 
 
+Arguments = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="TARGET... [QUERY]",
+        help="Artifacts, catalog stores, Parquet files, archive files (or SOURCE=PATH), "
+        "sources; then SQL, or - to read it from stdin. Without a query: a prompt.",
+    ),
+]
+Values = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="NAME=VALUE", help="A value of the query. Repeatable."),
+]
+OutputFile = Annotated[
+    Path | None, typer.Option("--output", "-o", help="File; its suffix says the format.")
+]
+FormatName = Annotated[
+    str | None, typer.Option("--format", metavar="FORMAT", help=f"{FORMATS}; default: table.")
+]
+
+
 @app.command()
 def sql(
     context: typer.Context,
-    arguments: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="TARGET... [QUERY]",
-            help="Artifacts, catalog stores, Parquet files, archive files (or SOURCE=PATH), "
-            "sources; then SQL, or - to read it from stdin. Without a query: a prompt.",
-        ),
-    ] = None,
+    arguments: Arguments = None,
     named: Annotated[str | None, typer.Option(help="A query of the gallery; see --list.")] = None,
-    values: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="A value of the query. Repeatable."),
-    ] = None,
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="File; its suffix says the format.")
-    ] = None,
-    form: Annotated[
-        str | None, typer.Option("--format", metavar="FORMAT", help=f"{FORMATS}; default: table.")
-    ] = None,
+    values: Values = None,
+    output: OutputFile = None,
+    form: FormatName = None,
     rows: Annotated[int, typer.Option(min=1, help="Rows of a table to show.")] = 40,
     show_list: Annotated[bool, typer.Option("--list", help="List the named queries.")] = False,
     show_macros: Annotated[bool, typer.Option("--macros", help="List the macros.")] = False,

@@ -1,4 +1,4 @@
-"""``starcat.lock``: which version of which artifact a project uses, from where, by digest.
+"""``starcat.lock``, the pins of a project: reading, writing, and pulling what it pins or asks for.
 
 One entry an artifact, sorted, without a clock: the same pins are the same bytes.
 """
@@ -14,10 +14,13 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict
 
 from starcat.errors import ConfigError, ProductError
-from starcat.releases.registry import is_address
-from starcat.releases.tree import Release, check_version, parse
+from starcat.progress import Progress, no_progress
+from starcat.releases.pulling import Pulled, pull_release
+from starcat.releases.registry import is_address, open_registry
+from starcat.releases.tree import Release, check_version, choose, parse, parse_wanted
 from starcat.storage.atomic import make_folder, replace_file, writing
 from starcat.storage.digests import json_bytes
+from starcat.storage.download import DownloadOptions
 from starcat.storage.locks import locked
 
 LOCK_NAME = "starcat.lock"
@@ -25,15 +28,9 @@ LOCK_VERSION = "1.0.0"
 
 
 class Pin(Release):
-    """An artifact that a lock file pins.
+    """An artifact that a lock file pins."""
 
-    Attributes
-    ----------
-    registry : str
-        Where it came from: an address, or a folder relative to the lock file's.
-    """
-
-    registry: str
+    registry: str  # where it came from: an address, or a folder relative to the lock file's
 
 
 class _Head(BaseModel):
@@ -124,3 +121,79 @@ def pin_of(path: Path, pins: Mapping[str, Pin], name: str, version: str | None) 
             value=version,
         )
     return pins[name]
+
+
+def pull_wanted(
+    wanted: str,
+    registry: str | None,
+    output: Path,
+    lock: Path,
+    options: DownloadOptions | None = None,
+    progress: Progress = no_progress,
+    max_bytes: int | None = None,
+) -> Pulled:
+    """Pull what a registry lists, and pin it."""
+    name, version = parse_wanted(wanted)
+    pin = read_pins(lock).get(name)
+    opened = open_registry(registry or _registry_of(lock, name, pin), options)
+    release = choose(opened.releases(), name, version, opened.address)
+    _check_pin(lock, pin, release, opened.address)
+    prepare(lock)
+    pulled = pull_release(opened, release, output, progress, max_bytes)
+    write_pin(lock, release, opened.address)
+    return pulled
+
+
+def _registry_of(lock: Path, name: str, pin: Pin | None) -> str:
+    """Return where an artifact was pulled from before."""
+    if pin is None:
+        raise ConfigError(
+            f"{lock} does not pin {name}, so nothing says where it comes from; name a folder or "
+            "an address with --registry",
+            key="registry",
+        )
+    return pinned_registry(lock, pin)
+
+
+def _check_pin(lock: Path, pin: Pin | None, release: Release, address: str) -> None:
+    """Refuse a version that is pinned with another content."""
+    if pin and pin.version == release.version and pin.manifest != release.manifest:
+        raise ProductError(
+            f"{address}: the manifest of {release.title} is "
+            f"{release.manifest.sha256[:12]}; {lock} pins {pin.manifest.sha256[:12]}. A published "
+            "version never changes: find out who changed it, or remove the entry from the lock "
+            "file to accept it",
+            path=lock,
+        )
+
+
+def pull_pinned(
+    wanted: str | None,
+    registry: str | None,
+    output: Path,
+    lock: Path,
+    options: DownloadOptions | None = None,
+    progress: Progress = no_progress,
+    max_bytes: int | None = None,
+) -> list[Pulled]:
+    """Pull exactly what a lock file says; no index is read, and the lock file stays."""
+    pins = read_pins(lock)
+    if not pins:
+        raise ConfigError(
+            f"{lock}: pins nothing; 'starcat pull NAME@VERSION --registry ...' writes it",
+            key="lock",
+            value=str(lock),
+        )
+    chosen = [pins[name] for name in sorted(pins)]
+    if wanted is not None:
+        chosen = [pin_of(lock, pins, *parse_wanted(wanted))]
+    return [
+        pull_release(
+            open_registry(registry or pinned_registry(lock, pin), options),
+            pin,
+            output,
+            progress,
+            max_bytes,
+        )
+        for pin in chosen
+    ]

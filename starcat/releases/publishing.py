@@ -34,23 +34,13 @@ _PARTS = {INCOMING, _LOCK, INDEX_NAME, "blobs", "versions"}
 
 @dataclass(frozen=True)
 class Published:
-    """What became of a publication.
+    """What became of a publication."""
 
-    Attributes
-    ----------
-    release : Listed
-        The release.
-    registry : Path
-        The folder of the registry.
-    outcome : {"published", "unchanged"}
-        ``unchanged`` where it was there with the same manifest.
-    new_blobs, new_bytes : int
-        Content that the registry did not have.
-    """
-
-    release: Listed
-    registry: Path
+    release: Listed  # the release
+    registry: Path  # the folder of the registry
+    # ``unchanged`` where it was there with the same manifest
     outcome: Literal["published", "unchanged"]
+    # new_blobs, new_bytes: content that the registry did not have
     new_blobs: int
     new_bytes: int
 

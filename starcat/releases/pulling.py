@@ -29,24 +29,12 @@ from starcat.storage.locks import locked
 
 @dataclass(frozen=True)
 class Pulled:
-    """What became of a pull.
+    """What became of a pull."""
 
-    Attributes
-    ----------
-    release : Release
-        The release.
-    registry : str
-        The folder or address that it came from.
-    folder : Path
-        The folder of the artifact.
-    outcome : {"pulled", "unchanged"}
-        ``unchanged`` where it was there already, whole.
-    """
-
-    release: Release
-    registry: str
-    folder: Path
-    outcome: Literal["pulled", "unchanged"]
+    release: Release  # the release
+    registry: str  # the folder or address that it came from
+    folder: Path  # the folder of the artifact
+    outcome: Literal["pulled", "unchanged"]  # ``unchanged`` where it was there already, whole
 
     def as_dict(self) -> dict[str, Any]:
         """Return the outcome as plain values."""

@@ -35,15 +35,9 @@ class Registry(Protocol):
 
 @dataclass(frozen=True)
 class FolderRegistry:
-    """A registry on disk.
+    """A registry on disk."""
 
-    Attributes
-    ----------
-    root : Path
-        Its folder.
-    """
-
-    root: Path
+    root: Path  # its folder
 
     @property
     def address(self) -> str:
@@ -82,18 +76,10 @@ class FolderRegistry:
 
 @dataclass(frozen=True)
 class HttpRegistry:
-    """A registry that a web server offers as files.
+    """A registry that a web server offers as files."""
 
-    Attributes
-    ----------
-    root : str
-        Its address, without a slash at the end.
-    options : DownloadOptions
-        How to download.
-    """
-
-    root: str
-    options: DownloadOptions
+    root: str  # its address, without a slash at the end
+    options: DownloadOptions  # how to download
 
     @property
     def address(self) -> str:

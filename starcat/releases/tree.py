@@ -39,18 +39,10 @@ class _Model(BaseModel):
 
 
 class Blob(_Model):
-    """Content by its digest.
+    """Content by its digest."""
 
-    Attributes
-    ----------
-    sha256 : str
-        Hexadecimal.
-    bytes : int
-        Size.
-    """
-
-    sha256: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
-    bytes: int = Field(ge=0)
+    sha256: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]  # hexadecimal
+    bytes: int = Field(ge=0)  # size
 
     @property
     def path(self) -> str:
@@ -59,19 +51,12 @@ class Blob(_Model):
 
 
 class Release(_Model):
-    """A version of an artifact.
+    """A version of an artifact."""
 
-    Attributes
-    ----------
-    name, version : str
-        Name and version of the artifact.
-    manifest : Blob
-        Its file ``manifest.json``, which names all the others.
-    """
-
+    # name, version: name and version of the artifact
     name: Name
     version: Version
-    manifest: Blob
+    manifest: Blob  # its file ``manifest.json``, which names all the others
 
     @property
     def title(self) -> str:
@@ -85,14 +70,9 @@ class Release(_Model):
 
 
 class Listed(Release):
-    """A release as the registry lists it.
+    """A release as the registry lists it."""
 
-    Attributes
-    ----------
-    files, bytes : int
-        How many files it has, the manifest among them, and their sizes together.
-    """
-
+    # files, bytes: how many files it has, the manifest among them, and their sizes together
     files: int = Field(ge=1)
     bytes: int = Field(ge=0)
 
