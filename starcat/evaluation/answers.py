@@ -16,8 +16,8 @@ from starcat.evaluation.bare_methods import (
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.methods.consensus import references
 from starcat.matcher.methods.hausdorff import rank_by_points
-from starcat.matcher.methods.reference import references
 from starcat.matcher.observation import Observation, as_frame, observe
 from starcat.matcher.result import MatchResult, no_match
 

@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike
 
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
-from starcat.matcher.batch import BatchResult
 from starcat.matcher.blind import identify_blind
 from starcat.matcher.c_engine import CEngine, c_engine, is_compiled
 from starcat.matcher.database import Database, open_database, open_image, products_in
@@ -27,7 +26,7 @@ from starcat.matcher.methods.table import best_method, method_named
 from starcat.matcher.numpy_engine import solve
 from starcat.matcher.observation import WIDEST_FOV_ERROR, Frame, as_frame
 from starcat.matcher.prior import Prior, prior_of
-from starcat.matcher.result import MatchResult, Origin, Refusal
+from starcat.matcher.result import MatchResult, Refusal
 from starcat.matcher.settings import Settings
 from starcat.onboard.layout import FEATURES
 from starcat.onboard.reading import is_image
@@ -248,13 +247,11 @@ class Matcher(Settings, _WithDatabase):
         """Identify frames in C, or all of them with numpy where the library does not take one."""
         engine = self._c_engine
         if engine is not None and all(engine.accepts(len(frame)) for frame in frames):
-            found = engine.identify(frames, self.settings, prior, threads)
-            if found.is_whole:
-                explain = None if self.database.image else partial(self._explain, prior)
-                origin: Origin = "lost_in_space" if prior is None else "tracking"
-                answers = BatchResult(found, frames, self.database, self.noise_px, explain, origin)
-                if prior is None:
-                    return answers
+            explain = None if self.database.image else partial(self._explain, prior)
+            answers = engine.identify(frames, self.settings, prior, threads, explain)
+            if answers.is_whole and prior is None:
+                return answers
+            if answers.is_whole and prior is not None:
                 return [prior.checked(answers[0], frames[0].camera, self.tolerance_px)]
         return [self._timed(frame, partial(solve, prior=prior)) for frame in frames]
 

@@ -142,7 +142,7 @@ def drive_starcat(
         near = prior_of(prior, PRIOR_DEG) if track else None
         frame = as_frame(px, matcher.database.camera, mag)
         found = library.identify([frame], matcher.settings, near)
-        return float(found.frames["seconds"][0])
+        return float(found.seconds[0])
 
     return Driver(prepare, solve, attitude, begin=begin, inside_s=inside_s)
 
