@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from starcat.artifact.crossmatch_table import NEEDED
+from starcat.artifact.other_catalogs import NEEDED
 from starcat.catalog.ingest import ingest
 from starcat.errors import OutputError, ParseError, ProductError, SchemaError
 from starcat.geometry.sphere import (

@@ -27,11 +27,10 @@ from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars
 from starcat.pipeline.build import build
 from starcat.pipeline.report_data import artifact_coverage
 from starcat.products.coverage import coverage_from_counts
-from starcat.report.coverage_report import report_coverage
+from starcat.report.coverage_map import HALF_HEIGHT, HALF_WIDTH, nearest_raster, project
 from starcat.report.page import table
 from starcat.report.plots import draw_histogram, draw_magnitudes, save_plot
-from starcat.report.report import count_magnitudes
-from starcat.report.sky_map import HALF_HEIGHT, HALF_WIDTH, nearest_raster, project
+from starcat.report.report import count_magnitudes, report_coverage
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import spec_from_dict
 

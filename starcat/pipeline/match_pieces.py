@@ -21,7 +21,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from starcat.arrays import Mask
-from starcat.artifact.crossmatch_table import NEEDED, moving_stars, table_from_matches
+from starcat.artifact.other_catalogs import NEEDED, moving_stars, table_from_matches
 from starcat.pipeline.counterparts import with_own_names
 from starcat.pipeline.match_summary import Tally, differences_of, tally_of, write_numbers
 from starcat.pipeline.star_rows import opened, rows_of_partition, rows_of_region

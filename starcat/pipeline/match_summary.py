@@ -12,7 +12,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.artifact.crossmatch_table import matched_stars
+from starcat.artifact.other_catalogs import matched_stars
 from starcat.products.crossmatch import VERDICTS, Matches
 from starcat.products.match_figures import ARCSEC, Figures
 from starcat.products.match_odds import Odds

@@ -48,7 +48,7 @@ class ConeRequest:
     radius_deg: float  # its radius; 0 asks for the columns only
     verbosity: int  # 1 for identity and place, 2 for all columns with a UCD, 3 for all
     maxrec: int | None  # rows at most; None where that is not said
-    form: Format  # how the answer is written
+    form: Format
     media_type: str  # what it is sent as
 
 

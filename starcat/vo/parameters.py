@@ -38,10 +38,10 @@ class Upload:
 class Question:
     """What a request asks."""
 
-    query: str  # ADQL
-    form: Format  # how to write the answer
-    max_rows: int  # rows of the answer at most
-    uploads: tuple[Upload, ...] = ()  # the tables that come with it
+    query: str
+    form: Format
+    max_rows: int
+    uploads: tuple[Upload, ...] = ()
     run_id: str = ""  # what the client calls it
 
 
