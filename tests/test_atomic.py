@@ -125,9 +125,7 @@ def filled(folder: Path, **files: str) -> Path:
         ({"a": "1", "c": "2"}, True, "replaced"),
     ],
 )
-def test_a_folder_in_place_of_another(
-    new: dict[str, str], replace: bool, outcome: str, tmp_path: Path
-) -> None:
+def test_a_folder_in_place_of_another(new, replace, outcome, tmp_path):
     final = tmp_path / "small"
     move_into_place(filled(tmp_path / "old", a="1", b="2"), final, replace=False)
     assert move_into_place(filled(tmp_path / "new", **new), final, replace=replace) == outcome
@@ -154,9 +152,7 @@ def test_what_the_system_refuses_becomes_an_output_error(tmp_path: Path) -> None
         raise ConnectionResetError(104, "reset")
 
 
-def test_folders_above_are_made_and_synchronised(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_folders_above_are_made_and_synchronised(tmp_path, monkeypatch):
     seen: list[Path] = []
     monkeypatch.setattr("starcat.storage.atomic.sync", seen.append)
     make_folder(tmp_path / "a" / "b")
@@ -164,9 +160,7 @@ def test_folders_above_are_made_and_synchronised(
     assert seen == [tmp_path, tmp_path / "a"]
 
 
-def test_nothing_is_synchronised_where_the_system_cannot(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_is_synchronised_where_the_system_cannot(tmp_path, monkeypatch):
     def refuse(*_: Any) -> int:
         raise PermissionError(13, "Permission denied")
 

@@ -225,11 +225,6 @@ def test_a_camera_of_a_field_has_that_field(width_px, height_px, fov_deg):
     assert camera.fov_y_deg == pytest.approx(fov_deg, rel=1e-13)
 
 
-def test_a_field_of_90_degrees_has_a_focal_length_of_half_the_side():
-    assert Camera(1000, 500, fov_x_deg=90.0).focal_length_px == pytest.approx(500.0, rel=1e-15)
-    assert Camera(1000, 500, fov_y_deg=90.0).focal_length_px == pytest.approx(250.0, rel=1e-15)
-
-
 @pytest.mark.parametrize("ratio", [0.99901, 1.0, 1.00099])
 def test_both_fields_may_be_given_if_they_agree(ratio):
     wide = Camera(1600, 1200, fov_x_deg=16.0)

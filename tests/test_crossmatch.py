@@ -23,7 +23,7 @@ from starcat.geometry.sphere import (
 )
 from starcat.products.crossmatch import VERDICTS, Matches, MovingStars, candidate_pairs, crossmatch
 from starcat.products.match_figures import ARCSEC, MatchModel
-from starcat.products.match_probability import pair_probabilities
+from starcat.products.match_odds import pair_probabilities
 from starcat.products.star_counts import TILES, MagnitudeCounts
 
 Array = NDArray[np.float64]

@@ -16,9 +16,9 @@ import pyarrow as pa
 import pytest
 from jsonschema import Draft202012Validator
 
-from starcat.artifact.crossmatch_table import counterpart_problems, matched_stars, moving_stars
 from starcat.artifact.diff import diff_artifacts
 from starcat.artifact.manifest import MANIFEST_VERSION, manifest_digest
+from starcat.artifact.other_catalogs import counterpart_problems, matched_stars, moving_stars
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import verify_artifact
 from starcat.artifact.writer import content_sha256

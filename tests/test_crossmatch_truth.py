@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from starcat.artifact.crossmatch_table import matched_stars, moving_stars
+from starcat.artifact.other_catalogs import matched_stars, moving_stars
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import verify_artifact
 from starcat.catalog.archives.gaia import embedded_sky

@@ -67,9 +67,7 @@ def test_a_brighter_limit_lets_stars_go(small_artifact: Path, make: Make) -> Non
     assert not back.went
 
 
-def test_a_star_beyond_the_read_limit_of_the_other_is_said_to_be(
-    small_artifact: Path, make: Make
-) -> None:
+def test_a_star_beyond_the_read_limit_of_the_other_is_said_to_be(small_artifact, make):
     a = open_artifact(small_artifact)
     b = make("b", catalog={"source": "sao", "read_limit_mag": 5.5})
     found = diff_artifacts(a, b)
@@ -83,9 +81,7 @@ def test_a_star_beyond_the_read_limit_of_the_other_is_said_to_be(
     assert len(b.table("rejected")) == sum(source["rejected"].values()) - beyond
 
 
-def test_every_star_is_accounted_for(
-    small_artifact: Path, make: Make, sao_lines: list[bytes]
-) -> None:
+def test_every_star_is_accounted_for(small_artifact, make, sao_lines):
     """One star leaves the catalog, one fades, one shifts, one brightens, one is new."""
     lines = list(sao_lines)
     gone, faded, shifted, brighter = 99, 199, 299, 399
@@ -117,8 +113,8 @@ def test_every_star_is_accounted_for(
 
 @pytest.mark.parametrize("is_repeated_first", [False, True])
 def test_a_repeated_record_does_not_hide_the_reason(
-    small_artifact: Path, make: Make, sao_lines: list[bytes], is_repeated_first: bool
-) -> None:
+    small_artifact, make, sao_lines, is_repeated_first
+):
     """A guide star has a companion in the other catalog, and one more record there."""
     star = int(open_artifact(small_artifact).table("stars")["star_id"][20].as_py())
     dec = float(sao_lines[star - 1][193:204])
@@ -158,9 +154,7 @@ def test_numbers_of_two_catalogs_are_not_the_same_star(small_artifact: Path) -> 
     assert [(change.name, change.b) for change in found.software] == [("numpy", "1.0")]
 
 
-def test_the_command_prints_some_and_json_has_all(
-    small_artifact: Path, make: Make, starcat: Any
-) -> None:
+def test_the_command_prints_some_and_json_has_all(small_artifact, make, starcat):
     b = make("b", selection={"faint_limit_mag": 5.0}, version="1.1.0")
     ran = starcat(["diff", small_artifact, b.folder])
     assert ran.code == 0
@@ -176,7 +170,5 @@ def test_the_command_prints_some_and_json_has_all(
     assert starcat(["diff", small_artifact, small_artifact, "--json"]).out.count('"is_same": true')
 
 
-def test_a_folder_that_is_no_artifact_is_an_error(
-    small_artifact: Path, tmp_path: Path, starcat: Any
-) -> None:
+def test_a_folder_that_is_no_artifact_is_an_error(small_artifact, tmp_path, starcat):
     assert starcat(["diff", small_artifact, tmp_path]).code == 3

@@ -19,7 +19,6 @@ from starcat.errors import BuildError, ConfigError
 from starcat.pipeline.build import Inputs, build
 from starcat.pipeline.catalog_snapshot import CatalogSnapshot, read_snapshot, reading_keys
 from starcat.pipeline.cost import PART_ROWS, PARTS, table_bytes
-from starcat.pipeline.counts import triple_of_rank
 from starcat.pipeline.estimate import Estimate, choose_stars, estimate, estimate_spec
 from starcat.pipeline.guide_stars import brightest_of_fields, select_stars
 from starcat.pipeline.recipes import tile_guide_stars
@@ -33,9 +32,7 @@ FILES = {"2mass-8x6": {"2mass": "psc_estimated.gz"}}
 
 
 @pytest.fixture(scope="module")
-def small(
-    tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]
-) -> tuple[Path, dict[str, list[Path]]]:
+def small(tmp_path_factory, sao_lines):
     folder = tmp_path_factory.mktemp("sao")
     (folder / "sao.dat").write_bytes(b"".join(sao_lines))
     return folder, {"sao": [folder / "sao.dat"]}
@@ -246,15 +243,6 @@ def test_the_size_of_a_large_table_is_known_from_parts():
     count = 5 * PART_ROWS * PARTS
     table = pa.table({"mag": np.random.default_rng(5).normal(size=count)})
     assert table_bytes(table) == pytest.approx(parquet_bytes(table), rel=0.05)
-
-
-@pytest.mark.parametrize("n", [3, 8, 20])
-def test_every_triple_has_its_rank(n):
-    found = triple_of_rank(np.arange(n * (n - 1) * (n - 2) // 6))
-    assert len(np.unique(found, axis=0)) == len(found)
-    assert (np.diff(found, axis=1) > 0).all()
-    assert found.min() == 0
-    assert found.max() == n - 1
 
 
 # --- What would take too long, or too much

@@ -185,9 +185,7 @@ BY_HAND: dict[str, Callable[[dict[str, Any]], bool]] = {
 
 
 @pytest.fixture(scope="module", params=[(1, 400), (2, 61), (3, 1)])
-def random_file(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[list[dict[str, Any]], Path]:
+def random_file(request, tmp_path_factory):
     made = random_records(*request.param)
     path = tmp_path_factory.mktemp("random") / "experiment.parquet"
     pq.write_table(pa.Table.from_pylist(made), path)
@@ -199,9 +197,7 @@ def test_every_rule_has_a_meaning() -> None:
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_rates_are_what_a_loop_counts(
-    rule: str, random_file: tuple[list[dict[str, Any]], Path]
-) -> None:
+def test_rates_are_what_a_loop_counts(rule, random_file):
     made, path = random_file
     rates = rates_of(path, rule, REACH_PX)
     enough = [r for r in made if r["n_guide_stars"] >= 4]
@@ -223,9 +219,7 @@ def test_rates_are_what_a_loop_counts(
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_failures_have_the_first_cause_that_holds(
-    rule: str, random_file: tuple[list[dict[str, Any]], Path]
-) -> None:
+def test_failures_have_the_first_cause_that_holds(rule, random_file):
     made, path = random_file
 
     def cause(r: dict[str, Any]) -> int:
@@ -239,9 +233,7 @@ def test_failures_have_the_first_cause_that_holds(
     assert list(found.values()) == [causes.count(k) for k in range(4)]
 
 
-def test_rows_are_judged_by_their_trials_limit(
-    random_file: tuple[list[dict[str, Any]], Path],
-) -> None:
+def test_rows_are_judged_by_their_trials_limit(random_file):
     made, path = random_file
     row = Row("g", "l", "small", replace(experiment_of("t"), tolerance_px=1.0), "attitude")
     assert row.experiment.attitude_limit_px == pytest.approx(REACH_PX)
@@ -263,9 +255,7 @@ def test_a_campaign_measures_every_row(outcome: Outcome, records: Path) -> None:
     assert clean.rates.by_rule.percent == 100.0
 
 
-def test_the_ceiling_is_the_share_of_frames_with_four_stars(
-    outcome: Outcome, records: Path
-) -> None:
+def test_the_ceiling_is_the_share_of_frames_with_four_stars(outcome, records):
     few = outcome.rows[-3]
     stars = pq.read_table(records / "S0" / "few.parquet")["n_guide_stars"].to_numpy()
     assert few.rates.ceiling == Share(int((stars >= 4).sum()), 8)
@@ -280,20 +270,19 @@ def without_times(path: Path) -> dict[str, Any]:
 
 
 def test_a_stopped_campaign_goes_on_where_it_was(
-    small_artifact: Path, records: Path, outcome: Outcome, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    small_artifact, records, outcome, tmp_path, monkeypatch
+):
     shutil.copytree(records / "S0", tmp_path / "S0")
     lost = tmp_path / "S0" / "all.parquet"
     left = lost.with_name(".all.parquet.0.partial")
     lost.rename(left)  # as if killed just before it was done
-    ran, part = [], experiment._run_part
+    ran, whole = [], experiment.score_frames
 
-    def counted(task: Any) -> Any:
-        ran.append(task[0].name)
-        return part(task)
+    def counted(one: Experiment, artifact: Path) -> Any:
+        ran.append(one.name)
+        return whole(one, artifact)
 
-    monkeypatch.setattr(experiment, "_run_part", counted)
+    monkeypatch.setattr(experiment, "score_frames", counted)
     again = run_paper(PAPER, {"small": small_artifact}, tmp_path, workers=1)
     assert ran == ["all"]
     for name in ("all", "few", "noise-1-pairs"):
@@ -305,9 +294,7 @@ def test_a_stopped_campaign_goes_on_where_it_was(
     assert list(tmp_path.rglob("*.partial")) == [left]  # of a killed process; this one leaves none
 
 
-def test_processes_give_the_same_records(
-    small_artifact: Path, records: Path, outcome: Outcome, tmp_path: Path
-) -> None:
+def test_processes_give_the_same_records(small_artifact, records, outcome, tmp_path):
     seen: list[tuple[str, int, int | None]] = []
     run_paper(
         PAPER, {"small": small_artifact}, tmp_path, quick=True, workers=2,
@@ -402,9 +389,7 @@ def test_values_out_of_range_are_refused(name: str, value: float) -> None:
         PARAMETERS[name].with_value(base, value)
 
 
-def test_a_sweep_varies_one_quantity_at_a_time(
-    small_artifact: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sweep_varies_one_quantity_at_a_time(small_artifact, monkeypatch):
     other = Method(METHODS["triangle"].propose, ("moons",))
     monkeypatch.setitem(METHODS, "other", other)  # the artifact has none
     given = {"noise_px": (0.4,), "false_stars": (3.0, 0.0), "scale": (1.0, 1.01)}
@@ -436,9 +421,7 @@ def test_a_sweep_of_nothing_varies_all_and_of_single_values_none(small_artifact:
 
 
 @pytest.mark.parametrize(("values", "method"), [({"dust": (1.0,)}, None), ({}, "magic")])
-def test_a_sweep_of_what_is_not_there_is_refused(
-    small_artifact: Path, values: Any, method: str | None
-) -> None:
+def test_a_sweep_of_what_is_not_there_is_refused(small_artifact, values, method):
     with pytest.raises(ConfigError, match=r"dust|magic"):
         plan_sweep(small_artifact, values, method=method)
 
@@ -477,9 +460,7 @@ def test_the_content_is_plain_json(content: dict[str, Any], report: Path) -> Non
     assert content["rows"][-1]["axis"] == ""
 
 
-def test_the_terminal_shows_every_row_within_100_columns(
-    content: dict[str, Any], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_terminal_shows_every_row_within_100_columns(content, capsys):
     print_evaluation(Evaluation((content,), Path("index.html")), as_json=False)
     shown = capsys.readouterr()
     lines = shown.out.splitlines()
@@ -547,9 +528,7 @@ class Page(HTMLParser):
             self.cells[-1] += data
 
 
-def test_the_page_has_every_row_and_needs_nothing_else(
-    content: dict[str, Any], report: Path
-) -> None:
+def test_the_page_has_every_row_and_needs_nothing_else(content, report):
     text = (report / "index.html").read_text(encoding="utf-8")
     page = Page(text)
     for line in [*content["rows"], *content["statistics"]]:
@@ -576,9 +555,7 @@ def test_a_quick_run_says_so(content: dict[str, Any], tmp_path: Path) -> None:
     }  # fmt: skip
 
 
-def test_the_same_evaluation_gives_the_same_files(
-    content: dict[str, Any], report: Path, tmp_path: Path
-) -> None:
+def test_the_same_evaluation_gives_the_same_files(content, report, tmp_path):
     write_evaluation(tmp_path, "A <title>", [content], "a machine")
     names = {path.name for path in report.iterdir()}
     assert names == {path.name for path in tmp_path.iterdir()}
@@ -587,9 +564,7 @@ def test_the_same_evaluation_gives_the_same_files(
         assert (report / name).read_bytes() == (tmp_path / name).read_bytes(), name
 
 
-def test_the_reproduction_is_made_from_what_is_stored(
-    content: dict[str, Any], report: Path, tmp_path: Path
-) -> None:
+def test_the_reproduction_is_made_from_what_is_stored(content, report, tmp_path):
     (tmp_path / "figures").mkdir()
     (tmp_path / "figures" / "S0_09_gone.svg").touch()
     (tmp_path / "figures" / "other.svg").touch()
@@ -704,9 +679,7 @@ def test_curves_are_called_as_their_rows(content: dict[str, Any], label: str, na
     assert series_of({**content["rows"][0], "label": label}) == name
 
 
-def test_a_curve_shows_all_methods_the_paper_and_the_ceiling(
-    content: dict[str, Any], tmp_path: Path
-) -> None:
+def test_a_curve_shows_all_methods_the_paper_and_the_ceiling(content, tmp_path):
     ((name, group, lines),) = curves(content)
     assert (name, len(lines)) == ("S0_01_position_noise", 4)
     assert not list(curves({**content, "rows": lines[::2]}))  # all at one place
@@ -743,9 +716,7 @@ def test_papers_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
         evaluate.papers_named("S9")
 
 
-def test_papers_are_evaluated_end_to_end(
-    monkeypatch: pytest.MonkeyPatch, small_artifact: Path, tmp_path: Path
-) -> None:
+def test_papers_are_evaluated_end_to_end(monkeypatch, small_artifact, tmp_path):
     monkeypatch.setattr(evaluate, "PAPERS", {"S0": PAPER})
     monkeypatch.setattr(evaluate, "prepare_artifacts", lambda *_, **__: {"small": small_artifact})
     done = evaluate_papers("S0", {}, tmp_path, quick=True, workers=1)
@@ -759,9 +730,7 @@ def test_papers_are_evaluated_end_to_end(
 
 
 @pytest.mark.slow
-def test_artifacts_are_built_from_presets(
-    monkeypatch: pytest.MonkeyPatch, small_spec: str, sao_lines: list[bytes], tmp_path: Path
-) -> None:
+def test_artifacts_are_built_from_presets(monkeypatch, small_spec, sao_lines, tmp_path):
     (tmp_path / "sao.dat").write_bytes(b"".join(sao_lines))
     spec = spec_from_dict(tomllib.loads(small_spec), "small.toml")
     monkeypatch.setattr(evaluate, "preset", lambda name: spec.model_copy(update={"name": name}))
@@ -791,9 +760,7 @@ def test_an_artifact_is_evaluated_end_to_end(small_artifact: Path, tmp_path: Pat
     assert "At a glance" not in done.page.read_text(encoding="utf-8")
 
 
-def test_sweeps_into_one_folder_stand_beside_each_other(
-    small_artifact: Path, tmp_path: Path
-) -> None:
+def test_sweeps_into_one_folder_stand_beside_each_other(small_artifact, tmp_path):
     """As the how-to's recipe makes them: two commands, one folder."""
 
     def sweep(frames: int = 3, **values: tuple[float, ...]) -> Evaluation:
@@ -824,9 +791,7 @@ def test_sweeps_into_one_folder_stand_beside_each_other(
         assert len(list(csv.DictReader(file))) == 7
 
 
-def test_a_sweep_with_another_camera_has_a_section_of_its_own(
-    small_artifact: Path, tmp_path: Path
-) -> None:
+def test_a_sweep_with_another_camera_has_a_section_of_its_own(small_artifact, tmp_path):
     for camera in (None, replace(LENS, focal_length_px=700.0), LENS):
         sweep = plan_sweep(small_artifact, {"noise_px": (0.5,)}, camera=camera, frames=2)
         done = evaluate_artifact(sweep, tmp_path, workers=1)
@@ -836,9 +801,7 @@ def test_a_sweep_with_another_camera_has_a_section_of_its_own(
     assert (done.page.parent / "small-1.0.0-camera-2.csv").is_file()
 
 
-def test_sweeps_of_another_artifact_or_code_are_left_out(
-    small_artifact: Path, tmp_path: Path
-) -> None:
+def test_sweeps_of_another_artifact_or_code_are_left_out(small_artifact, tmp_path):
     sweep = plan_sweep(small_artifact, {"noise_px": (0.5,)}, frames=2)
     results = evaluate_artifact(sweep, tmp_path, workers=1).page.parent / RESULTS
     (stored,) = json.loads(results.read_bytes())["evaluations"]

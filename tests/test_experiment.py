@@ -39,9 +39,7 @@ def test_the_true_magnitude_decides_what_is_seen_where_it_is_asked_to(random_dir
 
 
 def statuses(experiment: Experiment, artifact: Path, folder: Path) -> list[str]:
-    return pq.read_table(run_experiment(experiment, artifact, folder, workers=1))[
-        "status"
-    ].to_pylist()
+    return pq.read_table(run_experiment(experiment, artifact, folder))["status"].to_pylist()
 
 
 def test_the_matcher_is_told_the_share_of_the_trial(small_artifact: Path, tmp_path: Path):
@@ -56,7 +54,7 @@ def test_the_installed_engine_answers_as_numpy_does(small_artifact: Path, tmp_pa
     numpy = Experiment("numpy", "triangle", Attitudes("random", 30), Noise(0.3, limit_mag=6.0))
     installed = replace(numpy, name="installed", engine="auto")
     found = [
-        pq.read_table(run_experiment(experiment, small_artifact, tmp_path, workers=1))
+        pq.read_table(run_experiment(experiment, small_artifact, tmp_path))
         for experiment in (numpy, installed)
     ]
     for column in ("status", "n_named", "n_right", "n_wrong"):

@@ -63,9 +63,7 @@ def test_an_error_under_json_is_an_object(starcat: Run, tmp_path: Path) -> None:
         (["inspect", "--json"], "Missing argument", "inspect"),
     ],
 )
-def test_usage_errors_under_json_are_objects(
-    starcat: Run, arguments: list[str], words: str, hint: str
-) -> None:
+def test_usage_errors_under_json_are_objects(starcat, arguments, words, hint):
     run = starcat(arguments)
     error = error_of(run.err)
     assert (run.code, run.out, error["code"]) == (2, "", 2)
@@ -109,9 +107,7 @@ def test_a_hint_is_the_end_of_the_message(message: str, hint: str | None) -> Non
     ],
     ids=lambda error: type(error).__name__,
 )
-def test_what_nobody_foresaw_is_called_a_defect(
-    starcat: Run, breaking: Callable[[BaseException], None], error: Exception
-) -> None:
+def test_what_nobody_foresaw_is_called_a_defect(starcat, breaking, error):
     breaking(error)
     run = starcat(["sources"])
     assert (run.code, run.out) == (DEFECT, "") == (70, "")
@@ -138,19 +134,14 @@ def test_a_recursion_without_end_is_a_defect(starcat: Run, monkeypatch: pytest.M
     assert "RecursionError" in run.err
 
 
-def test_a_want_of_memory_is_no_defect(
-    starcat: Run, breaking: Callable[[BaseException], None]
-) -> None:
+def test_a_want_of_memory_is_no_defect(starcat, breaking):
     breaking(MemoryError("Unable to allocate 16.0 TiB"))
     run = starcat(["sources"])
     assert run.code == 1
     assert "out of memory (Unable to allocate 16.0 TiB) while 'starcat sources' ran" in run.err
 
 
-def test_a_defect_names_the_stage(
-    starcat: Run, monkeypatch: pytest.MonkeyPatch, small_spec: str, sao_lines: list[bytes],
-    tmp_path: Path,
-) -> None:  # fmt: skip
+def test_a_defect_names_the_stage(starcat, monkeypatch, small_spec, sao_lines, tmp_path):
     """A build whose self-test breaks: nothing is left, and the last stage is said."""
     (tmp_path / "sao.dat").write_bytes(b"".join(sao_lines))
     (tmp_path / "spec.toml").write_text(small_spec)

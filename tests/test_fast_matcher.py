@@ -16,7 +16,7 @@ from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.matcher import c_engine
-from starcat.matcher.batch import BatchResult
+from starcat.matcher.c_engine import BatchResult
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult

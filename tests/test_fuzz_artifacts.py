@@ -259,8 +259,8 @@ def put(product: str, name: str, structure: str, other: Path) -> Callable[[h5py.
     [("stars", "mag"), ("pairs", "i"), ("pairs", "kvector_counts"), ("pairs", "")],
 )
 def test_a_structure_that_no_build_writes_is_refused(
-    structure: str, product: str, name: str, copy: Path, small_artifact: Path
-) -> None:
+    structure, product, name, copy, small_artifact
+):
     other = small_artifact / "database.h5"
     before = spoil_database(copy, put(product, name, structure, other))
     try:
@@ -296,9 +296,7 @@ def test_made_up_databases_hurt_nobody(copy: Path, frame: Any, small_artifact: P
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_a_thousand_made_up_databases_hurt_nobody(
-    copy: Path, frame: Any, small_artifact: Path
-) -> None:
+def test_a_thousand_made_up_databases_hurt_nobody(copy, frame, small_artifact):
     run_structures(MANY, copy, frame, small_artifact / "database.h5")
 
 

@@ -354,9 +354,7 @@ def check_text(name: str, changes: list[tuple[float, int, bytes]], use: Use) -> 
 @given(name=st.sampled_from(sorted(PRESETS)), changes=edits)
 @example(name="gaia-12deg", changes=[(1.0, 0, b"a = " + b"[" * 2_000)])
 @example(name="gaia-12deg", changes=[(1.0, 0, b"x." * 3_000 + b"y = 1")])
-def test_a_damaged_file_is_refused_or_can_be_used(
-    name: str, changes: list[tuple[float, int, bytes]], use: Use
-) -> None:
+def test_a_damaged_file_is_refused_or_can_be_used(name, changes, use):
     check_text(name, changes, use)
 
 
@@ -364,9 +362,7 @@ def test_a_damaged_file_is_refused_or_can_be_used(
 @pytest.mark.timeout(900)
 @SLOW
 @given(name=st.sampled_from(sorted(PRESETS)), changes=edits)
-def test_many_damaged_files_are_refused_or_can_be_used(
-    name: str, changes: list[tuple[float, int, bytes]], use: Use
-) -> None:
+def test_many_damaged_files_are_refused_or_can_be_used(name, changes, use):
     check_text(name, changes, use)
 
 

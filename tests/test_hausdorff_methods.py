@@ -25,19 +25,20 @@ from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_
 from starcat.geometry.sphere import separation
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.methods import hausdorff, reference_sets
+from starcat.matcher.methods import hausdorff
 from starcat.matcher.methods.consensus import (
     _all_agreeing,
     consistent,
     consistent_candidates,
     neighbour_candidates,
+    references,
     support,
 )
-from starcat.matcher.methods.hausdorff import rank_by_points, rank_by_separations
-from starcat.matcher.methods.reference import references
-from starcat.matcher.methods.reference_sets import (
+from starcat.matcher.methods.hausdorff import (
     lowest,
     means_of_minima,
+    rank_by_points,
+    rank_by_separations,
     within_reach,
 )
 from starcat.matcher.observation import Observation
@@ -80,7 +81,7 @@ def members(sky: Database, product: str, values: str, star: int) -> list[float]:
 
 
 SETS = [[], [1.0, 2.0, 2.0, 5.0], [], [3.0], [0.5, 2.5], []]
-ARRANGED = reference_sets.reference_sets(
+ARRANGED = hausdorff.reference_sets(
     np.array([value for members in SETS for value in members]),
     np.cumsum([0] + [len(members) for members in SETS]),
 )

@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from starcat.artifact.crossmatch_table import NEEDED
+from starcat.artifact.other_catalogs import NEEDED
 from starcat.catalog.ingest import ingest
 from starcat.errors import OutputError, ParseError, ProductError, SchemaError
 from starcat.geometry.sphere import (
@@ -30,8 +30,7 @@ from starcat.geometry.sphere import (
 from starcat.pipeline.counterparts import match_files
 from starcat.pipeline.match_pieces import MOST_RINGS
 from starcat.pipeline.match_stores import match_stores
-from starcat.pipeline.match_summary import Summary
-from starcat.pipeline.medians import median_of, write_numbers
+from starcat.pipeline.match_summary import Summary, median_of, write_numbers
 from starcat.products.match_figures import ARCSEC
 from starcat.specs.product_sections import Crossmatch
 from starcat.storage.parquet import read_parquet, write_parquet, write_parts

@@ -22,7 +22,7 @@ from astropy.time import Time
 from jsonschema import Draft202012Validator
 
 from starcat.artifact.manifest import MANIFEST_VERSION, MOTIONS_VERSION, manifest_digest
-from starcat.artifact.motion_table import OUTCOMES, motion_problems
+from starcat.artifact.other_catalogs import OUTCOMES, motion_problems
 from starcat.artifact.reader import Artifact, open_artifact
 from starcat.artifact.verify import verify_artifact
 from starcat.catalog.archives.gaia import embedded_sky

@@ -23,7 +23,7 @@ from starcat.errors import QueryError
 from starcat.query.gallery import gallery, named_query
 from starcat.query.session import open_session
 from starcat.report import coverage_map, sky_map
-from starcat.report.sky_map import project
+from starcat.report.coverage_map import project
 from starcat.service.pages.rendering import time_text
 
 LATER = "fedcba9876543210"

@@ -22,15 +22,15 @@ from starcat.geometry.sphere import radec_from_directions, separation
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods import dynamic_angle, patterns
-from starcat.matcher.methods.dynamic_angle import Tolerance
-from starcat.matcher.methods.patterns import rank_by_cells, rank_by_rings, sector_pattern
-from starcat.matcher.methods.reference import (
+from starcat.matcher.methods.consensus import (
     RANKS,
     by_reference,
     references,
     rows_between,
     surroundings,
 )
+from starcat.matcher.methods.dynamic_angle import Tolerance
+from starcat.matcher.methods.patterns import rank_by_cells, rank_by_rings, sector_pattern
 from starcat.matcher.methods.table import METHODS
 from starcat.matcher.observation import Candidates, Observation
 from starcat.simulation.simulate import Noise

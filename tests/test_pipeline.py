@@ -78,9 +78,7 @@ Event = tuple[str, int, int | None]
 
 
 @pytest.fixture(scope="module")
-def first(
-    tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes], small_spec: str
-) -> tuple[Built, list[Event]]:
+def first(tmp_path_factory, sao_lines, small_spec):
     """The small spec, built once, and its progress."""
     folder = tmp_path_factory.mktemp("first")
     (folder / "sao.dat").write_bytes(b"".join(sao_lines))
@@ -151,9 +149,7 @@ def test_progress_only_goes_forward(first: tuple[Built, list[Event]]) -> None:
     ],
     ids=["no stars", "no field can be identified"],
 )
-def test_a_build_without_a_result_leaves_nothing(
-    changes: dict[str, Any], build_small: Callable[..., Built], tmp_path: Path
-) -> None:
+def test_a_build_without_a_result_leaves_nothing(changes, build_small, tmp_path):
     with pytest.raises(BuildError):
         build_small(**changes)
     assert os.listdir(tmp_path / "dist") == []
@@ -202,9 +198,7 @@ def test_the_second_build_changes_nothing(dist: Path, build_small: Callable[...,
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
-def test_another_artifact_is_kept_unless_told(
-    dist: Path, build_small: Callable[..., Built]
-) -> None:
+def test_another_artifact_is_kept_unless_told(dist, build_small):
     folder = dist / "small-1.0.0"
     before = content(folder)
     fainter = {"selection": {"faint_limit_mag": 5.9}}
@@ -245,9 +239,7 @@ def test_a_changed_byte_is_found(small_artifact: Path, tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def slower(
-    tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes], small_spec: str
-) -> tuple[Path, Path, dict[str, bytes], float]:
+def slower(tmp_path_factory, sao_lines, small_spec):
     """Spec, stars, content and seconds of a build that takes long enough to be hit."""
     folder = tmp_path_factory.mktemp("slower")
     spec, stars = folder / "spec.toml", folder / "sao.dat"
@@ -262,12 +254,7 @@ def slower(
 @pytest.mark.parametrize(
     ("number", "attempts"), [(signal.SIGKILL, 6), (signal.SIGTERM, 4)], ids=["kill", "terminate"]
 )
-def test_a_stopped_build_leaves_no_half_artifact(
-    number: signal.Signals,
-    attempts: int,
-    slower: tuple[Path, Path, dict[str, bytes], float],
-    tmp_path: Path,
-) -> None:
+def test_a_stopped_build_leaves_no_half_artifact(number, attempts, slower, tmp_path):
     spec, stars, whole, seconds = slower
     generator = random.Random(int(number))
     stopped = 0
@@ -323,9 +310,7 @@ def test_termination_cleans_up(stars: Path, small_spec: str, tmp_path: Path) -> 
     assert os.listdir(tmp_path / "dist") == []
 
 
-def test_leftovers_of_a_killed_build_do_not_disturb(
-    build_small: Callable[..., Built], tmp_path: Path
-) -> None:
+def test_leftovers_of_a_killed_build_do_not_disturb(build_small, tmp_path):
     stale = tmp_path / "dist" / ".small-1.0.0.abcdefgh.partial"
     stale.mkdir(parents=True)
     (stale / "database.h5").write_bytes(b"\x89HDF")
@@ -336,9 +321,7 @@ def test_leftovers_of_a_killed_build_do_not_disturb(
 
 
 @pytest.mark.slow
-def test_two_builds_at_once(
-    slower: tuple[Path, Path, dict[str, bytes], float], tmp_path: Path
-) -> None:
+def test_two_builds_at_once(slower, tmp_path):
     spec, stars, whole, _ = slower
     both = [
         subprocess.Popen(command(spec, stars, tmp_path), stdout=subprocess.DEVNULL)
@@ -348,9 +331,7 @@ def test_two_builds_at_once(
     assert content(tmp_path) == whole
 
 
-def test_replacing_is_undone_if_it_is_interrupted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_replacing_is_undone_if_it_is_interrupted(tmp_path, monkeypatch):
     final, partial = tmp_path / "small-1.0.0", tmp_path / ".small-1.0.0.x.partial"
     for folder in (final, partial):
         folder.mkdir()

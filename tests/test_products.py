@@ -10,7 +10,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from starcat.geometry.attitude import matrix_from_radec_roll
@@ -352,6 +352,7 @@ def test_inverted_lookups(name, column, key, count, kind):
 TURNS = st.tuples(st.floats(0.0, 360.0), st.floats(-90.0, 90.0), st.floats(0.0, 360.0))
 
 
+@settings(max_examples=15)  # each makes the products of a sky
 @given(TURNS)
 @pytest.mark.parametrize(
     ("name", "columns"),
@@ -370,6 +371,7 @@ def test_turned_neighbours(name, columns, turn):
         assert turned[key] == pytest.approx(values, rel=ROUNDING, abs=ROUNDING)
 
 
+@settings(max_examples=15)  # each makes the products of a sky
 @given(TURNS)
 def test_turned_pairs(turn):
     u = sky("everywhere")
@@ -379,6 +381,7 @@ def test_turned_pairs(turn):
     assert turned.separation_rad == pytest.approx(still.separation_rad, abs=ROUNDING)
 
 
+@settings(max_examples=15)  # each makes the products of a sky
 @given(TURNS)
 def test_turned_patterns(turn):
     # No value of this sky is near enough to an edge for rounding to carry it across (below).

@@ -44,9 +44,7 @@ def edit_manifest(folder: Path, change: Any) -> None:
     (folder / MANIFEST_NAME).write_bytes(json_bytes(manifest))
 
 
-def test_the_same_inputs_give_the_same_bytes(
-    small_artifact: Path, stars: Path, tmp_path: Path
-) -> None:
+def test_the_same_inputs_give_the_same_bytes(small_artifact, stars, tmp_path):
     events: list[str] = []
     rebuilt = rebuild(
         small_artifact, {"sao": [stars]}, tmp_path / "again", lambda stage, *_: events.append(stage)
@@ -61,9 +59,7 @@ def test_the_same_inputs_give_the_same_bytes(
     assert made.read_bytes() == (small_artifact / MANIFEST_NAME).read_bytes()
 
 
-def test_nothing_is_left_without_an_output(
-    small_artifact: Path, stars: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_is_left_without_an_output(small_artifact, stars, tmp_path, monkeypatch):
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(temporary))
@@ -89,9 +85,7 @@ def test_another_number_of_inputs_is_refused(small_artifact: Path, stars: Path) 
         rebuild(small_artifact, {"sao": [stars, more]})
 
 
-def test_a_missing_input_is_an_error(
-    small_artifact: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_input_is_an_error(small_artifact, tmp_path, monkeypatch):
     monkeypatch.setenv("STARCAT_CACHE", str(tmp_path / "none"))
     monkeypatch.delenv("STARCAT_CATALOGS", raising=False)
     with pytest.raises(SourceMissing):
@@ -108,9 +102,7 @@ def test_no_artifact_is_an_error(tmp_path: Path) -> None:
         rebuild(tmp_path, {})
 
 
-def test_other_libraries_are_named(
-    copy: Path, stars: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_libraries_are_named(copy, stars, monkeypatch):
     found = manifest_module.version
 
     def version(name: str) -> str:
@@ -162,9 +154,7 @@ def test_columns_that_came_out_differently_are_named(copy: Path, stars: Path) ->
 
 
 @pytest.mark.slow
-def test_the_command(
-    copy: Path, stars: Path, starcat: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command(copy, stars, starcat, capsys):
     ran = starcat(["rebuild", copy, "--input", f"sao={stars}"])
     assert ran.code == 0
     assert "every byte the same" in ran.out

@@ -27,11 +27,10 @@ from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars
 from starcat.pipeline.build import build
 from starcat.pipeline.report_data import artifact_coverage
 from starcat.products.coverage import coverage_from_counts
-from starcat.report.coverage_report import report_coverage
+from starcat.report.coverage_map import HALF_HEIGHT, HALF_WIDTH, nearest_raster, project
 from starcat.report.page import table
 from starcat.report.plots import draw_histogram, draw_magnitudes, save_plot
-from starcat.report.report import count_magnitudes
-from starcat.report.sky_map import HALF_HEIGHT, HALF_WIDTH, nearest_raster, project
+from starcat.report.report import count_magnitudes, report_coverage
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import spec_from_dict
 
@@ -99,9 +98,7 @@ def test_all_files_are_there_and_in_the_manifest(artifact: Artifact) -> None:
 
 
 @pytest.mark.slow
-def test_a_second_build_elsewhere_has_the_same_bytes(
-    artifact: Artifact, spec: BuildSpec, catalogs: Path, tmp_path: Path
-) -> None:
+def test_a_second_build_elsewhere_has_the_same_bytes(artifact, spec, catalogs, tmp_path):
     """In a fresh process, in another time zone, with settings of matplotlib's user."""
     (tmp_path / "spec.json").write_text(spec.model_dump_json())
     settings = "font.size: 31\naxes.facecolor: red\nsavefig.transparent: True\nsvg.fonttype: none\n"
@@ -290,9 +287,7 @@ def test_the_page_says_what_the_json_says(page: Page, report: dict[str, Any]) ->
     assert '"max_stars_per_field": 12' in page.text
 
 
-def test_the_page_says_what_the_camera_sees_and_rounds_means(
-    page: Page, report: dict[str, Any]
-) -> None:
+def test_the_page_says_what_the_camera_sees_and_rounds_means(page, report):
     assert ["camera", "512 x 512 px, 20 x 20 deg"] in page.tables[0]
     means = next(t for t in page.tables if t[0][0] == "in a field")
     assert [row[4] for row in means[1:]] == [
@@ -403,16 +398,12 @@ def test_coverage_prints_the_summary(starcat: Callable[..., Any], artifact: Arti
         assert words in run.out
 
 
-def test_coverage_as_json_is_that_of_the_report(
-    starcat: Callable[..., Any], artifact: Artifact, report: dict[str, Any]
-) -> None:
+def test_coverage_as_json_is_that_of_the_report(starcat, artifact, report):
     run = starcat(["coverage", artifact.folder, "--json"])
     assert json.loads(run.out) == report["coverage"] == artifact_coverage(artifact).as_dict()
 
 
-def test_coverage_writes_the_files_of_the_report(
-    starcat: Callable[..., Any], artifact: Artifact, tmp_path: Path
-) -> None:
+def test_coverage_writes_the_files_of_the_report(starcat, artifact, tmp_path):
     run = starcat(["coverage", artifact.folder, "-o", tmp_path / "new" / "folder"])
     assert run.code == 0
     made = {path.name for path in (tmp_path / "new" / "folder").iterdir()}
@@ -423,9 +414,7 @@ def test_coverage_writes_the_files_of_the_report(
         assert name in run.err
 
 
-def test_holes_go_to_stderr(
-    starcat: Callable[..., Any], small_spec: str, sao_lines: list[bytes], tmp_path: Path
-) -> None:
+def test_holes_go_to_stderr(starcat, small_spec, sao_lines, tmp_path):
     (tmp_path / "sao.dat").write_bytes(b"".join(sao_lines))
     few = small_spec.replace("boresights.count = 200", "boresights.count = 20")
     few = few.replace("min_identified = 0.8", "min_identified = 0.0")

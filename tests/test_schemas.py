@@ -241,9 +241,7 @@ def manifest(small_artifact: Path) -> dict[str, Any]:
     return copy.deepcopy(open_artifact(small_artifact).manifest)
 
 
-def test_a_built_manifest_follows_its_schema(
-    validator: Draft202012Validator, manifest: dict[str, Any]
-) -> None:
+def test_a_built_manifest_follows_its_schema(validator, manifest):
     validator.validate(manifest)
     assert json.loads(MANIFEST.read_text())["title"] == MANIFEST.stem
 
@@ -275,9 +273,7 @@ def test_every_product_follows_a_schema_that_ships(manifest: dict[str, Any]) -> 
     ],
     ids=str,
 )
-def test_other_manifests_are_refused(
-    path: tuple[Any, ...], value: object, validator: Draft202012Validator, manifest: dict[str, Any]
-) -> None:
+def test_other_manifests_are_refused(path, value, validator, manifest):
     place: Any = manifest
     for part in path[:-1]:
         place = place[part]
@@ -285,9 +281,7 @@ def test_other_manifests_are_refused(
     assert not validator.is_valid(manifest)
 
 
-def test_each_part_of_a_manifest_is_required(
-    validator: Draft202012Validator, manifest: dict[str, Any]
-) -> None:
+def test_each_part_of_a_manifest_is_required(validator, manifest):
     for part in manifest:
         assert not validator.is_valid({key: manifest[key] for key in manifest if key != part})
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -494,45 +495,35 @@ def test_the_preamble_gives_any_duckdb_the_same_views(starcat, small_artifact, s
         assert connection.execute(count).fetchall() == rows(session, count)
 
 
-def test_a_query_comes_from_stdin(small_artifact):
-    command = [sys.executable, "-m", "starcat", "sql", str(small_artifact)]
-    text = "SELECT 1 AS one;\nSELECT ';' AS two"
-    for extra, count in (([], 2), (["-"], 0)):
-        given = text if count else "SELECT 1 AS one"
-        done = subprocess.run(
-            [*command, *extra, "--format", "csv"], input=given, capture_output=True, text=True,
-            check=False, timeout=50,
-        )  # fmt: skip
-        assert (done.returncode, done.stderr) == (0, "")
-        assert done.stdout.startswith('"one"\n1\n')
-        assert ("two" in done.stdout) == bool(count)
+@pytest.fixture
+def ask_stdin(starcat, small_artifact, monkeypatch):
+    """The command with a text at its standard input."""
+
+    def ask(text: str, *arguments: object):
+        monkeypatch.setattr(sys, "stdin", io.StringIO(text))
+        return starcat(["sql", small_artifact, *arguments])
+
+    return ask
 
 
-def test_two_answers_do_not_share_a_file(small_artifact, tmp_path):
-    command = [
-        sys.executable,
-        "-m",
-        "starcat",
-        "sql",
-        str(small_artifact),
-        "-o",
-        tmp_path / "a.csv",
-    ]
-    done = subprocess.run(
-        command, input="SELECT 1; SELECT 2", capture_output=True, text=True, check=False, timeout=50
-    )
-    assert done.returncode == 2
-    assert "2 queries for one file" in done.stderr
-    assert not list(tmp_path.iterdir())
+def test_a_query_comes_from_stdin(ask_stdin):
+    run = ask_stdin("SELECT 1 AS one;\nSELECT ';' AS two", "--format", "csv")
+    assert (run.code, run.err, run.out) == (0, "", '"one"\n1\n"two"\n";"\n')
+    run = ask_stdin("SELECT 1 AS one", "-", "--format", "csv")
+    assert (run.code, run.err, run.out) == (0, "", '"one"\n1\n')
 
 
-def test_what_stdin_has_that_is_no_sql_is_told(small_artifact):
-    command = [sys.executable, "-m", "starcat", "sql", str(small_artifact)]
-    done = subprocess.run(
-        command, input="SELEC 1; SELECT 2", capture_output=True, text=True, check=False, timeout=50
-    )
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("starcat: error: no valid SQL")
+def test_two_answers_do_not_share_a_file(ask_stdin, tmp_path):
+    run = ask_stdin("SELECT 1; SELECT 2", "-o", tmp_path / "a.csv")
+    assert run.code == 2
+    assert "2 queries for one file" in run.err
+    assert not (tmp_path / "a.csv").exists()
+
+
+def test_what_stdin_has_that_is_no_sql_is_told(ask_stdin):
+    run = ask_stdin("SELEC 1; SELECT 2")
+    assert (run.code, run.out) == (2, "")
+    assert run.err.startswith("starcat: error: no valid SQL")
 
 
 def test_a_query_loads_nothing_heavy(small_artifact):

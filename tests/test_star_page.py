@@ -50,16 +50,12 @@ def cells(told: str, first: str) -> list[str]:
     return [cell.strip() for cell in line.strip("|").split("|")]
 
 
-def test_the_first_two_sections_are_what_the_record_says(
-    builder: ModuleType, excerpts: Path, page: str
-) -> None:
+def test_the_first_two_sections_are_what_the_record_says(builder, excerpts, page):
     assert sections(builder, excerpts) in page
 
 
 @pytest.mark.parametrize("folder", ["excerpts", "made_catalogs"])
-def test_the_bytes_on_the_page_are_in_the_file(
-    builder: ModuleType, page: str, folder: str, request: pytest.FixtureRequest
-) -> None:
+def test_the_bytes_on_the_page_are_in_the_file(builder, page, folder, request):
     catalogs = request.getfixturevalue(folder)
     told = page if folder == "excerpts" else sections(builder, catalogs)
     number = int(re.search(r"line\s(\d+)\sof", told)[1])  # type: ignore[index]
@@ -94,16 +90,12 @@ def test_its_motion_has_the_cosine_of_the_declination_in_it(told: str) -> None:
 
 
 @pytest.mark.slow
-def test_the_page_is_what_its_builder_writes(
-    builder: ModuleType, excerpts: Path, page: str
-) -> None:
+def test_the_page_is_what_its_builder_writes(builder, excerpts, page):
     assert builder.star_page(excerpts) == page
 
 
 @pytest.mark.slow
-def test_a_page_of_made_catalogs_has_all_sections(
-    builder: ModuleType, made_catalogs: Path, page: str
-) -> None:
+def test_a_page_of_made_catalogs_has_all_sections(builder, made_catalogs, page):
     written = builder.star_page(made_catalogs)
     headings = re.compile(r"^## .*$", re.MULTILINE)
     assert headings.findall(written) == headings.findall(page)

@@ -30,7 +30,7 @@ from starcat.service.jobs.job_states import begin_next
 from starcat.service.jobs.slots import ENDED_WITH_SERVER
 from starcat.service.service import Service
 from starcat.service.settings import Settings
-from starcat.service.vo.tap_spool import ClientGone, Spool
+from starcat.service.vo.tap import ClientGone, Spool
 from starcat.vo.parameters import Question
 
 LOCAL = "http://127.0.0.1:8000"

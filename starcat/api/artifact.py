@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # a program that only matches has none of the libraries behin
     from starcat.matcher.matcher import Matcher
     from starcat.query.result import Answer
     from starcat.query.session import Limits
-    from starcat.report.coverage_report import CoverageReport
+    from starcat.report.report import CoverageReport
 
 
 class Artifact(reader.Artifact):

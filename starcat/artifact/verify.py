@@ -17,22 +17,23 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from starcat.artifact.crossmatch_table import counterparts_of
-from starcat.artifact.database_checks import group_problems, index_problems, root_problems
+from starcat.artifact.checks import (
+    REFERENCE_CHECKS,
+    TABLE_CHECKS,
+    HeldProduct,
+    columns_follow_the_schema,
+    group_problems,
+    index_problems,
+    root_problems,
+)
 from starcat.artifact.manifest import (
     DATABASE_NAME,
     MANIFEST_NAME,
     manifest_digest,
     read_manifest,
 )
-from starcat.artifact.motion_table import motion_count_problems
+from starcat.artifact.other_catalogs import counterparts_of, motion_count_problems
 from starcat.artifact.reader import Artifact
-from starcat.artifact.table_checks import (
-    REFERENCE_CHECKS,
-    TABLE_CHECKS,
-    HeldProduct,
-    columns_follow_the_schema,
-)
 from starcat.catalog.stars import directions_of
 from starcat.catalog.verdict import Reason
 from starcat.errors import ArtifactMissing, ProductError, StarcatError

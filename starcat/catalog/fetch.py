@@ -165,7 +165,6 @@ def _none_delivered(
 
 
 def _take_present(expected: ExpectedFile, path: Path) -> FetchedFile:
-    """Check a file that is in the folder; it is left as it is."""
     if not path.is_file():
         raise OutputError(f"{path} is in the way: it is not a file. Move it.", path=path)
     try:

@@ -19,7 +19,6 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pooch
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from starcat.catalog.readers.blocks import GZIP_MAGIC, Block, read_blocks
@@ -199,7 +198,6 @@ def _record(expected: ExpectedFile, final: Path, entry: LockEntry) -> None:
 
 
 def _write_lock(folder: Path, entries: Mapping[str, LockEntry]) -> None:
-    """Write the lock file, whole or not at all."""
     path = folder / LOCK_NAME
     content = {name: entry.model_dump() for name, entry in entries.items()}
     partial = folder / f".{LOCK_NAME}.{secrets.token_hex(4)}.partial"
@@ -276,7 +274,6 @@ def _count_records(expected: ExpectedFile, path: Path, name: str) -> int:
 
 
 def _count_packed(block: Block, name: str) -> int:
-    """Count the records of a block of a binary file."""
     record_bytes = block.file.layout.record_bytes or 1
     rows, rest = divmod(len(block.data), record_bytes)
     if rest:
@@ -296,8 +293,10 @@ def _count_lines(block: Block, name: str) -> int:
     starts = np.concatenate(([0], ends[:-1] + 1))
     # For an empty first line the index is -1, which is the last byte of the text: a line feed.
     lengths = ends - starts - (octets[ends - 1] == _CARRIAGE_RETURN)
-    comment = layout.comment.encode("latin-1")
-    is_record = (lengths > 0) & ~_begins_with(octets, starts, comment)
+    is_record = lengths > 0
+    if layout.comment:
+        prefix = layout.comment.encode("latin-1")
+        is_record &= [not line.startswith(prefix) for line in text.split(b"\n")[:-1]]
     if layout.layout == "fixed_width":
         wrong = np.flatnonzero(is_record & (lengths != layout.record_bytes))
         if wrong.size:
@@ -308,17 +307,3 @@ def _count_lines(block: Block, name: str) -> int:
                 line=line,
             )
     return int(np.count_nonzero(is_record))
-
-
-def _begins_with(
-    octets: NDArray[np.uint8], starts: NDArray[np.int64], prefix: bytes
-) -> NDArray[np.bool_]:
-    """Return which lines begin with a text; where the text is empty, none does."""
-    if not prefix:
-        return np.zeros(starts.size, dtype=bool)
-    matches = np.ones(starts.size, dtype=bool)
-    for offset, character in enumerate(prefix):
-        # A line that is shorter than the prefix differs from it at its line feed. The minimum keeps
-        # the index within the text for the last line.
-        matches &= octets[np.minimum(starts + offset, octets.size - 1)] == character
-    return matches

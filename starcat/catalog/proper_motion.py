@@ -22,11 +22,9 @@ MAS = np.pi / (180.0 * 3600.0 * 1000.0)  # rad in a milliarcsecond
 class Motion:
     """Positions and proper motions at one epoch, all of shape (N,)."""
 
-    # ra_deg, dec_deg: degrees, ICRS
-    ra_deg: Array
+    ra_deg: Array  # ICRS, as is dec_deg
     dec_deg: Array
-    # pm_ra_cosdec_mas_yr, pm_dec_mas_yr: milliarcseconds a year; NaN where unknown
-    pm_ra_cosdec_mas_yr: Array
+    pm_ra_cosdec_mas_yr: Array  # NaN where either motion is unknown
     pm_dec_mas_yr: Array
 
 

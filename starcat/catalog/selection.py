@@ -152,7 +152,6 @@ def merge_doubles(stars: pa.Table, selection: Selection, verdicts: Verdicts) -> 
 
 
 def _groups(pairs: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
-    """Return the rows of each connected group of pairs, in order of the first row."""
     graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     _, label = connected_components(graph, directed=False)
     rows = np.unique(pairs)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from starcat.artifact.reader import Artifact
     from starcat.artifact.verify import Verification
     from starcat.pipeline.rebuild import Rebuilt
-    from starcat.report.coverage_report import CoverageReport
+    from starcat.report.report import CoverageReport
 
 app = typer.Typer()
 
@@ -248,7 +248,7 @@ _BARS, _BAR_WIDTH = 20, 50
 def print_coverage(artifact: Artifact, folder: Path | None, *, as_json: bool) -> None:
     """Print the coverage of an artifact, and write its tables and plots where asked to."""
     from starcat.pipeline.report_data import artifact_coverage
-    from starcat.report.coverage_report import holes_warning, write_coverage
+    from starcat.report.report import holes_warning, write_coverage
 
     report = artifact_coverage(artifact)
     if as_json:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from starcat.artifact.reader import Artifact
     from starcat.pipeline.build import Built
     from starcat.pipeline.cost import Cost
-    from starcat.report.coverage_report import CoverageReport
+    from starcat.report.report import CoverageReport
     from starcat.simulation.selftest import Rates
     from starcat.specs.build_spec import BuildSpec
 

@@ -16,8 +16,8 @@ from starcat.evaluation.bare_methods import (
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.methods.consensus import references
 from starcat.matcher.methods.hausdorff import rank_by_points
-from starcat.matcher.methods.reference import references
 from starcat.matcher.observation import Observation, as_frame, observe
 from starcat.matcher.result import MatchResult, no_match
 
@@ -41,7 +41,7 @@ def bare(name: Name) -> Answerer:
     def answer(
         matcher: Matcher, centroids_px: Array, camera: Camera, mag: Array | None
     ) -> MatchResult:
-        observation = observe(as_frame(centroids_px, camera, mag), matcher.settings)
+        observation = observe(as_frame(centroids_px, camera, mag), matcher)
         none = no_match(len(centroids_px), observation.dropped)
         if len(observation) < 2:
             return none

@@ -12,13 +12,14 @@ import numpy as np
 from starcat.arrays import Array, Rows
 from starcat.geometry.sphere import separation
 from starcat.matcher.database import Database
+from starcat.matcher.methods.consensus import references
 from starcat.matcher.methods.hausdorff import (
     distances_around,
+    lowest,
+    means_of_minima,
     rank_by_points,
     rank_by_separations,
 )
-from starcat.matcher.methods.reference import references
-from starcat.matcher.methods.reference_sets import lowest, means_of_minima
 from starcat.matcher.observation import Observation
 
 LIMIT_PX = 12.0

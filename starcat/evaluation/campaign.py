@@ -175,7 +175,7 @@ def _running(
 
 
 def _run(experiment: Experiment, artifact: Path, folder: Path) -> Experiment:
-    run_experiment(experiment, artifact, folder, workers=1)
+    run_experiment(experiment, artifact, folder)
     return experiment
 
 

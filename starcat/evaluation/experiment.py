@@ -9,8 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import cache, lru_cache
 from pathlib import Path
@@ -35,14 +34,10 @@ from starcat.geometry.sphere import directions_from_radec
 from starcat.matcher.c_engine import library_version
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.settings import MIN_SHARE, REACH, TriangleOrder
-from starcat.progress import Progress, no_progress
 from starcat.simulation.simulate import Noise, Sky, simulate_frame
 from starcat.storage.atomic import whole_file
 
 _TYPES = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}
-
-AT_ONCE = 250
-"""Frames of one task of a process."""
 
 MEASURED_ROOMS = ("geometry", "matcher", "simulation", "evaluation")
 """The rooms whose code decides what an experiment finds."""
@@ -98,31 +93,16 @@ class Experiment:
         return 2.0 * REACH * self.tolerance_px
 
 
-def run_experiment(
-    experiment: Experiment,
-    artifact: Path,
-    folder: Path,
-    *,
-    workers: int = 2,
-    progress: Progress = no_progress,
-) -> Path:
+def run_experiment(experiment: Experiment, artifact: Path, folder: Path) -> Path:
     """Run an experiment, unless its result is there."""
     path = folder / f"{experiment.name}.parquet"
     facts = description(experiment, artifact)
     if path.is_file() and pq.read_schema(path).metadata.get(b"starcat_trial") == facts:
         return path
-    count = frame_count(experiment)
-    starts = range(0, count, AT_ONCE)
-    tasks = [(experiment, artifact, first, min(first + AT_ONCE, count)) for first in starts]
-    verdicts: list[Score] = []
-    for part in _mapped(tasks, workers):
-        verdicts.extend(part)
-        progress(experiment.name, len(verdicts), count)
+    scores = score_frames(experiment, artifact)
     # Without an attitude its errors are NaN, which a query would take for a number.
     columns = {
-        name: pa.array(
-            [getattr(verdict, name) for verdict in verdicts], _TYPES[kind], from_pandas=True
-        )
+        name: pa.array([getattr(one, name) for one in scores], _TYPES[kind], from_pandas=True)
         for name, kind in get_type_hints(Score).items()
     }
     table = pa.table(columns).replace_schema_metadata({b"starcat_trial": facts})
@@ -161,23 +141,14 @@ def frame_count(experiment: Experiment) -> int:
     return min(whole, wanted.count) if wanted.count else whole
 
 
-def _mapped(tasks: list[tuple[Experiment, Path, int, int]], workers: int) -> Iterator[list[Score]]:
-    if workers == 1 or len(tasks) == 1:
-        yield from map(_run_part, tasks)
-        return
-    with ProcessPoolExecutor(workers) as pool:
-        yield from pool.map(_run_part, tasks)
-
-
-def _run_part(task: tuple[Experiment, Path, int, int]) -> list[Score]:
-    """Identify some frames of an experiment: the work of one process."""
-    experiment, artifact, first, last = task
+def score_frames(experiment: Experiment, artifact: Path) -> list[Score]:
+    """Simulate, identify and score the frames of an experiment."""
     matcher, sky = _opened(artifact, experiment)
     camera = experiment.camera or matcher.database.camera
     assumed = experiment.assumed or camera
     answer: Callable[..., Any] = ANSWERS[experiment.answer]
-    verdicts = []
-    for number in range(first, last):
+    scores = []
+    for number in range(frame_count(experiment)):
         generator = np.random.default_rng([experiment.seed, number])
         matrix = attitude_of(experiment, number, matcher.database.directions, generator)
         frame = simulate_frame(sky, camera, matrix, experiment.noise, generator)
@@ -186,8 +157,8 @@ def _run_part(task: tuple[Experiment, Path, int, int]) -> list[Score]:
         result = answer(matcher, frame.centroids_px, assumed, mag)
         time_ms = 1000.0 * (time.process_time() - begun)
         reach_px = REACH * experiment.tolerance_px
-        verdicts.append(score(number, frame, result, matcher.database, camera, reach_px, time_ms))
-    return verdicts
+        scores.append(score(number, frame, result, matcher.database, camera, reach_px, time_ms))
+    return scores
 
 
 @lru_cache(maxsize=4)

@@ -17,16 +17,28 @@ from __future__ import annotations
 
 import re
 import zipfile
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from starcat.arrays import Mask
 from starcat.errors import SchemaError
-from starcat.exchange.columns import Label, check_names, column_error, unit_text
-from starcat.exchange.numpy_columns import NumpyColumn, numpy_columns
+from starcat.exchange.columns import (
+    Label,
+    check_names,
+    column_error,
+    field_facts,
+    is_list,
+    is_number,
+    plain_schema,
+    unit_text,
+)
+from starcat.exchange.text import list_items, plain_values
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -40,6 +52,53 @@ _BREAKS = re.compile(r"\0|[^\S \t\n]")
 """White space that is neither blank, tab nor newline: Python ends lines at most of it."""
 
 _ENTRY_NAME_BYTES = (1 << 16) - 1  # what an entry of a zip file has room for
+
+
+@dataclass(frozen=True)
+class NumpyColumn:
+    """One column of N rows as numpy holds it."""
+
+    name: str
+    # Numbers, truth values, or texts as objects; of a ragged column all items one after the other.
+    # Null is NaN, 0, False or an empty text.
+    values: NDArray[Any]
+    is_null: Mask
+    # Shape (N + 1,): where the list of each row begins and ends; None where rows are no lists.
+    offsets: NDArray[np.int64] | None
+    facts: dict[str, str]  # unit, description and ucd where the column has them
+
+    @property
+    def is_text(self) -> bool:
+        """Whether the values are texts."""
+        return self.values.dtype == np.object_
+
+    def lists(self) -> list[NDArray[Any]]:
+        """Return the items of each row of a ragged column."""
+        if self.offsets is None:
+            raise ValueError(f"{self.name}: its rows are no lists")
+        return np.split(self.values, self.offsets[1:-1]) if len(self.is_null) else []
+
+
+def numpy_columns(table: pa.Table, *, signed: bool) -> list[NumpyColumn]:
+    """Return the columns of a table as numpy arrays.
+
+    With `signed`, integers are of the types that FITS and VOTable have: bytes without a sign, and
+    16, 32 and 64 bits with one.
+    """
+    table = table.cast(plain_schema(table.schema))
+    return [
+        _numpy_column(field, table[field.name].combine_chunks(), signed=signed)
+        for field in table.schema
+    ]
+
+
+def _numpy_column(field: pa.Field, values: pa.Array, *, signed: bool) -> NumpyColumn:
+    is_null = values.is_null().to_numpy(zero_copy_only=False)
+    offsets = None
+    if is_list(values.type) and is_number(values.type.value_type):
+        offsets, values = list_items(field.name, values)
+    plain = plain_values(field.name, values, signed=signed)
+    return NumpyColumn(field.name, _to_numpy(plain), is_null, offsets, field_facts(field))
 
 
 def write_fits(batches: pa.RecordBatchReader, path: Path, label: Label) -> int:
@@ -210,6 +269,16 @@ def write_npz(batches: pa.RecordBatchReader, path: Path, label: Label) -> int:
             if column.is_null.any():
                 _add_array(archive, f"{column.name}.is_null", column.is_null)
     return rows
+
+
+def _to_numpy(values: pa.Array) -> NDArray[Any]:
+    """Return values with null as NaN, 0, False or an empty text."""
+    if pa.types.is_string(values.type):
+        return np.array(pc.fill_null(values, "").to_pylist(), dtype=np.object_)
+    if pa.types.is_floating(values.type):
+        return np.asarray(values.to_numpy(zero_copy_only=False))
+    nothing = False if pa.types.is_boolean(values.type) else 0
+    return np.asarray(pc.fill_null(values, nothing).to_numpy(zero_copy_only=False))
 
 
 def _arrays(batches: pa.RecordBatchReader, file_format: str) -> tuple[list[NumpyColumn], int]:

@@ -1,4 +1,4 @@
-"""Tables as CSV, TSV and JSON text, batch by batch.
+"""Values as text, and tables as CSV, TSV and JSON, batch by batch.
 
 CSV: nothing for null, ``""`` for an empty text (for both where there is one column only),
 ``nan`` and ``inf`` for numbers that are none, lists and records as JSON in the cell. JSON: an
@@ -16,11 +16,21 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.csv as pcsv
+from numpy.typing import NDArray
 
-from starcat.exchange.columns import is_list, plain_batch, plain_schema, time_texts
+from starcat.errors import SchemaError
+from starcat.exchange.columns import column_error, is_list, plain_batch, plain_schema, time_texts
 
 _STEP_ROWS = 1 << 14
 _BREAKS = "[\\t\\r\\n]"
+
+_WIDER = {
+    pa.int8(): pa.int16(),
+    pa.uint16(): pa.int32(),
+    pa.uint32(): pa.int64(),
+    pa.uint64(): pa.int64(),
+}
+"""What VOTable and FITS have instead of the integers that they lack."""
 
 
 def csv_chunks(batches: pa.RecordBatchReader) -> Iterator[tuple[bytes, int]]:
@@ -82,6 +92,51 @@ def json_texts(values: pa.Array) -> pa.Array:
     return pc.fill_null(texts, "null")
 
 
+def list_items(name: str, values: pa.Array) -> tuple[NDArray[np.int64], pa.Array]:
+    """Return where the list of each row begins and ends, and the items of all rows."""
+    offsets, items = _list_offsets(values), values.flatten()
+    if items.null_count and pa.types.is_integer(items.type):
+        raise column_error(
+            name,
+            ": a list of integers has a missing item, which only CSV, "
+            "JSON and Parquet can hold; cast the items to DOUBLE",
+            str(values.type),
+        )
+    return offsets, items
+
+
+def _list_offsets(values: pa.Array) -> NDArray[np.int64]:
+    lengths = pc.fill_null(values.value_lengths(), 0).to_numpy(zero_copy_only=False)
+    return np.concatenate(([0], np.cumsum(lengths, dtype=np.int64)))
+
+
+def plain_values(name: str, values: pa.Array, *, signed: bool) -> pa.Array:
+    """Return values as numbers, truth values or texts."""
+    kind = values.type
+    if pa.types.is_decimal(kind):
+        return _narrowed(name, values, pa.float64() if kind.scale else pa.int64())
+    if signed and kind in _WIDER:
+        return _narrowed(name, values, _WIDER[kind])
+    if pa.types.is_temporal(kind):
+        return time_texts(values)
+    if is_list(kind) or pa.types.is_struct(kind):
+        return pc.if_else(values.is_valid(), json_texts(values), None)
+    return values
+
+
+def _narrowed(name: str, values: pa.Array, kind: pa.DataType) -> pa.Array:
+    try:
+        return values.cast(kind)
+    except pa.ArrowInvalid as error:
+        raise SchemaError(
+            f"column {name!r} of type {values.type} has a value that does not fit {kind}, the "
+            "widest integer of this format; cast it to VARCHAR or DOUBLE",
+            field=name,
+            found=str(values.type),
+            expected=str(kind),
+        ) from error
+
+
 def _small_batches(batches: pa.RecordBatchReader, schema: pa.Schema) -> Iterator[pa.RecordBatch]:
     """Yield the rows in steps whose text fits into memory, however large the batches are."""
     for batch in batches:
@@ -118,8 +173,7 @@ def _quoted(texts: pa.Array) -> pa.Array:
 
 def _list_texts(values: pa.Array) -> pa.Array:
     items = json_texts(values.flatten())
-    lengths = pc.fill_null(values.value_lengths(), 0).to_numpy(zero_copy_only=False)
-    offsets = np.concatenate(([0], np.cumsum(lengths))).astype(np.int32)
+    offsets = _list_offsets(values).astype(np.int32)
     joined = pc.binary_join(pa.ListArray.from_arrays(offsets, items), ",")
     texts = pc.binary_join_element_wise("[", joined, "]", "")
     return pc.if_else(values.is_valid(), texts, None)

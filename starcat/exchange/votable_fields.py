@@ -23,7 +23,7 @@ from starcat.exchange.columns import (
     is_number,
     unit_text,
 )
-from starcat.exchange.numpy_columns import list_items, plain_values
+from starcat.exchange.text import list_items, plain_values
 from starcat.storage.parquet import ARROW_DATATYPES
 
 _NOT_XML = re.compile("[^\t\n -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")

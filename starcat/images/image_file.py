@@ -45,27 +45,23 @@ _KINDS = {
     b"MM\0+": "TIFF",
     b"\xff\xd8\xff": "JPEG",
 }
+# What is written under which suffix.
 WRITTEN_KINDS = {
     ".fits": "FITS", ".fit": "FITS", ".fts": "FITS", ".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF",
     ".jpg": "JPEG", ".jpeg": "JPEG",
 }  # fmt: skip
-"""What is written under which suffix."""
-_LUMINANCE = np.array([0.299, 0.587, 0.114])
-"""Weights of red, green and blue: ITU-R BT.601."""
-
+_LUMINANCE = np.array([0.299, 0.587, 0.114])  # weights of red, green and blue: ITU-R BT.601
 _BINOMIAL = np.array([0.25, 0.5, 0.25])
 
 _WCS_SUFFIXES = (".fits", ".fit", ".fts")
+# Keywords that a world coordinate system of a header is made of.
 _OF_A_WCS = re.compile(
     r"(WCSAXES|WCSNAME|C(TYPE|UNIT|RVAL|RPIX|DELT|ROTA)\d|(PC|CD)\d_\d|P[VS]\d_\d+|LONPOLE|LATPOLE"
     r"|RADE(SYS|CSYS)|EQUINOX|MJDREF[IF]?|[AB]P?_(ORDER|DMAX|\d_\d))"
 )
-"""Keywords that a world coordinate system of a header is made of."""
 
 
-def read_image(
-    path: Path, *, flip: bool | None = None, hdu: int | None = None, plane: int | None = None
-) -> Grey:
+def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None) -> Grey:
     """Read the grey values of an image.
 
     The FITS standard does not say which row is the top one. Programs that write arrays put the
@@ -86,7 +82,7 @@ def read_image(
         raise ConfigError(f"{path}: neither FITS nor PNG, TIFF or JPEG; convert it to one of these")
     try:
         if kind == "FITS":
-            values, upside_down = _read_fits(data, path, hdu, plane)
+            values, upside_down = _read_fits(data, path, plane)
         else:
             values, upside_down = _read_picture(data)
     except ConfigError as error:
@@ -100,9 +96,7 @@ def read_image(
     return np.ascontiguousarray(values, dtype=np.float64)
 
 
-def _read_fits(
-    data: bytes, path: Path, hdu: int | None, plane: int | None
-) -> tuple[NDArray[Any], bool]:
+def _read_fits(data: bytes, path: Path, plane: int | None) -> tuple[NDArray[Any], bool]:
     """Return the plane of a FITS file, and whether it says that its first row is the bottom."""
     from astropy.io import fits
     from astropy.utils.exceptions import AstropyWarning
@@ -111,7 +105,7 @@ def _read_fits(
         warnings.simplefilter("ignore", AstropyWarning)  # about headers, as cameras write them
         with fits.open(io.BytesIO(data), memmap=False) as parts:
             shapes = [part.shape if part.is_image else () for part in parts]
-            chosen = _part_of_fits(shapes, hdu, plane)
+            chosen = _part_of_fits(shapes, plane)
             _log.info("%s: HDU %d of %d (%s)", path, chosen, len(parts), _shapes_told(shapes))
             values = np.asarray(parts[chosen].data)
             order = str(parts[chosen].header.get("ROWORDER", "")).strip().upper()
@@ -122,12 +116,12 @@ def _read_fits(
     return grey, order == "BOTTOM-UP"
 
 
-def _part_of_fits(shapes: list[tuple[int, ...]], hdu: int | None, plane: int | None) -> int:
+def _part_of_fits(shapes: list[tuple[int, ...]], plane: int | None) -> int:
     """Return the HDU to be read: the first of one plane, else the first of three."""
     counts = [
         int(np.prod(shape[:-2])) if len(shape) >= 2 and min(shape) > 0 else 0 for shape in shapes
     ]
-    wanted = [number for number, count in enumerate(counts) if hdu in (None, number) and count]
+    wanted = [number for number, count in enumerate(counts) if count]
     if plane is not None:
         found = [number for number in wanted if 0 <= plane < counts[number]]
         if not found:

@@ -127,7 +127,6 @@ def draw_identified(
 ) -> None:
     """Draw which spots of a frame are which stars."""
     check_kind(path, "picture")
-    _check(image, camera_size, centroids_px, names, mag)
     with own_style():
         figure, axes, scale = _canvas(camera_size, title, below)
         frame = FrameAxes(
@@ -155,23 +154,6 @@ def compass_from_matrix(matrix: Matrix) -> tuple[Array, Array]:
     roll = np.radians(radec_roll_from_matrix(matrix)[2])
     north = np.array([-np.sin(roll), -np.cos(roll)])
     return north, np.array([north[1], -north[0]])
-
-
-def _check(
-    image: NDArray[Any] | None,
-    camera_size: tuple[int, int],
-    centroids_px: Pixels,
-    names: Sequence[str | None],
-    mag: Array | None,
-) -> None:
-    count = len(names)
-    if centroids_px.shape != (count, 2) or (mag is not None and mag.shape != (count,)):
-        raise ValueError(
-            f"{count} names, centroids_px of shape {centroids_px.shape}, mag of shape "
-            f"{None if mag is None else mag.shape}; expected one of each for every spot"
-        )
-    if image is not None and image.shape != camera_size[::-1]:
-        raise ValueError(f"image of shape {image.shape} from a camera of {camera_size} px")
 
 
 def _canvas(camera_size: tuple[int, int], title: str, below: str) -> tuple[Figure, Axes, float]:

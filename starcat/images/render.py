@@ -21,25 +21,18 @@ from starcat.images.image_file import WRITTEN_KINDS, write_image
 from starcat.matcher.centroids import write_centroids
 from starcat.simulation.simulate import Frame
 
-CENTROIDS_SUFFIX = ".csv"
-"""Suffix of the file that a simulated frame's centroids are written to."""
-
-_REACH_SIGMA = 6.0
-"""A star is drawn this far to each side: 4e-9 of its light falls outside."""
-_HOT_RANGE = (0.02, 0.5)
-"""Electrons of a hot pixel, as parts of the full well."""
-_MOST_ELECTRONS = 1e15
-"""Above it a count has no digits left; numpy draws none above 9e18."""
+CENTROIDS_SUFFIX = ".csv"  # suffix of the file that a simulated frame's centroids are written to
+_REACH_SIGMA = 6.0  # a star is drawn this far to each side: 4e-9 of its light falls outside
+_HOT_RANGE = (0.02, 0.5)  # electrons of a hot pixel, as parts of the full well
+_MOST_ELECTRONS = 1e15  # above it a count has no digits left; numpy draws none above 9e18
 
 
 @dataclass(frozen=True)
 class Optics:
     """A lens and a detector, for one exposure.
 
-    References
-    ----------
-    .. [1] Liebe 2002, "Accuracy performance of star trackers - a tutorial", IEEE Transactions
-       on Aerospace and Electronic Systems 38 (2), 587-599.
+    The light of a star is that of Liebe 2002, "Accuracy performance of star trackers - a
+    tutorial", IEEE Transactions on Aerospace and Electronic Systems 38 (2), 587-599.
     """
 
     psf_sigma_px: float = 1.0  # standard deviation of the Gaussian spot, pixels
@@ -53,14 +46,6 @@ class Optics:
     full_well_e: float = 50_000.0  # electrons that a pixel can hold; what is above is lost
     hot_pixels: int = 0  # pixels with a high dark current, at places that the seed gives
 
-    def __post_init__(self) -> None:
-        for name in ("psf_sigma_px", "gain_e_per_adu", "full_well_e"):
-            if not 0.0 < getattr(self, name) < np.inf:
-                raise ValueError(f"{name} is {getattr(self, name)}; expected a positive number")
-        for name in ("zero_point_e", "background_e", "read_noise_e", "bias_adu", "hot_pixels"):
-            if not 0.0 <= getattr(self, name) < np.inf:
-                raise ValueError(f"{name} is {getattr(self, name)}; expected 0 or more")
-
 
 def star_electrons(
     centroids_px: Pixels, mag: Array, camera_size: tuple[int, int], optics: Optics
@@ -68,7 +53,6 @@ def star_electrons(
     """Return the mean number of electrons that stars release, without background or noise."""
     width, height = camera_size
     centroids_px, mag = np.asarray(centroids_px), np.asarray(mag)
-    _check(centroids_px, mag, camera_size)
     image = np.zeros((height, width))
     drawn = np.isfinite(centroids_px).all(axis=1)
     electrons = optics.zero_point_e * 10.0 ** (-0.4 * mag[drawn])
@@ -83,18 +67,6 @@ def star_electrons(
         patch = image[max(y, 0) : y + size, max(x, 0) : x + size]
         patch += electrons[star] * down[:, None] * across
     return image
-
-
-def _check(centroids_px: Pixels, mag: Array, camera_size: tuple[int, int]) -> None:
-    if centroids_px.ndim != 2 or centroids_px.shape[1] != 2 or mag.shape != centroids_px.shape[:1]:
-        raise ValueError(
-            f"centroids_px of shape {centroids_px.shape} and mag of shape {mag.shape}; "
-            "expected (N, 2) and (N,)"
-        )
-    if not np.isfinite(mag).all():
-        raise ValueError("mag has values that are not finite; every star needs a magnitude")
-    if min(camera_size) < 1:
-        raise ValueError(f"camera_size is {camera_size}; expected at least 1 x 1 px")
 
 
 def _profiles(centre: Array, sigma: float) -> tuple[Array, NDArray[np.int64]]:

@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 import os
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib import import_module
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +23,11 @@ from starcat.arrays import Array
 from starcat.errors import ConfigError, ProductError
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
-from starcat.matcher.observation import Frame
+from starcat.matcher.observation import Dropped, Frame
 from starcat.matcher.prior import Prior
-from starcat.matcher.result import Status
+from starcat.matcher.result import MatchResult, Origin, Refusal, Status, no_match
 from starcat.matcher.settings import Settings
+from starcat.matcher.stars import ARCSEC
 from starcat.onboard.image import Contents, make_image
 from starcat.onboard.layout import FEATURES, METHODS
 
@@ -77,24 +78,6 @@ ANSWER = np.dtype(
 logarithm of the false-match probability, and the time that the library took."""
 
 
-@dataclass(frozen=True)
-class Answers:
-    """What the library found in N frames with K centroids in all."""
-
-    # The centroids of frame n are rows ``starts[n]`` to ``starts[n + 1]``; shape (N + 1,).
-    starts: NDArray[np.int64]
-    # A record a frame; attitudes are zeros unless it is identified; shape (N,).
-    frames: NDArray[np.void]
-    # Row of the database; -1 where none; a key of `DROPPED` where the centroid was not used;
-    # shape (K,).
-    star_index: NDArray[np.int32]
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether the library took all frames; a camera or limit may be beyond it."""
-        return all(code in STATUSES for code in self.frames["status"].tolist())
-
-
 def is_compiled() -> bool:
     """Return whether the C library is there."""
     return _onboard is not None
@@ -112,11 +95,116 @@ def most_stars() -> int:
     return int(_onboard.lib.STARCAT_MAX_STARS)
 
 
+Explain = Callable[[Frame], "Refusal | None"]
+
+
+@dataclass(frozen=True)
+class BatchResult(Sequence[MatchResult]):
+    """The answers of the C library to many frames of one camera."""
+
+    # A record of `ANSWER` a frame; attitudes are zeros unless it is identified.
+    records: NDArray[np.void]
+    # The centroids of frame n are rows ``starts[n]`` to ``starts[n + 1]`` of ``star_index``.
+    starts: NDArray[np.int64]
+    # Row of the database; -1 where none; a key of `DROPPED` where the centroid was not used.
+    star_index: NDArray[np.int32]
+    frames: Sequence[Frame]
+    database: Database
+    # Noise of a centroid, where it was stated.
+    noise_px: float | None = None
+    # Searches a frame again and says why it gets no answer, which the library does not.
+    explain: Explain | None = None
+    # Where the library looked for the stars.
+    origin: Origin = "lost_in_space"
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.records)
+
+    def __iter__(self) -> Iterator[MatchResult]:
+        """Return the answers one after the other."""
+        return (self[n] for n in range(len(self)))
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the library took all frames; a camera or limit may be beyond it."""
+        return all(code in STATUSES for code in self.records["status"].tolist())
+
+    @property
+    def status(self) -> list[Status]:
+        """What each frame came to."""
+        return [STATUSES[code] for code in self.records["status"].tolist()]
+
+    @property
+    def seconds(self) -> NDArray[np.float64]:
+        """Time that each frame took, without the call."""
+        return np.asarray(self.records["seconds"])
+
+    @property
+    def q_body_from_icrs(self) -> NDArray[np.float64]:
+        """Scalar-last attitudes, shape (N, 4); NaN unless identified."""
+        found = self.records
+        return np.where(found["status"][:, None] == 0, found["q_body_from_icrs"], np.nan)
+
+    @overload
+    def __getitem__(self, frame: int) -> MatchResult: ...
+    @overload
+    def __getitem__(self, frame: slice) -> list[MatchResult]: ...
+    def __getitem__(self, frame: int | slice) -> MatchResult | list[MatchResult]:
+        """Return the answer to one frame, or those to some."""
+        if isinstance(frame, slice):
+            return [self[n] for n in range(*frame.indices(len(self)))]
+        frame = range(len(self))[frame]
+        star = self.star_index[self.starts[frame] : self.starts[frame + 1]]
+        found, asked = self.records[frame], self.frames[frame]
+        facts: dict[str, Any] = {
+            "origin": self.origin,
+            "time_s": float(found["seconds"]),
+            "frame": asked,
+            "database": self.database,
+            "noise_px": self.noise_px,
+        }
+        code, dropped = int(found["status"]), _dropped(star)
+        if STATUSES[code] != "identified":
+            return no_match(len(star), dropped, self._why(code, asked), **facts)
+        answer = MatchResult(
+            "identified",
+            np.maximum(star, -1),
+            found["matrix"].copy(),
+            float(found["residual_rad"]) * ARCSEC,
+            math.exp(found["log_chance"]),
+            dropped,
+            asked.camera,
+            **facts,
+        )
+        # The library's own, which rounds otherwise than the one that the matrix makes.
+        vars(answer)["q_body_from_icrs"] = found["q_body_from_icrs"].copy()
+        return answer
+
+    def _why(self, code: int, frame: Frame) -> Refusal | Callable[[], Refusal | None] | None:
+        """Return why a frame has no answer, or what finds it out."""
+        if code == OUT_OF_STEPS:
+            return Refusal("steps")
+        if STATUSES[code] == "too_few_stars":
+            return Refusal("too_few_stars")
+        return None if self.explain is None else partial(self.explain, frame)
+
+
+def _dropped(star: NDArray[np.int32]) -> Dropped:
+    """Return row and reason of every centroid that was not used, repeats last."""
+    if star.min(initial=-1) >= -1:
+        return ()
+    rows = np.flatnonzero(star < -1)
+    reasons = [(int(row), DROPPED[int(star[row])]) for row in rows]
+    return tuple(sorted(reasons, key=lambda item: item[1] == "duplicate"))
+
+
 class CEngine:
     """An onboard image in memory, and the C library that reads it."""
 
     def __init__(
         self,
+        database: Database,
         data: bytes,
         rows: NDArray[np.int64] | None = None,
         directions: Array | None = None,
@@ -134,7 +222,7 @@ class CEngine:
             )
         count = int(self._image.n_stars)
         own = np.arange(count) if rows is None else rows
-        self._directions = directions
+        self._database, self._directions = database, directions
         # Numbers below 0 say why a centroid has no star; they index this table from its end.
         self._rows = np.concatenate([own, [-4, -3, -2, -1]]).astype(np.int32)
 
@@ -148,70 +236,66 @@ class CEngine:
         settings: Settings,
         prior: Prior | None = None,
         threads: int = 1,
-    ) -> Answers:
+        explain: Explain | None = None,
+    ) -> BatchResult:
         """Identify the stars of frames of one camera, with a prior of one frame near it."""
         starts = np.zeros(len(frames) + 1, dtype=np.int64)
-        if not frames:
-            return Answers(starts, np.zeros(0, ANSWER), np.zeros(0, np.int32))
-        if len(frames) == 1:  # by far the most frequent call
-            starts[1], px, mag = len(frames[0]), frames[0].centroids_px, frames[0].magnitudes
+        np.cumsum([len(frame) for frame in frames], out=starts[1:])
+        records, star_index = np.zeros(len(frames), ANSWER), np.full(starts[-1], -1, np.int32)
+        parts = [range(n, min(n + CHUNK, len(frames))) for n in range(0, len(frames), CHUNK)]
+        run = partial(self._run, frames, settings, prior, (starts, records, star_index))
+        if threads <= 1 or len(parts) <= 1:
+            for part in parts:
+                run(part)
         else:
-            np.cumsum([len(frame) for frame in frames], out=starts[1:])
-            px = np.concatenate([*(frame.centroids_px for frame in frames), np.empty((0, 2))])
-            given = [frame.magnitudes for frame in frames if frame.magnitudes is not None]
-            mag = np.concatenate(given) if given else None
-        x, y = np.ascontiguousarray(px.T)
-        work = _Work(
-            self._image,
-            self._directions,
-            _camera(frames[0].camera),
-            _options(settings),
-            (x, y, None if mag is None else np.ascontiguousarray(mag)),
-            prior,
-        )
-        answers = Answers(starts, np.zeros(len(frames), ANSWER), np.full(len(px), -1, np.int32))
-        if threads <= 1 or len(frames) <= CHUNK:
-            work.run(range(len(frames)), answers)
-        else:
-            slices = [range(n, min(n + CHUNK, len(frames))) for n in range(0, len(frames), CHUNK)]
             with ThreadPoolExecutor(min(threads, os.cpu_count() or 1)) as pool:
-                list(pool.map(lambda part: work.run(part, answers), slices))
-        return Answers(starts, answers.frames, self._rows[answers.star_index])
+                list(pool.map(run, parts))
+        return BatchResult(
+            records,
+            starts,
+            self._rows[star_index],
+            frames,
+            self._database,
+            settings.noise_px,
+            explain,
+            "lost_in_space" if prior is None else "tracking",
+        )
 
-
-@dataclass(frozen=True)
-class _Work:
-    """What the calls for the parts of many frames share."""
-
-    image: Any
-    directions: Array | None
-    camera: Any
-    options: Any
-    # x, y and, where they are known, magnitudes of all centroids.
-    columns: tuple[Array, Array, Array | None]
-    prior: Prior | None
-
-    def run(self, part: range, answers: Answers) -> None:
+    def _run(
+        self,
+        frames: Sequence[Frame],
+        settings: Settings,
+        prior: Prior | None,
+        answers: tuple[NDArray[np.int64], NDArray[np.void], NDArray[np.int32]],
+        part: range,
+    ) -> None:
         """Let the library answer some of the frames, in memory of its own."""
         ffi, lib = _onboard.ffi, _onboard.lib
-        prior = self.prior
+        starts, records, star_index = answers
+        some = [frames[n] for n in part]
+        first, last = starts[part.start], starts[part.stop]
+        px = some[0].centroids_px
+        mags = [frame.magnitudes for frame in some if frame.magnitudes is not None]
+        if len(some) > 1:  # one is by far the most frequent call
+            px = np.concatenate([frame.centroids_px for frame in some])
         arrays = (
-            ("int64_t[]", answers.starts[part.start :]),
-            *(("double[]", column) for column in self.columns),
+            ("int64_t[]", starts[part.start : part.stop + 1] - first),
+            *(("double[]", column) for column in np.ascontiguousarray(px.T)),
+            ("double[]", np.concatenate(mags) if mags else None),
             ("double[]", None if prior is None else prior.q_body_from_icrs),
-            ("double[]", self.directions),
+            ("double[]", self._directions),
         )
         *pointers, directions = (
             ffi.NULL if array is None else ffi.from_buffer(kind, array) for kind, array in arrays
         )
         error_rad = 0.0 if prior is None else prior.error_rad
         lib.starcat_many(
-            self.image,
-            self.camera,
-            self.options,
+            self._image,
+            _camera(some[0].camera),
+            _options(settings),
             ffi.new("starcat_frames *", [len(part), *pointers, error_rad, directions]),
-            ffi.from_buffer("starcat_answer[]", answers.frames[part.start :]),
-            ffi.from_buffer("int32_t[]", answers.star_index),
+            ffi.from_buffer("starcat_answer[]", records[part.start : part.stop]),
+            ffi.from_buffer("int32_t[]", star_index[first:last]),
             *_memory(),
         )
 
@@ -279,7 +363,7 @@ def _count(database: Database, method: str) -> int:
 
 def _made(database: Database, method_number: int) -> CEngine | None:
     if database.image is not None:
-        return CEngine(database.image.data)
+        return CEngine(database, database.image.data)
     method = METHODS[method_number]
     product, columns = FEATURES[method]
     arrays = database.products[product]
@@ -301,4 +385,4 @@ def _made(database: Database, method_number: int) -> CEngine | None:
     if made.most_near > most_stars():
         return None
     exact = np.ascontiguousarray(database.directions[made.star_rows])
-    return CEngine(made.data, made.star_rows, exact)
+    return CEngine(database, made.data, made.star_rows, exact)

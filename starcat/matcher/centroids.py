@@ -29,24 +29,16 @@ _LIGHT = ("flux", "sum")
 
 @dataclass(frozen=True)
 class MeasuredFrame:
-    """The centroids of one frame, as a file has them.
+    """The centroids of one frame, as a file has them."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the frame; that of the file where the frame has none of its own.
-    centroids_px : ndarray of float64, shape (N, 2)
-        Pixels, in the order of the file.
-    mag : ndarray of float64, shape (N,), or None
-        Magnitudes, NaN where a centroid has none; None where the file has none. Those of light
-        are -2.5 log10 of it, their zero point unknown.
-    ignored : tuple of str
-        Columns or keys of the file that are not known, and so were not used.
-    """
-
+    # Name of the frame; that of the file where the frame has none of its own.
     name: str
+    # Pixels, in the order of the file; shape (N, 2).
     centroids_px: Array
+    # Magnitudes, NaN where a centroid has none; None where the file has none. Those of light are
+    # -2.5 log10 of it, their zero point unknown; shape (N,).
     mag: Array | None = None
+    # Columns or keys of the file that are not known, and so were not used.
     ignored: tuple[str, ...] = ()
 
 

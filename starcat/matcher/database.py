@@ -26,7 +26,14 @@ from starcat.errors import ArtifactMissing, ProductError, SchemaVersionError, St
 from starcat.geometry.camera import Camera
 from starcat.onboard.reading import OnboardImage, read_image
 from starcat.storage.hdf5 import own_dataset, own_group
-from starcat.storage.product_table import LARGEST, MAY_BE_UNKNOWN, PRODUCTS, RANGES, Numbers
+from starcat.storage.product_table import (
+    LARGEST,
+    MAY_BE_UNKNOWN,
+    PRODUCTS,
+    RANGES,
+    SMALLEST,
+    Numbers,
+)
 
 Made = TypeVar("Made")
 
@@ -249,7 +256,7 @@ def check_product(
         if not math.isfinite(numbers[attribute]) or abs(numbers[attribute]) > LARGEST:
             raise _damaged(name, f"attribute {attribute}", f"is {numbers[attribute]}")
     for attribute in layout.numbers:
-        if numbers[attribute] <= 0.0:
+        if numbers[attribute] < SMALLEST:
             raise _damaged(name, f"attribute {attribute}", f"is {numbers[attribute]}")
     for column in layout.texts:
         checks.shape(column, "S", rows)

@@ -7,19 +7,18 @@ reference is in numpy; where it can, the C library answers, with the same stars.
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
 
 from numpy.typing import ArrayLike
 
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
-from starcat.matcher.batch import BatchResult
 from starcat.matcher.blind import identify_blind
 from starcat.matcher.c_engine import CEngine, c_engine, is_compiled
 from starcat.matcher.database import Database, open_database, open_image, products_in
@@ -27,8 +26,16 @@ from starcat.matcher.methods.table import best_method, method_named
 from starcat.matcher.numpy_engine import solve
 from starcat.matcher.observation import WIDEST_FOV_ERROR, Frame, as_frame
 from starcat.matcher.prior import Prior, prior_of
-from starcat.matcher.result import MatchResult, Origin, Refusal
-from starcat.matcher.settings import Settings
+from starcat.matcher.result import MatchResult, Refusal
+from starcat.matcher.settings import (
+    CERTAIN,
+    MIN_SHARE,
+    Engine,
+    Settings,
+    TriangleOrder,
+    check_scale_free,
+    has_default_search,
+)
 from starcat.onboard.layout import FEATURES
 from starcat.onboard.reading import is_image
 
@@ -74,7 +81,16 @@ class Matcher(Settings, _WithDatabase):
         cls,
         artifact: str | os.PathLike[str],
         method: str | None = "triangle",
-        **settings: Any,
+        *,
+        tolerance_px: float | None = None,
+        max_false_match_probability: float = CERTAIN,
+        selection: TriangleOrder = TriangleOrder(),  # noqa: B008
+        noise_px: float | None = None,
+        noise_mag: float | None = None,
+        engine: Engine = "auto",
+        min_share: float = MIN_SHARE,
+        max_steps: float = math.inf,
+        time_limit_s: float = math.inf,
     ) -> Matcher:
         """Open the database of an artifact, or an onboard image.
 
@@ -86,8 +102,9 @@ class Matcher(Settings, _WithDatabase):
         method : str, default "triangle"
             A key of `METHODS`; None for the best one that the artifact's products allow. An
             image has one method, which is used whatever is asked for.
-        **settings
-            Any of the other attributes but ``database``, by name.
+        tolerance_px, max_false_match_probability, selection, noise_px, noise_mag, engine, \
+        min_share, max_steps, time_limit_s
+            As the attributes.
 
         Returns
         -------
@@ -106,15 +123,26 @@ class Matcher(Settings, _WithDatabase):
         if is_image(path):
             database = open_image(path)
             chosen = database.image.method if database.image else ""
-            if settings.get("engine", "auto") == "auto":
-                settings["engine"] = "c"
+            engine = "c" if engine == "auto" else engine
         else:
             held = products_in(path)
             chosen = best_method(held) if method is None else method
             known = method_named(chosen)
             usable = (name for name in known.optional if name in held)
             database = open_database(path, (*known.products, *usable))
-        return cls(database, chosen, **settings)
+        return cls(
+            database,
+            chosen,
+            tolerance_px,  # type: ignore[arg-type]
+            max_false_match_probability,
+            selection,
+            noise_px=noise_px,
+            noise_mag=noise_mag,
+            engine=engine,
+            min_share=min_share,
+            max_steps=max_steps,
+            time_limit_s=time_limit_s,
+        )
 
     def identify(
         self,
@@ -216,7 +244,7 @@ class Matcher(Settings, _WithDatabase):
         return self._answers(given, threads=threads or os.cpu_count() or 1)
 
     @cached_property
-    def settings(self) -> Settings:
+    def _settings(self) -> Settings:
         """The settings without the database."""
         return Settings(**{field.name: getattr(self, field.name) for field in fields(Settings)})
 
@@ -224,7 +252,7 @@ class Matcher(Settings, _WithDatabase):
     def _c_engine(self) -> CEngine | None:
         """The C library with this matcher's image, where it serves."""
         is_wide = self.engine == "auto" and self.tolerance_px > WIDE_PX
-        if self.engine == "numpy" or not self.has_default_search:
+        if self.engine == "numpy" or not has_default_search(self):
             return None
         if is_wide and self.database.image is None:
             return None
@@ -238,7 +266,7 @@ class Matcher(Settings, _WithDatabase):
             )
         if self.method not in FEATURES:
             return f"method {self.method!r} is not in C; choose one of {', '.join(FEATURES)}"
-        if not self.has_default_search:
+        if not has_default_search(self):
             return "it has no other selection, share of the frame and limits than the default ones"
         return f"{self.database.name} has too many stars or features for an onboard image"
 
@@ -248,13 +276,11 @@ class Matcher(Settings, _WithDatabase):
         """Identify frames in C, or all of them with numpy where the library does not take one."""
         engine = self._c_engine
         if engine is not None and all(engine.accepts(len(frame)) for frame in frames):
-            found = engine.identify(frames, self.settings, prior, threads)
-            if found.is_whole:
-                explain = None if self.database.image else partial(self._explain, prior)
-                origin: Origin = "lost_in_space" if prior is None else "tracking"
-                answers = BatchResult(found, frames, self.database, self.noise_px, explain, origin)
-                if prior is None:
-                    return answers
+            explain = None if self.database.image else partial(self._explain, prior)
+            answers = engine.identify(frames, self._settings, prior, threads, explain)
+            if answers.is_whole and prior is None:
+                return answers
+            if answers.is_whole and prior is not None:
                 return [prior.checked(answers[0], frames[0].camera, self.tolerance_px)]
         return [self._timed(frame, partial(solve, prior=prior)) for frame in frames]
 
@@ -262,7 +288,7 @@ class Matcher(Settings, _WithDatabase):
         """Return why the C library has no answer: what the search with numpy comes to."""
         # What is unlikely enough for one of the two searches near a prior may not be found by
         # the other.
-        found = solve(self.settings, self.database, frame, prior=prior)
+        found = solve(self._settings, self.database, frame, prior=prior)
         return Refusal("prior") if found.ok and prior is not None else found.refusal
 
     def _timed(
@@ -270,7 +296,7 @@ class Matcher(Settings, _WithDatabase):
     ) -> MatchResult:
         """Identify a frame with numpy, and say how long that took and what was asked."""
         before_s = time.perf_counter()
-        found = search(self.settings, self.database, frame)
+        found = search(self._settings, self.database, frame)
         return replace(
             found,
             time_s=time.perf_counter() - before_s,
@@ -283,7 +309,7 @@ class Matcher(Settings, _WithDatabase):
         if self.database.image is not None:
             text = "an onboard image needs the focal length; open the artifact that it is of"
             raise ConfigError(text, key="fov_error", value=fov_error)
-        self.check_scale_free()
+        check_scale_free(self)
         if not 0.0 < fov_error <= WIDEST_FOV_ERROR:
             text = f"fov_error is {fov_error}; expected 0 to {WIDEST_FOV_ERROR:g}"
             raise ConfigError(text, key="fov_error", value=fov_error)

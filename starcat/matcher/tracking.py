@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 
 from numpy.typing import ArrayLike
 
@@ -97,11 +98,9 @@ class Tracker:
 
         Parameters
         ----------
-        centroids_px, camera, magnitudes, fov_error
-            As for `Matcher.identify`.
-        prior, prior_error_deg
-            As for `Matcher.identify`; they take the place of the prediction, as what a gyroscope
-            says does.
+        centroids_px, camera, magnitudes, fov_error, prior, prior_error_deg
+            As for `Matcher.identify`; a prior, of a gyroscope for example, takes the place of the
+            prediction.
         time_s : float, optional
             Time of the frame, later than that of the one before; frames without a time are
             one after the other at equal intervals. Give it for every frame, or for none.
@@ -122,20 +121,14 @@ class Tracker:
         expected, error_deg = prior, prior_error_deg
         if expected is None and error_deg is None:
             expected, error_deg = self._predicted(now, camera)
+        identify = partial(
+            self.matcher.identify, centroids_px, camera, magnitudes=magnitudes, fov_error=fov_error
+        )
         found = None
         if expected is not None or error_deg is not None:
-            found = self.matcher.identify(
-                centroids_px,
-                camera,
-                magnitudes=magnitudes,
-                fov_error=fov_error,
-                prior=expected,
-                prior_error_deg=error_deg,
-            )
+            found = identify(prior=expected, prior_error_deg=error_deg)
         if found is None or found.status == "no_match":
-            found = self.matcher.identify(
-                centroids_px, camera, magnitudes=magnitudes, fov_error=fov_error
-            )
+            found = identify()
         self._time = now
         if found.ok:
             x, y, z, w = found.q_body_from_icrs.tolist()

@@ -49,8 +49,7 @@ from starcat.pipeline.report_data import (
 from starcat.products.boresights import FieldStars
 from starcat.products.coverage import field_coverage
 from starcat.progress import Progress, no_progress
-from starcat.report.coverage_report import CoverageReport, holes_warning
-from starcat.report.report import write_report
+from starcat.report.report import CoverageReport, holes_warning, write_report
 from starcat.simulation.selftest import Rates, self_test
 from starcat.specs.build_spec import BuildSpec
 from starcat.storage.atomic import Outcome, move_into_place, whole_folder

@@ -16,13 +16,13 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from starcat.artifact.crossmatch_table import (
+from starcat.artifact.manifest import SourceFacts
+from starcat.artifact.other_catalogs import (
     NEEDED,
     counterparts_of,
     moving_stars,
     table_from_matches,
 )
-from starcat.artifact.manifest import SourceFacts
 from starcat.artifact.writer import Product
 from starcat.catalog.ingest import Ingested
 from starcat.catalog.selection import Selected

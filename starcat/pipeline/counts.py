@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
@@ -21,8 +20,6 @@ from starcat.products.boresights import FieldStars
 from starcat.products.levels import level_fields, thin_levels
 from starcat.specs.build_spec import BuildSpec
 
-Counts = NDArray[np.int64]
-
 SAMPLE = 2000
 """Stars around which neighbours are counted, and triangles whose fields are."""
 
@@ -32,8 +29,6 @@ for neighbours; so many lose little."""
 
 QUANTILES = 64
 """Numbers of neighbours that stand for those of all stars, where a pattern's cells are counted."""
-
-GOLDEN_RATIO = 0.5 * (1.0 + 5.0**0.5)
 
 
 @dataclass(frozen=True)
@@ -169,29 +164,11 @@ def count_triangles(fields: FieldStars, stars: int, brightest: int) -> tuple[flo
     held = np.ones(len(star), dtype=np.int32)
     of_field = csr_array((held, star, offsets), shape=(len(size), stars))
     of_star = of_field.T.tocsr()
-    # Multiples of the golden ratio are spread evenly, and never in step with the fields.
-    chosen = (np.arange(min(records, SAMPLE)) * GOLDEN_RATIO % 1.0 * records).astype(np.int64)
-    ends = np.cumsum(each)
-    field = np.searchsorted(ends, chosen, side="right")
-    members = triple_of_rank(chosen - (ends[field] - each[field]))
+    generator = np.random.default_rng(0)
+    field = generator.choice(len(size), SAMPLE, p=each / records)
+    drawn = generator.random((SAMPLE, size.max()))
+    drawn[np.arange(size.max()) >= size[field, None]] = 2.0  # no star of the field
+    members = np.argsort(drawn, axis=1)[:, :3]
     i, j, k = star[offsets[field][:, None] + members].T
     shared = of_star[i].multiply(of_star[j]).multiply(of_star[k]).sum(axis=1)
     return float(records), float(records * np.mean(1.0 / np.asarray(shared).ravel()))
-
-
-def triple_of_rank(rank: Counts) -> Counts:
-    """Return three numbers for each rank, each three of them once.
-
-    Examples
-    --------
-    >>> triple_of_rank(np.array([0, 1, 3, 4]))
-    array([[0, 1, 2],
-           [0, 1, 3],
-           [1, 2, 3],
-           [0, 1, 4]])
-    """
-    n = np.arange(2 + int(np.ceil((6.0 * (1.0 + rank.max(initial=0))) ** (1.0 / 3.0))) + 1)
-    k = np.searchsorted(n * (n - 1) * (n - 2) // 6, rank, side="right") - 1
-    rest = rank - k * (k - 1) * (k - 2) // 6
-    j = np.searchsorted(n * (n - 1) // 2, rest, side="right") - 1
-    return np.stack([rest - j * (j - 1) // 2, j, k], axis=-1)

@@ -42,7 +42,7 @@ from starcat.products.coverage import (
 )
 from starcat.products.levels import boresights_of_level, level_fields
 from starcat.progress import Progress, no_progress
-from starcat.report.coverage_report import holes_warning
+from starcat.report.report import holes_warning
 from starcat.specs.build_spec import BuildSpec, Selection
 from starcat.storage.schema import product_schema
 

@@ -23,20 +23,21 @@ from starcat.pipeline.counterparts import (
     read_star_table,
     schema_with_own_names,
 )
-from starcat.pipeline.match_pieces import Judged, judge_piece, measure_piece
-from starcat.pipeline.match_plan import (
+from starcat.pipeline.match_pieces import (
     PIECE_LOAD,
     Extent,
     Job,
+    Judged,
     Piece,
     extent_of_partition,
     hop_of,
+    judge_piece,
+    measure_piece,
     numbers_path,
     pieces_of,
     rows_path,
 )
-from starcat.pipeline.match_summary import Summary, Tally, summary_of
-from starcat.pipeline.medians import median_of
+from starcat.pipeline.match_summary import Summary, Tally, median_of, summary_of
 from starcat.pipeline.star_rows import opened, store_of_file
 from starcat.products.match_figures import ARCSEC, Measured, figures_of
 from starcat.progress import Progress, no_progress

@@ -1,38 +1,42 @@
-"""What a cross-identification found, in counts that parts add up to and in words for people."""
+"""What a cross-identification found: counts that parts add up to, medians of many files."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.artifact.crossmatch_table import matched_stars
+from starcat.artifact.other_catalogs import matched_stars
 from starcat.products.crossmatch import VERDICTS, Matches
-from starcat.products.match_figures import ARCSEC
+from starcat.products.match_figures import ARCSEC, Figures
+from starcat.products.match_odds import Odds
+from starcat.storage.atomic import whole_file
+
+_STEP_BITS = 16
+_CHUNK = 1 << 20
 
 
 @dataclass(frozen=True)
 class Summary:
     """What a cross-identification of two catalogs found."""
 
-    # stars, counterparts: rows of the two
     stars: int
     counterparts: int
     radius_arcsec: float  # largest separation of a candidate
-    # matched, unmatched: stars with a counterpart, be it ambiguous, and all others
-    matched: int
-    unmatched: int
+    matched: int  # stars with a counterpart, be it ambiguous
+    unmatched: int  # all others
     verdicts: dict[str, int]  # stars by the verdict on their likeliest candidate
     no_candidate: int  # stars with none within the radius
     mutual: int  # stars that are their likeliest candidate's likeliest star
-    # median_separation_arcsec, median_delta_mag: over the matched stars; None where there is none
-    median_separation_arcsec: float | None
+    median_separation_arcsec: float | None  # over the matched stars; None where there is none
     median_delta_mag: float | None
-    # position_error_arcsec, expected_delta_mag, completeness: the figures behind the odds, given or
-    # measured
+    # The figures behind the odds, given or measured:
     position_error_arcsec: float
     expected_delta_mag: float
     completeness: float
@@ -68,22 +72,6 @@ class Tally:
         )
 
 
-class MeasuredFigures(Protocol):
-    """The figures behind the odds."""
-
-    @property
-    def position_error_rad(self) -> float:
-        """Standard deviation of the difference of two positions, each axis."""
-
-    @property
-    def delta_mag(self) -> float:
-        """Magnitude of the counterpart minus that of the star."""
-
-    @property
-    def completeness(self) -> float:
-        """Share of the stars that have a counterpart."""
-
-
 def tally_of(found: Matches, table: pa.Table) -> Tally:
     """Count what was found."""
     first = found.rank == 1
@@ -107,7 +95,7 @@ def summary_of(
     tally: Tally,
     rows: tuple[int, int],
     radius_arcsec: float,
-    figures: MeasuredFigures,
+    figures: Figures | Odds,
     median_separation_arcsec: float | None,
     median_delta_mag: float | None,
 ) -> Summary:
@@ -128,3 +116,51 @@ def summary_of(
         round(figures.delta_mag, 6),
         round(figures.completeness, 6),
     )
+
+
+def write_numbers(values: Array, path: Path) -> None:
+    """Write numbers to a file that `median_of` reads."""
+    with whole_file(path) as partial:
+        partial.write_bytes(np.ascontiguousarray(values, dtype="<f8").tobytes())
+
+
+def median_of(paths: Sequence[Path]) -> tuple[int, float | None]:
+    """Return how many numbers files have, and the median of all.
+
+    Notes
+    -----
+    The bits of a float, its sign inverted, are a number in the same order. The median's are found
+    16 at a time, highest first, by counting in four passes those that begin alike.
+    """
+    count = sum(path.stat().st_size for path in paths) // 8
+    if not count:
+        return 0, None
+    lower, upper = _ranked(paths, (count - 1) // 2), _ranked(paths, count // 2)
+    return count, lower if count % 2 else (lower + upper) / 2.0
+
+
+def _ranked(paths: Sequence[Path], rank: int) -> float:
+    """Return the number that so many are before in ascending order."""
+    start = 0
+    for shift in range(64 - _STEP_BITS, -1, -_STEP_BITS):
+        counts = np.zeros(1 << _STEP_BITS, dtype=np.int64)
+        for keys in _keys(paths):
+            here = keys if shift + _STEP_BITS == 64 else keys[keys >> (shift + _STEP_BITS) == start]
+            step = (here >> np.uint64(shift)) & np.uint64((1 << _STEP_BITS) - 1)
+            counts += np.bincount(step.astype(np.int64), minlength=len(counts))
+        before = np.cumsum(counts)
+        found = int(np.searchsorted(before, rank, side="right"))
+        rank -= int(before[found] - counts[found])
+        start = start << _STEP_BITS | found
+    bits = start ^ (1 << 63) if start >> 63 else start ^ ((1 << 64) - 1)
+    return float(np.array([bits], dtype=np.uint64).view(np.float64)[0])
+
+
+def _keys(paths: Sequence[Path]) -> Iterator[NDArray[np.uint64]]:
+    """Yield the numbers as integers that are in the same order."""
+    for path in paths:
+        with path.open("rb") as file:
+            while data := file.read(8 * _CHUNK):
+                bits = np.frombuffer(data, dtype="<u8").astype(np.uint64)
+                is_negative = bits >> np.uint64(63) == 1
+                yield np.where(is_negative, ~bits, bits | np.uint64(1 << 63))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array
 from starcat.artifact.manifest import SourceFacts
-from starcat.artifact.motion_table import JOINED, NO_CANDIDATE, NO_MOTION, OWN_MOTION
+from starcat.artifact.other_catalogs import JOINED, NO_CANDIDATE, NO_MOTION, OWN_MOTION
 from starcat.artifact.writer import Product
 from starcat.catalog.ingest import Ingested, unmoved_stars
 from starcat.catalog.proper_motion import Motion, propagate

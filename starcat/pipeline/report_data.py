@@ -27,8 +27,7 @@ from starcat.pipeline.guide_stars import MIN_GUIDE_STARS
 from starcat.pipeline.recipes import field_size
 from starcat.products.boresights import FieldStars, tile_sphere
 from starcat.products.coverage import Coverage, coverage_from_counts
-from starcat.report.coverage_report import CoverageReport, holes_warning, report_coverage
-from starcat.report.report import count_magnitudes
+from starcat.report.report import CoverageReport, count_magnitudes, holes_warning, report_coverage
 from starcat.simulation.selftest import Rates
 from starcat.specs.build_spec import BuildSpec
 

@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from starcat.artifact.crossmatch_table import NEEDED
+from starcat.artifact.other_catalogs import NEEDED
 from starcat.errors import ParseError, ProductError, SchemaError, reason
 from starcat.pipeline.counterparts import check_star_columns
 from starcat.storage.schema import product_schema

@@ -35,7 +35,6 @@ class FieldSize(Protocol):
 class NominalField:
     """A field of view that is stated, not that of a detector."""
 
-    # fov_x_deg, fov_y_deg: full angles across width and height, degrees
     fov_x_deg: float
     fov_y_deg: float
 
@@ -44,7 +43,7 @@ class NominalField:
 class FieldStars:
     """The stars in each of a number of fields."""
 
-    boresights: Directions  # shape (F, 3): ICRS directions
+    boresights: Directions
     # shape (F + 1,): the stars of field f are ``star_index[offsets[f]:offsets[f + 1]]``
     offsets: NDArray[np.int64]
     # shape (M,): rows of the star table, brightest first within a field

@@ -23,9 +23,9 @@ Counts = NDArray[np.int64]
 class Coverage:
     """What the field of each boresight holds."""
 
-    boresights: Directions  # shape (F, 3): ICRS directions
+    boresights: Directions
     stars: Counts  # shape (F,): guide stars in the field
-    pairs: Counts  # shape (F,): pairs of them
+    pairs: Counts  # shape (F,)
     triangles: Counts  # shape (F,): triangles of the brightest of them
 
 
@@ -39,21 +39,19 @@ class Spread:
     one_percent: int
     median: int
     maximum: int
-    mean: float  # the numbers over all fields
+    mean: float
 
 
 @dataclass(frozen=True)
 class CoverageSummary:
     """The coverage of the sphere in a few numbers."""
 
-    fields: int  # number of boresights
-    # stars, pairs, triangles: the numbers of a field
+    fields: int
     stars: Spread
     pairs: Spread
     triangles: Spread
     # the field with the fewest stars; the first along the spiral where several have
     worst_boresight: int
-    # worst_ra_deg, worst_dec_deg: its direction, degrees, ICRS
     worst_ra_deg: float
     worst_dec_deg: float
     histogram: Counts  # shape (maximum + 1,): ``histogram[n]`` fields hold n stars
@@ -63,11 +61,10 @@ class CoverageSummary:
 class TilingGap:
     """The direction that is farthest from all boresights."""
 
-    boresights: int  # how many there are
+    boresights: int
     tile_radius_rad: float  # radius of the largest circle inside the field: seen whatever the roll
     # every direction has a boresight within it, and this one none nearer
     covering_radius_rad: float
-    # ra_deg, dec_deg: the direction, degrees, ICRS
     ra_deg: float
     dec_deg: float
 

@@ -15,11 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from starcat.arrays import Array, Mask
+from starcat.arrays import Array
 from starcat.geometry.sphere import chord_from_separation, separation
-from starcat.products.match_figures import Figures, MatchModel, figures_of, measure
-from starcat.products.match_odds import Odds, match_odds
-from starcat.products.match_probability import runs
+from starcat.products.match_figures import (
+    Figures,
+    MatchModel,
+    MovingStars,
+    Pairs,
+    figures_of,
+    measure,
+)
+from starcat.products.match_odds import Odds, match_odds, runs
 from starcat.products.star_counts import Census
 
 Rows = NDArray[np.int64]
@@ -34,87 +40,15 @@ CHUNK = 1 << 17
 
 
 @dataclass(frozen=True)
-class MovingStars:
-    """Stars of one catalog, each at its own epoch."""
-
-    directions: Array  # shape (N, 3): ICRS unit vectors at ``epoch_jyear``
-    # shape (N, 3): proper motions as vectors along the sky, radians a year; 0 where unknown
-    velocities: Array
-    has_motion: Mask  # shape (N,): whether the proper motion is known
-    epoch_jyear: Array  # shape (N,): Julian years
-    mag: Array  # shape (N,): magnitudes; NaN where unknown
-    # shape (N,): standard deviations of the positions, each axis, radians
-    error_rad: Array | None = None
-
-    def at(self, rows: Rows, epoch_jyear: Array | float) -> Array:
-        """Return directions at an epoch.
-
-        Parameters
-        ----------
-        rows : ndarray of int64, shape (M,)
-            Which stars.
-        epoch_jyear : ndarray of float64, shape (M,) or float
-            Julian years; stars without proper motion stay.
-
-        Returns
-        -------
-        ndarray of float64, shape (M, 3)
-            ICRS unit vectors.
-        """
-        years = np.broadcast_to(epoch_jyear, len(rows)) - self.epoch_jyear[rows]
-        moved: Array = self.directions[rows] + self.velocities[rows] * years[:, None]
-        moved /= np.sqrt(np.einsum("ij,ij->i", moved, moved))[:, None]
-        return moved
-
-
-@dataclass(frozen=True)
-class Pairs:
-    """Stars and candidate counterparts within a radius; arrays of shape (M,)."""
-
-    # star, counterpart: rows of the two sets
-    star: Rows
-    counterpart: Rows
-    separation_rad: Array  # radians, at ``epoch_jyear``
-    epoch_jyear: Array  # Julian year at which the two were compared
-    unmoved_years: Array  # years between their positions where neither could be moved, else 0
-
-    def take(self, rows: Rows | Mask) -> Pairs:
-        """Return some of the pairs.
-
-        Parameters
-        ----------
-        rows : ndarray of int64 or bool, shape (K,)
-            Which ones.
-
-        Returns
-        -------
-        Pairs
-            In the order of the rows.
-        """
-        return Pairs(
-            self.star[rows],
-            self.counterpart[rows],
-            self.separation_rad[rows],
-            self.epoch_jyear[rows],
-            self.unmoved_years[rows],
-        )
-
-
-@dataclass(frozen=True)
 class Matches:
     """Every candidate of every star, by star and rank; arrays of shape (M,)."""
 
-    # star, counterpart: rows of the two sets
-    star: Rows
-    counterpart: Rows
-    # rank, star_rank: rank of the candidate among those of its star, and of the star among those of
-    # its candidate; 1 is the likeliest
-    rank: Rows
-    star_rank: Rows
-    # n_candidates, n_stars: candidates of the star, and stars that the candidate is one of, within
-    # the radius
-    n_candidates: Rows
-    n_stars: Rows
+    star: Rows  # of the first set
+    counterpart: Rows  # of the other set
+    rank: Rows  # of the candidate among those of its star; 1 is the likeliest
+    star_rank: Rows  # of the star among those of its candidate
+    n_candidates: Rows  # of the star, within the radius
+    n_stars: Rows  # that the candidate is one of
     separation_rad: Array  # radians, at ``epoch_jyear``
     # magnitude of the candidate minus that of the star; NaN where either is unknown
     delta_mag: Array
@@ -123,33 +57,11 @@ class Matches:
     verdict: Rows  # index into `VERDICTS`
 
     def count(self, verdict: str) -> int:
-        """Return how many stars have a best candidate with a verdict.
-
-        Parameters
-        ----------
-        verdict : str
-            One of `VERDICTS`.
-
-        Returns
-        -------
-        int
-            Stars.
-        """
+        """Return how many stars have a best candidate with a verdict."""
         return int(((self.rank == 1) & (self.verdict == VERDICTS.index(verdict))).sum())
 
     def take(self, order: Rows) -> Matches:
-        """Return some of the matches.
-
-        Parameters
-        ----------
-        order : ndarray of int64, shape (K,)
-            Rows.
-
-        Returns
-        -------
-        Matches
-            In that order.
-        """
+        """Return some of the matches."""
         arrays = {name: value[order] for name, value in vars(self).items() if name != "odds"}
         return Matches(**arrays, odds=self.odds.take(order))
 
@@ -199,27 +111,11 @@ def judged(
     figures: Figures,
     model: MatchModel,
 ) -> Matches:
-    """Give every pair its odds, ranks and verdict.
+    """Give every pair its odds, ranks and verdict, in order of (star, rank).
 
-    Parameters
-    ----------
-    stars, counterparts : MovingStars
-        The two catalogs, or parts of them.
-    pairs : Pairs
-        All candidates within the radius, by star and counterpart. Where the catalogs are parts,
-        only pairs whose star and candidate have all their other pairs here are judged rightly,
-        and their probabilities are right where that is so of their whole cluster.
-    radius_rad : float
-        Largest separation of a candidate.
-    figures : Figures
-        What is known of the two whole catalogs.
-    model : MatchModel
-        Errors of positions and magnitudes, and what the verdicts ask for.
-
-    Returns
-    -------
-    Matches
-        In order of (star, rank).
+    The figures are those of the whole catalogs. Where stars and counterparts are parts of them,
+    only pairs whose star and candidate have all their other pairs here are judged rightly, and
+    their probabilities are right where that is so of their whole cluster.
     """
     odds = match_odds(stars, counterparts, pairs, radius_rad, figures, model)
     i, j = pairs.star, pairs.counterpart

@@ -18,15 +18,7 @@ from starcat.geometry.kvector import KVector
 
 @dataclass(frozen=True)
 class Ragged:
-    """A list a row.
-
-    Attributes
-    ----------
-    offsets : ndarray of int64, shape (N + 1,)
-        The list of row n is ``values[offsets[n]:offsets[n + 1]]``.
-    values : ndarray, shape (M,)
-        All lists, one behind the other.
-    """
+    """A list a row: that of row n is ``values[offsets[n]:offsets[n + 1]]``."""
 
     offsets: NDArray[np.int64]
     values: NDArray[Any]
@@ -34,34 +26,14 @@ class Ragged:
 
 @dataclass(frozen=True)
 class Index:
-    """Arrays and numbers beside a product's columns, kept in the HDF5 file alone.
-
-    Attributes
-    ----------
-    datasets : dict of str to ndarray
-        By name; descriptions are in the schema's text.
-    attributes : dict of str to float
-        By name, with units in the names.
-    """
+    """Arrays and numbers beside a product's columns, kept in the HDF5 file alone."""
 
     datasets: dict[str, NDArray[Any]] = field(default_factory=dict)
-    attributes: dict[str, float] = field(default_factory=dict)
+    attributes: dict[str, float] = field(default_factory=dict)  # with units in the names
 
 
 def kvector_index(kvector: KVector) -> Index:
-    """Return a K-vector as an index.
-
-    Parameters
-    ----------
-    kvector : KVector
-        Over the product's sort key.
-
-    Returns
-    -------
-    Index
-        Dataset ``kvector_counts``; attributes ``kvector_intercept`` and ``kvector_slope``, in
-        the unit of the sort key.
-    """
+    """Return a K-vector as an index: its counts, intercept and slope."""
     line = {"kvector_intercept": kvector.intercept, "kvector_slope": kvector.slope}
     return Index({"kvector_counts": kvector.counts}, line)
 
@@ -69,20 +41,8 @@ def kvector_index(kvector: KVector) -> Index:
 def row_offsets(key: NDArray[np.integer[Any]], count: int) -> NDArray[np.int64]:
     """Return where the rows of each key begin in a table sorted by it.
 
-    Parameters
-    ----------
-    key : ndarray of int, shape (M,)
-        Ascending, 0 to ``count - 1``.
-    count : int
-        Number of keys.
+    The rows of key n, from 0 to ``count - 1``, are ``offsets[n]:offsets[n + 1]``.
 
-    Returns
-    -------
-    ndarray of int64, shape (count + 1,)
-        The rows of key n are ``offsets[n]:offsets[n + 1]``.
-
-    Examples
-    --------
     >>> row_offsets(np.array([0, 0, 2]), 3)
     array([0, 2, 2, 3])
     """
@@ -92,18 +52,8 @@ def row_offsets(key: NDArray[np.integer[Any]], count: int) -> NDArray[np.int64]:
 def sorted_unique(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the distinct keys in order.
 
-    Parameters
-    ----------
-    keys : ndarray of int64, shape (M,)
-        In any order.
+    Sorting whole and dropping repeats is faster here than hashing.
 
-    Returns
-    -------
-    ndarray of int64
-        Ascending. Sorting whole and dropping repeats is faster here than hashing.
-
-    Examples
-    --------
     >>> sorted_unique(np.array([3, 1, 3]))
     array([1, 3])
     """
@@ -116,21 +66,9 @@ def sorted_unique(keys: NDArray[np.int64]) -> NDArray[np.int64]:
 def stable_order(labels: NDArray[np.integer[Any]], count: int) -> NDArray[np.int64]:
     """Return the order that groups rows by a small label and keeps them in order within it.
 
-    Parameters
-    ----------
-    labels : ndarray of int, shape (M,)
-        From 0 to ``count - 1``.
-    count : int
-        Number of labels.
+    As a stable argsort of labels from 0 to ``count - 1``, in time linear in their number: 16
+    bits at a time, which numpy sorts by counting.
 
-    Returns
-    -------
-    ndarray of int64, shape (M,)
-        As a stable argsort, in time linear in M: 16 bits of the labels at a time, which numpy
-        sorts by counting.
-
-    Examples
-    --------
     >>> stable_order(np.array([1, 0, 1]), 2)
     array([1, 0, 2])
     """

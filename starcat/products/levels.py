@@ -21,8 +21,8 @@ from starcat.products.pairs_and_triangles import distinct_triangles
 
 Rows = NDArray[np.int32]
 
+# Boresights of a level, at the least: wide fields need few, and may have more for nothing.
 FEWEST_BORESIGHTS = 1000
-"""Boresights of a level, at the least: wide fields need few, and may have more for nothing."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,6 @@ class Levels:
     """Stars and triangles of each level, the narrowest first."""
 
     level: Rows  # shape (L,): 1 to L; level 0 is the camera's own field
-    # fov_x_deg, fov_y_deg: shape (L,): full angles of a level's fields
     fov_x_deg: Array
     fov_y_deg: Array
     stars: Ragged  # rows of the star table, ascending
@@ -38,7 +37,7 @@ class Levels:
     i: Ragged
     j: Ragged
     k: Ragged
-    index: Index  # nothing
+    index: Index
 
 
 def level_fields(
@@ -137,11 +136,8 @@ def thin_levels(
 
 def boresights_of_level(boresights: int, narrowest: FieldSize, field: FieldSize) -> int:
     """Return how many boresights tile the sphere for a level: the wider its field, the fewer."""
-    return max(FEWEST_BORESIGHTS, round(boresights * _shrink(narrowest, field)))
-
-
-def _shrink(narrow: FieldSize, wide: FieldSize) -> float:
-    return (narrow.fov_x_deg * narrow.fov_y_deg) / (wide.fov_x_deg * wide.fov_y_deg)
+    area, larger = (one.fov_x_deg * one.fov_y_deg for one in (narrowest, field))
+    return max(FEWEST_BORESIGHTS, round(boresights * (area / larger)))
 
 
 def _ragged(lists: Sequence[Rows]) -> Ragged:

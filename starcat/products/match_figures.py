@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
-from starcat.products.star_counts import Census, MagnitudeCounts, PositionsAndMagnitudes
+from starcat.products.star_counts import Census, MagnitudeCounts
 
 Rows = NDArray[np.int64]
 
@@ -28,24 +27,46 @@ LEAST_ERROR_RAD = 0.01 * ARCSEC
 catalog has copied the positions of the other."""
 
 
-class CandidatePairs(Protocol):
-    """What the odds need to know of pairs."""
+@dataclass(frozen=True)
+class MovingStars:
+    """Stars of one catalog, each at its own epoch."""
 
-    @property
-    def star(self) -> Rows:
-        """Rows of the stars, ascending."""
+    directions: Array  # shape (N, 3): ICRS unit vectors at ``epoch_jyear``
+    # shape (N, 3): proper motions as vectors along the sky, radians a year; 0 where unknown
+    velocities: Array
+    has_motion: Mask  # shape (N,): whether the proper motion is known
+    epoch_jyear: Array  # shape (N,): Julian years
+    mag: Array  # shape (N,): magnitudes; NaN where unknown
+    # shape (N,): standard deviations of the positions, each axis, radians
+    error_rad: Array | None = None
 
-    @property
-    def counterpart(self) -> Rows:
-        """Rows of the candidates."""
+    def at(self, rows: Rows, epoch_jyear: Array | float) -> Array:
+        """Return directions of some stars at an epoch; those without proper motion stay."""
+        years = np.broadcast_to(epoch_jyear, len(rows)) - self.epoch_jyear[rows]
+        moved: Array = self.directions[rows] + self.velocities[rows] * years[:, None]
+        moved /= np.sqrt(np.einsum("ij,ij->i", moved, moved))[:, None]
+        return moved
 
-    @property
-    def separation_rad(self) -> Array:
-        """Separations at the epoch of comparison."""
 
-    @property
-    def unmoved_years(self) -> Array:
-        """Years between positions that neither proper motion could bridge."""
+@dataclass(frozen=True)
+class Pairs:
+    """Stars and candidate counterparts within a radius; arrays of shape (M,)."""
+
+    star: Rows  # of the first set
+    counterpart: Rows  # of the other set
+    separation_rad: Array  # radians, at ``epoch_jyear``
+    epoch_jyear: Array  # Julian year at which the two were compared
+    unmoved_years: Array  # years between their positions where neither could be moved, else 0
+
+    def take(self, rows: Rows | Mask) -> Pairs:
+        """Return some of the pairs."""
+        return Pairs(
+            self.star[rows],
+            self.counterpart[rows],
+            self.separation_rad[rows],
+            self.epoch_jyear[rows],
+            self.unmoved_years[rows],
+        )
 
 
 @dataclass(frozen=True)
@@ -77,51 +98,22 @@ class Measured:
     """What all candidate pairs of two catalogs say of them."""
 
     with_candidates: int  # stars that have any
-    # sure, sure_with_mag: pairs whose star and candidate have no other, and those with both
-    # magnitudes
-    sure: int
-    sure_with_mag: int
-    # median_separation_rad, median_delta_mag: over these; NaN where there is none
-    median_separation_rad: float
+    sure: int  # pairs whose star and candidate have no other
+    sure_with_mag: int  # those of them with both magnitudes
+    median_separation_rad: float  # over these; NaN where there is none
     median_delta_mag: float
 
 
 def is_sure(star: Rows, counterpart: Rows) -> Mask:
-    """Return which pairs are sure: neither the star nor the candidate has another.
-
-    Parameters
-    ----------
-    star, counterpart : ndarray of int64, shape (M,)
-        Rows of all pairs.
-
-    Returns
-    -------
-    ndarray of bool, shape (M,)
-        True where it is.
-    """
+    """Return which pairs are sure: neither the star nor the candidate has another."""
     if not len(star):
         return np.empty(0, dtype=bool)
     alone = np.bincount(star)[star] == 1
     return np.asarray(alone & (np.bincount(counterpart)[counterpart] == 1))
 
 
-def measure(
-    stars: PositionsAndMagnitudes, counterparts: PositionsAndMagnitudes, pairs: CandidatePairs
-) -> Measured:
-    """Return what the pairs of two whole catalogs say of them.
-
-    Parameters
-    ----------
-    stars, counterparts : MovingStars
-        The two catalogs.
-    pairs : Pairs
-        All candidates within the radius, by star.
-
-    Returns
-    -------
-    Measured
-        Counts and medians.
-    """
+def measure(stars: MovingStars, counterparts: MovingStars, pairs: Pairs) -> Measured:
+    """Return what the pairs of two whole catalogs say of them."""
     sure = is_sure(pairs.star, pairs.counterpart)
     angle = pairs.separation_rad[sure]
     delta = counterparts.mag[pairs.counterpart[sure]] - stars.mag[pairs.star[sure]]
@@ -143,10 +135,8 @@ class Figures:
     # catalogs state their errors themselves
     position_error_rad: float
     delta_mag: float  # magnitude of the counterpart minus that of the star, on average
-    # completeness, shared: share of the stars that have a counterpart, and of the counterparts that
-    # have a star
-    completeness: float
-    shared: float
+    completeness: float  # share of the stars that have a counterpart
+    shared: float  # share of the counterparts that have a star
     density: Array  # shape (TILES,): counterparts per steradian around each tile of the sky
     magnitudes: MagnitudeCounts  # of the counterparts
 
@@ -154,24 +144,7 @@ class Figures:
 def figures_of(
     stars: Census, counterparts: Census, measured: Measured, radius_rad: float, model: MatchModel
 ) -> Figures:
-    """Return the figures of two catalogs, given by the model or measured.
-
-    Parameters
-    ----------
-    stars, counterparts : Census
-        Counts of the two.
-    measured : Measured
-        What all their pairs say.
-    radius_rad : float
-        Largest separation of a candidate.
-    model : MatchModel
-        What is not to be measured.
-
-    Returns
-    -------
-    Figures
-        The figures.
-    """
+    """Return the figures of two catalogs, given by the model or measured."""
     density = counterparts.density()
     share = _completeness(stars, measured, density * np.pi * radius_rad**2, model)
     # As many counterparts have a star as stars have a counterpart.

@@ -199,9 +199,8 @@ class Answer:
         """
         import pyarrow as pa
 
-        from starcat.exchange.array_files import astropy_table
+        from starcat.exchange.array_files import astropy_table, numpy_columns
         from starcat.exchange.columns import plain_batch, plain_schema
-        from starcat.exchange.numpy_columns import numpy_columns
 
         schema = plain_schema(self._found.schema)
         batches = [plain_batch(batch, schema) for batch in self._found.to_batches()]

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
-from starcat.catalog.verdict import rejected_path
 from starcat.errors import ProductError, QueryError, TargetMissing
 from starcat.progress import Progress, no_progress
 from starcat.query.engine import Engine
@@ -130,6 +129,8 @@ def _check_file(path: Path) -> None:
 
 def _tables(path: Path, engine: Engine) -> Target:
     """Return a Parquet file, with the rejected rows beside it where there are any."""
+    from starcat.catalog.verdict import rejected_path
+
     views = [_table(path, engine)]
     beside = rejected_path(path)
     if beside.is_file():

@@ -15,7 +15,7 @@ import numpy as np
 from starcat.arrays import Array
 from starcat.images.figure_file import figure_bytes, own_style, write_figure
 from starcat.products.coverage import Coverage, CoverageSummary
-from starcat.report.sky_map import (
+from starcat.report.coverage_map import (
     HALF_HEIGHT,
     HALF_WIDTH,
     galactic_equator,

@@ -36,8 +36,8 @@ class Catalog(Section):
     motions: tuple[Literal["hipparcos", "tycho2"], ...] = Field(
         (),
         strict=False,  # a list in TOML
-        description="catalogs that stars without a proper motion get one from, the first that has "
-        "one first; found as [products.crossmatch] says",
+        description="catalogs that supply missing proper motions, in order of preference; found "
+        "as [products.crossmatch] says",
         examples=[["tycho2"]],
     )
 

@@ -14,6 +14,9 @@ Numbers = Mapping[str, float]
 LARGEST = 1e6
 """No angle, distance, magnitude or direction of a database is larger, in its own unit."""
 
+SMALLEST = 1e-9
+"""No radius, bin or number of bins is smaller: what is divided by it stays a number."""
+
 RANGES = {
     "ratio": (1.0, 1e20),
     "separation_rad": (0.0, pi),
@@ -50,7 +53,7 @@ class ProductLayout:
     bins: dict[str, Callable[[Numbers], float]] = field(default_factory=dict)
     # Real numbers, one a star.
     per_star: tuple[str, ...] = ()
-    # Attributes above 0.
+    # Attributes of at least `SMALLEST`.
     numbers: tuple[str, ...] = ()
 
     @property

@@ -87,7 +87,6 @@ def _connected(client_class: Any, scheduler: str) -> Iterator[Client]:
 
 
 def _check_versions(client: Client) -> None:
-    """Check that the workers run what this process runs."""
     here = versions()
     for worker, there in client.run(versions).items():
         if there != here:

@@ -68,9 +68,8 @@ class Stored:
     folder: Path  # where it is
     outcome: Outcome  # what happened to the folder
     manifest: dict[str, Any]  # the content of its ``store.json``
-    # problems, notes: the first malformed records, and what a user should know of the inputs
-    problems: tuple[str, ...]
-    notes: tuple[str, ...]
+    problems: tuple[str, ...]  # the first malformed records
+    notes: tuple[str, ...]  # what a user should know of the inputs
 
 
 @dataclass(frozen=True)
@@ -152,7 +151,6 @@ def _all_options(plan: StorePlan, files: SourceFiles) -> dict[str, Any]:
 
 
 def _make(run: _Ingest) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Go through all steps, in the hidden folder."""
     plan = run.plan
     for folder in (plan.rejected, plan.runs):
         folder.mkdir(parents=True, exist_ok=True)
@@ -268,7 +266,6 @@ def bordering(pixels: Sequence[Pixel], margin_rad: float) -> Bordering:
 def _margins_all(
     run: _Ingest, beside: Bordering, finished: Sequence[dict[str, Any]], content: str
 ) -> list[tuple[Pixel, dict[str, Any]]]:
-    """Write the margins, and return those that have stars."""
     has_stars = {pixel for pixel, facts in zip(beside, finished, strict=True) if facts["rows"]}
     batches: dict[Pixel, list[tuple[Path, int]]] = {pixel: [] for pixel in beside}
     for pixel, others in beside.items():

@@ -111,7 +111,7 @@ def _properties(catalog: Described) -> dict[str, Any]:
 
 
 def write_skymap(path: Path, order: int, counts: NDArray[np.int64]) -> None:
-    """Write options many stars each pixel has, as a HEALPix map in a FITS file."""
+    """Write how many stars each pixel has, as a HEALPix map in a FITS file."""
     from astropy.io import fits
 
     column = fits.Column("PIXELS", "K", array=counts)
@@ -145,9 +145,8 @@ class Written:
 
     parts: Sequence[Facts]  # results of splitting, one a file
     repeated: int  # records of stars that were read before
-    # partitions, margins: results of finishing, and of writing margins
-    partitions: Sequence[tuple[Pixel, Facts]]
-    margins: Sequence[tuple[Pixel, Facts]]
+    partitions: Sequence[tuple[Pixel, Facts]]  # results of finishing
+    margins: Sequence[tuple[Pixel, Facts]]  # results of writing margins
 
 
 def make_manifest(

@@ -80,7 +80,6 @@ def _first_reach(pixel: Pixel, count: int) -> float:
 
 
 def _farther(reach: float, chord: float) -> float:
-    """Return how far to look for a nearer neighbour than one a chord away."""
     if not np.isfinite(chord):
         return min(8.0 * reach, np.pi)
     separation = float(separation_from_chord(np.array(chord)))

@@ -47,9 +47,8 @@ class Pixel:
     (360287970189639680, True)
     """
 
-    # order, number: nested HEALPix
     order: int
-    number: int
+    number: int  # nested
 
     @property
     def first(self) -> int:

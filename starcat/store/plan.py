@@ -38,9 +38,8 @@ class StoreOptions:
     memory_bytes: int = MEMORY_BYTES
     workers: int = 2  # processes on this machine
     scheduler: str | None = None  # address of a Dask cluster to use instead
-    # resume, replace: whether to go on with an unfinished run, and to replace a store that differs
-    resume: bool = False
-    replace: bool = False
+    resume: bool = False  # go on with an unfinished run
+    replace: bool = False  # replace a store that differs
 
 
 def rows_of_a_run(options: StoreOptions) -> int:

@@ -166,7 +166,7 @@ def _paths(store: Store) -> list[Path]:
 def _bright_rows(
     number: int, path: Path, options: IngestOptions, *, is_ours: bool
 ) -> tuple[pa.Table, int]:
-    """Return a file's stars within the limit, and options many are beyond it."""
+    """Return a file's stars within the limit, and how many are beyond it."""
     names = product_schema("stars").arrow_schema.names
     try:
         with pq.ParquetFile(path) as file:
@@ -250,7 +250,6 @@ def _as_stars(table: pa.Table, number: int, options: IngestOptions, *, is_ours: 
 
 
 def _moved(stars: pa.Table, epoch_jyear: float | None) -> pa.Table:
-    """Return stars at an epoch, as reading archive files moves them."""
     names = ("ra_deg", "dec_deg", "epoch_jyear", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")
     columns: dict[str, Any] = {name: floats_of(stars, name) for name in names}
     columns["quality_flags"] = stars["quality_flags"].to_numpy()

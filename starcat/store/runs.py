@@ -55,12 +55,10 @@ PLACES = np.dtype([("star_id", np.int64), ("place", np.int64)])
 class Run:
     """A run on disk."""
 
-    # stars, places: arrow file of the stars; file of `PLACES`, by bucket
-    stars: Path
-    places: Path
-    # pixels, rows: shape (B,): coarse pixel and number of stars of each batch
-    pixels: Pixels
-    rows: NDArray[np.int64]
+    stars: Path  # Arrow file
+    places: Path  # file of `PLACES`, by bucket
+    pixels: Pixels  # shape (B,): the coarse pixel of each batch
+    rows: NDArray[np.int64]  # shape (B,): its stars
     buckets: NDArray[np.int64]  # shape (BUCKETS + 1,): where each bucket begins in ``places``
 
 
@@ -224,9 +222,8 @@ class RunIndex:
     order: int  # order of the coarse pixels
     paths: tuple[Path, ...]  # arrow files of the runs
     pixels: Pixels  # shape (B,): coarse pixel of each batch, ascending
-    # runs, batches: shape (B,): number of its run, and its number in the run
-    runs: NDArray[np.int64]
-    batches: NDArray[np.int64]
+    runs: NDArray[np.int64]  # shape (B,): the run of each batch
+    batches: NDArray[np.int64]  # shape (B,): its number in the run
     # shape (R, BUCKETS + 1): where each bucket of numbers begins in the places of each run
     buckets: NDArray[np.int64]
 

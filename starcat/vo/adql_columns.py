@@ -19,7 +19,7 @@ class Source:
     """Something that stands after FROM."""
 
     name: str  # its alias, or the name of the table; lower case, empty where it has none
-    columns: Columns | None  # none where they are not known
+    columns: Columns | None  # None where they are not known
 
 
 class Names:

@@ -75,7 +75,7 @@ class Point:
 class Circle:
     """All places that are no farther from a centre than a radius."""
 
-    centre: Point  # its centre
+    centre: Point
     radius: str  # SQL of the radius, degrees
 
     @property

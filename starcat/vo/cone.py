@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from starcat.errors import ConfigError, TargetMissing, quoted
+from starcat.errors import ConfigError, TargetMissing
 from starcat.exchange.columns import described, field_facts
 from starcat.exchange.formats import Format, response_format
 from starcat.exchange.votable_fields import error_document
@@ -20,6 +20,7 @@ from starcat.query.names import quoted as sql_text
 from starcat.query.names import quoted_name
 from starcat.query.session import Session
 from starcat.query.targets import POSITION, View
+from starcat.vo.parameters import parameter_error
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -47,7 +48,7 @@ class ConeRequest:
     radius_deg: float  # its radius; 0 asks for the columns only
     verbosity: int  # 1 for identity and place, 2 for all columns with a UCD, 3 for all
     maxrec: int | None  # rows at most; None where that is not said
-    form: Format  # how the answer is written
+    form: Format
     media_type: str  # what it is sent as
 
 
@@ -146,11 +147,8 @@ def _degrees(given: Mapping[str, str], key: str) -> float:
     except ValueError:
         value = math.nan
     if not least <= value <= most:
-        raise ConfigError(
-            f"{key} is {quoted(given[key])}; give decimal degrees from {least:g} to {most:g}",
-            key=key,
-            value=given[key],
-        )
+        told = f"give decimal degrees from {least:g} to {most:g}"
+        raise parameter_error(key, given[key], told)
     return value
 
 
@@ -171,7 +169,5 @@ def _whole(
     is_number = text.isascii() and text.isdigit() and len(text) < 19
     if not is_number or int(text) < least or (most is not None and int(text) > most):
         upto = "" if most is None else f" to {most}"
-        raise ConfigError(
-            f"{key} is {quoted(text)}; give a whole number from {least}{upto}", key=key, value=text
-        )
+        raise parameter_error(key, text, f"give a whole number from {least}{upto}")
     return int(text)

@@ -38,10 +38,10 @@ class Upload:
 class Question:
     """What a request asks."""
 
-    query: str  # ADQL
-    form: Format  # how to write the answer
-    max_rows: int  # rows of the answer at most
-    uploads: tuple[Upload, ...] = ()  # the tables that come with it
+    query: str
+    form: Format
+    max_rows: int
+    uploads: tuple[Upload, ...] = ()
     run_id: str = ""  # what the client calls it
 
 
@@ -72,21 +72,20 @@ class Parameters:
         return list(self._given)
 
 
+def parameter_error(key: str, value: str | None, told: str) -> ConfigError:
+    """Return what is wrong with the value of a parameter."""
+    return ConfigError(f"{key} is {quoted(value or '')}; {told}", key=key, value=value)
+
+
 def question(given: Parameters, most_rows: int) -> Question:
     """Return what a request asks."""
     request = given.one("REQUEST")
     if request not in (None, "doQuery"):
-        raise ConfigError(
-            f"REQUEST is {quoted(request or '')}; it may be doQuery only, or be left out",
-            key="REQUEST",
-            value=request,
-        )
+        raise parameter_error("REQUEST", request, "it may be doQuery only, or be left out")
     language = given.one("LANG")
     if language is not None and language.upper() not in LANGUAGES:
-        raise ConfigError(
-            f"LANG is {quoted(language)}; queries are written in one of {', '.join(LANGUAGES)}",
-            key="LANG",
-            value=language,
+        raise parameter_error(
+            "LANG", language, f"queries are written in one of {', '.join(LANGUAGES)}"
         )
     query = given.one("QUERY")
     if query is None:
@@ -108,9 +107,7 @@ def max_rows(text: str | None, most: int) -> int:
     if text is None:
         return most
     if not (text.isascii() and text.isdigit()):
-        raise ConfigError(
-            f"MAXREC is {quoted(text)}; it is a whole number from 0 on", key="MAXREC", value=text
-        )
+        raise parameter_error("MAXREC", text, "it is a whole number from 0 on")
     return most if len(text) > len(str(most)) + 10 else min(int(text), most)
 
 
@@ -120,11 +117,11 @@ def uploads(given: list[str]) -> tuple[Upload, ...]:
     for pair in (pair for value in given for pair in value.split(";") if pair.strip()):
         name, comma, place = (word.strip() for word in pair.partition(","))
         if not comma or not _TABLE_NAME.fullmatch(name):
-            raise ConfigError(
-                f"UPLOAD is {quoted(pair)}; it is a name of letters, digits and underscores, a "
+            raise parameter_error(
+                "UPLOAD",
+                pair,
+                "it is a name of letters, digits and underscores, a "
                 "comma and param: with the name of a part of the request",
-                key="UPLOAD",
-                value=pair,
             )
         scheme, _, part = place.partition(":")
         result = _RESULT.fullmatch(place)

@@ -74,7 +74,7 @@ class Key:
     # Full name of the table that it refers to, and the column there.
     target: str
     target_column: str
-    description: str = ""  # what the reference means
+    description: str = ""
 
 
 @dataclass(frozen=True)
@@ -84,8 +84,8 @@ class Table:
     # As the session has them, without quotes.
     schema: str
     name: str
-    columns: tuple[Column, ...]  # in order
-    description: str = ""  # what a row is
+    columns: tuple[Column, ...]
+    description: str = ""
     keys: tuple[Key, ...] = ()  # references to other tables
     view: str = ""  # name of its view in a session, where it has another; else empty
 
@@ -94,9 +94,9 @@ class Table:
 class Schema:
     """A schema: the tables of a database, of a catalog, or those of TAP itself."""
 
-    name: str  # as the session has it
-    description: str  # what it is
-    tables: tuple[Table, ...]  # in order
+    name: str
+    description: str
+    tables: tuple[Table, ...]
 
 
 class Tables:

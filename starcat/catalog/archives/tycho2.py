@@ -69,16 +69,13 @@ def stars(records: Records, band: str, _: Verdicts) -> Columns:
         "colour_mag": records["bt_mag"] - records["vt_mag"],
         "colour_bands": "BT-VT",
         "double_flag": join_flags({**flag_parts, "CCDM": (in_ccdm, records["ccdm"])}),
-        "is_flagged_double": place_is_double(flag_parts) | in_ccdm,
+        "is_flagged_double": np.logical_or.reduce(
+            [in_ccdm, *(where for where, _ in flag_parts.values())]
+        ),
         "companion_separation_arcsec": np.where(prox < PROX_BEYOND, 0.1 * prox, np.nan),
         "hip_number": records["hip"],
         "quality_flags": quality_flags(len(records), bits),
     }
-
-
-def place_is_double(parts: dict[str, Any]) -> Mask:
-    """Return where any of a record's position flags means a double star."""
-    return np.asarray(np.logical_or.reduce([where for where, _ in parts.values()]))
 
 
 def _place_tyc2(records: Records) -> dict[str, Any]:

@@ -16,8 +16,8 @@ import numpy as np
 from starcat.arrays import Array, Rows
 from starcat.geometry.patterns import bin_of
 from starcat.matcher.database import Database, ProductArrays
+from starcat.matcher.methods.consensus import Surroundings, by_reference, rows_between, surroundings
 from starcat.matcher.methods.pair_voting import bases
-from starcat.matcher.methods.reference import Surroundings, by_reference, rows_between, surroundings
 from starcat.matcher.observation import Candidates, Observation
 
 _TURN = 2.0 * np.pi

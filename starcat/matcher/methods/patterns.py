@@ -23,10 +23,10 @@ from starcat.arrays import Array, Rows
 from starcat.geometry.patterns import cell_of, cyclic_shifts, ring_of, sector_of
 from starcat.geometry.sphere import separation
 from starcat.matcher.database import Database, ProductArrays
-from starcat.matcher.methods.consensus import consistent_candidates
-from starcat.matcher.methods.reference import (
+from starcat.matcher.methods.consensus import (
     Surroundings,
     by_reference,
+    consistent_candidates,
     references,
     rows_between,
     surroundings,

@@ -16,8 +16,7 @@ from starcat.artifact.reader import Artifact
 from starcat.errors import ProductError, TargetMissing
 from starcat.geometry.sphere import directions_from_radec
 from starcat.matcher.methods.table import METHODS
-from starcat.report.coverage_map import Fields, field_at, raster_png, sky_map
-from starcat.report.sky_map import nearest_raster
+from starcat.report.coverage_map import Fields, field_at, nearest_raster, raster_png, sky_map
 from starcat.service.access import Builder, Reader, Role
 from starcat.service.jobs.submission import submit_evaluation
 from starcat.service.library import Database

@@ -18,10 +18,10 @@ from starcat.report.coverage_map import (
     Fields,
     SkyMap,
     bins_of,
+    nearest_raster,
     raster_png,
     sky_map,
 )
-from starcat.report.sky_map import nearest_raster
 
 MAP_WIDTH = 720
 """Columns of the raster of a map: what a card of the page is wide."""

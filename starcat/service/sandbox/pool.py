@@ -147,6 +147,6 @@ def _close(idle: list[tuple[K, ProcessT]]) -> None:
 def _busy() -> Problem:
     return Problem(
         503,
-        f"all that may run at the same time was busy for {WAIT_S:g} s; ask again later",
+        f"the service was busy for {WAIT_S:g} s: too many requests at once; ask again later",
         headers={"Retry-After": f"{WAIT_S:.0f}"},
     )

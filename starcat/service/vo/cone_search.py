@@ -14,7 +14,7 @@ from starcat.errors import QueryLimitError, StarcatError, TargetMissing
 from starcat.exchange.columns import Label
 from starcat.exchange.writers import result_chunks
 from starcat.service.access import Reader
-from starcat.service.problems import Problem, problem_of
+from starcat.service.problems import Problem, RenderingRoute, as_json, problem_of
 from starcat.service.service import Service, TheService
 from starcat.store.layout import is_store
 from starcat.vo.cone import (
@@ -27,7 +27,21 @@ from starcat.vo.cone import (
     with_ucds,
 )
 
-router = APIRouter(prefix="/scs", tags=["cone search"])
+
+class ConeRoute(RenderingRoute):
+    """A route whose errors are VOTables, but for those of who may do what."""
+
+    def render(self, error: Exception, request: Request) -> Response:
+        """Return an error as cone searches have it; a wrong parameter is a bad request."""
+        problem = problem_of(error)
+        if not isinstance(error, StarcatError | Problem) or problem.status in (401, 403):
+            return as_json(error)
+        is_bad = problem.status == 422 and not isinstance(error, QueryLimitError)
+        headers = {**getattr(error, "headers", {}), **_VOTABLE}
+        return Response(cone_error(problem.detail), 400 if is_bad else problem.status, headers)
+
+
+router = APIRouter(prefix="/scs", tags=["cone search"], route_class=ConeRoute)
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}(\.[A-Za-z0-9_-]{1,99}){0,9}")
 _OF_A_JOB = re.compile(r"-[0-9a-f]{16}(\.parquet)?$")
@@ -82,13 +96,8 @@ async def search(catalog: str, request: Request, service: TheService, reader: Re
     The catalog is the id or the name of a database, with its version or without (then it is the
     newest), or the name of a catalog that was read.
     """
-    try:
-        asked = cone_request(request.query_params.multi_items())
-        found = await service.query_pool.run(_answer, service, catalog, asked)
-    except (StarcatError, Problem) as error:
-        told = problem_of(error)
-        headers = error.headers if isinstance(error, Problem) else {}
-        return Response(cone_error(told.detail), _status(error), {**headers, **_VOTABLE})
+    asked = cone_request(request.query_params.multi_items())
+    found = await service.query_pool.run(_answer, service, catalog, asked)
     return StreamingResponse(_chunks(found), headers={"Content-Type": asked.media_type})
 
 
@@ -141,9 +150,3 @@ def _chunks(held: SpooledTemporaryFile[bytes]) -> Iterator[bytes]:
     with held:
         while chunk := held.read(_CHUNK_BYTES):
             yield chunk
-
-
-def _status(error: Exception) -> int:
-    """Return the status of an answer: what is wrong with a parameter is a bad request."""
-    status = problem_of(error).status
-    return 400 if status == 422 and not isinstance(error, QueryLimitError) else status

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import tempfile
 import threading
+from collections.abc import Generator, Iterator
 from datetime import UTC, datetime
 from itertools import chain
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Annotated, Literal
 
 from anyio import CancelScope, to_thread
@@ -26,7 +28,6 @@ from starcat.service.vo.tap_request import (
     TheRequest,
     base_url,
 )
-from starcat.service.vo.tap_spool import ClientGone, Spool
 from starcat.vo.documents import (
     MEDIA_TYPE,
     availability,
@@ -41,6 +42,77 @@ from starcat.vo.parameters import Question, question
 router = APIRouter(prefix=PREFIX, tags=["TAP"], route_class=TapRoute)
 
 _STARTED = datetime.now(UTC)
+
+
+READ_BYTES = 1 << 18
+
+LOOK_S = 1.0
+"""How often a reader that waits looks whether the answer has ended."""
+
+
+class ClientGone(Exception):  # noqa: N818 - the name reads as the fact
+    """Nobody waits for the answer any more."""
+
+
+class Spool:
+    """An answer on its way: made as fast as the query gives it, sent as fast as the client reads.
+
+    What is not taken yet waits in a file, so a client that reads slowly keeps no query from being
+    answered.
+    """
+
+    def __init__(
+        self, parts: Generator[bytes, None, None], scratch: Path, gone: threading.Event
+    ) -> None:
+        self._parts = parts
+        self._gone = gone
+        self._written = 0
+        self._is_done = False
+        self._error: BaseException | None = None
+        self._changed = threading.Condition()
+        self._file = TemporaryFile(dir=scratch)  # noqa: SIM115 - closed by `close`
+        self._thread = threading.Thread(target=self._make, name="tap-answer", daemon=True)
+        self._thread.start()
+
+    def __iter__(self) -> Iterator[bytes]:
+        """Give the bytes in order; what failed is raised behind the last that were made."""
+        at = 0
+        while True:
+            with self._changed:
+                while self._written == at and not self._is_done:
+                    self._changed.wait(LOOK_S)
+                if self._written == at:
+                    if self._error is not None:
+                        raise self._error
+                    return
+                self._file.seek(at)
+                part = self._file.read(min(READ_BYTES, self._written - at))
+            at += len(part)
+            yield part
+
+    def close(self) -> None:
+        """End the making, and forget what was made."""
+        self._gone.set()
+        self._thread.join()
+        self._file.close()
+
+    def _make(self) -> None:
+        try:
+            for part in self._parts:
+                if self._gone.is_set():
+                    break
+                with self._changed:
+                    self._file.seek(self._written)
+                    self._file.write(part)
+                    self._written += len(part)
+                    self._changed.notify_all()
+        except BaseException as error:
+            self._error = error
+        finally:
+            self._parts.close()
+            with self._changed:
+                self._is_done = True
+                self._changed.notify_all()
 
 
 class _Closing(StreamingResponse):

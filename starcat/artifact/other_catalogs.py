@@ -1,12 +1,13 @@
-"""Counterparts in other catalogs as an artifact holds them: tables, and what must hold of them.
+"""What an artifact holds of other catalogs: counterparts, and where motions are from.
 
-A star table becomes moving stars, matches become rows of the ``crossmatch`` schema, and the
-rows are checked against the stars that they belong to.
+A star table becomes moving stars, matches become rows of the ``crossmatch`` schema, and the rows of
+both products are checked against the stars that they belong to.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -17,7 +18,8 @@ from starcat.arrays import Array
 from starcat.catalog.proper_motion import MAS, Motion, propagate_directions
 from starcat.catalog.stars import floats_of
 from starcat.geometry.sphere import directions_from_radec, separation, tangent_axes
-from starcat.products.crossmatch import VERDICTS, Matches, MovingStars
+from starcat.products.crossmatch import VERDICTS, Matches
+from starcat.products.match_figures import MovingStars
 from starcat.storage.schema import product_schema
 
 NEEDED = (
@@ -153,3 +155,53 @@ def _rank_problems(table: pa.Table) -> Iterator[str]:
         wrong |= ~(whole <= 1.0 + PROBABILITY_TOLERANCE)
     for row in np.flatnonzero(wrong)[:1]:
         yield f"probability of row {row}: the candidates of a star share at most 1"
+
+
+JOINED, OWN_MOTION, NO_CANDIDATE, NO_MOTION = "joined", "own_motion", "no_candidate", "no_motion"
+
+OUTCOMES = (JOINED, OWN_MOTION, NO_CANDIDATE, "ambiguous", "taken", "doubtful", NO_MOTION)
+"""What may be said of a star in the product ``motions``; the schema says what each means."""
+
+WAY_TOLERANCE_ARCSEC = 1e-6
+"""The way between two directions and the way at a speed differ by less."""
+
+
+def motion_problems(table: pa.Table, stars: pa.Table) -> Iterator[str]:
+    """Yield where the product ``motions`` contradicts itself or the stars."""
+    if not np.array_equal(table["star"].to_numpy(), np.arange(len(stars))):
+        yield f"star: not the rows 0 to {len(stars) - 1} of the stars, each once"
+        return
+    unknown = set(pc.unique(table["outcome"]).to_pylist()) - set(OUTCOMES)
+    if unknown:
+        yield f"outcome {', '.join(sorted(unknown))}; expected one of {', '.join(OUTCOMES)}"
+    pm = ("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")
+    moves = ~(np.isnan(floats_of(stars, pm[0])) | np.isnan(floats_of(stars, pm[1])))
+    named = pc.is_in(table["outcome"], pa.array([JOINED, OWN_MOTION])).to_numpy()
+    for row in np.flatnonzero(moves != named)[:1]:
+        has = "has a" if moves[row] else "has no"
+        yield f"outcome of row {row} is {table['outcome'][int(row)]}, but the star {has} motion"
+    joined = pc.equal(table["outcome"], JOINED).to_numpy()
+    # A straight line at constant speed: after the angle a the motion is cos(a)^2 of the first.
+    years = floats_of(stars, "epoch_jyear") - floats_of(table, "from_jyear")
+    motion = np.hypot(floats_of(stars, pm[0]), floats_of(stars, pm[1])) * MAS
+    way = np.degrees(0.5 * np.arcsin(np.minimum(2.0 * motion * np.abs(years), 1.0))) * 3600.0
+    told = floats_of(table, "moved_arcsec")
+    right = np.where(joined, np.abs(way - told) <= WAY_TOLERANCE_ARCSEC, np.isnan(told))
+    for row in np.flatnonzero(~right)[:1]:
+        yield f"moved_arcsec of row {row} is not the way that its star has gone"
+
+
+def joined_of(table: pa.Table, catalog: str) -> int:
+    """Return how many stars have their motion from a catalog."""
+    rows = pc.and_(pc.equal(table["outcome"], JOINED), pc.equal(table["catalog"], catalog))
+    return int(pc.sum(rows).as_py() or 0)
+
+
+def motion_count_problems(table: pa.Table, source: Mapping[str, Any]) -> Iterator[str]:
+    """Yield where the manifest says otherwise than the product ``motions`` of a catalog."""
+    found = joined_of(table, source["source"])
+    if found != source.get("joined"):
+        yield (
+            f"{source['source']}: {source.get('joined')} stars have their motion from it, but the "
+            f"product motions holds {found}"
+        )
