@@ -94,22 +94,18 @@ class Matcher(Settings, _WithDatabase):
     ) -> Matcher:
         """Open the database of an artifact, or an onboard image.
 
+        With an image everything is as in flight: the C library, and directions as they are rounded.
+
         Parameters
         ----------
         artifact : str or path-like
-            The artifact's folder, or an image as `starcat export --to onboard` writes it. With an
-            image everything is as in flight: the C library, and directions as they are rounded.
+            The artifact's folder, or an image as `starcat export --to onboard` writes it.
         method : str, default "triangle"
             A key of `METHODS`; None for the best one that the artifact's products allow. An
             image has one method, which is used whatever is asked for.
         tolerance_px, max_false_match_probability, selection, noise_px, noise_mag, engine, \
         min_share, max_steps, time_limit_s
-            As the attributes.
-
-        Returns
-        -------
-        Matcher
-            Ready to identify.
+            As the fields of `Settings`.
 
         Raises
         ------
