@@ -261,6 +261,7 @@ def test_the_cli_loads_nothing_heavy_before_it_knows_the_command():
 MAX_MODULE_LINES, MAX_FUNCTION_LINES, MAX_DOCSTRING_SHARE = 500, 60, 0.22
 SECTION = re.compile(r"^ *(Parameters|Returns|Raises|Yields)\n *-{3,}$", re.MULTILINE)
 ROOMS_OF_ARRAYS = {"geometry", "products", "matcher"}
+MODULES_OF_ARRAYS = {"starcat.evaluation.bare_methods"}
 
 
 def public_modules() -> set[str]:
@@ -293,7 +294,7 @@ def test_modules_and_functions_can_be_read_at_a_glance(module):
     tree = ast.parse(source)
     sizes = {one.name: one.end_lineno - one.lineno + 1 for one in functions_of(tree)}
     assert not {name: size for name, size in sizes.items() if size > MAX_FUNCTION_LINES}
-    if room_of(module) in ROOMS_OF_ARRAYS or module in public_modules():
+    if room_of(module) in ROOMS_OF_ARRAYS or module in public_modules() | MODULES_OF_ARRAYS:
         return
     documented = [one for one in functions_of(tree) if SECTION.search(ast.get_docstring(one) or "")]
     assert not [one.name for one in documented], "one line, or a type, says it"
