@@ -23,14 +23,10 @@ from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.progress import Progress, no_progress
 
+# Fewest identified frames of a calibration: with fewer, leaving some out says nothing.
 MIN_FRAMES = 3
-"""Fewest identified frames of a calibration: with fewer, leaving some out says nothing."""
-
-MOST_NAMED = 10
-"""Frames that a message names at most."""
-
-SKEWED = 5.0
-"""Pixels are said not to be square if an axis is off by this many standard errors."""
+MOST_NAMED = 10  # frames that a message names at most
+SKEWED = 5.0  # pixels are said not to be square if an axis is off by this many standard errors
 
 
 @dataclass(frozen=True)

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+# Share by which the focal length of the camera to start from may be wrong, where no range of
+# fields is given.
 USUAL_ERROR = 0.1
-"""Share by which the focal length of the camera to start from may be wrong, where no range of
-fields is given."""
 
 
 def calibrate_files(
@@ -146,8 +146,7 @@ def write_camera(calibration: Calibration, path: Path) -> None:
 
 
 _BLUE, _GREY, _RED = "#2c6e9e", "#b9c4cc", "#d1495b"
-_LONG_ARROW = 0.06
-"""Length of an arrow of three standard deviations, in widths of the detector."""
+_LONG_ARROW = 0.06  # length of an arrow of three standard deviations, in widths of the detector
 _BINS = 8
 
 

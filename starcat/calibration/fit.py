@@ -128,29 +128,23 @@ def _pair(w: Points, aspect: float, skew: float) -> Array:
     return np.column_stack([w.real + skew * w.imag, (1.0 + aspect) * w.imag])
 
 
+# Where Huber's loss turns from a parabola to lines, in standard deviations of a centroid.
 BEND = 3.0
-"""Where Huber's loss turns from a parabola to lines, in standard deviations of a centroid."""
 
+# Variance of a normal variable of variance 1 where those beyond `BEND` are left out.
 KEPT_VARIANCE = 0.9733
-"""Variance of a normal variable of variance 1 where those beyond `BEND` are left out."""
+TURNS = 30  # most steps towards the attitudes of one camera; without wrong stars it takes three
 
-TURNS = 30
-"""Most steps towards the attitudes of one camera; without wrong stars it takes three."""
-
+# First steps, in which stars beyond the bend count as if the loss were a parabola through them.
 CAREFUL = 2
-"""First steps, in which stars beyond the bend count as if the loss were a parabola through them."""
 
+# Curvature of a star beyond the bend in later steps, so that none is infinitely long.
 LEAST_CURVE = 0.01
-"""Curvature of a star beyond the bend in later steps, so that none is infinitely long."""
 
+# A smaller step ends the search for attitudes: what is left is a thousandth of it, 2e-4 arcsec.
 STILL_RAD = 1e-6
-"""A smaller step ends the search for attitudes: what is left is a thousandth of it, 2e-4 arcsec."""
-
-EXACT = 1e-8
-"""Share of the sum of squares by which the last step of a fit lowers it at most."""
-
-PASSES = 4
-"""Most fits of one camera, until the noise is known."""
+EXACT = 1e-8  # share of the sum of squares by which the last step of a fit lowers it at most
+PASSES = 4  # most fits of one camera, until the noise is known
 
 
 @dataclass(frozen=True)

@@ -32,33 +32,26 @@ from starcat.calibration.fit import (
 )
 from starcat.errors import ConfigError
 
-FOLDS = 5
-"""Groups of frames that are left out in turn; each frame is its own where there are fewer."""
+FOLDS = 5  # groups of frames that are left out in turn; each frame is its own where there are fewer
+FAR_PX = 1e6  # a bend of Huber's loss that nothing is beyond: least squares of all stars
+NEAR = 1e-5  # accuracy of the fits that are compared
+MIN_STARS = 4  # stars that a frame keeps at least
 
-FAR_PX = 1e6
-"""A bend of Huber's loss that nothing is beyond: least squares of all stars."""
-
-NEAR = 1e-5
-"""Accuracy of the fits that are compared."""
-
-MIN_STARS = 4
-"""Stars that a frame keeps at least."""
-
+# A model loses to a better one if the difference is larger than this many standard errors: of many
+# frames. Of five it is 1.9, of three 2.5.
 SURE = 1.5
-"""A model loses to a better one if the difference is larger than this many standard errors: of
-many frames. Of five it is 1.9, of three 2.5."""
 
+# The models that are compared: none to three radial terms, with and without a free principal
+# point, with and without the tangential terms.
 MODELS = tuple(
     (*FOCAL, *RADIAL[:radial], *centre, *tangential)
     for radial in range(4)
     for centre in ((), CENTRE)
     for tangential in ((), TANGENTIAL)
 )
-"""The models that are compared: none to three radial terms, with and without a free principal
-point, with and without the tangential terms."""
 
+# The terms whose values and errors are reported whether they are supported or not.
 COMPLETE = (*FOCAL, *CENTRE, *RADIAL[:2], *TANGENTIAL)
-"""The terms whose values and errors are reported whether they are supported or not."""
 
 
 @dataclass(frozen=True)

@@ -38,38 +38,26 @@ from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import NOISE_DEVIATIONS
 from starcat.progress import Progress
 
-WIDE_PX = 6.0
-"""Tolerance as long as the camera is hardly known."""
+WIDE_PX = 6.0  # tolerance as long as the camera is hardly known
+NARROW_PX = 0.5  # smallest tolerance, however good the centroids are
 
-NARROW_PX = 0.5
-"""Smallest tolerance, however good the centroids are."""
-
+# Ratio of neighbouring focal lengths of the first step, for a method that has to be told the focal
+# length. Within `WIDE_PX` it bears an error of half of that and more.
 STEP = 1.015
-"""Ratio of neighbouring focal lengths of the first step, for a method that has to be told the
-focal length. Within `WIDE_PX` it bears an error of half of that and more."""
+FOV_ERROR = 0.1  # error of the focal length that the method ``triangle`` finds by itself
+FOUND_PX = 4.0  # tolerance of the first step where the focal length is found with the attitude
 
-FOV_ERROR = 0.1
-"""Error of the focal length that the method ``triangle`` finds by itself."""
-
-FOUND_PX = 4.0
-"""Tolerance of the first step where the focal length is found with the attitude."""
-
+# Middle parts of the frame that the first step tries: a lens distorts least in the middle.
 SHARES = (1.0, 0.7, 0.5)
-"""Middle parts of the frame that the first step tries: a lens distorts least in the middle."""
 
+# Brightest centroids of a frame, without magnitudes those nearest to the middle, that the first
+# step asks about: a question without an answer takes a tenth of the time that all take.
 FEW = 16
-"""Brightest centroids of a frame, without magnitudes those nearest to the middle, that the first
-step asks about: a question without an answer takes a tenth of the time that all take."""
+AT_ONCE = 3  # frames that are tried together at all focal lengths, before others
+GROWTH = 1.3  # how much larger the part of the frame is that the next round identifies
+MAX_ROUNDS = 12  # largest number of rounds; it takes four to seven
 
-AT_ONCE = 3
-"""Frames that are tried together at all focal lengths, before others."""
-
-GROWTH = 1.3
-"""How much larger the part of the frame is that the next round identifies."""
-
-MAX_ROUNDS = 12
-"""Largest number of rounds; it takes four to seven."""
-
+# The models that a round chooses from.
 ROUND_MODELS = (
     FOCAL,
     (*FOCAL, "k1"),
@@ -77,7 +65,6 @@ ROUND_MODELS = (
     (*FOCAL, "k1", *CENTRE),
     (*FOCAL, "k1", "k2", *CENTRE),
 )
-"""The models that a round chooses from."""
 
 
 @dataclass(frozen=True)

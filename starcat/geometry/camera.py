@@ -19,8 +19,8 @@ from starcat.errors import ConfigError
 from starcat.geometry.distortion import NO_DISTORTION, Distortion, checked_number
 from starcat.geometry.sphere import separation
 
+# Largest width and height that is accepted: no detector has more pixels on a side.
 LARGEST_PX = 1_000_000
-"""Largest width and height that is accepted: no detector has more pixels on a side."""
 
 
 @dataclass(frozen=True, init=False)

@@ -19,16 +19,15 @@ from starcat.errors import ConfigError
 
 Points = NDArray[np.complex128]
 
-HORIZON = 1e8
-"""Largest x/z of a direction that has an image: 2 milliarcsec short of 90 degrees."""
+HORIZON = 1e8  # largest x/z of a direction that has an image: 2 milliarcsec short of 90 degrees
 
+# Largest coefficient that is accepted. A k3 of this size moves the edge of a field of 0.25 deg by
+# a hundredth of its distance.
 LARGEST = 1e14
-"""Largest coefficient that is accepted. A k3 of this size moves the edge of a field of 0.25 deg
-by a hundredth of its distance."""
 
+# Most steps of Newton's method. Points need one to three, unless they are next to the fold or have
+# no inverse.
 NEWTON_STEPS = 50
-"""Most steps of Newton's method. Points need one to three, unless they are next to the fold or
-have no inverse."""
 
 
 def checked_number(name: str, value: object, low: float = -np.inf, high: float = np.inf) -> float:
@@ -166,5 +165,4 @@ class Distortion:
         return np.where(unsolved, np.nan, z)
 
 
-NO_DISTORTION = Distortion()
-"""The distortion of a lens that is as good as a pinhole: none."""
+NO_DISTORTION = Distortion()  # the distortion of a lens that is as good as a pinhole: none

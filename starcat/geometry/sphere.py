@@ -113,8 +113,7 @@ def _length(v: Array) -> Array:
     return np.asarray(np.sqrt(np.einsum("...i,...i->...", v, v)))
 
 
-_ROUNDING = 1e-12
-"""By so much a zone is wider than its cap: more than the sines are off by."""
+_ROUNDING = 1e-12  # by so much a zone is wider than its cap: more than the sines are off by
 
 
 @dataclass(frozen=True)

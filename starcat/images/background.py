@@ -21,25 +21,23 @@ from starcat.version import install_command
 
 Grey = NDArray[np.float32]
 
-SMALLEST_PX = 16
-"""Narrowest image in which a background can be told from stars."""
+SMALLEST_PX = 16  # narrowest image in which a background can be told from stars
+# What a square pixel adds to the variance of a spot, and rounding to whole numbers to noise.
 PIXEL_VARIANCE = 1.0 / 12.0
-"""What a square pixel adds to the variance of a spot, and rounding to whole numbers to noise."""
 _BOX_PX = 64
+# Boxes of the background, tried one after the other where there are clouds.
 _BOXES_PX = (64, 32, 16)
-"""Boxes of the background, tried one after the other where there are clouds."""
 _SAMPLE_PX, _SAMPLES = 48, 6
 _EXCESS_SIGMA_PX = (1.0, 4.0)
+# Share of the pixels at the black point between which the noise is told from the others.
 _CUT_SHARE = (0.2, 0.985)
-"""Share of the pixels at the black point between which the noise is told from the others."""
 _STAR_NOISE = 4.5
-_FLAT_EXCESS = 0.3
-"""Smoothed pixels with so little of the noise of white ones are flat, not noisy."""
+_FLAT_EXCESS = 0.3  # smoothed pixels with so little of the noise of white ones are flat, not noisy
+# Noise is white up to the first; the background has structure beyond the second.
 _WHITE_EXCESS, _CLOUD_EXCESS = 1.3, 1.6
-"""Noise is white up to the first; the background has structure beyond the second."""
 _HOT_NOISE = 4.0
+# A hot pixel's neighbours have less than this part of the light that a star would give them.
 _HOT_PART = 0.25
-"""A hot pixel's neighbours have less than this part of the light that a star would give them."""
 
 
 @dataclass(frozen=True)

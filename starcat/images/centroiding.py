@@ -28,8 +28,8 @@ from starcat.images.spot_width import SIGMA_RANGE_PX, is_sharp, sigma_of_stars
 
 _NARROWEST_WINDOW_PX = 1.0  # a narrower window follows the pixel grid (docs/decisions.md)
 _APERTURE_SIGMA = 2.0
+# A plateau: pixels that differ by no more than read noise, and by half a per cent.
 _PLATEAU_NOISE, _PLATEAU_DEPTH, _PLATEAU_PIXELS = 6.0, 0.005, 3
-"""A plateau: pixels that differ by no more than read noise, and by half a per cent."""
 
 
 @dataclass(frozen=True)

@@ -19,17 +19,14 @@ from starcat.images.background import Levels, load_sep
 
 _log = logging.getLogger(__name__)
 
+# Pixels above the threshold that sep is given room for: so many, and this part of the image.
 _ROOM, _ROOM_SHARE = 300_000, 0.3
-"""Pixels above the threshold that sep is given room for: so many, and this part of the image."""
-_MOST_PARTS = 4096
-"""Parts that sep may divide an object into: a Moon with its glow has thousands."""
+_MOST_PARTS = 4096  # parts that sep may divide an object into: a Moon with its glow has thousands
+# The threshold is raised by this factor, so many times, where the room does not do.
 _RAISE, _TRIES = 1.5, 4
-"""The threshold is raised by this factor, so many times, where the room does not do."""
 _FEWEST, _MOST = 5, 30
-_LONG = 2.5
-"""Length over width from which a spot is long, by standard deviations along its axes."""
-_ALIGNED = 0.9
-"""Length of the mean of unit vectors with twice the angle: 1 if all are parallel."""
+_LONG = 2.5  # length over width from which a spot is long, by standard deviations along its axes
+_ALIGNED = 0.9  # length of the mean of unit vectors with twice the angle: 1 if all are parallel
 
 
 def detect(levels: Levels, sigma: float, threshold: float) -> NDArray[Any]:

@@ -15,23 +15,22 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+# Colours of the sky, of what is identified and of what is not.
 SKY, STAR, LOST = "#0b1220", "#5ad1e6", "#ffb454"
-"""Colours of the sky, of what is identified and of what is not."""
+# Colours of names, and the radius of a mark above which the first one is taken.
 _BRIGHT, _FAINT, _LARGE_PT = "#f4fbfd", "#a9bcc7", 7.0
-"""Colours of names, and the radius of a mark above which the first one is taken."""
 LABEL_PT = 8.0
-LETTER_PT = 0.62 * LABEL_PT
-"""Size of names, and about the width of a letter."""
+LETTER_PT = 0.62 * LABEL_PT  # size of names, and about the width of a letter
 _MOST_LABELS = 60
 _LABEL_GAP_PT = 4.0
 _COMPASS_PT = 76.0
+# Layers of a spot: their sizes and opacities.
 _GLOW = ((3.2, 0.06), (2.2, 0.10), (1.5, 0.18), (1.0, 1.0))
-"""Layers of a spot: their sizes and opacities."""
 
 
 _LONG_SIDE_PX = 900
+# Right, left, the four diagonals, above, below: the order of preference.
 _DIRECTIONS = ((1, 0), (-1, 0), (1, -1), (1, 1), (-1, -1), (-1, 1), (0, -1), (0, 1))
-"""Right, left, the four diagonals, above, below: the order of preference."""
 
 
 @dataclass(frozen=True)

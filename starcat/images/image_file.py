@@ -45,22 +45,20 @@ _KINDS = {
     b"MM\0+": "TIFF",
     b"\xff\xd8\xff": "JPEG",
 }
+# What is written under which suffix.
 WRITTEN_KINDS = {
     ".fits": "FITS", ".fit": "FITS", ".fts": "FITS", ".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF",
     ".jpg": "JPEG", ".jpeg": "JPEG",
 }  # fmt: skip
-"""What is written under which suffix."""
-_LUMINANCE = np.array([0.299, 0.587, 0.114])
-"""Weights of red, green and blue: ITU-R BT.601."""
-
+_LUMINANCE = np.array([0.299, 0.587, 0.114])  # weights of red, green and blue: ITU-R BT.601
 _BINOMIAL = np.array([0.25, 0.5, 0.25])
 
 _WCS_SUFFIXES = (".fits", ".fit", ".fts")
+# Keywords that a world coordinate system of a header is made of.
 _OF_A_WCS = re.compile(
     r"(WCSAXES|WCSNAME|C(TYPE|UNIT|RVAL|RPIX|DELT|ROTA)\d|(PC|CD)\d_\d|P[VS]\d_\d+|LONPOLE|LATPOLE"
     r"|RADE(SYS|CSYS)|EQUINOX|MJDREF[IF]?|[AB]P?_(ORDER|DMAX|\d_\d))"
 )
-"""Keywords that a world coordinate system of a header is made of."""
 
 
 def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None) -> Grey:

@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 GRID, LINES, PLANET = "#3d6b86", "#8f86c9", "#ffe08a"
 _STEPS_DEG = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 30.0, 45.0)
 _POINTS = 181
-_INTERVALS = 5
-"""Wanted number of intervals of the grid across the frame."""
+_INTERVALS = 5  # wanted number of intervals of the grid across the frame
 
 
 @dataclass(frozen=True)

@@ -21,15 +21,10 @@ from starcat.images.image_file import WRITTEN_KINDS, write_image
 from starcat.matcher.centroids import write_centroids
 from starcat.simulation.simulate import Frame
 
-CENTROIDS_SUFFIX = ".csv"
-"""Suffix of the file that a simulated frame's centroids are written to."""
-
-_REACH_SIGMA = 6.0
-"""A star is drawn this far to each side: 4e-9 of its light falls outside."""
-_HOT_RANGE = (0.02, 0.5)
-"""Electrons of a hot pixel, as parts of the full well."""
-_MOST_ELECTRONS = 1e15
-"""Above it a count has no digits left; numpy draws none above 9e18."""
+CENTROIDS_SUFFIX = ".csv"  # suffix of the file that a simulated frame's centroids are written to
+_REACH_SIGMA = 6.0  # a star is drawn this far to each side: 4e-9 of its light falls outside
+_HOT_RANGE = (0.02, 0.5)  # electrons of a hot pixel, as parts of the full well
+_MOST_ELECTRONS = 1e15  # above it a count has no digits left; numpy draws none above 9e18
 
 
 @dataclass(frozen=True)

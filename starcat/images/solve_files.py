@@ -40,23 +40,21 @@ Content = dict[str, Any]
 
 STDIN = Path("-")
 
+# Files that are read as images; all others hold centroids.
 IMAGE_SUFFIXES = (
     ".fits", ".fit", ".fts", ".gz", ".fz", ".png", ".tif", ".tiff", ".jpg", ".jpeg",
 )  # fmt: skip
-"""Files that are read as images; all others hold centroids."""
 
+# Error of the focal length that is allowed for an image where none is stated: who describes a
+# camera by its data sheet is seldom farther off.
 FOV_ERROR_OF_IMAGES = 0.02
-"""Error of the focal length that is allowed for an image where none is stated: who describes a
-camera by its data sheet is seldom farther off."""
+CAMERA_NAME = "camera.toml"  # what messages call the text of a camera file
 
-CAMERA_NAME = "camera.toml"
-"""What messages call the text of a camera file."""
-
+# Options that a matcher is opened with; the others are about a file.
 MATCHER_OPTIONS = (
     *("method", "tolerance_px", "noise_px", "noise_mag", "max_false_match_probability"),
     *("min_share", "max_steps", "time_limit_s"),
 )
-"""Options that a matcher is opened with; the others are about a file."""
 
 
 class IdentifyOptions(BaseModel):

@@ -13,19 +13,17 @@ from scipy.special import erf
 from starcat.arrays import Array, Mask
 from starcat.images.background import Levels
 
-SIGMA_RANGE_PX = (0.3, 5.0)
-"""Narrowest and widest spot that is looked for."""
+SIGMA_RANGE_PX = (0.3, 5.0)  # narrowest and widest spot that is looked for
 _STEP = 1.15
-_HALF_PX = 16
-"""A star is looked at this far to each side."""
+_HALF_PX = 16  # a star is looked at this far to each side
 _REACH_SIGMA = 4.0
 _MOST_SPOTS = 150
+# A spot narrower than this is a hot pixel with its neighbour, if there is another explanation.
 _SHARP_PX = 0.45
-"""A spot narrower than this is a hot pixel with its neighbour, if there is another explanation."""
 _CLEAR_SNR, _SHARP_SNR = 15.0, 12.0
 _FEW = 5
+# In a flat image spots count that have this share of the signal of the tenth brightest.
 _BRIGHT, _BRIGHT_SHARE = 10, 0.1
-"""In a flat image spots count that have this share of the signal of the tenth brightest."""
 
 
 def best_widths(levels: Levels, places: Array) -> tuple[Array, Array]:

@@ -32,7 +32,15 @@ from starcat.matcher.observation import (
 )
 from starcat.matcher.pose import first_poses, pose_at
 from starcat.matcher.result import MatchResult
-from starcat.matcher.settings import Budget, BudgetSpentError, Limit, Settings, TriangleOrder
+from starcat.matcher.settings import (
+    Budget,
+    BudgetSpentError,
+    Limit,
+    Settings,
+    TriangleOrder,
+    certainty,
+    check_scale_free,
+)
 from starcat.matcher.verification import AT_ONCE, Agreement, BestOf, agree, agreeing_centroids
 
 MOST_CENTROIDS = 40
@@ -230,9 +238,10 @@ def identify_blind(
         raise ConfigError(
             "an onboard image serves one field of view; open the artifact that it is of", key="fov"
         )
-    settings.check_scale_free()
+    check_scale_free(settings)
     parts = parts_of_range(levels(database), frame.camera, fov_deg)
-    budget, certain = settings.budget(), settings.certainty / len(parts)
+    budget = Budget(settings.max_steps, settings.time_limit_s)
+    certain = certainty(settings) / len(parts)
     searches = [_begun(part, settings, frame, budget, certain) for part in parts]
     if len(searches[0].whole) < MIN_STARS:
         return answer_of(None, searches[0].whole)

@@ -167,7 +167,7 @@ class BatchResult(Sequence[MatchResult]):
         code, dropped = int(found["status"]), _dropped(star)
         if STATUSES[code] != "identified":
             return no_match(len(star), dropped, self._why(code, asked), **facts)
-        return MatchResult(
+        answer = MatchResult(
             "identified",
             np.maximum(star, -1),
             found["matrix"].copy(),
@@ -177,6 +177,9 @@ class BatchResult(Sequence[MatchResult]):
             asked.camera,
             **facts,
         )
+        # The library's own, which rounds otherwise than the one that the matrix makes.
+        vars(answer)["q_body_from_icrs"] = found["q_body_from_icrs"].copy()
+        return answer
 
     def _why(self, code: int, frame: Frame) -> Refusal | Callable[[], Refusal | None] | None:
         """Return why a frame has no answer, or what finds it out."""

@@ -7,13 +7,13 @@ reference is in numpy; where it can, the C library answers, with the same stars.
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
 
 from numpy.typing import ArrayLike
 
@@ -27,7 +27,15 @@ from starcat.matcher.numpy_engine import solve
 from starcat.matcher.observation import WIDEST_FOV_ERROR, Frame, as_frame
 from starcat.matcher.prior import Prior, prior_of
 from starcat.matcher.result import MatchResult, Refusal
-from starcat.matcher.settings import Settings
+from starcat.matcher.settings import (
+    CERTAIN,
+    MIN_SHARE,
+    Engine,
+    Settings,
+    TriangleOrder,
+    check_scale_free,
+    has_default_search,
+)
 from starcat.onboard.layout import FEATURES
 from starcat.onboard.reading import is_image
 
@@ -73,25 +81,31 @@ class Matcher(Settings, _WithDatabase):
         cls,
         artifact: str | os.PathLike[str],
         method: str | None = "triangle",
-        **settings: Any,
+        *,
+        tolerance_px: float | None = None,
+        max_false_match_probability: float = CERTAIN,
+        selection: TriangleOrder = TriangleOrder(),  # noqa: B008
+        noise_px: float | None = None,
+        noise_mag: float | None = None,
+        engine: Engine = "auto",
+        min_share: float = MIN_SHARE,
+        max_steps: float = math.inf,
+        time_limit_s: float = math.inf,
     ) -> Matcher:
         """Open the database of an artifact, or an onboard image.
+
+        With an image everything is as in flight: the C library, and directions as they are rounded.
 
         Parameters
         ----------
         artifact : str or path-like
-            The artifact's folder, or an image as `starcat export --to onboard` writes it. With an
-            image everything is as in flight: the C library, and directions as they are rounded.
+            The artifact's folder, or an image as `starcat export --to onboard` writes it.
         method : str, default "triangle"
             A key of `METHODS`; None for the best one that the artifact's products allow. An
             image has one method, which is used whatever is asked for.
-        **settings
-            Any of the other attributes but ``database``, by name.
-
-        Returns
-        -------
-        Matcher
-            Ready to identify.
+        tolerance_px, max_false_match_probability, selection, noise_px, noise_mag, engine, \
+        min_share, max_steps, time_limit_s
+            As the fields of `Settings`.
 
         Raises
         ------
@@ -105,15 +119,26 @@ class Matcher(Settings, _WithDatabase):
         if is_image(path):
             database = open_image(path)
             chosen = database.image.method if database.image else ""
-            if settings.get("engine", "auto") == "auto":
-                settings["engine"] = "c"
+            engine = "c" if engine == "auto" else engine
         else:
             held = products_in(path)
             chosen = best_method(held) if method is None else method
             known = method_named(chosen)
             usable = (name for name in known.optional if name in held)
             database = open_database(path, (*known.products, *usable))
-        return cls(database, chosen, **settings)
+        return cls(
+            database,
+            chosen,
+            tolerance_px,  # type: ignore[arg-type]
+            max_false_match_probability,
+            selection,
+            noise_px=noise_px,
+            noise_mag=noise_mag,
+            engine=engine,
+            min_share=min_share,
+            max_steps=max_steps,
+            time_limit_s=time_limit_s,
+        )
 
     def identify(
         self,
@@ -215,7 +240,7 @@ class Matcher(Settings, _WithDatabase):
         return self._answers(given, threads=threads or os.cpu_count() or 1)
 
     @cached_property
-    def settings(self) -> Settings:
+    def _settings(self) -> Settings:
         """The settings without the database."""
         return Settings(**{field.name: getattr(self, field.name) for field in fields(Settings)})
 
@@ -223,7 +248,7 @@ class Matcher(Settings, _WithDatabase):
     def _c_engine(self) -> CEngine | None:
         """The C library with this matcher's image, where it serves."""
         is_wide = self.engine == "auto" and self.tolerance_px > WIDE_PX
-        if self.engine == "numpy" or not self.has_default_search:
+        if self.engine == "numpy" or not has_default_search(self):
             return None
         if is_wide and self.database.image is None:
             return None
@@ -237,7 +262,7 @@ class Matcher(Settings, _WithDatabase):
             )
         if self.method not in FEATURES:
             return f"method {self.method!r} is not in C; choose one of {', '.join(FEATURES)}"
-        if not self.has_default_search:
+        if not has_default_search(self):
             return "it has no other selection, share of the frame and limits than the default ones"
         return f"{self.database.name} has too many stars or features for an onboard image"
 
@@ -248,7 +273,7 @@ class Matcher(Settings, _WithDatabase):
         engine = self._c_engine
         if engine is not None and all(engine.accepts(len(frame)) for frame in frames):
             explain = None if self.database.image else partial(self._explain, prior)
-            answers = engine.identify(frames, self.settings, prior, threads, explain)
+            answers = engine.identify(frames, self._settings, prior, threads, explain)
             if answers.is_whole and prior is None:
                 return answers
             if answers.is_whole and prior is not None:
@@ -259,7 +284,7 @@ class Matcher(Settings, _WithDatabase):
         """Return why the C library has no answer: what the search with numpy comes to."""
         # What is unlikely enough for one of the two searches near a prior may not be found by
         # the other.
-        found = solve(self.settings, self.database, frame, prior=prior)
+        found = solve(self._settings, self.database, frame, prior=prior)
         return Refusal("prior") if found.ok and prior is not None else found.refusal
 
     def _timed(
@@ -267,7 +292,7 @@ class Matcher(Settings, _WithDatabase):
     ) -> MatchResult:
         """Identify a frame with numpy, and say how long that took and what was asked."""
         before_s = time.perf_counter()
-        found = search(self.settings, self.database, frame)
+        found = search(self._settings, self.database, frame)
         return replace(
             found,
             time_s=time.perf_counter() - before_s,
@@ -280,7 +305,7 @@ class Matcher(Settings, _WithDatabase):
         if self.database.image is not None:
             text = "an onboard image needs the focal length; open the artifact that it is of"
             raise ConfigError(text, key="fov_error", value=fov_error)
-        self.check_scale_free()
+        check_scale_free(self)
         if not 0.0 < fov_error <= WIDEST_FOV_ERROR:
             text = f"fov_error is {fov_error}; expected 0 to {WIDEST_FOV_ERROR:g}"
             raise ConfigError(text, key="fov_error", value=fov_error)

@@ -13,7 +13,7 @@ from starcat.matcher.observation import Candidates, Frame, Observation, observe
 from starcat.matcher.pose import focal_length_error_px
 from starcat.matcher.prior import Prior, search_near
 from starcat.matcher.result import MatchResult, Origin, Refusal, no_match
-from starcat.matcher.settings import BudgetSpentError, Limit, Settings
+from starcat.matcher.settings import Budget, BudgetSpentError, Limit, Settings, certainty
 from starcat.matcher.stars import ARCSEC
 from starcat.matcher.verification import Agreement, BestOf, verify
 
@@ -31,8 +31,13 @@ def solve(
             f"a frame of {len(frame)} centroids and this camera are beyond the C library, and "
             "an onboard image holds nothing for numpy; open the artifact that it is of"
         )
-    observation = observe(frame, settings, fov_error=fov_error, budget=settings.budget())
-    best, limit = BestOf(settings.certainty), None
+    observation = observe(
+        frame,
+        settings,
+        fov_error=fov_error,
+        budget=Budget(settings.max_steps, settings.time_limit_s),
+    )
+    best, limit = BestOf(certainty(settings)), None
     if len(observation) >= MIN_STARS:
         limit = _search(observation, database, prior, best)
     answer = answer_of(best.found, observation, limit, prior)

@@ -174,27 +174,30 @@ class Settings:
         value = getattr(self, name)
         return ConfigError(f"{name} is {value!r}; expected {expected}", key=name, value=value)
 
-    @property
-    def has_default_search(self) -> bool:
-        """Whether what only numpy can be told is as by default."""
-        own = self.selection, self.max_batches, self.min_share, self.max_steps, self.time_limit_s
-        return own == (TriangleOrder(), MAX_BATCHES, MIN_SHARE, math.inf, math.inf)
 
-    @property
-    def certainty(self) -> float:
-        """False-match probability that ends a search."""
-        limit = self.max_false_match_probability
-        return limit if limit <= CERTAIN else max(CERTAIN, 0.01 * limit)
+def has_default_search(settings: Settings) -> bool:
+    """Return whether what only numpy can be told is as by default."""
+    own = (
+        settings.selection,
+        settings.max_batches,
+        settings.min_share,
+        settings.max_steps,
+        settings.time_limit_s,
+    )
+    return own == (TriangleOrder(), MAX_BATCHES, MIN_SHARE, math.inf, math.inf)
 
-    def budget(self) -> Budget:
-        """Return the budget of a search that begins now."""
-        return Budget(self.max_steps, self.time_limit_s)
 
-    def check_scale_free(self) -> None:
-        """Check that the method can do without the focal length."""
-        if self.method not in SCALE_FREE:
-            text = f"method {self.method!r} needs the focal length; only 'triangle' can find it"
-            raise ConfigError(text, key="method", value=self.method)
+def certainty(settings: Settings) -> float:
+    """Return the false-match probability that ends a search."""
+    limit = settings.max_false_match_probability
+    return limit if limit <= CERTAIN else max(CERTAIN, 0.01 * limit)
+
+
+def check_scale_free(settings: Settings) -> None:
+    """Check that the method can do without the focal length."""
+    if settings.method not in SCALE_FREE:
+        text = f"method {settings.method!r} needs the focal length; only 'triangle' can find it"
+        raise ConfigError(text, key="method", value=settings.method)
 
 
 class BudgetSpentError(Exception):

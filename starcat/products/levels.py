@@ -21,8 +21,8 @@ from starcat.products.pairs_and_triangles import distinct_triangles
 
 Rows = NDArray[np.int32]
 
+# Boresights of a level, at the least: wide fields need few, and may have more for nothing.
 FEWEST_BORESIGHTS = 1000
-"""Boresights of a level, at the least: wide fields need few, and may have more for nothing."""
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from starcat.geometry.proximity import pairs_within
 from starcat.geometry.sphere import radec_from_directions, tangent_axes
 from starcat.products.index import Index, row_offsets, stable_order
 
+# Number of stars whose rows are sorted together, few enough for the processor's cache.
 STARS_AT_ONCE = 4096
-"""Number of stars whose rows are sorted together, few enough for the processor's cache."""
 
 
 @dataclass(frozen=True)

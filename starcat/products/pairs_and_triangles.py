@@ -63,11 +63,8 @@ def find_pairs(
     return StarPairs(i, j, build_kvector(angle[order]))
 
 
-_PACKED_BITS = 21
-"""Three row numbers of so many bits fit into one int64."""
-
-AT_ONCE = 1 << 19
-"""Number of triangles whose features are computed together."""
+_PACKED_BITS = 21  # three row numbers of so many bits fit into one int64
+AT_ONCE = 1 << 19  # number of triangles whose features are computed together
 
 
 @dataclass(frozen=True)

@@ -18,15 +18,14 @@ from starcat.geometry.sphere import saff_kuijlaars
 
 Rows = NDArray[np.int64]
 
-TILES = 3072
-"""Number of pieces of the sky, 13 square degrees each, in which stars are counted."""
+TILES = 3072  # number of pieces of the sky, 13 square degrees each, in which stars are counted
 
+# The density of a tile is the mean over so many tiles around it, as one tile has few stars.
 TILES_AVERAGED = 9
-"""The density of a tile is the mean over so many tiles around it, as one tile has few stars."""
 
+# Step of the distribution of magnitudes, and standard deviation of the kernel that smooths it;
+# magnitudes.
 MAG_BIN, MAG_SMOOTHING = 0.1, 0.5
-"""Step of the distribution of magnitudes, and standard deviation of the kernel that smooths
-it; magnitudes."""
 
 
 class PositionsAndMagnitudes(Protocol):

@@ -19,6 +19,7 @@ import numpy as np
 from starcat.arrays import Array, Directions
 from starcat.sky.observer import AU_KM, DAY_S, LIGHT_KM_S, Observer, aberrated
 
+# Equatorial radii (IAU 2015 nominal values and Archinal et al. 2018).
 RADII_KM = {
     "Sun": 695_700.0,
     "Moon": 1737.4,
@@ -31,8 +32,9 @@ RADII_KM = {
     "Neptune": 24_764.0,
     "Earth": 6378.137,
 }
-"""Equatorial radii (IAU 2015 nominal values and Archinal et al. 2018)."""
 
+# Number in ``plan94``, and its largest error in 1800 to 2050 as seen from the Sun, arcsec (its
+# longitude and latitude, from the notes of that routine).
 _PLANETS = {
     "Mercury": (1, 4.2),
     "Venus": (2, 5.1),
@@ -42,17 +44,11 @@ _PLANETS = {
     "Uranus": (7, 86.3),
     "Neptune": (8, 11.2),
 }
-"""Number in ``plan94``, and its largest error in 1800 to 2050 as seen from the Sun, arcsec (its
-longitude and latitude, from the notes of that routine)."""
+_MOON_ERROR_ARCSEC = 20.0  # of ``moon98``, with a second of unknown leap seconds
 
-_MOON_ERROR_ARCSEC = 20.0
-"""Of ``moon98``, with a second of unknown leap seconds."""
-
+# How far from the middle of the Earth an observer without a position may be.
 _WITHIN_ORBIT_KM = 7000.0
-"""How far from the middle of the Earth an observer without a position may be."""
-
-_AU_DAY = LIGHT_KM_S * DAY_S / AU_KM
-"""Speed of light, au per day."""
+_AU_DAY = LIGHT_KM_S * DAY_S / AU_KM  # speed of light, au per day
 
 
 @dataclass(frozen=True)
@@ -138,16 +134,15 @@ def _ephemeris_error_rad(name: str, from_sun_au: Array, from_observer_au: Array)
     return float(error_au / np.sqrt(from_observer_au @ from_observer_au))
 
 
+# V of the Sun from 1 au, and of the full Moon from its mean distance, with the Sun 1 au away.
 SUN_MAG, MOON_MAG = -26.75, -12.74
-"""V of the Sun from 1 au, and of the full Moon from its mean distance, with the Sun 1 au away."""
-
 MOON_DISTANCE_AU = 384_400.0 / 149_597_870.7
 
+# ICRS unit vector (IAU: RA 40.589, Dec 83.537 deg).
 _SATURN_POLE = np.array([0.08547883, 0.07323576, 0.99364475])
-"""ICRS unit vector (IAU: RA 40.589, Dec 83.537 deg)."""
 
+# ICRS unit vector (IAU: RA 257.311, Dec -15.175 deg).
 _URANUS_POLE = np.array([-0.21199958, -0.94155916, -0.26176809])
-"""ICRS unit vector (IAU: RA 257.311, Dec -15.175 deg)."""
 
 
 def apparent_magnitude(name: str, from_sun_au: Array, from_observer_au: Array) -> float:
@@ -228,6 +223,7 @@ def _polynomial(x: float, *terms: float) -> float:
     return float(np.polynomial.polynomial.polyval(x, terms))
 
 
+# Magnitude at 1 au from the Sun and from the observer, by the phase angle in degrees.
 PHASE_CURVES: Mapping[str, Callable[[float], float]] = {
     "Mercury": _mercury,
     "Venus": _venus,
@@ -236,4 +232,3 @@ PHASE_CURVES: Mapping[str, Callable[[float], float]] = {
     "Jupiter": _jupiter,
     "Neptune": _neptune,
 }
-"""Magnitude at 1 au from the Sun and from the observer, by the phase angle in degrees."""

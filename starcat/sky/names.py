@@ -23,12 +23,10 @@ from starcat.geometry.sphere import (
     tangent_axes,
 )
 
-REACH_ARCSEC = 20.0
-"""Largest separation from the place that the list has for a star."""
+REACH_ARCSEC = 20.0  # largest separation from the place that the list has for a star
 
+# How much fainter and brighter than V a catalog may have a star: V - Ks of the reddest is 9.
 FAINTER_MAG, BRIGHTER_MAG = 2.0, 9.0
-"""How much fainter and brighter than V a catalog may have a star: V - Ks of the reddest is 9."""
-
 _FOLDER = Path(__file__).parent
 _MAS = np.radians(1.0 / 3_600_000.0)
 

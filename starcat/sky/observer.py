@@ -25,15 +25,9 @@ import numpy as np
 from starcat.arrays import Array, Directions
 from starcat.errors import ConfigError
 
-LIGHT_KM_S = 299_792.458
-"""Speed of light in vacuum (exact)."""
-
-AU_KM = 149_597_870.7
-"""Astronomical unit (IAU 2012 Resolution B2, exact)."""
-
-_SUN_RADIUS_AU = 1.974_125_743_36e-8
-"""Schwarzschild radius of the Sun, au: ``2 GM / c^2``."""
-
+LIGHT_KM_S = 299_792.458  # speed of light in vacuum (exact)
+AU_KM = 149_597_870.7  # astronomical unit (IAU 2012 Resolution B2, exact)
+_SUN_RADIUS_AU = 1.974_125_743_36e-8  # Schwarzschild radius of the Sun, au: ``2 GM / c^2``
 _MAS = np.radians(1.0 / 3_600_000.0)
 
 
@@ -94,9 +88,7 @@ def _unit(u: Array) -> Array:
 
 Origin = Literal["earth", "barycentre"]
 
-FIRST_YEAR, LAST_YEAR = 1900, 2099
-"""Years of the ephemeris."""
-
+FIRST_YEAR, LAST_YEAR = 1900, 2099  # years of the ephemeris
 DAY_S = 86_400.0
 
 

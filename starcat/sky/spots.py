@@ -23,14 +23,12 @@ from starcat.matcher.settings import CERTAIN, TOLERANCE_PX
 from starcat.sky.bodies import Bodies, bodies_seen
 from starcat.sky.observer import Observer
 
+# A body is looked for if it is at most this much fainter than the database's faintest star.
 FAINTER_MAG = 1.0
-"""A body is looked for if it is at most this much fainter than the database's faintest star."""
 
+# A body that is larger, as the Earth is from an orbit, has no spot.
 LARGEST_SPOT_RAD = np.radians(1.0)
-"""A body that is larger, as the Earth is from an orbit, has no spot."""
-
-BRIGHTEST = 3
-"""So many of the brightest spots may be planets that a frame was not identified for."""
+BRIGHTEST = 3  # so many of the brightest spots may be planets that a frame was not identified for
 
 
 def identify_in_time(
@@ -62,10 +60,9 @@ def identify_in_time(
     Returns
     -------
     MatchResult
-        Spots of planets are in ``dropped``, with the planet's name in small letters as the
-        reason. A frame that is not identified is asked again without one or two of its three
-        brightest spots; such an answer counts if a planet is at each of them, with the
-        probability of all these questions.
+        Spots of planets are in ``dropped``, by the planet's name in small letters. A frame that is
+        not identified is asked again without one or two of its three brightest spots; such an
+        answer counts if planets are there, with the probability of all these questions.
     """
     given = as_frame(centroids_px, camera, magnitudes)
     frame, mag = given.centroids_px, given.magnitudes

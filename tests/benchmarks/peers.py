@@ -141,7 +141,7 @@ def drive_starcat(
         px, mag, prior, _ = given
         near = prior_of(prior, PRIOR_DEG) if track else None
         frame = as_frame(px, matcher.database.camera, mag)
-        found = library.identify([frame], matcher.settings, near)
+        found = library.identify([frame], matcher, near)
         return float(found.seconds[0])
 
     return Driver(prepare, solve, attitude, begin=begin, inside_s=inside_s)
