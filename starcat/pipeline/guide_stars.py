@@ -89,8 +89,8 @@ def check_tiling(
     if found > most:
         raise BuildError(
             f"{spec.name}: too dense to estimate: the {spec.boresights.count:,} fields of the "
-            f"tiling have about {found:,.0f} stars, limit {most:,}; use a brighter faint_limit_mag, "
-            "selection.max_stars_per_field, or a smaller boresights.count"
+            f"tiling have about {found:,.0f} stars, limit {most:,}; use a brighter "
+            "faint_limit_mag, selection.max_stars_per_field, or a smaller boresights.count"
         )
 
 
