@@ -28,16 +28,10 @@ AGAIN_S = 0.2
 
 
 class Client:
-    """A service.
+    """A service at an address such as ``http://127.0.0.1:8000``.
 
-    Parameters
-    ----------
-    url : str
-        Its address, such as ``http://127.0.0.1:8000``.
-    token : str, optional
-        Where the service asks for one.
-    timeout_s : float
-        Seconds without a byte after which it counts as gone.
+    It raises the errors of `starcat.errors` that the service tells of, and `ServiceError` where
+    no byte comes for ``timeout_s``.
     """
 
     def __init__(self, url: str, token: str | None = None, timeout_s: float = 120.0) -> None:
@@ -48,62 +42,15 @@ class Client:
             self._session.headers["Authorization"] = f"Bearer {token}"
 
     def build(self, spec: str | Mapping[str, Any], progress: Progress = no_progress) -> Content:
-        """Have a database built, and wait for it.
-
-        Parameters
-        ----------
-        spec : str or mapping
-            The text of a spec (TOML), or its keys as JSON has them.
-        progress : Progress
-            Called with stages as the service tells them.
-
-        Returns
-        -------
-        dict
-            The job when it is done; its ``result`` has the id of the ``database``.
-
-        Raises
-        ------
-        StarcatError
-            If the spec is refused, or the job fails: with its words and exit code.
-        """
+        """Build a spec, TOML or its keys, and wait: the job's ``result`` names the database."""
         return self.wait(self.submit(spec), progress)
 
     def submit(self, spec: str | Mapping[str, Any]) -> str:
-        """Have a database built, and do not wait for it.
-
-        Parameters
-        ----------
-        spec : str or mapping
-            As for `build`.
-
-        Returns
-        -------
-        str
-            Id of the job, which `wait` takes.
-        """
+        """Have a database built, and return the id of the job, which `wait` takes."""
         return str(self._json("POST", "jobs", json={"kind": "build", "spec": spec})["id"])
 
     def wait(self, job_id: str, progress: Progress = no_progress) -> Content:
-        """Wait for a job.
-
-        Parameters
-        ----------
-        job_id : str
-            Its id.
-        progress : Progress
-            Called with stages as the service tells them.
-
-        Returns
-        -------
-        dict
-            The job when it is done.
-
-        Raises
-        ------
-        StarcatError
-            If it failed or was cancelled.
-        """
+        """Wait for a job, and return it; raise its error if it failed or was cancelled."""
         seen = "0"
         while True:
             for number, kind, data in self._events(job_id, seen):
@@ -128,30 +75,9 @@ class Client:
         max_rows: int | None = None,
         time_limit_s: float | None = None,
     ) -> Content:
-        """Ask a question in SQL.
+        """Ask a question about databases (ids or titles) and catalogs.
 
-        Parameters
-        ----------
-        targets : sequence of str
-            Ids or titles of databases, names of catalogs.
-        query, named : str
-            SQL, or the name of a query of the gallery.
-        values : mapping of str to object, optional
-            The values of the ``$name`` in it.
-        max_rows : int, optional
-            Rows at most.
-        time_limit_s : float, optional
-            Seconds that it may take.
-
-        Returns
-        -------
-        dict
-            ``columns`` with name, type, unit and description; ``rows``; ``is_cut``.
-
-        Raises
-        ------
-        QueryError
-            If it cannot be answered.
+        The answer has ``columns`` (name, type, unit, description), ``rows`` and ``is_cut``.
         """
         given = _given(query=query, values=values, named=named, max_rows=max_rows)
         asked = {"targets": list(targets), **given, **_given(time_limit_s=time_limit_s)}
@@ -168,29 +94,7 @@ class Client:
         named: str | None = None,
         time_limit_s: float | None = None,
     ) -> int:
-        """Ask a question in SQL, and keep the answer in a file.
-
-        Parameters
-        ----------
-        path : Path
-            The file, replaced if it exists.
-        form : {"csv", "json", "parquet", "votable", "fits", "ecsv", "npz"}
-            Its format.
-        targets, query, values, named, time_limit_s
-            As for `sql`.
-
-        Returns
-        -------
-        int
-            Rows.
-
-        Raises
-        ------
-        QueryError
-            If it cannot be answered.
-        ServiceError
-            If the answer breaks off.
-        """
+        """Write the answer to a question to a file, and return how many rows it has."""
         given = _given(query=query, values=values, named=named, time_limit_s=time_limit_s)
         asked = {"targets": list(targets), "format": form, **given}
         with closing(self._answer("POST", "sql", json=asked, stream=True)) as answer:
@@ -203,27 +107,10 @@ class Client:
         frames: Path | Mapping[str, Any],
         options: Mapping[str, Any] | None = None,
     ) -> Content:
-        """Identify the stars of frames.
+        """Identify a file of frames, or ``centroids_px`` and perhaps ``mag``.
 
-        Parameters
-        ----------
-        database : str
-            Id or title of the database.
-        frames : Path or mapping
-            A file of centroids or an image; or ``centroids_px``, and perhaps ``mag``.
-        options : mapping, optional
-            As ``/api/v1/identify/options`` describes them.
-
-        Returns
-        -------
-        dict
-            ``frames`` as 'starcat identify --json' prints them, ``database``, ``method``,
-            ``notes``.
-
-        Raises
-        ------
-        ConfigError
-            If a frame or an option cannot be used.
+        Options are as ``/api/v1/identify/options`` describes them; ``frames`` of the answer as
+        'starcat identify --json' prints them.
         """
         return dict(self._of_frames(f"identify/{quote(database, safe='')}", frames, options).json())
 
@@ -234,51 +121,14 @@ class Client:
         options: Mapping[str, Any] | None = None,
         form: str = "png",
     ) -> bytes:
-        """Return a picture of the first frame, its stars named.
-
-        Parameters
-        ----------
-        database, frames, options
-            As for `identify`.
-        form : {"png", "svg"}
-            Its format.
-
-        Returns
-        -------
-        bytes
-            The file.
-        """
+        """Return a picture (PNG or SVG) of the first frame, its stars named."""
         path = f"identify/{quote(database, safe='')}/picture?format={form}"
         return self._of_frames(path, frames, options).content
 
     def download(
         self, database: str, folder: Path, progress: Progress = no_progress
     ) -> tuple[Path, str]:
-        """Bring a database: every file checked on arrival, then the artifact as a whole.
-
-        Parameters
-        ----------
-        database : str
-            Its id.
-        folder : Path
-            Folder to put ``<name>-<version>/`` into.
-        progress : Progress
-            Called with ("download", bytes there are, bytes in all).
-
-        Returns
-        -------
-        path : Path
-            The artifact.
-        outcome : {"written", "unchanged"}
-            ``unchanged`` where the same was there.
-
-        Raises
-        ------
-        DownloadError, ProductError
-            If a file is not what the manifest says.
-        OutputError
-            If something else is there.
-        """
+        """Bring a database, checked; return its folder, and "written" or "unchanged"."""
         where = f"databases/{quote(database, safe='')}"
         data = self._answer("GET", f"{where}/manifest").content
         manifest = parse_manifest(data, f"{self.url}/api/v1/{where}/manifest", "try again")
@@ -309,70 +159,19 @@ class Client:
         return final, outcome
 
     def files(self, database: str) -> list[Content]:
-        """Return the files of a database.
-
-        Parameters
-        ----------
-        database : str
-            Its id.
-
-        Returns
-        -------
-        list of dict
-            ``path``, ``bytes``, ``sha256`` and ``content_type`` of each.
-        """
+        """Return ``path``, ``bytes``, ``sha256``, ``content_type`` of the files of a database."""
         return list(self._answer("GET", f"databases/{database}/files").json())
 
     def report(self, database: str) -> Content:
-        """Return the report of a build.
-
-        Parameters
-        ----------
-        database : str
-            Its id.
-
-        Returns
-        -------
-        dict
-            As ``report/report.json`` of the artifact has it.
-        """
+        """Return the report of a build, ``report/report.json`` of the artifact."""
         return self._json("GET", f"databases/{database}/report")
 
     def publish(self, database: str, note: str = "") -> Content:
-        """Publish a database.
-
-        Parameters
-        ----------
-        database : str
-            Its id.
-        note : str
-            What is to be known about it.
-
-        Returns
-        -------
-        dict
-            The release, and ``outcome``: ``published``, or ``unchanged``.
-
-        Raises
-        ------
-        OutputError
-            If the version is there with another content.
-        """
+        """Publish a database; ``outcome`` is ``published``, or ``unchanged``."""
         return self._json("POST", "releases", json={"database": database, "note": note})
 
     def estimate(self, spec: str | Mapping[str, Any]) -> Content:
-        """Say what a build would give.
-
-        Parameters
-        ----------
-        spec : str or mapping
-            As for `build`.
-
-        Returns
-        -------
-        dict
-            Stars, sizes and time.
-        """
+        """Say what a build would give: stars, sizes and time."""
         key = "toml" if isinstance(spec, str) else "spec"
         return self._json("POST", "specs/estimate", json={key: spec})
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -69,34 +70,30 @@ def error_of_kind(kind: str, words: str, *, key: str | None = None) -> StarcatEr
     return None if issubclass(found, OnboardSizeError) else found(words)
 
 
+@dataclass(eq=False, repr=False)
 class StarcatError(Exception):
     """Base of all errors that starcat raises on purpose."""
 
+    message: str
     exit_code = 1
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class ConfigError(StarcatError, ValueError):
     """A build spec, preset, option or data-source file that cannot be used."""
 
     exit_code = 2
-
-    def __init__(self, message: str, *, key: str | None = None, value: object = None) -> None:
-        super().__init__(message)
-        self.key = key
-        self.value = value
+    key: str | None = None
+    value: object = None
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class SourceError(StarcatError):
     """A catalog file that is missing, damaged or not what it should be."""
 
     exit_code = 3
-
-    def __init__(
-        self, message: str, *, source: str | None = None, path: Path | None = None
-    ) -> None:
-        super().__init__(message)
-        self.source = source
-        self.path = path
+    source: str | None = None
+    path: Path | None = None
 
 
 class SourceMissing(SourceError):  # noqa: N818 - the name reads as the fact
@@ -107,39 +104,24 @@ class ChecksumMismatch(SourceError):  # noqa: N818
     """A file whose digest is not the one recorded for it."""
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class ParseError(SourceError):
     """A file whose content does not follow the source's record layout."""
 
-    def __init__(
-        self,
-        message: str,
-        *,
-        source: str | None = None,
-        path: Path | None = None,
-        line: int | None = None,
-        byte_range: tuple[int, int] | None = None,
-        field: str | None = None,
-    ) -> None:
-        super().__init__(message, source=source, path=path)
-        self.line = line
-        self.byte_range = byte_range
-        self.field = field
+    line: int | None = None
+    byte_range: tuple[int, int] | None = None
+    field: str | None = None
 
 
 class DownloadError(SourceError):
     """A file that could not be fetched from any of its addresses."""
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class BuildError(StarcatError):
-    """A build that ran but has no usable result: no stars left, or a failed self-test.
+    """A build that ran but has no usable result: no stars left, or a failed self-test."""
 
-    After a failed self-test ``built`` is what was made (`starcat.pipeline.build.Built`), whose
-    folder is gone; else it is None.
-    """
-
-    def __init__(self, message: str, *, built: object = None) -> None:
-        super().__init__(message)
-        self.built = built
+    built: object = None  # after a self-test: `starcat.pipeline.build.Built`, its folder gone
 
 
 class CalibrationError(StarcatError):
@@ -152,59 +134,43 @@ class NotIdentifiedError(StarcatError):
     exit_code = 6
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class ServiceError(StarcatError):
     """A service that cannot be reached, or that refuses what is asked of it."""
 
-    def __init__(self, message: str, *, exit_code: int = 1, status: int | None = None) -> None:
-        super().__init__(message)
-        self.exit_code = exit_code
-        self.status = status
+    exit_code: int = 1
+    status: int | None = None
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class OutputError(StarcatError):
     """A place that cannot be written to, or already holds something else."""
 
-    def __init__(self, message: str, *, path: Path | None = None) -> None:
-        super().__init__(message)
-        self.path = path
+    path: Path | None = None
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class SchemaError(StarcatError):
     """A table or artifact that does not follow the schema of its product."""
 
     exit_code = 4
-
-    def __init__(
-        self,
-        message: str,
-        *,
-        product: str | None = None,
-        field: str | None = None,
-        found: object = None,
-        expected: object = None,
-    ) -> None:
-        super().__init__(message)
-        self.product = product
-        self.field = field
-        self.found = found
-        self.expected = expected
+    product: str | None = None
+    field: str | None = None
+    found: object = None
+    expected: object = None
 
 
 class SchemaVersionError(SchemaError):
     """A product written with a schema version that this reader does not know."""
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class ProductError(StarcatError):
     """A product or artifact that is corrupt, incomplete or does not match its manifest."""
 
     exit_code = 5
-
-    def __init__(
-        self, message: str, *, product: str | None = None, path: Path | None = None
-    ) -> None:
-        super().__init__(message)
-        self.product = product
-        self.path = path
+    product: str | None = None
+    path: Path | None = None
 
 
 class ArtifactMissing(ProductError):  # noqa: N818 - the name reads as the fact
@@ -213,23 +179,19 @@ class ArtifactMissing(ProductError):  # noqa: N818 - the name reads as the fact
     exit_code = 3
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class OnboardImageError(ProductError):
     """An onboard image that is damaged, cut short, or another file."""
 
-    def __init__(
-        self, message: str, *, path: Path | None = None, bad_blocks: Sequence[int] = ()
-    ) -> None:
-        super().__init__(message, path=path)
-        self.bad_blocks = tuple(bad_blocks)
+    bad_blocks: Sequence[int] = ()
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class OnboardSizeError(StarcatError):
     """An onboard image that cannot be made as small as was asked for."""
 
-    def __init__(self, message: str, *, max_bytes: int, smallest_bytes: int) -> None:
-        super().__init__(message)
-        self.max_bytes = max_bytes
-        self.smallest_bytes = smallest_bytes
+    max_bytes: int
+    smallest_bytes: int
 
 
 class QueryError(StarcatError):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple, Protocol
 
 from typer import Abort, TyperException
@@ -31,24 +31,12 @@ _SENTENCE = re.compile(r"; |\. (?=[A-Z])")
 
 @dataclass(frozen=True)
 class Failure:
-    """Why a command ended without a result.
+    """Why a command ended without a result."""
 
-    Attributes
-    ----------
-    code : int
-        What the shell sees.
-    kind : str
-        Name of the exception's class.
-    message : str
-        What was found, where, and what to do.
-    hint : str, optional
-        The part of the message that says what to do.
-    """
-
-    code: int
-    kind: str
-    message: str
-    hint: str | None = None
+    code: int  # what the shell sees
+    kind: str  # name of the exception's class
+    message: str  # what was found, where, and what to do
+    hint: str | None = None  # the part of the message that says what to do
 
     def as_text(self) -> str:
         """Return what people read."""
@@ -56,13 +44,7 @@ class Failure:
 
     def as_json(self) -> str:
         """Return what programs read."""
-        content = {
-            "code": self.code,
-            "kind": self.kind,
-            "message": self.message,
-            "hint": self.hint,
-        }
-        return json.dumps({"error": content}, ensure_ascii=False) + "\n"
+        return json.dumps({"error": asdict(self)}, ensure_ascii=False) + "\n"
 
 
 def failure_of(error: Exception, doing: str) -> Failure:
@@ -157,12 +139,9 @@ def _usage(error: TyperException) -> str | None:
 
 def _stage_of(error: Exception) -> str:
     """Return the stage that an exception was raised in, where progress bars noted one."""
-    notes = [n.removeprefix(AT_STAGE) for n in _notes(error) if n.startswith(AT_STAGE)]
-    return f" at '{shown(notes[0], 80)}'" if notes else ""
-
-
-def _notes(error: Exception) -> list[str]:
-    return [note for note in getattr(error, "__notes__", []) if isinstance(note, str)]
+    notes = [str(note) for note in getattr(error, "__notes__", [])]
+    stages = [note.removeprefix(AT_STAGE) for note in notes if note.startswith(AT_STAGE)]
+    return f" at '{shown(stages[0], 80)}'" if stages else ""
 
 
 def _in_brackets(error: Exception) -> str:
