@@ -114,9 +114,9 @@ def _check_levels(stars: int, spec: BuildSpec) -> None:
         boresights += count
     if max(found, boresights) > MOST_FIELD_STARS:
         raise BuildError(
-            f"{spec.name}: too dense to estimate: the {boresights:,} fields of all levels hold up to "
-            f"{found / 1e6:,.1f} M stars (limit {MOST_FIELD_STARS / 1e6:g} M); use fewer boresights, "
-            "a smaller products.levels.stars_per_field, or a larger products.levels.max_ratio"
+            f"{spec.name}: too dense to estimate: the {boresights:,} fields of all levels may have "
+            f"{found:,.0f} stars, limit {MOST_FIELD_STARS:,}; use a smaller boresights.count or "
+            "products.levels.stars_per_field, or a larger products.levels.max_ratio"
         )
 
 

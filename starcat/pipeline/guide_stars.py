@@ -22,7 +22,7 @@ MIN_GUIDE_STARS = 4
 """Fewer than these cannot be identified by anything."""
 
 MOST_FIELD_STARS = 4_000_000
-"""Most stars that an estimate counts, over all fields of a tiling or of its levels."""
+"""Stars of all fields of a tiling that an estimate goes through at the most, and of all levels."""
 
 FIRST_LOOK = 4.0
 """Times as many stars as fill a field of the mean are looked at first."""
@@ -81,16 +81,16 @@ def field_share(spec: BuildSpec) -> float:
 def check_tiling(
     stars: int, spec: BuildSpec, thinned_to: int | None, most: int = MOST_FIELD_STARS
 ) -> None:
-    """Refuse a tiling with too many stars for an estimate."""
+    """Check that the fields of a tiling have not too many stars to be gone through in a moment."""
     in_field = stars * field_share(spec)
     if thinned_to is not None:
         in_field = min(in_field, FIRST_LOOK * thinned_to)
     found = spec.boresights.count * in_field
     if found > most:
         raise BuildError(
-            f"{spec.name}: too dense to estimate: the {spec.boresights.count:,} fields hold about "
-            f"{found / 1e6:,.1f} M stars (limit {most / 1e6:g} M); use a brighter faint_limit_mag, "
-            "selection.max_stars_per_field, or fewer boresights"
+            f"{spec.name}: too dense to estimate: the {spec.boresights.count:,} fields of the "
+            f"tiling have about {found:,.0f} stars, limit {most:,}; use a brighter "
+            "faint_limit_mag, selection.max_stars_per_field, or a smaller boresights.count"
         )
 
 
