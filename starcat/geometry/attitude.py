@@ -150,7 +150,7 @@ def solve_wahba_svd(body: Directions, icrs: Directions, weights: Array | None = 
 
 
 def determinant(matrix: Matrix) -> float:
-    """Return the determinant of one matrix, of which the general routine takes ten times as long."""
+    """Return the determinant of one matrix, in a tenth of the general time."""
     (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
     return float(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
 
