@@ -29,11 +29,11 @@ def test_brackets_are_shown_as_they_are(capsys: pytest.CaptureFixture[str]) -> N
 
 def test_no_command_escapes_them_once_more(capsys: pytest.CaptureFixture[str]) -> None:
     folder = Path("/data/[old]")
-    print_exported(Exported("a", "csv", folder, (), False), as_json=False)
+    print_exported(Exported("a", "csv", folder, (), False))
     finding = Finding("stars.parquet", "stars", f"{folder}: gone")
-    print_verification(Verification(folder / "a-1.0.0", 1, (finding,)), as_json=False)
+    print_verification(Verification(folder / "a-1.0.0", 1, (finding,)))
     change = FileChange("stars.parquet", f"{folder}: differs")
-    print_rebuilt(Rebuilt("a", 1, (change,), ()), as_json=False)
+    print_rebuilt(Rebuilt("a", 1, (change,), ()))
     shown = capsys.readouterr().out
     assert shown.count("/data/[old]") == 3
     assert "\\" not in shown
