@@ -110,15 +110,8 @@ def parts_of(star: dict[str, Any], expected: dict[str, Any]) -> dict[str, Any]:
     ],
 )
 def test_every_record_is_kept_or_rejected(
-    catalogs: Path,
-    excerpt: Callable[[str, str], Ingested],
-    has_excerpts: bool,
-    source: str,
-    name: str,
-    kept: int,
-    made: int,
-    rejected: dict[str, int],
-) -> None:
+    catalogs, excerpt, has_excerpts, source, name, kept, made, rejected
+):
     read, kept = excerpt(source, name), kept if has_excerpts else made
     with gzip.open(catalogs / name) as file:
         assert read.rows_read == sum(1 for _ in file)
@@ -134,7 +127,7 @@ def test_every_record_is_kept_or_rejected(
     np.testing.assert_allclose(length, 1.0, atol=4e-16)
 
 
-def test_the_embedded_sky_of_gaia() -> None:
+def test_the_embedded_sky_of_gaia():
     read = ingest("gaia", [embedded_sky()], neighbours=False)
     assert len(read.stars) == read.rows_read == 482_176
     assert read.rejected_by_reason == {}
@@ -158,26 +151,20 @@ def test_the_embedded_sky_of_gaia() -> None:
     assert set(read.stars["epoch_jyear"].to_pylist()) == {2016.0}
 
 
-def test_number_of_naked_eye_stars_of_sao(
-    excerpt: Callable[[str, str], Ingested], has_excerpts: bool
-) -> None:
+def test_number_of_naked_eye_stars_of_sao(excerpt, has_excerpts):
     mag = floats_of(excerpt("sao", "sao.dat.gz").stars, "mag")
     assert (mag <= 6.0).sum() == (5_103 if has_excerpts else 5_179)
     assert (mag <= 6.9).sum() == (14_195 if has_excerpts else 8_647)
 
 
-def test_the_digests_are_those_of_the_files(
-    catalogs: Path, excerpt: Callable[[str, str], Ingested]
-) -> None:
+def test_the_digests_are_those_of_the_files(catalogs, excerpt):
     (fact,) = excerpt("sao", "sao.dat.gz").files
     content = (catalogs / "sao.dat.gz").read_bytes()
     assert (fact.sha256, fact.bytes) == (hashlib.sha256(content).hexdigest(), len(content))
     assert fact.rows == gzip.decompress(content).count(b"\n")
 
 
-def test_sao_positions_are_those_of_the_fk5(
-    catalogs: Path, excerpt: Callable[[str, str], Ingested], has_excerpts: bool
-) -> None:
+def test_sao_positions_are_those_of_the_fk5(catalogs, excerpt, has_excerpts):
     text = (catalogs / "fk5_sao_cross_index.txt").read_text(encoding="ascii")
     fk5 = {
         int(line[79:85]): (
@@ -211,9 +198,7 @@ def test_sao_positions_are_those_of_the_fk5(
         ("2mass", "psc_measured.gz"),
     ],
 )
-def test_epoch_moves_every_star_by_its_own_years(
-    catalogs: Path, excerpt: Callable[[str, str], Ingested], source: str, name: str
-) -> None:
+def test_epoch_moves_every_star_by_its_own_years(catalogs, excerpt, source, name):
     own = excerpt(source, name).stars
     moved = ingest(source, [catalogs / name], epoch_jyear=2026.5).stars
     start = Motion(
@@ -236,9 +221,7 @@ def test_epoch_moves_every_star_by_its_own_years(
     np.testing.assert_array_equal(no_motion, ~has_motion)
 
 
-def test_a_blank_position_of_hipparcos_is_the_reason(
-    excerpt: Callable[[str, str], Ingested],
-) -> None:
+def test_a_blank_position_of_hipparcos_is_the_reason(excerpt):
     rejected = excerpt("hipparcos", "hip_main.dat.gz").rejected
     assert rejected["reason"].to_pylist() == ["no_position"] * 5
     assert rejected["ra_deg"].null_count == 5
@@ -248,7 +231,7 @@ def test_a_blank_position_of_hipparcos_is_the_reason(
 # Tycho-1
 
 
-def test_the_literal_records_are_the_samples(excerpts: Path) -> None:
+def test_the_literal_records_are_the_samples(excerpts):
     samples = excerpts / "samples"
     for name, lines in (
         ("tycho1_I239_records.txt", TYC_MAIN),
@@ -308,9 +291,7 @@ def test_the_literal_records_are_the_samples(excerpts: Path) -> None:
         ),
     ],
 )
-def test_genuine_records_of_tycho1(
-    row: Callable[..., dict[str, Any]], line: bytes, expected: dict[str, Any]
-) -> None:
+def test_genuine_records_of_tycho1(row, line, expected):
     assert parts_of(row("tycho1", line), expected) == expected
 
 
@@ -342,9 +323,7 @@ def test_genuine_records_of_tycho1(
         ),
     ],
 )
-def test_flags_of_tycho1(
-    row: Callable[..., dict[str, Any]], fields: dict[str, Any], expected: dict[str, Any]
-) -> None:
+def test_flags_of_tycho1(row, fields, expected):
     star = row("tycho1", with_fields("tycho1", TYC_MAIN[0], **fields))
     assert parts_of(star, expected) == expected
 
@@ -359,18 +338,14 @@ def test_flags_of_tycho1(
         ({"tyc2": "     "}, "malformed_record"),
     ],
 )
-def test_records_of_tycho1_that_are_no_stars(
-    read: Callable[..., Ingested], fields: dict[str, Any], reason: str
-) -> None:
+def test_records_of_tycho1_that_are_no_stars(read, fields, reason):
     found = read("tycho1", TYC_MAIN[1], with_fields("tycho1", TYC_MAIN[0], **fields))
     assert len(found.stars) == 1
     assert found.rejected_by_reason == {reason: 1}
 
 
 @pytest.mark.parametrize(("band", "mag", "second"), [("BT", 10.555, 8.682), ("VT", 8.682, 10.555)])
-def test_bands_of_tycho1(
-    row: Callable[..., dict[str, Any]], band: str | None, mag: float | None, second: float | None
-) -> None:
+def test_bands_of_tycho1(row, band, mag, second):
     star = row("tycho1", TYC_MAIN[0], band=band)
     assert (star["mag"], star["band"], star["second_mag"]) == (mag, band, second)
 
@@ -434,15 +409,11 @@ def test_bands_of_tycho1(
         ),
     ],
 )
-def test_genuine_records_of_tycho2(
-    row: Callable[..., dict[str, Any]], line: bytes, expected: dict[str, Any]
-) -> None:
+def test_genuine_records_of_tycho2(row, line, expected):
     assert parts_of(row("tycho2", line), expected) == expected
 
 
-def test_a_star_without_mean_position_stays_at_its_own_epoch(
-    row: Callable[..., dict[str, Any]],
-) -> None:
+def test_a_star_without_mean_position_stays_at_its_own_epoch(row):
     star = row("tycho2", TYC2[2], epoch_jyear=2030.0)
     assert (star["ra_deg"], star["dec_deg"]) == (1.58432611, 0.94286667)
     assert star["epoch_jyear"] == pytest.approx(1991.635, abs=1e-9)
@@ -487,22 +458,18 @@ def test_a_star_without_mean_position_stays_at_its_own_epoch(
         ),
     ],
 )
-def test_genuine_records_of_the_supplement(
-    row: Callable[..., dict[str, Any]], line: bytes, expected: dict[str, Any]
-) -> None:
+def test_genuine_records_of_the_supplement(row, line, expected):
     assert parts_of(row("tycho2", line, name="suppl_1.dat"), expected) == expected
 
 
 @pytest.mark.parametrize(("band", "mag"), [("VT", None), ("BT", None), ("V", 10.279)])
-def test_hp_is_neither_bt_nor_vt(
-    row: Callable[..., dict[str, Any]], band: str | None, mag: float | None
-) -> None:
+def test_hp_is_neither_bt_nor_vt(row, band, mag):
     star = row("tycho2", SUPPL_1[1], name="suppl_1.dat", band=band)
     assert (star["mag"], star["band"]) == (mag, band)
 
 
 @pytest.mark.parametrize("is_supplement_first", [False, True])
-def test_tycho2_and_its_supplement_are_one_table(tmp_path: Path, is_supplement_first: bool) -> None:
+def test_tycho2_and_its_supplement_are_one_table(tmp_path, is_supplement_first):
     (tmp_path / "tyc2.dat").write_bytes(b"\n".join(TYC2) + b"\n")
     (tmp_path / "suppl_1.dat").write_bytes(b"\n".join(SUPPL_1) + b"\n")
     paths = [tmp_path / "tyc2.dat", tmp_path / "suppl_1.dat"]
@@ -521,7 +488,7 @@ def test_tycho2_and_its_supplement_are_one_table(tmp_path: Path, is_supplement_f
     assert ra[4] == pytest.approx(4.36837051 - moved, abs=1e-9)
 
 
-def test_a_star_in_both_files_is_read_once(tmp_path: Path) -> None:
+def test_a_star_in_both_files_is_read_once(tmp_path):
     again = with_fields("tycho2", SUPPL_1[0], tyc1="0001", tyc2="00008")
     (tmp_path / "tyc2.dat").write_bytes(TYC2[0] + b"\n")
     (tmp_path / "suppl_1.dat").write_bytes(again + b"\n")
@@ -552,14 +519,12 @@ def test_a_star_in_both_files_is_read_once(tmp_path: Path) -> None:
         ({"bt_mag": "13.146"}, {"mag": pytest.approx(12.056), "quality_flags": 0}),
     ],
 )
-def test_flags_of_tycho2(
-    row: Callable[..., dict[str, Any]], fields: dict[str, Any], expected: dict[str, Any]
-) -> None:
+def test_flags_of_tycho2(row, fields, expected):
     star = row("tycho2", with_fields("tycho2", TYC2[0], **fields))
     assert parts_of(star, expected) == expected
 
 
-def test_a_record_of_tycho2_without_any_position(read: Callable[..., Ingested]) -> None:
+def test_a_record_of_tycho2_without_any_position(read):
     nowhere = with_fields("tycho2", TYC2[2], ra_deg=" " * 12, de_deg=" " * 12)
     found = read("tycho2", TYC2[0], nowhere)
     assert found.rejected_by_reason == {"no_position": 1}
@@ -588,12 +553,7 @@ def hipparcos_line(catalogs: Path) -> bytes:
         ({"var_flag": " ", "hp_max": "     ", "hp_min": "     "}, {"amplitude_mag": None}),
     ],
 )
-def test_amplitudes_of_hipparcos(
-    row: Callable[..., dict[str, Any]],
-    hipparcos_line: bytes,
-    fields: dict[str, Any],
-    expected: dict[str, Any],
-) -> None:
+def test_amplitudes_of_hipparcos(row, hipparcos_line, fields, expected):
     star = row("hipparcos", with_fields("hipparcos", hipparcos_line, **fields))
     known = expected["amplitude_mag"]
     assert star["amplitude_mag"] == (None if known is None else pytest.approx(known))
@@ -612,13 +572,7 @@ def test_amplitudes_of_hipparcos(
         ({"proxy": "H"}, "Proxy=H", False),
     ],
 )
-def test_duplicity_of_hipparcos(
-    row: Callable[..., dict[str, Any]],
-    hipparcos_line: bytes,
-    fields: dict[str, Any],
-    flag: str | None,
-    is_double: bool,
-) -> None:
+def test_duplicity_of_hipparcos(row, hipparcos_line, fields, flag, is_double):
     blank = {"mult_flag": " ", "ccdm": " " * 10, "n_comp": "  ", "proxy": " "}
     star = row("hipparcos", with_fields("hipparcos", hipparcos_line, **{**blank, **fields}))
     assert (star["double_flag"], star["is_flagged_double"]) == (flag, is_double)
@@ -627,16 +581,14 @@ def test_duplicity_of_hipparcos(
 @pytest.mark.parametrize(
     ("hvar", "is_variable"), [("P", True), ("U", True), ("C", False), ("M", False)]
 )
-def test_types_of_variability_of_hipparcos(
-    row: Callable[..., dict[str, Any]], hipparcos_line: bytes, hvar: str, is_variable: bool
-) -> None:
+def test_types_of_variability_of_hipparcos(row, hipparcos_line, hvar, is_variable):
     line = with_fields("hipparcos", hipparcos_line, hvar_type=hvar, var_flag=" ")
     star = row("hipparcos", line)
     assert star["is_flagged_variable"] is is_variable
     assert star["variable_flag"] == (f"H52={hvar}" if is_variable else None)
 
 
-def test_columns_of_hipparcos(row: Callable[..., dict[str, Any]], hipparcos_line: bytes) -> None:
+def test_columns_of_hipparcos(row, hipparcos_line):
     line = with_fields(
         "hipparcos",
         hipparcos_line,
@@ -678,7 +630,7 @@ def test_columns_of_hipparcos(row: Callable[..., dict[str, Any]], hipparcos_line
 # 2MASS
 
 
-def test_the_genuine_record_of_2mass(row: Callable[..., dict[str, Any]]) -> None:
+def test_the_genuine_record_of_2mass(row):
     expected = {
         "star_id": 1101364107,
         "designation": "2MASS J00042876-8955069",
@@ -711,13 +663,7 @@ def test_the_genuine_record_of_2mass(row: Callable[..., dict[str, Any]]) -> None
         ("0.5*J+0.5*Ks", 12.215, "H", "J-Ks"),
     ],
 )
-def test_bands_of_2mass(
-    row: Callable[..., dict[str, Any]],
-    band: str | None,
-    mag: float | None,
-    second_band: str,
-    colour_bands: str,
-) -> None:
+def test_bands_of_2mass(row, band, mag, second_band, colour_bands):
     star = row("2mass", PSC, band=band)
     assert star["mag"] == pytest.approx(mag, abs=1e-12)
     assert (star["band"], star["second_band"]) == (band, second_band)
@@ -762,12 +708,7 @@ def test_bands_of_2mass(
         ({"jdate": "2450814.5"}, "Ks", {"epoch_jyear": 1998.0}),
     ],
 )
-def test_flags_of_2mass(
-    row: Callable[..., dict[str, Any]],
-    fields: dict[str, Any],
-    band: str | None,
-    expected: dict[str, Any],
-) -> None:
+def test_flags_of_2mass(row, fields, band, expected):
     star = row("2mass", psc(**fields), band=band)
     if "quality_flags" in expected:
         expected = {
@@ -791,16 +732,14 @@ def test_flags_of_2mass(
         ({"gal_contam": "1", "mp_flg": "1"}, "minor_planet"),
     ],
 )
-def test_records_of_2mass_that_are_no_stars(
-    read: Callable[..., Ingested], fields: dict[str, Any], reason: str
-) -> None:
+def test_records_of_2mass_that_are_no_stars(read, fields, reason):
     bad = psc(**{"pts_key": "7", **fields})
     found = read("2mass", PSC, bad)
     assert found.stars["star_id"].to_pylist() == [1101364107]
     assert found.rejected_by_reason == {reason: 1}
 
 
-def test_an_artifact_in_another_band_does_not_matter(row: Callable[..., dict[str, Any]]) -> None:
+def test_an_artifact_in_another_band_does_not_matter(row):
     assert row("2mass", psc(cc_flg="P00"))["mag"] == 11.963
 
 
@@ -815,15 +754,13 @@ def test_an_artifact_in_another_band_does_not_matter(row: Callable[..., dict[str
         ("23595999-0000000Z", 2_026_235_959_990_000_000),
     ],
 )
-def test_designation_packed_into_a_number(
-    row: Callable[..., dict[str, Any]], designation: str, packed: int
-) -> None:
+def test_designation_packed_into_a_number(row, designation, packed):
     star = row("2mass", psc(pts_key=r"\N", designation=designation))
     assert star["star_id"] == packed
     assert star["designation"] == "2MASS J" + designation.strip()
 
 
-def test_a_part_without_component_letters_packs_as_one_with(read: Callable[..., Ingested]) -> None:
+def test_a_part_without_component_letters_packs_as_one_with(read):
     short = psc(pts_key=r"\N", designation="00042876+8955069")
     both = read("2mass", short, psc(pts_key=r"\N", designation="00042876+8955069A"))
     assert both.stars["star_id"].to_pylist() == [
@@ -840,7 +777,7 @@ def sao(**texts: str) -> bytes:
     return with_fields("sao", SAO, **texts)
 
 
-def test_the_genuine_record_of_sao(row: Callable[..., dict[str, Any]]) -> None:
+def test_the_genuine_record_of_sao(row):
     star = row("sao", SAO)
     expected = {
         "star_id": 106,
@@ -867,7 +804,7 @@ def test_the_genuine_record_of_sao(row: Callable[..., dict[str, Any]]) -> None:
     assert star["pm_dec_mas_yr"] == pytest.approx(78.0, abs=1.0)
 
 
-def test_fk5_to_icrs_is_that_of_sofa(catalogs: Path) -> None:
+def test_fk5_to_icrs_is_that_of_sofa(catalogs):
     with gzip.open(catalogs / "sao.dat.gz") as file:
         lines = [file.readline().rstrip(b"\n") for _ in range(500)]
     places = [(184, 193), (194, 204), (161, 167), (178, 183)]
@@ -890,7 +827,7 @@ def test_fk5_to_icrs_is_that_of_sofa(catalogs: Path) -> None:
     np.testing.assert_allclose(made[3], sofa[3] * in_mas, rtol=0, atol=1e-3)
 
 
-def test_a_deleted_record_of_sao(read: Callable[..., Ingested]) -> None:
+def test_a_deleted_record_of_sao(read):
     found = read("sao", SAO, sao(sao="   107", del_flag="D"))
     assert found.stars["star_id"].to_pylist() == [106]
     assert found.rejected_by_reason == {"deleted": 1}
@@ -906,13 +843,7 @@ def test_a_deleted_record_of_sao(read: Callable[..., Ingested]) -> None:
         ({"v_mag": " 6.4", "p_mag": " 7.2"}, "P", 7.2, 6.4),
     ],
 )
-def test_magnitudes_of_sao(
-    row: Callable[..., dict[str, Any]],
-    fields: dict[str, Any],
-    band: str | None,
-    mag: float | None,
-    second: float | None,
-) -> None:
+def test_magnitudes_of_sao(row, fields, band, mag, second):
     star = row("sao", sao(**fields), band=band)
     assert (star["mag"], star["second_mag"], star["band"]) == (mag, second, band)
 
@@ -930,30 +861,26 @@ NO_RADIANS = {"ra2000_rad": " " * 10, "de2000_rad": " " * 11}
         ({"ra2000_h": "23"}, 15 * (23 + 39 / 60 + 47.119 / 3600), 82 + 29 / 60 + 37.80 / 3600),
     ],
 )
-def test_sexagesimal_position_where_the_radians_are_blank(
-    row: Callable[..., dict[str, Any]], fields: dict[str, Any], ra: float, dec: float
-) -> None:
+def test_sexagesimal_position_where_the_radians_are_blank(row, fields, ra, dec):
     star = row("sao", sao(**NO_RADIANS, **fields))
     found = directions_from_radec(star["ra_deg"], star["dec_deg"])
     # FK5 against ICRS: at most 32 mas.
     assert separation(found, directions_from_radec(ra, dec)) < 0.032 * ARCSEC_RAD
 
 
-def test_the_radians_come_first(row: Callable[..., dict[str, Any]]) -> None:
+def test_the_radians_come_first(row):
     star = row("sao", sao(ra2000_h="11", de2000_sign="-"))
     assert star["ra_deg"] == pytest.approx(9.9463, abs=1e-3)
     assert star["dec_deg"] == pytest.approx(82.4938, abs=1e-3)
 
 
-def test_a_record_of_sao_without_position(read: Callable[..., Ingested]) -> None:
+def test_a_record_of_sao_without_position(read):
     nowhere = sao(sao="   107", **NO_RADIANS, ra2000_h="  ")
     assert read("sao", SAO, nowhere).rejected_by_reason == {"no_position": 1}
 
 
 @pytest.mark.parametrize("number", PRINTED_PM_DEC_ARCSEC_YR)
-def test_proper_motions_that_only_the_printed_catalog_has(
-    row: Callable[..., dict[str, Any]], number: int
-) -> None:
+def test_proper_motions_that_only_the_printed_catalog_has(row, number):
     printed = {208759: -180.0, 208795: -42.0, 212470: -72.0}[number]
     star = row("sao", sao(sao=str(number), pm_de2000="      "))
     assert star["pm_dec_mas_yr"] == pytest.approx(printed, abs=1.0)  # FK5 spin: below 1 mas/yr
@@ -962,7 +889,7 @@ def test_proper_motions_that_only_the_printed_catalog_has(
     assert given["pm_dec_mas_yr"] == pytest.approx(500.0, abs=1.0)
 
 
-def test_a_blank_proper_motion_of_any_other_star(row: Callable[..., dict[str, Any]]) -> None:
+def test_a_blank_proper_motion_of_any_other_star(row):
     star = row("sao", sao(pm_de2000="      "))
     assert star["pm_dec_mas_yr"] is None
     assert star["quality_flags"] == Quality.NO_PROPER_MOTION
@@ -982,9 +909,7 @@ def test_a_blank_proper_motion_of_any_other_star(row: Callable[..., dict[str, An
         (" ", False, False),
     ],
 )
-def test_remarks_of_sao(
-    row: Callable[..., dict[str, Any]], rem: str, is_double: bool, is_variable: bool
-) -> None:
+def test_remarks_of_sao(row, rem, is_double, is_variable):
     star = row("sao", sao(rem=rem))
     assert star["is_flagged_double"] is is_double
     assert star["double_flag"] == (f"Rem={rem}" if is_double else None)
@@ -1006,13 +931,7 @@ def test_remarks_of_sao(
         ({"rem": "7", "r_vmag": "17"}, "Rem=7", "Rem=7;r_Vmag=17", None),
     ],
 )
-def test_other_flags_of_sao(
-    row: Callable[..., dict[str, Any]],
-    fields: dict[str, Any],
-    double: str | None,
-    variable: str | None,
-    delta_mag: float | None,
-) -> None:
+def test_other_flags_of_sao(row, fields, double, variable, delta_mag):
     star = row("sao", sao(**{"rem": "0", **fields}))
     assert (star["double_flag"], star["variable_flag"]) == (double, variable)
     assert star["is_flagged_double"] is (double is not None)
@@ -1027,7 +946,7 @@ GENUINE = {"sao": SAO, "tycho1": TYC_MAIN[0], "tycho2": TYC2[0], "2mass": PSC}
 
 
 @pytest.mark.parametrize("source", GENUINE)
-def test_a_file_cut_off_in_its_last_line(read: Callable[..., Ingested], source: str) -> None:
+def test_a_file_cut_off_in_its_last_line(read, source):
     found = read(source, GENUINE[source], GENUINE[source][:30])
     assert len(found.stars) == 1
     assert found.rejected_by_reason == {"malformed_record": 1}
@@ -1039,9 +958,7 @@ def test_a_file_cut_off_in_its_last_line(read: Callable[..., Ingested], source: 
 
 
 @pytest.mark.parametrize("source", GENUINE)
-def test_a_block_without_a_good_record(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str
-) -> None:
+def test_a_block_without_a_good_record(tmp_path, monkeypatch, source):
     monkeypatch.setattr("starcat.catalog.readers.blocks.BLOCK_BYTES", 600)
     path = tmp_path / FILES[source]
     path.write_bytes((GENUINE[source] + b"\n") * 4 + b"bad\n" * 9)
@@ -1051,9 +968,7 @@ def test_a_block_without_a_good_record(
 
 @pytest.mark.parametrize("source", FILES)
 @pytest.mark.parametrize("content", [b"hello\n", b"<html>\n<body>\n", b"\x00\xff\n"])
-def test_another_file_is_not_taken_for_the_catalog(
-    read: Callable[..., Ingested], source: str, content: bytes
-) -> None:
+def test_another_file_is_not_taken_for_the_catalog(read, source, content):
     with pytest.raises(ParseError, match="Is this the right archive") as caught:
         read(source, content)
     assert caught.value.line == 1
@@ -1061,7 +976,7 @@ def test_another_file_is_not_taken_for_the_catalog(
 
 
 @pytest.mark.parametrize("source", FILES)
-def test_a_file_of_empty_lines_has_no_records(read: Callable[..., Ingested], source: str) -> None:
+def test_a_file_of_empty_lines_has_no_records(read, source):
     with pytest.raises(ParseError, match="no record in the file"):
         read(source, b"", b"")
 
@@ -1070,9 +985,7 @@ def test_a_file_of_empty_lines_has_no_records(read: Callable[..., Ingested], sou
     ("bad", "rows", "is_refused"),
     [(10, 100, False), (11, 100, True), (11, 1_100, False), (12, 1_100, True)],
 )
-def test_more_than_ten_malformed_records_and_one_percent(
-    read: Callable[..., Ingested], bad: int, rows: int, is_refused: bool
-) -> None:
+def test_more_than_ten_malformed_records_and_one_percent(read, bad, rows, is_refused):
     lines = [sao(sao=f"{n:6d}") for n in range(1, rows + 1)]
     for n in range(bad):
         lines[7 + 8 * n] = lines[n][:-1]
@@ -1085,14 +998,14 @@ def test_more_than_ten_malformed_records_and_one_percent(
         assert read("sao", *lines).rejected_by_reason == {"malformed_record": bad}
 
 
-def test_the_same_star_twice_in_a_file(read: Callable[..., Ingested]) -> None:
+def test_the_same_star_twice_in_a_file(read):
     found = read("sao", sao(v_mag=" 5.0"), sao(v_mag=" 6.0"))
     assert found.stars["mag"].to_pylist() == [5.0]
     assert found.rejected_by_reason == {"duplicate_record": 1}
     assert found.rejected["mag"].to_pylist() == [6.0]
 
 
-def test_rows_are_sorted_and_remember_their_line(read: Callable[..., Ingested]) -> None:
+def test_rows_are_sorted_and_remember_their_line(read):
     stars = read("sao", *(sao(sao=f"{n:6d}") for n in (30, 10, 20))).stars
     assert stars["star_id"].to_pylist() == [10, 20, 30]
     assert stars["source_line"].to_pylist() == [2, 3, 1]
@@ -1103,8 +1016,8 @@ def test_rows_are_sorted_and_remember_their_line(read: Callable[..., Ingested]) 
     [(6.4, [1], {"beyond_read_limit": 2}), (6.3, [], {"beyond_read_limit": 3})],
 )
 def test_read_limit_keeps_the_limit_itself_but_no_star_without_magnitude(
-    read: Callable[..., Ingested], limit: float, kept: list[int], reasons: dict[str, int]
-) -> None:
+    read, limit, kept, reasons
+):
     mags = {1: " 6.4", 2: " 6.5", 3: "99.9"}
     lines = [sao(sao=f"{n:6d}", v_mag=mag) for n, mag in mags.items()]
     found = read("sao", *lines, read_limit_mag=limit)
@@ -1114,9 +1027,7 @@ def test_read_limit_keeps_the_limit_itself_but_no_star_without_magnitude(
     assert len(found.rejected) == 0
 
 
-def test_a_record_beyond_the_read_limit_is_only_counted_whatever_else_it_is(
-    read: Callable[..., Ingested],
-) -> None:
+def test_a_record_beyond_the_read_limit_is_only_counted_whatever_else_it_is(read):
     doubtful = {"mp_flg": "1", "k_m": "9.0"}
     lines = [psc(pts_key="1", **doubtful), psc(pts_key="2", k_m="7.9"), b"not a record"]
     found = read("2mass", *lines, psc(pts_key="3", k_m="7.9", mp_flg="1"), read_limit_mag=8.0)
@@ -1138,15 +1049,13 @@ def test_a_record_beyond_the_read_limit_is_only_counted_whatever_else_it_is(
     ],
 )
 def test_an_upper_limit_of_the_brightness_is_no_magnitude_within_the_read_limit(
-    read: Callable[..., Ingested], fields: dict[str, str], is_beyond: bool
-) -> None:
+    read, fields, is_beyond
+):
     found = read("2mass", psc(**{"k_m": "7.0", **fields}), read_limit_mag=8.0)
     assert found.beyond_read_limit == int(is_beyond)
 
 
-def test_records_that_get_lost_are_a_fault_of_starcat(
-    read: Callable[..., Ingested], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_records_that_get_lost_are_a_fault_of_starcat(read, monkeypatch):
     joined = StarTables.joined
 
     def lose_one(tables: StarTables) -> Any:
@@ -1158,7 +1067,7 @@ def test_records_that_get_lost_are_a_fault_of_starcat(
         read("sao", sao(sao="     1"), sao(sao="     2"))
 
 
-def test_nearest_neighbours_are_those_of_all_that_was_read(read: Callable[..., Ingested]) -> None:
+def test_nearest_neighbours_are_those_of_all_that_was_read(read):
     apart = {1: "37.80", 2: "47.80", 3: "07.80"}  # seconds of declination
     mags = {1: " 5.0", 2: " 7.5", 3: "99.9"}
     lines = [sao(sao=f"{n:6d}", de2000_s=apart[n], v_mag=mags[n], **NO_RADIANS) for n in (1, 2, 3)]
@@ -1170,7 +1079,7 @@ def test_nearest_neighbours_are_those_of_all_that_was_read(read: Callable[..., I
     assert read("sao", lines[0]).stars["nearest_separation_arcsec"].null_count == 1
 
 
-def test_blocks_do_not_matter(catalogs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blocks_do_not_matter(catalogs, monkeypatch):
     whole = ingest("sao", [catalogs / "sao.dat.gz"], neighbours=False)
     monkeypatch.setattr("starcat.catalog.readers.blocks.BLOCK_BYTES", 200_001)
     parts = ingest("sao", [catalogs / "sao.dat.gz"], neighbours=False)
@@ -1180,7 +1089,7 @@ def test_blocks_do_not_matter(catalogs: Path, monkeypatch: pytest.MonkeyPatch) -
     np.testing.assert_allclose(found, expected, rtol=0, atol=4e-16)
 
 
-def test_progress_ends_with_all_bytes(catalogs: Path) -> None:
+def test_progress_ends_with_all_bytes(catalogs):
     calls: list[tuple[str, int, int | None]] = []
     path = catalogs / "sao.dat.gz"
     ingest("sao", [path], neighbours=False, progress=lambda *call: calls.append(call))
@@ -1198,20 +1107,18 @@ def test_progress_ends_with_all_bytes(catalogs: Path) -> None:
         ("soa", None, "did you mean 'sao'"),
     ],
 )
-def test_sources_and_bands_that_there_are_not(
-    tmp_path: Path, source: str, band: str | None, message: str
-) -> None:
+def test_sources_and_bands_that_there_are_not(tmp_path, source, band, message):
     with pytest.raises(ConfigError) as caught:
         ingest(source, [tmp_path], band=band)
     assert message in str(caught.value)
 
 
-def test_no_files() -> None:
+def test_no_files():
     with pytest.raises(SourceMissing, match="no input files"):
         ingest("sao", [])
 
 
-def test_a_missing_supplement_is_told(catalogs: Path) -> None:
+def test_a_missing_supplement_is_told(catalogs):
     """Without suppl_1 the sky lacks its brightest stars: whoever builds on it should know."""
     read = ingest("tycho2", [catalogs / "tyc2.dat.gz"])
     (note,) = read.notes

@@ -6,9 +6,7 @@ import json
 import shutil
 import struct
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -89,7 +87,7 @@ def copy(artifact: Path, tmp_path: Path) -> Path:
 # In an artifact ------------------------------------------------------------------------------
 
 
-def test_an_artifact_names_the_counterparts(artifact: Path):
+def test_an_artifact_names_the_counterparts(artifact):
     opened = open_artifact(artifact)
     table, stars = opened.table("crossmatch"), opened.table("stars")
     product_schema("crossmatch").check(table)
@@ -105,7 +103,7 @@ def test_an_artifact_names_the_counterparts(artifact: Path):
     assert best["designation"][0].as_py() == f"Gaia DR3 {star_id[0] + FIRST_ID - 1}"
 
 
-def test_every_manifest_is_of_one_version(artifact: Path, small_artifact: Path):
+def test_every_manifest_is_of_one_version(artifact, small_artifact):
     manifest = json.loads((artifact / "manifest.json").read_bytes())
     schema = json.loads(
         (resource_folder("schemas") / f"manifest-{MANIFEST_VERSION}.json").read_text()
@@ -123,7 +121,7 @@ def test_every_manifest_is_of_one_version(artifact: Path, small_artifact: Path):
     assert plain["spec"]["products"]["crossmatch"]["enabled"] is False
 
 
-def test_the_spec_of_a_manifest_is_whole(small_artifact: Path, small_spec: str):
+def test_the_spec_of_a_manifest_is_whole(small_artifact, small_spec):
     plain = spec_of(small_spec)
     dumped = json.loads((small_artifact / "manifest.json").read_bytes())["spec"]
     assert dumped == plain.recorded()
@@ -137,15 +135,15 @@ def test_the_spec_of_a_manifest_is_whole(small_artifact: Path, small_spec: str):
     assert spec_from_dict(plain.model_dump(mode="json"), "manifest.json") == plain
 
 
-def test_a_rebuild_gives_the_same_bytes(artifact: Path, files: Path):
+def test_a_rebuild_gives_the_same_bytes(artifact, files):
     assert rebuild(artifact, {name: [files] for name in ("sao", "gaia")}).is_identical
 
 
-def test_a_sound_artifact_passes(artifact: Path):
+def test_a_sound_artifact_passes(artifact):
     assert verify_artifact(artifact).findings == ()
 
 
-def test_diff_says_that_it_came(artifact: Path, small_artifact: Path):
+def test_diff_says_that_it_came(artifact, small_artifact):
     found = diff_artifacts(open_artifact(small_artifact), open_artifact(artifact))
     changes = {change.product: (change.rows_a, change.is_same) for change in found.products}
     assert changes.pop("crossmatch") == (None, False)
@@ -191,28 +189,28 @@ def changed(table: pa.Table, name: str, row: int, value: object) -> pa.Table:
         ("verdict", "doubtful", "stars have a counterpart, but the product crossmatch holds"),
     ],
 )
-def test_what_is_wrong_is_found(name: str, value: object, words: str, copy: Path):
+def test_what_is_wrong_is_found(name, value, words, copy):
     table = read_parquet(copy / "crossmatch.parquet")
     seal(copy, changed(table, name, 7, value))
     found = " | ".join(str(finding) for finding in verify_artifact(copy).findings)
     assert words in found
 
 
-def test_rows_out_of_order_are_found(copy: Path):
+def test_rows_out_of_order_are_found(copy):
     table = read_parquet(copy / "crossmatch.parquet")
     seal(copy, table.take([1, 0, *range(2, len(table))]))
     found = " | ".join(str(finding) for finding in verify_artifact(copy).findings)
     assert "in the order of star, catalog, rank" in found
 
 
-def test_an_empty_product_has_no_problems(artifact: Path):
+def test_an_empty_product_has_no_problems(artifact):
     opened = open_artifact(artifact)
     none = opened.table("crossmatch").slice(0, 0)
     assert list(counterpart_problems(none, opened.table("stars"))) == []
     assert len(matched_stars(none)) == 0
 
 
-def test_the_radius_of_the_spec_is_kept(files: Path, small_spec: str):
+def test_the_radius_of_the_spec_is_kept(files, small_spec):
     spec = spec_of(
         small_spec.replace('"small"', '"both"').replace('"sao"', '"gaia"'),
         enabled=True,
@@ -228,9 +226,7 @@ def test_the_radius_of_the_spec_is_kept(files: Path, small_spec: str):
     assert verify_artifact(folder).findings == ()
 
 
-def test_a_rejected_companion_is_a_rival(
-    files: Path, small_spec: str, sao_lines: list[bytes], tmp_path: Path
-):
+def test_a_rejected_companion_is_a_rival(files, small_spec, sao_lines, tmp_path):
     # A star too faint for the guide stars, 3 arcsec from star 10, which Gaia has but once.
     dec = float(sao_lines[9][193:204]) + 3.0 * ARCSEC
     line = b"   601" + sao_lines[9][6:80] + b" 6.3" + sao_lines[9][84:193]
@@ -251,7 +247,7 @@ def test_a_rejected_companion_is_a_rival(
 
 
 def test_a_missing_catalog_is_known_before_anything_is_read(
-    files: Path, small_spec: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    files, small_spec, tmp_path, monkeypatch
 ):
     monkeypatch.setenv("STARCAT_CACHE", str(tmp_path / "none"))
     monkeypatch.delenv("STARCAT_CATALOGS", raising=False)
@@ -281,9 +277,7 @@ def test_a_missing_catalog_is_known_before_anything_is_read(
         ({"radius": 5.0}, "did you mean 'radius_arcsec'"),
     ],
 )
-def test_sections_that_make_no_sense_are_refused(
-    section: dict[str, object], words: str, small_spec: str
-):
+def test_sections_that_make_no_sense_are_refused(section, words, small_spec):
     with pytest.raises(ConfigError, match=words):
         spec_of(small_spec, **section)
 
@@ -300,7 +294,7 @@ def tables(files: Path) -> tuple[Path, Path]:
     return made[0], made[1]
 
 
-def test_moving_stars_are_those_of_the_table(tables: tuple[Path, Path]):
+def test_moving_stars_are_those_of_the_table(tables):
     table = read_star_table(tables[0])
     stars = moving_stars(table)
     moved = propagate(
@@ -320,7 +314,7 @@ def test_moving_stars_are_those_of_the_table(tables: tuple[Path, Path]):
     assert speed == pytest.approx(np.hypot(*known) * MAS, rel=1e-12)
 
 
-def test_two_files_give_the_rows_of_the_product(tables: tuple[Path, Path], tmp_path: Path):
+def test_two_files_give_the_rows_of_the_product(tables, tmp_path):
     output = tmp_path / "made" / "x.parquet"
     found = match_files(*tables, output, Crossmatch())
     table = read_parquet(output)
@@ -337,7 +331,7 @@ def test_two_files_give_the_rows_of_the_product(tables: tuple[Path, Path], tmp_p
     assert table.schema.field("star_id").metadata[b"description"].startswith(b"Permanent number")
 
 
-def test_a_table_of_no_stars_is_matched_with_none(tables: tuple[Path, Path]):
+def test_a_table_of_no_stars_is_matched_with_none(tables):
     stars, others = (read_star_table(path) for path in tables)
     table, found = match_tables(stars.slice(0, 0), others, Crossmatch())
     product_schema("crossmatch").check(table)
@@ -347,9 +341,7 @@ def test_a_table_of_no_stars_is_matched_with_none(tables: tuple[Path, Path]):
     assert found.median_separation_arcsec is None
 
 
-def test_the_command_prints_a_summary(
-    tables: tuple[Path, Path], tmp_path: Path, starcat: Callable[..., Any]
-):
+def test_the_command_prints_a_summary(tables, tmp_path, starcat):
     output = tmp_path / "x.parquet"
     ran = starcat(["crossmatch", *tables, "-o", output])
     assert ran.code == 0
@@ -364,14 +356,12 @@ def test_the_command_prints_a_summary(
     assert content["matched"] < 100
 
 
-def test_the_tables_of_an_artifact_are_star_tables(
-    artifact: Path, tables: tuple[Path, Path], tmp_path: Path
-):
+def test_the_tables_of_an_artifact_are_star_tables(artifact, tables, tmp_path):
     found = match_files(artifact / "stars.parquet", tables[1], tmp_path / "x.parquet", Crossmatch())
     assert found.matched == len(open_artifact(artifact).table("crossmatch"))
 
 
-def test_files_that_are_no_star_tables_are_refused(tables: tuple[Path, Path], tmp_path: Path):
+def test_files_that_are_no_star_tables_are_refused(tables, tmp_path):
     with pytest.raises(SourceMissing, match="no such file"):
         read_star_table(tmp_path / "none.parquet")
     (tmp_path / "text.parquet").write_text("HIP 1")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -33,7 +32,7 @@ TINY = RecordFile(
 )
 
 
-def test_every_field_of_a_genuine_2mass_record() -> None:
+def test_every_field_of_a_genuine_2mass_record():
     names = [column.name for column in PSC.columns]
     parsed = parse_delimited(RECORD, PSC, names)
     assert parsed.problems == []
@@ -47,7 +46,7 @@ def test_every_field_of_a_genuine_2mass_record() -> None:
             assert value == float(text), column.name
 
 
-def test_text_is_padded_with_blanks_as_fixed_width_text_is() -> None:
+def test_text_is_padded_with_blanks_as_fixed_width_text_is():
     parsed = parse_delimited(b"a,1,x\nbcd,2,?\n", TINY, ["name", "code"])
     assert parsed["name"].tolist() == [b"a  ", b"bcd"]
     assert parsed.is_blank("code").tolist() == [False, True]
@@ -62,7 +61,7 @@ def test_text_is_padded_with_blanks_as_fixed_width_text_is() -> None:
         (b"|2451809.7124|", rb"|\N|", "jdate"),
     ],
 )
-def test_no_value_is_nan(old: bytes, new: bytes, column: str) -> None:
+def test_no_value_is_nan(old, new, column):
     parsed = parse_delimited(RECORD + b"\n" + RECORD.replace(old, new), PSC, ["ra", column])
     assert parsed.problems == []
     assert np.isnan(parsed[column]).tolist() == [False, True]
@@ -72,7 +71,7 @@ def test_no_value_is_nan(old: bytes, new: bytes, column: str) -> None:
 @pytest.mark.parametrize(
     "text", ["12.x67", "1_2", "12,4", "12 4", "--1", "-", "nan", "inf", "1e999"]
 )
-def test_letters_in_a_number_cost_only_that_line(names: list[str], text: str) -> None:
+def test_letters_in_a_number_cost_only_that_line(names, text):
     bad = RECORD.replace(b"|12.467|", b"|" + text.encode() + b"|")
     parsed = parse_delimited(b"\n".join([RECORD, bad, RECORD]), PSC, names, first_line=50)
     assert parsed.problems == [Problem(51, "j_m", None, repr(text), "a number like F")]
@@ -81,7 +80,7 @@ def test_letters_in_a_number_cost_only_that_line(names: list[str], text: str) ->
     assert parsed["ra"].tolist() == [1.119851, 1.119851]
 
 
-def test_a_line_with_two_bad_numbers_has_one_problem() -> None:
+def test_a_line_with_two_bad_numbers_has_one_problem():
     bad = RECORD.replace(b"|12.467|", b"|x|").replace(b"|12.131|", b"|y|")
     parsed = parse_delimited(RECORD + b"\n" + bad, PSC, ["h_m", "j_m"])
     assert [(problem.line, problem.field) for problem in parsed.problems] == [(2, "h_m")]
@@ -91,7 +90,7 @@ def test_a_line_with_two_bad_numbers_has_one_problem() -> None:
     ("line", "found"),
     [(RECORD + b"|1", "61 fields"), (RECORD.rpartition(b"|")[0], "59 fields"), (b"x", "1 fields")],
 )
-def test_wrong_number_of_fields(line: bytes, found: str) -> None:
+def test_wrong_number_of_fields(line, found):
     parsed = parse_delimited(line + b"\n" + RECORD, PSC, ["ra"], first_line=7)
     assert parsed.problems == [Problem(7, "record", None, found, "60 fields")]
     assert parsed.line.tolist() == [8]
@@ -106,7 +105,7 @@ def test_wrong_number_of_fields(line: bytes, found: str) -> None:
         (RECORD.replace(b"|00042876-8955069 |", rb"|\N|"), "designation"),
     ],
 )
-def test_a_required_field_that_is_blank(line: bytes, column: str) -> None:
+def test_a_required_field_that_is_blank(line, column):
     parsed = parse_delimited(line + b"\n" + RECORD, PSC, ["ra", "dec", "designation"])
     assert parsed.problems == [Problem(1, column, None, "a blank field", "a value")]
     assert parsed.line.tolist() == [2]
@@ -122,7 +121,7 @@ def test_a_required_field_that_is_blank(line: bytes, column: str) -> None:
         (b"\n\n", []),
     ],
 )
-def test_line_ends_and_empty_lines(data: bytes, lines: list[int]) -> None:
+def test_line_ends_and_empty_lines(data, lines):
     parsed = parse_delimited(data, PSC, ["ra", "coadd", "designation"])
     assert parsed.problems == []
     assert parsed.line.tolist() == lines
@@ -130,7 +129,7 @@ def test_line_ends_and_empty_lines(data: bytes, lines: list[int]) -> None:
     assert parsed["designation"].tolist() == [b"00042876-8955069 "] * len(lines)
 
 
-def test_text_nulls_are_nan_and_comments_are_no_records() -> None:
+def test_text_nulls_are_nan_and_comments_are_no_records():
     data = b"# heading\na,none,x\n#b,1,x\nc,99.99,x\nd,99.990,x\ne,9.99,x\n"
     parsed = parse_delimited(data, TINY, ["name", "mag"])
     assert parsed.problems == []
@@ -138,21 +137,21 @@ def test_text_nulls_are_nan_and_comments_are_no_records() -> None:
     assert np.isnan(parsed["mag"]).tolist() == [True, True, True, False]
 
 
-def test_nulls_hold_where_the_block_is_read_field_by_field() -> None:
+def test_nulls_hold_where_the_block_is_read_field_by_field():
     parsed = parse_delimited(b"a,none,x\nb,bad,x\nc,99.99,?\nd,7.5,x\n", TINY, ["mag", "code"])
     assert [problem.line for problem in parsed.problems] == [2]
     assert np.isnan(parsed["mag"]).tolist() == [True, True, False]
     assert parsed.is_blank("code").tolist() == [False, True, False]
 
 
-def test_quotes_and_bytes_beyond_ascii_are_text() -> None:
+def test_quotes_and_bytes_beyond_ascii_are_text():
     parsed = parse_delimited(b'"a,1,x\n\xb7b,2,"\n', TINY, ["name", "mag", "code"])
     assert parsed.problems == []
     assert parsed["name"].tolist() == [b'"a', b"\xb7b"]
     assert parsed["code"].tolist() == [b"x", b'"']
 
 
-def test_a_genuine_gcvs_record_with_comments_around_it() -> None:
+def test_a_genuine_gcvs_record_with_comments_around_it():
     record = (
         b"114484\tRT And\tEA/RS\t8.97\t0\t9.83\t9.28\tV\t51421.737\t0.6289216\t17\tF8V+K1\n"
         b"116287\tZ And\tZAND\t7.7\t0\t11.3\t\tV\t\t\t\tM2III+B1eq\n"
@@ -168,7 +167,7 @@ def test_a_genuine_gcvs_record_with_comments_around_it() -> None:
     assert parsed.is_blank("period").tolist() == [False, True]
 
 
-def test_blocks_do_not_matter(catalogs: Path) -> None:
+def test_blocks_do_not_matter(catalogs):
     with gzip.open(catalogs / "psc_measured.gz") as file:
         data = file.read()
     names = ["ra", "designation", "j_m", "jdate"]
@@ -203,9 +202,7 @@ def same(one: Records, other: Records) -> None:
 
 
 @given(st.lists(st.tuples(LINES, ENDS), max_size=6), st.booleans(), st.integers(1, 99))
-def test_a_block_read_at_once_is_as_if_read_by_lines(
-    parts: list[tuple[bytes, bytes]], is_cut: bool, first_line: int
-) -> None:
+def test_a_block_read_at_once_is_as_if_read_by_lines(parts, is_cut, first_line):
     data = b"".join(line + end for line, end in parts)
     data = data.removesuffix(b"\n") if is_cut else data
     chosen = list(TINY.columns)
@@ -218,7 +215,7 @@ def test_a_block_read_at_once_is_as_if_read_by_lines(
         assert b"\r" in data or b"\n\n" in data or data[:1] in b"\n#" or b"\n#" in data
 
 
-def test_a_regular_block_is_read_at_once() -> None:
+def test_a_regular_block_is_read_at_once():
     data = (RECORD + b"\n") * 3
     names = [column.name for column in PSC.columns]
     at_once = delimited._parse_regular(data, PSC, [PSC.column(name) for name in names], 5)
@@ -227,7 +224,7 @@ def test_a_regular_block_is_read_at_once() -> None:
     assert at_once.line.tolist() == [5, 6, 7]
 
 
-def test_text_of_one_length_and_of_several_is_padded_alike() -> None:
+def test_text_of_one_length_and_of_several_is_padded_alike():
     even = parse_delimited(b"abc,1,x\ndef,2,y\n", TINY, ["name"])["name"]
     uneven = parse_delimited(b"abc,1,x\nd,2,y\n\xb7\xb7\xb7,3,\n", TINY, ["name", "code"])
     assert even.tobytes() == b"abcdef"

@@ -15,10 +15,7 @@ from numpy.typing import NDArray
 
 from starcat.errors import ConfigError
 from starcat.exchange import hats
-from starcat.exchange.hats import (
-    HatsCatalog,
-    write_hats,
-)
+from starcat.exchange.hats import HatsCatalog, write_hats
 from starcat.store.pixels import HEALPIX_COLUMN, Pixel, healpix_29
 
 pytest.importorskip("cdshealpix")
@@ -81,11 +78,9 @@ def partitions(folder: Path) -> dict[Path, pa.Table]:
 
 
 @given(
-    ra_deg=st.floats(0.0, 360.0, exclude_max=True),
-    z=st.floats(-1.0, 1.0),
-    order=st.integers(0, 12),
+    ra_deg=st.floats(0.0, 360.0, exclude_max=True), z=st.floats(-1.0, 1.0), order=st.integers(0, 12)
 )
-def test_pixels_are_those_of_the_definition(ra_deg: float, z: float, order: int) -> None:
+def test_pixels_are_those_of_the_definition(ra_deg, z, order):
     dec_deg = float(np.degrees(np.arcsin(z)))
     ra, dec = np.array([ra_deg]), np.array([dec_deg])
     pixel = int(healpix_29(ra, dec)[0] >> 2 * (29 - order))
@@ -98,7 +93,7 @@ def test_pixels_are_those_of_the_definition(ra_deg: float, z: float, order: int)
     assert pixel in near
 
 
-def test_random_stars_have_exactly_the_pixels_of_the_definition(sky: pa.Table) -> None:
+def test_random_stars_have_exactly_the_pixels_of_the_definition(sky):
     ra_deg, dec_deg = sky["ra_deg"].to_numpy(), sky["dec_deg"].to_numpy()
     found: NDArray[np.int64] = healpix_29(ra_deg, dec_deg) >> 2 * (29 - 18)
     wanted = [pixel_by_definition(*place, 18) for place in zip(ra_deg, dec_deg, strict=True)]
@@ -106,7 +101,7 @@ def test_random_stars_have_exactly_the_pixels_of_the_definition(sky: pa.Table) -
 
 
 @pytest.mark.parametrize(("max_rows", "order"), [(1_000_000, 0), (200, 1), (20, 3)])
-def test_the_layout(sky: pa.Table, tmp_path: Path, max_rows: int, order: int) -> None:
+def test_the_layout(sky, tmp_path, max_rows, order):
     folder = tmp_path / "sky"
     made = write_hats(sky, folder, "sky", max_rows)
     files = partitions(folder)
@@ -128,7 +123,7 @@ def test_the_layout(sky: pa.Table, tmp_path: Path, max_rows: int, order: int) ->
         assert footer.row_group(0).column(0).compression == "ZSTD"
 
 
-def test_what_describes_the_catalog(sky: pa.Table, tmp_path: Path) -> None:
+def test_what_describes_the_catalog(sky, tmp_path):
     folder = tmp_path / "sky"
     made = write_hats(sky, folder, "my-sky", 300)
     lines = (folder / "hats.properties").read_text().splitlines()
@@ -152,7 +147,7 @@ def test_what_describes_the_catalog(sky: pa.Table, tmp_path: Path) -> None:
     assert {Path(group.column(0).file_path) for group in groups} == set(files)
 
 
-def test_the_same_stars_give_the_same_files(sky: pa.Table, tmp_path: Path) -> None:
+def test_the_same_stars_give_the_same_files(sky, tmp_path):
     shuffled = sky.take(np.random.default_rng(3).permutation(len(sky)))
     contents = []
     for name, table in (("a", sky), ("b", shuffled)):
@@ -167,39 +162,39 @@ def test_the_same_stars_give_the_same_files(sky: pa.Table, tmp_path: Path) -> No
     assert contents[0] == contents[1]
 
 
-def test_stars_without_a_position_are_left_out(tmp_path: Path) -> None:
+def test_stars_without_a_position_are_left_out(tmp_path):
     table = star_table([10.0, None, float("nan"), 20.0], [5.0, 5.0, 5.0, None])
     made = write_hats(table, tmp_path / "sky", "sky")
     assert (made.rows, made.left_out) == (1, 3)
 
 
-def test_poles_and_the_meridian(tmp_path: Path) -> None:
+def test_poles_and_the_meridian(tmp_path):
     table = star_table([0.0, 359.9999999999999, 180.0, 0.0, 360.0], [90.0, 0.0, -90.0, 0.0, 0.0])
     assert write_hats(table, tmp_path / "sky", "sky").rows == 5
 
 
-def test_more_stars_in_one_place_than_a_partition_holds(tmp_path: Path) -> None:
+def test_more_stars_in_one_place_than_a_partition_holds(tmp_path):
     table = star_table([10.0] * 3, [5.0] * 3)
     with pytest.raises(ConfigError, match=r"3 stars are in one place.*--max-partition-rows"):
         write_hats(table, tmp_path / "sky", "sky", 2)
     assert not (tmp_path / "sky").exists()
 
 
-def test_tables_that_are_no_star_tables(tmp_path: Path) -> None:
+def test_tables_that_are_no_star_tables(tmp_path):
     with pytest.raises(ConfigError, match="no column star_id, ra_deg, dec_deg"):
         write_hats(pa.table({"i": [1]}), tmp_path / "sky", "pairs")
     with pytest.raises(ConfigError, match="none of its 1 rows has a position"):
         write_hats(star_table([None], [None]), tmp_path / "sky", "rejected")
 
 
-def test_without_cdshealpix(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_without_cdshealpix(monkeypatch, tmp_path):
     monkeypatch.setitem(__import__("sys").modules, "cdshealpix.nested", None)
     with pytest.raises(ConfigError, match=r"pip install 'starcat-guide-stars\[hats\]'"):
         hats.write_hats(star_table([1.0], [1.0]), tmp_path / "sky", "sky")
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_lsdb_opens_it(sky: pa.Table, tmp_path: Path) -> None:
+def test_lsdb_opens_it(sky, tmp_path):
     lsdb = pytest.importorskip("lsdb", reason="LSDB comes with the extra dev")
     write_hats(sky, tmp_path / "sky", "sky", 300)
     catalog = lsdb.open_catalog(tmp_path / "sky")

@@ -58,9 +58,7 @@ def same(one: Ingested, other: Ingested) -> None:
 @pytest.mark.usefixtures("small_blocks")
 @pytest.mark.parametrize("limit_mag", [None, 13.0])
 @pytest.mark.parametrize("count", [1, 6])
-def test_the_number_of_workers_does_not_matter(
-    parts: list[Path], limit_mag: float | None, count: int
-) -> None:
+def test_the_number_of_workers_does_not_matter(parts, limit_mag, count):
     read = [
         ingest("2mass", parts[:count], read_limit_mag=limit_mag, neighbours=False, workers=workers)
         for workers in (1, 2, 5)
@@ -73,7 +71,7 @@ def test_the_number_of_workers_does_not_matter(
 
 
 @pytest.mark.usefixtures("small_blocks")
-def test_a_file_read_by_itself_has_the_parts_that_ingest_joins(parts: list[Path]) -> None:
+def test_a_file_read_by_itself_has_the_parts_that_ingest_joins(parts):
     whole = ingest("2mass", parts[:3], read_limit_mag=14.0, neighbours=False)
     stars, rejected, counted, facts = [], [], 0, []
     for number, path in enumerate(parts[:3]):
@@ -94,7 +92,7 @@ def test_a_file_read_by_itself_has_the_parts_that_ingest_joins(parts: list[Path]
     assert sum(len(table) for table in rejected) == len(whole.rejected)
 
 
-def test_facts_of_a_file_that_was_not_read_to_its_end(parts: list[Path]) -> None:
+def test_facts_of_a_file_that_was_not_read_to_its_end(parts):
     reading = FileReading(InputFile(parts[0], PSC), 0, SOURCE)
     next(reading.blocks())
     with pytest.raises(SourceError, match="not read to its end"):
@@ -102,7 +100,7 @@ def test_facts_of_a_file_that_was_not_read_to_its_end(parts: list[Path]) -> None
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_progress_of_files_ends_with_all_bytes(parts: list[Path], workers: int) -> None:
+def test_progress_of_files_ends_with_all_bytes(parts, workers):
     events: list[tuple[str, int, int | None]] = []
     ingest("2mass", parts, neighbours=False, workers=workers, progress=lambda *e: events.append(e))
     size = sum(path.stat().st_size for path in parts)
@@ -120,9 +118,7 @@ def copy_of(parts: list[Path], folder: Path) -> list[Path]:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_the_error_of_the_first_bad_file_is_told(
-    parts: list[Path], tmp_path: Path, workers: int
-) -> None:
+def test_the_error_of_the_first_bad_file_is_told(parts, tmp_path, workers):
     copies = copy_of(parts, tmp_path)
     for bad in (2, 4):
         copies[bad].write_bytes(gzip.compress(b"1|2|3\n" * 50, mtime=0))
@@ -131,7 +127,7 @@ def test_the_error_of_the_first_bad_file_is_told(
     assert caught.value.path == copies[2]
 
 
-def test_an_interrupted_reading_stops(parts: list[Path]) -> None:
+def test_an_interrupted_reading_stops(parts):
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
@@ -141,7 +137,7 @@ def test_an_interrupted_reading_stops(parts: list[Path]) -> None:
 
 @pytest.mark.usefixtures("small_blocks")
 @pytest.mark.parametrize("rows", [1, 50, 10_000])
-def test_merged_blocks_hold_the_same_in_the_same_order(parts: list[Path], rows: int) -> None:
+def test_merged_blocks_hold_the_same_in_the_same_order(parts, rows):
     parse = partial(parse_block, options=IngestOptions("2mass", "Ks", read_limit_mag=14.0))
     reading = FileReading(InputFile(parts[0], PSC), 0, SOURCE)
     blocks = [part for _, parsed in read_files([reading], parse) for part in parsed]

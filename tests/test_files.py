@@ -86,8 +86,8 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("is_gzip", [False, True])
 @pytest.mark.parametrize("end", [b"\n", b""])
 def test_blocks_are_whole_lines_in_order_plain_or_gzipped(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes: int, is_gzip: bool, end: bytes
-) -> None:
+    tmp_path, monkeypatch, block_bytes, is_gzip, end
+):
     monkeypatch.setattr(blocks_module, "BLOCK_BYTES", block_bytes)
     content = LINES[:600].rstrip(b"\n") + end
     path = tmp_path / "tiny.dat"
@@ -101,7 +101,7 @@ def test_blocks_are_whole_lines_in_order_plain_or_gzipped(
 
 @pytest.mark.parametrize("is_gzip", [False, True])
 @pytest.mark.usefixtures("small_blocks")
-def test_digest_and_size_are_those_of_the_file_on_disk(tmp_path: Path, is_gzip: bool) -> None:
+def test_digest_and_size_are_those_of_the_file_on_disk(tmp_path, is_gzip):
     path = tmp_path / "tiny.dat"
     path.write_bytes(gzip.compress(LINES) if is_gzip else LINES)
     _, (digest,) = read(path, text_file())
@@ -109,7 +109,7 @@ def test_digest_and_size_are_those_of_the_file_on_disk(tmp_path: Path, is_gzip: 
     assert digest.bytes_read == path.stat().st_size
 
 
-def test_gzip_members_one_after_another_are_one_file(tmp_path: Path) -> None:
+def test_gzip_members_one_after_another_are_one_file(tmp_path):
     path = tmp_path / "tiny.dat.gz"
     path.write_bytes(gzip.compress(LINES[:60]) + gzip.compress(LINES[60:120]))
     blocks, (digest,) = read(path, text_file())
@@ -118,7 +118,7 @@ def test_gzip_members_one_after_another_are_one_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("is_named_gz", [False, True])
-def test_compression_is_recognised_by_content(tmp_path: Path, is_named_gz: bool) -> None:
+def test_compression_is_recognised_by_content(tmp_path, is_named_gz):
     path = tmp_path / ("tiny.dat.gz" if is_named_gz else "tiny.dat")
     path.write_bytes(LINES if is_named_gz else gzip.compress(LINES))
     blocks, _ = read(path, text_file())
@@ -126,7 +126,7 @@ def test_compression_is_recognised_by_content(tmp_path: Path, is_named_gz: bool)
 
 
 @pytest.mark.usefixtures("small_blocks")
-def test_truncated_gzip_names_the_file_and_the_last_line(tmp_path: Path) -> None:
+def test_truncated_gzip_names_the_file_and_the_last_line(tmp_path):
     noise = random.Random(1)
     content = b"".join(b"%05d\n" % noise.randrange(100_000) for _ in range(10_000))
     path = tmp_path / "tiny.dat.gz"
@@ -142,7 +142,7 @@ def test_truncated_gzip_names_the_file_and_the_last_line(tmp_path: Path) -> None
     assert ends == []
 
 
-def test_no_cut_and_no_changed_byte_gives_other_lines(tmp_path: Path) -> None:
+def test_no_cut_and_no_changed_byte_gives_other_lines(tmp_path):
     whole = gzip.compress(LINES[:600], mtime=0)
     path = tmp_path / "tiny.dat.gz"
     unseen = 0
@@ -161,7 +161,7 @@ def test_no_cut_and_no_changed_byte_gives_other_lines(tmp_path: Path) -> None:
     assert unseen < 3  # a code length of a letter that does not occur
 
 
-def test_gzip_with_a_wrong_checksum(tmp_path: Path) -> None:
+def test_gzip_with_a_wrong_checksum(tmp_path):
     path = tmp_path / "tiny.dat.gz"
     whole = bytearray(gzip.compress(LINES))
     whole[-8] ^= 1
@@ -170,7 +170,7 @@ def test_gzip_with_a_wrong_checksum(tmp_path: Path) -> None:
         read(path, text_file())
 
 
-def test_rubbish_behind_a_gzip_member(tmp_path: Path) -> None:
+def test_rubbish_behind_a_gzip_member(tmp_path):
     path = tmp_path / "tiny.dat.gz"
     path.write_bytes(gzip.compress(LINES) + b"rubbish" * 2)
     with pytest.raises(ParseError, match="damaged"):
@@ -178,21 +178,21 @@ def test_rubbish_behind_a_gzip_member(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", gzip.compress(b"", mtime=0)])
-def test_an_empty_file_is_refused(tmp_path: Path, content: bytes) -> None:
+def test_an_empty_file_is_refused(tmp_path, content):
     path = tmp_path / "tiny.dat"
     path.write_bytes(content)
     with pytest.raises(ParseError, match=r"tiny\.dat: the file is empty; expected records of tiny"):
         read(path, text_file())
 
 
-def test_a_file_that_cannot_be_opened(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_opened(tmp_path):
     with pytest.raises(SourceError, match="cannot be read"):
         read(tmp_path / "missing.dat", text_file())
 
 
 @pytest.mark.usefixtures("small_blocks")
 @pytest.mark.parametrize("is_gzip", [False, True])
-def test_binary_blocks_are_whole_records(tmp_path: Path, is_gzip: bool) -> None:
+def test_binary_blocks_are_whole_records(tmp_path, is_gzip):
     path = tmp_path / "packed.bin"
     path.write_bytes(gzip.compress(pack(50)) if is_gzip else pack(50))
     blocks, _ = read(path, BINARY)
@@ -204,7 +204,7 @@ def test_binary_blocks_are_whole_records(tmp_path: Path, is_gzip: bool) -> None:
     assert not any(part.problems for part in parsed)
 
 
-def test_a_binary_record_that_is_cut_off_is_a_problem(tmp_path: Path) -> None:
+def test_a_binary_record_that_is_cut_off_is_a_problem(tmp_path):
     path = tmp_path / "packed.bin"
     path.write_bytes(pack(5)[:-1])
     blocks, _ = read(path, BINARY)
@@ -216,14 +216,9 @@ def test_a_binary_record_that_is_cut_off_is_a_problem(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("content", "found"),
-    [
-        (b"JUNK" + pack(1)[4:], "b'JUNK"),
-        (b"PACK", "b'PACK'"),
-        (b"", "b''"),
-        (LINES, "b'00001"),
-    ],
+    [(b"JUNK" + pack(1)[4:], "b'JUNK"), (b"PACK", "b'PACK'"), (b"", "b''"), (LINES, "b'00001")],
 )
-def test_a_binary_file_of_another_kind(tmp_path: Path, content: bytes, found: str) -> None:
+def test_a_binary_file_of_another_kind(tmp_path, content, found):
     path = tmp_path / "packed.bin"
     path.write_bytes(content)
     with pytest.raises(ParseError, match="expected b'PACK' and a header of 8 bytes") as caught:
@@ -232,21 +227,21 @@ def test_a_binary_file_of_another_kind(tmp_path: Path, content: bytes, found: st
     assert caught.value.byte_range == (1, 8)
 
 
-def test_a_binary_file_with_only_its_header_is_empty(tmp_path: Path) -> None:
+def test_a_binary_file_with_only_its_header_is_empty(tmp_path):
     path = tmp_path / "packed.bin"
     path.write_bytes(pack(0))
     with pytest.raises(ParseError, match="empty"):
         read(path, BINARY)
 
 
-def test_a_gzipped_binary_file_cut_off_in_its_header(tmp_path: Path) -> None:
+def test_a_gzipped_binary_file_cut_off_in_its_header(tmp_path):
     path = tmp_path / "packed.bin.gz"
     path.write_bytes(gzip.compress(pack(5))[:12])
     with pytest.raises(ParseError, match="cut off"):
         read(path, BINARY)
 
 
-def test_parts_are_read_in_the_order_of_the_archive(tmp_path: Path) -> None:
+def test_parts_are_read_in_the_order_of_the_archive(tmp_path):
     for name in ("many.02", "many.00.gz", "many.01"):
         (tmp_path / name).write_bytes(b"")
     expected = [("many.00.gz", "many"), ("many.01", "many"), ("many.02", "many")]
@@ -264,20 +259,20 @@ def test_parts_are_read_in_the_order_of_the_archive(tmp_path: Path) -> None:
         (["many.dat", "unrelated.txt"], ["many.dat"]),
     ],
 )
-def test_what_a_folder_gives(tmp_path: Path, present: list[str], expected: object) -> None:
+def test_what_a_folder_gives(tmp_path, present, expected):
     for name in present:
         (tmp_path / name).write_bytes(b"")
     assert [name for name, _ in names_found([tmp_path])] == expected
 
 
-def test_a_missing_part_is_named(tmp_path: Path) -> None:
+def test_a_missing_part_is_named(tmp_path):
     (tmp_path / "many.00").write_bytes(b"")
     (tmp_path / "many.02").write_bytes(b"")
     with pytest.raises(SourceMissing, match=r"has 2 of 3 parts of many.\{part\}; missing: 01\."):
         SourceFiles.find(SOURCE, [tmp_path])
 
 
-def test_many_missing_parts_are_not_all_named(tmp_path: Path) -> None:
+def test_many_missing_parts_are_not_all_named(tmp_path):
     source = source_of(text_file(file_names=("t.{part}",), parts=tuple(map(str, range(10, 40)))))
     (tmp_path / "t.10").write_bytes(b"")
     with pytest.raises(SourceMissing, match="missing: 11, 12, 13, 14, 15, 16, 17, 18 …"):
@@ -285,7 +280,7 @@ def test_many_missing_parts_are_not_all_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("present", [[], ["extra.dat"], ["other.dat"]])
-def test_a_folder_without_the_file_that_is_needed(tmp_path: Path, present: list[str]) -> None:
+def test_a_folder_without_the_file_that_is_needed(tmp_path, present):
     for name in present:
         (tmp_path / name).write_bytes(b"")
     with pytest.raises(SourceMissing, match="starcat fetch tiny") as caught:
@@ -293,7 +288,7 @@ def test_a_folder_without_the_file_that_is_needed(tmp_path: Path, present: list[
     assert caught.value.path == tmp_path
 
 
-def test_a_path_that_does_not_exist(tmp_path: Path) -> None:
+def test_a_path_that_does_not_exist(tmp_path):
     with pytest.raises(SourceMissing, match=r"nowhere does not exist.*extra\.dat\[\.gz\]"):
         SourceFiles.find(SOURCE, [tmp_path / "nowhere"])
 
@@ -309,12 +304,12 @@ def test_a_path_that_does_not_exist(tmp_path: Path) -> None:
         ("extraxdat", "many"),
     ],
 )
-def test_layout_of_a_file_by_its_name_or_the_first(tmp_path: Path, name: str, layout: str) -> None:
+def test_layout_of_a_file_by_its_name_or_the_first(tmp_path, name, layout):
     (tmp_path / name).write_bytes(b"")
     assert names_found([tmp_path / name]) == [(name, layout)]
 
 
-def test_files_named_one_by_one_keep_their_order(tmp_path: Path) -> None:
+def test_files_named_one_by_one_keep_their_order(tmp_path):
     for name in ("many.02", "many.00"):
         (tmp_path / name).write_bytes(b"")
     found = names_found([tmp_path / "many.02", tmp_path / "many.00"])
@@ -334,21 +329,19 @@ def test_files_named_one_by_one_keep_their_order(tmp_path: Path) -> None:
         ([], None),
     ],
 )
-def test_what_a_folder_lacks_of_a_source(
-    tmp_path: Path, names: list[str], expected: object
-) -> None:
+def test_what_a_folder_lacks_of_a_source(tmp_path, names, expected):
     for name in names:
         (tmp_path / name).write_bytes(b"")
     assert lacking(SOURCE, tmp_path) == expected
 
 
-def test_a_folder_of_the_name_of_a_file_is_not_the_file(tmp_path: Path) -> None:
+def test_a_folder_of_the_name_of_a_file_is_not_the_file(tmp_path):
     (tmp_path / "many.dat").mkdir()
     assert lacking(SOURCE, tmp_path) is None
 
 
 @pytest.mark.parametrize("workers", [1, 2, 5])
-def test_results_come_in_the_order_of_the_items(workers: int) -> None:
+def test_results_come_in_the_order_of_the_items(workers):
     delays = random.Random(7)
     waits = [delays.uniform(0.0, 0.004) for _ in range(60)]
 
@@ -359,12 +352,12 @@ def test_results_come_in_the_order_of_the_items(workers: int) -> None:
     assert list(map_in_order(slow, iter(range(60)), workers)) == [n * n for n in range(60)]
 
 
-def test_two_items_are_worked_on_at_once() -> None:
+def test_two_items_are_worked_on_at_once():
     both = threading.Barrier(2, timeout=5.0)
     assert len(list(map_in_order(lambda _: both.wait(), iter(range(4))))) == 4
 
 
-def test_no_more_than_a_few_items_are_read_ahead() -> None:
+def test_no_more_than_a_few_items_are_read_ahead():
     taken = []
     items = (taken.append(n) or n for n in range(100))
     results = map_in_order(str, items, workers=2)
@@ -373,12 +366,12 @@ def test_no_more_than_a_few_items_are_read_ahead() -> None:
     results.close()
 
 
-def test_no_items() -> None:
+def test_no_items():
     assert list(map_in_order(str, iter(()))) == []
 
 
 @pytest.mark.parametrize("bad", [0, 3, 9])
-def test_an_error_in_the_function_reaches_the_caller_in_its_place(bad: int) -> None:
+def test_an_error_in_the_function_reaches_the_caller_in_its_place(bad):
     def fail(item: int) -> int:
         if item == bad:
             raise ZeroDivisionError
@@ -390,7 +383,7 @@ def test_an_error_in_the_function_reaches_the_caller_in_its_place(bad: int) -> N
     assert done == list(range(bad))
 
 
-def test_an_error_in_the_items_reaches_the_caller() -> None:
+def test_an_error_in_the_items_reaches_the_caller():
     def items() -> Iterator[int]:
         yield from (1, 2, 3)
         raise ZeroDivisionError

@@ -69,9 +69,7 @@ def fields(draw: st.DrawFn) -> tuple[str, list[str], list[str]]:
 
 
 @given(fields())
-def test_a_number_in_its_format_is_the_float_of_its_text(
-    case: tuple[str, list[str], list[str]],
-) -> None:
+def test_a_number_in_its_format_is_the_float_of_its_text(case):
     format_, texts, plain = case
     parsed = parse_texts(texts, format_)
     assert parsed.problems == []
@@ -85,8 +83,8 @@ def test_a_number_in_its_format_is_the_float_of_its_text(
     st.booleans(),
 )
 def test_a_number_in_another_format_than_its_column_is_the_float_of_its_text(
-    number: object, format_: str, is_left: bool
-) -> None:
+    number, format_, is_left
+):
     text = str(number)
     field = text.ljust(13) if is_left else text.rjust(13)
     parsed = parse_texts([field], format_)
@@ -117,18 +115,18 @@ def test_a_number_in_another_format_than_its_column_is_the_float_of_its_text(
         ("F20.17", " 0.10000000000000001", 0.1),
     ],
 )
-def test_ways_to_write_a_number(format_: str, text: str, expected: float) -> None:
+def test_ways_to_write_a_number(format_, text, expected):
     parsed = parse_texts([text], format_)
     assert parsed.problems == []
     assert parsed["x"].tolist() == [expected]
 
 
-def test_minus_zero_keeps_its_sign() -> None:
+def test_minus_zero_keeps_its_sign():
     assert np.signbit(parse_texts(["-0.00", " 0.00"], "F5.2")["x"]).tolist() == [True, False]
 
 
 @pytest.mark.parametrize("format_", ["F5.2", "I5", "F"])
-def test_a_blank_field_is_nan(format_: str) -> None:
+def test_a_blank_field_is_nan(format_):
     parsed = parse_texts(["     ", "    1"], format_)
     assert np.isnan(parsed["x"]).tolist() == [True, False]
     assert parsed.problems == []
@@ -146,9 +144,7 @@ def test_a_blank_field_is_nan(format_: str) -> None:
         ("I4", ("99", "n/a"), ["  99", "n/a "], [True, True]),
     ],
 )
-def test_texts_that_mean_no_value(
-    format_: str, null: tuple[str, ...], texts: list[str], is_null: list[bool]
-) -> None:
+def test_texts_that_mean_no_value(format_, null, texts, is_null):
     parsed = parse_texts(texts, format_, null=null)
     assert parsed.problems == []
     assert np.isnan(parsed["x"]).tolist() == is_null
@@ -183,14 +179,14 @@ def test_texts_that_mean_no_value(
         ("I5", "1E-99"),
     ],
 )
-def test_a_field_that_is_no_number_of_its_kind(format_: str, text: str) -> None:
+def test_a_field_that_is_no_number_of_its_kind(format_, text):
     parsed = parse_texts(["    1", text, "    2"], format_)
     assert parsed["x"].tolist() == [1.0, 2.0]
     assert parsed.line.tolist() == [1, 3]
     assert parsed.problems == [Problem(2, "x", (1, 5), repr(text), f"a number like {format_}")]
 
 
-def test_bytes_beyond_ascii_are_reported_as_they_are() -> None:
+def test_bytes_beyond_ascii_are_reported_as_they_are():
     (problem,) = parse_named(GOOD + b"\nabc 12| 5\xb725\n").problems
     assert (problem.line, problem.byte_range, problem.found) == (2, (8, 12), "' 5·25'")
 
@@ -208,16 +204,14 @@ def test_bytes_beyond_ascii_are_reported_as_they_are() -> None:
     ],
 )
 @pytest.mark.parametrize("end", [b"\n", b"\r\n"])
-def test_a_bad_line_is_left_out_alone_and_has_one_problem(
-    line: bytes, expected: Problem, end: bytes
-) -> None:
+def test_a_bad_line_is_left_out_alone_and_has_one_problem(line, expected, end):
     parsed = parse_named(GOOD + end + line + end + GOOD + end)
     assert parsed.problems == [expected]
     assert parsed.line.tolist() == [1, 3]
     assert parsed["count"].tolist() == [12.0, 12.0]
 
 
-def test_problem_as_text() -> None:
+def test_problem_as_text():
     problem = parse_named(b"abc x2| 5.25\n", first_line=9).problems[0]
     assert str(problem) == "line 9 bytes 4-6, count: found ' x2'; expected a number like I3"
     short = parse_named(b"abc\n", first_line=9).problems[0]
@@ -241,7 +235,7 @@ def test_problem_as_text() -> None:
         (b"\r\n\n", []),
     ],
 )
-def test_line_ends_and_empty_lines(data: bytes, lines: list[int]) -> None:
+def test_line_ends_and_empty_lines(data, lines):
     parsed = parse_named(data)
     assert parsed.problems == []
     assert parsed.line.tolist() == lines
@@ -249,13 +243,13 @@ def test_line_ends_and_empty_lines(data: bytes, lines: list[int]) -> None:
     assert parsed["name"].tolist() == [b"abc"] * len(lines)
 
 
-def test_lines_are_counted_from_the_first() -> None:
+def test_lines_are_counted_from_the_first():
     parsed = parse_named(GOOD + b"\nbad\n" + GOOD + b"\n", first_line=1000)
     assert parsed.line.tolist() == [1000, 1002]
     assert [problem.line for problem in parsed.problems] == [1001]
 
 
-def test_problems_come_in_the_order_of_the_lines() -> None:
+def test_problems_come_in_the_order_of_the_lines():
     bad = [b"abc   | 5.25", b"short", b"abc 12| 5.x5", b"abc 12  5.25", GOOD, b"abc y2| 5.25"]
     problems = parse_named(b"\n".join(bad)).problems
     assert [problem.line for problem in problems] == [1, 2, 3, 4, 6]
@@ -279,7 +273,7 @@ def test_problems_come_in_the_order_of_the_lines() -> None:
     ),
     st.data(),
 )
-def test_blocks_do_not_matter(lines: list[bytes], data: st.DataObject) -> None:
+def test_blocks_do_not_matter(lines, data):
     cut = data.draw(st.integers(0, len(lines)))
     whole = parse_named(b"".join(line + b"\n" for line in lines))
     first = parse_named(b"".join(line + b"\n" for line in lines[:cut]))
@@ -290,7 +284,7 @@ def test_blocks_do_not_matter(lines: list[bytes], data: st.DataObject) -> None:
         np.testing.assert_array_equal(np.concatenate([first[name], second[name]]), values)
 
 
-def test_only_the_columns_asked_for_are_parsed() -> None:
+def test_only_the_columns_asked_for_are_parsed():
     line = b"abc 12| 5,25"
     assert list(parse_fixed_width(line, NAMED, ["count"]).columns) == ["count"]
     assert parse_fixed_width(line, NAMED, ["count"]).problems == []
@@ -298,13 +292,13 @@ def test_only_the_columns_asked_for_are_parsed() -> None:
         parse_fixed_width(line, NAMED, ["nothing"])
 
 
-def test_text_is_kept_with_its_blanks() -> None:
+def test_text_is_kept_with_its_blanks():
     parsed = parse_named(b" a  12| 5.25\n    12| 5.25\n")
     assert parsed["name"].tolist() == [b" a ", b"   "]
     assert parsed.is_blank("name").tolist() == [False, True]
 
 
-def test_the_first_fields_of_a_genuine_tycho_record() -> None:
+def test_the_first_fields_of_a_genuine_tycho_record():
     source = data_source("tycho1").files[0]
     columns = [column for column in source.columns if column.bytes and column.bytes[1] <= 77]
     literals = {place: text for place, text in source.literals.items() if int(place) <= 77}

@@ -32,14 +32,14 @@ def check_neighbours(read: Ingested) -> None:
         assert stated[row] == pytest.approx(angle.min(), rel=1e-9, abs=1e-7)
 
 
-def test_sao(tmp_path: Path, catalogs: Path) -> None:
+def test_sao(tmp_path, catalogs):
     read = ingest("sao", [make_sao(tmp_path, catalogs)], epoch_jyear=2026.0)
     assert read.rows_read == len(read.stars) == SAO_ROWS
     assert read.stars["star_id"].to_pylist() == list(range(1, SAO_ROWS + 1))
     check_neighbours(read)
 
 
-def test_tycho2_in_parts_and_in_one_file(tmp_path: Path, catalogs: Path) -> None:
+def test_tycho2_in_parts_and_in_one_file(tmp_path, catalogs):
     parts = make_tycho2(tmp_path / "parts", catalogs, compress=False)
     read = ingest("tycho2", [parts], epoch_jyear=2026.0)
     number = read.stars["star_id"].to_numpy()
@@ -57,7 +57,7 @@ def test_tycho2_in_parts_and_in_one_file(tmp_path: Path, catalogs: Path) -> None
     assert again.stars.select(names).equals(read.stars.select(names))
 
 
-def test_no_direction_of_a_million_lies_outside_every_tile() -> None:
+def test_no_direction_of_a_million_lies_outside_every_tile():
     boresights = saff_kuijlaars(10_000)
     sample = np.random.default_rng(6).normal(size=(1_000_000, 3))
     sample /= np.linalg.norm(sample, axis=1)[:, None]

@@ -219,7 +219,7 @@ def run(folder: Path, source_name: str, layout_name: str, cases: int) -> None:
 
 
 @pytest.mark.parametrize(("source_name", "layout_name"), TARGETS)
-def test_the_undamaged_records_are_kept(tmp_path: Path, source_name: str, layout_name: str) -> None:
+def test_the_undamaged_records_are_kept(tmp_path, source_name, layout_name):
     check_archive(tmp_path, source_name, layout_name, [])
     layout = layout_of(source_name, layout_name)
     path = tmp_path / layout.file_names[0].replace("{part}", "aaa")
@@ -231,12 +231,12 @@ def test_the_undamaged_records_are_kept(tmp_path: Path, source_name: str, layout
 
 
 @pytest.mark.parametrize(("source_name", "layout_name"), TARGETS)
-def test_damaged_records(tmp_path: Path, source_name: str, layout_name: str) -> None:
+def test_damaged_records(tmp_path, source_name, layout_name):
     run(tmp_path, source_name, layout_name, 100)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize(("source_name", "layout_name"), TARGETS)
-def test_many_damaged_records(tmp_path: Path, source_name: str, layout_name: str) -> None:
+def test_many_damaged_records(tmp_path, source_name, layout_name):
     run(tmp_path, source_name, layout_name, 2000)

@@ -62,7 +62,7 @@ def pairs_of(frame: Any) -> dict[tuple[int, int], float]:
     }
 
 
-def test_lsdb_opens_a_store(stores: tuple[Path, Path]):
+def test_lsdb_opens_a_store(stores):
     for store in stores:
         catalog = lsdb.open_catalog(store)
         opened = open_store(store)
@@ -73,7 +73,7 @@ def test_lsdb_opens_a_store(stores: tuple[Path, Path]):
         assert catalog.margin.hc_structure.catalog_info.margin_threshold == opened.margin_arcsec
 
 
-def test_hats_finds_a_store_valid(stores: tuple[Path, Path]):
+def test_hats_finds_a_store_valid(stores):
     from hats.io.validation import is_valid_collection
 
     for store in stores:
@@ -81,7 +81,7 @@ def test_hats_finds_a_store_valid(stores: tuple[Path, Path]):
 
 
 @pytest.mark.slow
-def test_lsdb_finds_the_same_pairs(stores: tuple[Path, Path], tmp_path: Path):
+def test_lsdb_finds_the_same_pairs(stores, tmp_path):
     wanted = Crossmatch(radius_arcsec=RADIUS_ARCSEC)
     match_stores(*stores, tmp_path / "ours.parquet", wanted)
     ours = read_parquet(tmp_path / "ours.parquet")

@@ -135,9 +135,7 @@ def check_same(
 
 
 @pytest.mark.parametrize(("radius_arcsec", "max_rows"), [(0.5, 40), (10.0, 1), (600.0, 5)])
-def test_stores_are_matched_as_whole_tables_are(
-    radius_arcsec: float, max_rows: int, tmp_path: Path
-):
+def test_stores_are_matched_as_whole_tables_are(radius_arcsec, max_rows, tmp_path):
     a, b = sky(8, radius_arcsec, 3.0)
     found = check_same(a, b, radius_arcsec, tmp_path, max_rows=max_rows, piece_load=25)
     assert found.matched > 30
@@ -155,7 +153,7 @@ def test_stores_are_matched_as_whole_tables_are(
     st.sampled_from([1, 25, 1 << 19]),
 )
 def test_any_stores_are_matched_as_whole_tables_are(
-    seed: int, radius_arcsec: float, crowding: float, max_rows: int, piece_load: int
+    seed, radius_arcsec, crowding, max_rows, piece_load
 ):
     a, b = sky(seed, radius_arcsec, crowding)
     with tempfile.TemporaryDirectory() as folder:
@@ -163,7 +161,7 @@ def test_any_stores_are_matched_as_whole_tables_are(
 
 
 @pytest.mark.slow
-def test_a_cluster_longer_than_messages_go(tmp_path: Path):
+def test_a_cluster_longer_than_messages_go(tmp_path):
     """Each star of a row of them is a candidate of the next: all hang together."""
     generator = np.random.default_rng(4)
     count = 2 * MOST_RINGS
@@ -181,7 +179,7 @@ def test_a_cluster_longer_than_messages_go(tmp_path: Path):
 
 
 @pytest.mark.parametrize("who_moves", ["the star", "the candidate"])
-def test_a_star_that_was_far_away_a_century_ago(who_moves: str, tmp_path: Path):
+def test_a_star_that_was_far_away_a_century_ago(who_moves, tmp_path):
     """Barnard's star moves 1,030 arcsec in a century, over several of the small partitions."""
     generator = np.random.default_rng(7)
     count = 150
@@ -207,7 +205,7 @@ def test_a_star_that_was_far_away_a_century_ago(who_moves: str, tmp_path: Path):
 
 
 @pytest.mark.parametrize(("of_a", "of_b"), [(0, 5), (5, 0), (0, 0)])
-def test_catalogs_without_stars(of_a: int, of_b: int, tmp_path: Path):
+def test_catalogs_without_stars(of_a, of_b, tmp_path):
     generator = np.random.default_rng(1)
     tables = [star_table(np.arange(n) + 0.5, np.zeros(n), generator) for n in (of_a, of_b)]
     found = check_same(tables[0], tables[1], 10.0, tmp_path)
@@ -228,7 +226,7 @@ def catalogs_made(catalogs: Path, tmp_path_factory: pytest.TempPathFactory) -> P
 @pytest.mark.parametrize(
     ("a", "b"), [("sao", "hipparcos.parquet"), ("sao.parquet", "hipparcos"), ("sao", "hipparcos")]
 )
-def test_a_store_and_a_file(a: str, b: str, catalogs_made: Path, tmp_path: Path):
+def test_a_store_and_a_file(a, b, catalogs_made, tmp_path):
     wanted = Crossmatch(radius_arcsec=20.0)
     files = (catalogs_made / "sao.parquet", catalogs_made / "hipparcos.parquet")
     expected = match_files(*files, tmp_path / "whole.parquet", wanted)
@@ -241,7 +239,7 @@ def test_a_store_and_a_file(a: str, b: str, catalogs_made: Path, tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_the_command_takes_stores(catalogs_made: Path, tmp_path: Path, starcat: Callable[..., Any]):
+def test_the_command_takes_stores(catalogs_made, tmp_path, starcat):
     stores = (catalogs_made / "sao", catalogs_made / "hipparcos")
     output = tmp_path / "x.parquet"
     ran = starcat(["crossmatch", *stores, "-o", output, "--workers", 1, "--json"])
@@ -255,7 +253,7 @@ def test_the_command_takes_stores(catalogs_made: Path, tmp_path: Path, starcat: 
 
 @pytest.mark.slow
 @pytest.mark.timeout(180)
-def test_two_processes_give_the_same_bytes(catalogs_made: Path, tmp_path: Path):
+def test_two_processes_give_the_same_bytes(catalogs_made, tmp_path):
     from starcat.store.cluster import cluster, run_tasks
 
     stores = (catalogs_made / "sao", catalogs_made / "hipparcos")
@@ -332,7 +330,7 @@ def test_a_hop_leads_no_farther_than_the_next_ring(order, share, hop_rad, rings,
         max_size=5,
     )
 )
-def test_the_median_of_files_is_that_of_all_numbers(parts: list[list[float]]):
+def test_the_median_of_files_is_that_of_all_numbers(parts):
     together = [number for part in parts for number in part]
     with tempfile.TemporaryDirectory() as folder:
         paths = [Path(folder) / f"{k}.f8" for k in range(len(parts))]
@@ -342,7 +340,7 @@ def test_the_median_of_files_is_that_of_all_numbers(parts: list[list[float]]):
         assert median_of(paths) == (len(together), expected)
 
 
-def test_a_table_in_parts_is_the_same_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_table_in_parts_is_the_same_file(tmp_path, monkeypatch):
     monkeypatch.setattr("starcat.storage.parquet.ROW_GROUP_ROWS", 1000)
     generator = np.random.default_rng(2)
     stars = star_table(generator.uniform(0, 360, 4500), np.zeros(4500), generator)
@@ -381,13 +379,13 @@ def changed(path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
     pq.write_table(change(pq.ParquetFile(path).read()), path)
 
 
-def test_a_store_that_matches_itself(store: Path):
+def test_a_store_that_matches_itself(store):
     found = matched(store)
     assert (found.stars, found.matched, found.verdicts["unique"]) == (60, 60, 60)
     assert found.median_separation_arcsec == 0.0
 
 
-def test_catalogs_of_others_may_have_larger_texts(store: Path):
+def test_catalogs_of_others_may_have_larger_texts(store):
     expected = matched(store)
     for path in store.rglob("Npix=*.parquet"):
         changed(
@@ -404,7 +402,7 @@ def test_catalogs_of_others_may_have_larger_texts(store: Path):
     assert matched(store) == expected
 
 
-def test_stores_that_cannot_be_matched(store: Path):
+def test_stores_that_cannot_be_matched(store):
     part = a_part(store)
     whole = pq.ParquetFile(part).read()
     before = sorted(path.name for path in store.parent.iterdir())
@@ -437,7 +435,7 @@ def test_stores_that_cannot_be_matched(store: Path):
     assert sorted(path.name for path in store.parent.iterdir()) == before
 
 
-def test_partitions_that_overlap_are_found(store: Path):
+def test_partitions_that_overlap_are_found(store):
     pixels = [Pixel(0, number) for number in range(12)]
     table = pa.concat_tables(pq.ParquetFile(path).read() for path in store.rglob("Npix=*.parquet"))
     inner = next(pixel for pixel in pixels if _within(table, pixel).num_rows)
@@ -458,6 +456,6 @@ def _within(table: pa.Table, pixel: Pixel) -> pa.Table:
     return table.filter(pa.array((places >= pixel.first) & (places < pixel.end)))
 
 
-def test_a_place_that_cannot_be_written_is_known_first(store: Path):
+def test_a_place_that_cannot_be_written_is_known_first(store):
     with pytest.raises(OutputError, match="Is a directory"):
         match_stores(store, store, store, Crossmatch())

@@ -97,15 +97,18 @@ class TestMethod:
 
     def test_noise_missing_and_false_stars_give_no_wrong_answer(self, matcher):
         answers = []
-        for frame in frames(matcher, 40, Noise(0.4, 0.1, 3)):
+        # As many right names and answers as each kind of method gives: triangles the most.
+        by_triangles = SKIES[matcher.method] == "triangles"
+        count, least_named, least_answered = (60, 0.9, 0.95) if by_triangles else (40, 0.7, 0.92)
+        for frame in frames(matcher, count, Noise(0.4, 0.1, 3)):
             found = matcher.identify(frame.centroids_px)
             if found.ok:
                 assert answers_rightly(found, frame, matcher)
                 named = found.star_index >= 0
                 # A false spot beside the place of a star may pass for it.
-                assert (found.star_index[named] == frame.star_index[named]).mean() > 0.7
+                assert (found.star_index[named] == frame.star_index[named]).mean() > least_named
             answers.append(found.ok)
-        assert np.mean(answers) >= 0.92
+        assert np.mean(answers) >= least_answered
 
     def test_neither_the_order_nor_magnitudes_change_the_answer(self, matcher):
         generator = np.random.default_rng(4)

@@ -136,7 +136,7 @@ def test_no_stars():
     assert u.shape == (0, 3)
 
 
-def test_a_star_that_ends_exactly_at_the_pole() -> None:
+def test_a_star_that_ends_exactly_at_the_pole():
     # cos(90 deg) is 6e-17 in float64; this proper motion takes away just that in a year.
     # A division that leaves such stars out must say what it leaves in their place.
     left = np.cos(np.radians(90.0)) / MAS

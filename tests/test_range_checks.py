@@ -6,7 +6,6 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -51,11 +50,11 @@ PSC = {
 }
 
 
-def test_a_record_of_2mass_with_a_date_is_kept(read: Read) -> None:
+def test_a_record_of_2mass_with_a_date_is_kept(read):
     assert len(read("2mass", "psc", **PSC).stars) == 41
 
 
-def test_a_record_of_2mass_without_a_date_is_rejected(read: Read, tmp_path: Path) -> None:
+def test_a_record_of_2mass_without_a_date_is_rejected(read, tmp_path):
     found = read("2mass", "psc", **{**PSC, "jdate": "\\N"})
     assert len(found.stars) == 40
     assert found.rejected_by_reason == {"no_position": 1}
@@ -63,7 +62,7 @@ def test_a_record_of_2mass_without_a_date_is_rejected(read: Read, tmp_path: Path
     assert pq.read_table(tmp_path / "stars.parquet").num_rows == 40
 
 
-def test_a_record_of_tycho2_without_a_mean_position_or_an_epoch_is_rejected(read: Read) -> None:
+def test_a_record_of_tycho2_without_a_mean_position_or_an_epoch_is_rejected(read):
     fields = {"tyc1": 9000, "tyc2": 1, "tyc3": 1, "ra_deg": 10.0, "de_deg": 20.0, "vt_mag": 5.0}
     epochs = {"ep_ra_1990": 1.5, "ep_de_1990": 1.5}
     assert len(read("tycho2", "tyc2", **fields, **epochs).stars) == 41
@@ -114,8 +113,8 @@ GAIA = {"source_id": 5, "ra_deg": 10.0, "dec_deg": 20.0, "mag_g": 5.0}
     ],
 )
 def test_a_number_that_the_column_cannot_hold_is_malformed(
-    read: Read, source: str, layout: str, good: dict[str, Any], field: str, value: Any
-) -> None:
+    read, source, layout, good, field, value
+):
     assert len(read(source, layout, **good).stars) == 41
     found = read(source, layout, **{**good, field: value})
     assert len(found.stars) == 40
@@ -125,7 +124,7 @@ def test_a_number_that_the_column_cannot_hold_is_malformed(
     assert " to " in problem
 
 
-def test_ninety_degrees_and_a_minute_is_no_declination(read: Read) -> None:
+def test_ninety_degrees_and_a_minute_is_no_declination(read):
     fields = {"sao": 258997, "v_mag": 5.0, "ra2000_h": 1, "ra2000_m": 2, "ra2000_s": 3.0}
     north = {"de2000_sign": "+", "de2000_d": 90, "de2000_m": 0, "de2000_s": 0.0}
     assert len(read("sao", "sao", **fields, **north).stars) == 41
@@ -133,13 +132,13 @@ def test_ninety_degrees_and_a_minute_is_no_declination(read: Read) -> None:
     assert found.rejected_by_reason == {"no_position": 1}
 
 
-def test_a_right_ascension_of_360_degrees_is_0(read: Read) -> None:
+def test_a_right_ascension_of_360_degrees_is_0(read):
     found = read("2mass", "psc", **{**PSC, "ra": "360.000000"})
     assert 0.0 in found.stars["ra_deg"].to_pylist()
     assert len(found.stars) == 41
 
 
-def test_a_proper_motion_that_only_the_pole_makes_possible(read: Read) -> None:
+def test_a_proper_motion_that_only_the_pole_makes_possible(read):
     # 100 s of time a year is 1.5 million mas/yr at the equator, and 2,600 near the pole.
     near = {**SAO, "pm_ra2000": "99.9999", "pm_de2000": "0.0", "de2000_rad": "1.57"}
     assert len(read("sao", "sao", **near).stars) == 41
@@ -147,7 +146,7 @@ def test_a_proper_motion_that_only_the_pole_makes_possible(read: Read) -> None:
     assert found.rejected_by_reason == {"impossible_value": 1}
 
 
-def test_one_message_does_not_quote_a_whole_field(read: Read) -> None:
+def test_one_message_does_not_quote_a_whole_field(read):
     found = read("2mass", "psc", **{**PSC, "ra": "7" * 20_000 + "x"})
     (problem,) = found.problems
     assert len(problem) < 300
@@ -156,7 +155,7 @@ def test_one_message_does_not_quote_a_whole_field(read: Read) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(RANGES))
-def test_the_ends_of_ranges(name: str) -> None:
+def test_the_ends_of_ranges(name):
     least, greatest = RANGES[name]
     values = np.array([least, greatest, np.nextafter(least, -np.inf), np.nextafter(greatest, 1e99)])
     columns = {"ra_deg": np.ones(4), "dec_deg": np.ones(4), "epoch_jyear": 2000.0, name: values}
@@ -166,19 +165,19 @@ def test_the_ends_of_ranges(name: str) -> None:
     assert verdicts.reasons.to_pylist() == ["impossible_value"] * 2
 
 
-def test_ranges_follow_limits_then_digits_then_units() -> None:
+def test_ranges_follow_limits_then_digits_then_units():
     assert Column(name="a", format="I3", unit="h").range == (-999.0, 999.0)
     assert Column(name="a", format="I3", limits=(1, 7)).range == (1.0, 7.0)
     assert Column(name="a", format="F5.2", unit="h").range == (0.0, 24.0)
     assert Column(name="a", format="F5.2", unit="deg").range is None
 
 
-def test_limits_swapped_are_refused() -> None:
+def test_limits_swapped_are_refused():
     with pytest.raises(ValueError, match=r"limits \(7.0, 1.0\) are not least <= greatest"):
         Column(name="a", format="I3", limits=(7, 1))
 
 
-def test_progress_counts_bytes_within_a_file(tmp_path: Path) -> None:
+def test_progress_counts_bytes_within_a_file(tmp_path):
     line = archive_records("sao", synthetic_sky(1))["sao"][0]
     lines = [b"%6d" % number + line[6:] for number in range(1, 60_001)]
     path = tmp_path / "sao.dat"

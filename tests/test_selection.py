@@ -90,11 +90,11 @@ def judge(stars: pa.Table, selection: Selection) -> list[str]:
         (np.nan, "no_magnitude"),
     ],
 )
-def test_both_limits_are_kept_themselves(mag: float, verdict: str) -> None:
+def test_both_limits_are_kept_themselves(mag, verdict):
     assert judge(alone([mag]), rules(6.0, bright=2.0)) == [verdict]
 
 
-def test_no_stars() -> None:
+def test_no_stars():
     selected = select_guide_stars(alone([]), rules())
     assert (len(selected.guide_stars), len(selected.rejected)) == (0, 0)
 
@@ -110,7 +110,7 @@ def limits_around(angle_rad: float) -> tuple[float, float]:
     return limit, float(np.nextafter(limit, 1.0))
 
 
-def test_the_separation_itself_is_too_close() -> None:
+def test_the_separation_itself_is_too_close():
     stars = sky([20.0, 20.05], [3.0, 4.0])
     angle = float(separation(*directions_of(stars)))
     below, at = limits_around(angle)
@@ -119,7 +119,7 @@ def test_the_separation_itself_is_too_close() -> None:
 
 
 @pytest.mark.parametrize("dec", [0.0, 60.0, 89.99, -90.0])
-def test_separation_is_on_the_sphere_and_across_zero_hours(dec: float) -> None:
+def test_separation_is_on_the_sphere_and_across_zero_hours(dec):
     close = directions_from_radec([359.99, 0.01], [dec, dec])
     expected = "double" if 0.02 * np.cos(np.radians(dec)) <= 0.015 else "kept"
     stars = sky_of(close, [3.0, 3.0])
@@ -135,9 +135,7 @@ def test_separation_is_on_the_sphere_and_across_zero_hours(dec: float) -> None:
         (0.0, ["kept", "double"]),
     ],
 )
-def test_a_faint_companion_does_not_count_but_a_bright_one_does(
-    max_delta_mag: float | None, expected: list[str]
-) -> None:
+def test_a_faint_companion_does_not_count_but_a_bright_one_does(max_delta_mag, expected):
     stars = sky([0.0, 0.01], [3.0, 5.0])
     assert judge(stars, rules(max_delta_mag=max_delta_mag)) == expected
 
@@ -151,35 +149,33 @@ def test_a_faint_companion_does_not_count_but_a_bright_one_does(
         (9.0, ["double", "too_faint"]),
     ],
 )
-def test_companions_up_to_their_own_limit(
-    companion_limit_mag: float | None, expected: list[str]
-) -> None:
+def test_companions_up_to_their_own_limit(companion_limit_mag, expected):
     stars = sky([0.0, 0.01], [5.0, 6.5])
     assert judge(stars, rules(companion_limit_mag=companion_limit_mag)) == expected
 
 
-def test_a_companion_limit_above_the_faint_limit_takes_companions_away() -> None:
+def test_a_companion_limit_above_the_faint_limit_takes_companions_away():
     stars = sky([0.0, 0.01], [5.0, 5.5])
     assert judge(stars, rules(companion_limit_mag=5.2)) == ["kept", "kept"]
 
 
-def test_a_bright_star_that_is_rejected_is_still_a_companion() -> None:
+def test_a_bright_star_that_is_rejected_is_still_a_companion():
     stars = sky([0.0, 0.01], [1.0, 4.0])
     assert judge(stars, rules(bright=2.0)) == ["too_bright", "double"]
 
 
-def test_a_star_without_magnitude_is_nobodys_companion() -> None:
+def test_a_star_without_magnitude_is_nobodys_companion():
     assert judge(sky([0.0, 0.01], [4.0, np.nan]), rules()) == ["kept", "no_magnitude"]
 
 
 @pytest.mark.parametrize("action", ["remove", "merge"])
-def test_separation_zero_takes_only_stars_at_the_same_place(action: str) -> None:
+def test_separation_zero_takes_only_stars_at_the_same_place(action):
     stars = sky([5.0, 5.0, 5.0001], [3.0, 4.0, 4.5])
     expected = ["double", "double", "kept"] if action == "remove" else ["kept", "merged", "kept"]
     assert judge(stars, rules(min_separation_deg=0.0, action=action)) == expected
 
 
-def test_doubles_can_be_kept() -> None:
+def test_doubles_can_be_kept():
     stars = sky([0.0, 0.01], [3.0, 3.0], is_flagged_double=[True, False])
     assert judge(stars, rules(action="keep", flags="strict")) == ["kept", "kept"]
 
@@ -191,7 +187,7 @@ def merged(ra_deg: Sequence[float], mag: Sequence[float], **options: Any) -> Sel
     return select_guide_stars(sky(ra_deg, mag), rules(action="merge", **options))
 
 
-def test_two_equal_stars_become_one_between_them() -> None:
+def test_two_equal_stars_become_one_between_them():
     selected = merged([359.99, 0.01], [5.0, 5.0])
     (star,) = selected.guide_stars.to_pylist()
     assert star["star_id"] == 1
@@ -203,7 +199,7 @@ def test_two_equal_stars_become_one_between_them() -> None:
     assert selected.rejected["mag"].to_pylist() == [5.0]
 
 
-def test_the_photocentre_is_nearer_to_the_brighter_star_whose_number_stays() -> None:
+def test_the_photocentre_is_nearer_to_the_brighter_star_whose_number_stays():
     mag = 4.0 + 2.5 * np.log10(3.0)  # a third of the light
     selected = merged([10.04, 10.0], [mag, 4.0])
     (star,) = selected.guide_stars.to_pylist()
@@ -213,7 +209,7 @@ def test_the_photocentre_is_nearer_to_the_brighter_star_whose_number_stays() -> 
     assert star["mag"] == pytest.approx(4.0 - 2.5 * np.log10(4.0 / 3.0))
 
 
-def test_a_chain_of_three_is_one_star() -> None:
+def test_a_chain_of_three_is_one_star():
     selected = merged([0.0, 0.04, 0.08, 1.0], [5.0, 5.0, 5.0, 5.0], min_separation_deg=0.05)
     assert verdicts(selected) == {1: "kept", 2: "merged", 3: "merged", 4: "kept"}
     assert count_by_reason(selected.rejected) == {"merged": 2}
@@ -222,12 +218,12 @@ def test_a_chain_of_three_is_one_star() -> None:
     assert selected.guide_stars["quality_flags"].to_pylist()[1] == 0
 
 
-def test_two_groups_do_not_mix() -> None:
+def test_two_groups_do_not_mix():
     selected = merged([0.0, 5.0, 0.01, 5.01], [5.0, 4.0, 4.5, 4.5])
     assert verdicts(selected) == {1: "merged", 2: "kept", 3: "kept", 4: "merged"}
 
 
-def test_a_merged_star_is_compared_with_the_limits_as_one() -> None:
+def test_a_merged_star_is_compared_with_the_limits_as_one():
     both = [5.0, 5.0]  # together 4.25
     assert list(verdicts(merged([0.0, 0.01], both, bright=4.5)).values()) == [
         "too_bright",
@@ -242,12 +238,12 @@ def test_a_merged_star_is_compared_with_the_limits_as_one() -> None:
 @pytest.mark.parametrize(
     ("max_delta_mag", "expected"), [(1.9, ["kept", "kept"]), (2.0, ["kept", "merged"])]
 )
-def test_stars_too_different_are_not_merged(max_delta_mag: float, expected: list[str]) -> None:
+def test_stars_too_different_are_not_merged(max_delta_mag, expected):
     selected = merged([0.0, 0.01], [3.0, 5.0], max_delta_mag=max_delta_mag)
     assert list(verdicts(selected).values()) == expected
 
 
-def test_a_star_without_magnitude_is_not_merged() -> None:
+def test_a_star_without_magnitude_is_not_merged():
     selected = merged([0.0, 0.01], [3.0, np.nan])
     assert verdicts(selected) == {1: "kept", 2: "no_magnitude"}
     assert selected.guide_stars["quality_flags"].to_pylist() == [0]
@@ -277,9 +273,7 @@ CLOSE, WIDE, UNKNOWN = 10.0, 1000.0, np.nan  # arcsec; the limit is 0.047 deg = 
         ("unresolved", False, CLOSE, 0.0, True),
     ],
 )
-def test_flagged_doubles(
-    flags: str, flagged: bool, apart: float, delta: float, is_kept: bool
-) -> None:
+def test_flagged_doubles(flags, flagged, apart, delta, is_kept):
     stars = alone(
         [4.0],
         is_flagged_double=[flagged],
@@ -290,7 +284,7 @@ def test_flagged_doubles(
     assert found == ["kept" if is_kept else "flagged_double"]
 
 
-def test_without_a_largest_difference_any_that_is_stated_counts() -> None:
+def test_without_a_largest_difference_any_that_is_stated_counts():
     columns = {"is_flagged_double": [True] * 2, "companion_delta_mag": [9.0, np.nan]}
     assert judge(alone([4.0, 4.0], **columns), rules()) == ["flagged_double", "kept"]
 
@@ -310,9 +304,7 @@ def test_without_a_largest_difference_any_that_is_stated_counts() -> None:
         (0.0, 0.01, "variable"),
     ],
 )
-def test_the_largest_amplitude_is_kept_itself(
-    limit: float | None, amplitude: float, verdict: str
-) -> None:
+def test_the_largest_amplitude_is_kept_itself(limit, amplitude, verdict):
     stars = alone([4.0], amplitude_mag=[amplitude], is_flagged_variable=[True])
     assert judge(stars, rules(variables=Variables(max_amplitude_mag=limit))) == [verdict]
 
@@ -333,7 +325,7 @@ def test_the_largest_amplitude_is_kept_itself(
         ("strict", False, 0.9, "variable"),
     ],
 )
-def test_flagged_variables(flags: str, flagged: bool, amplitude: float, verdict: str) -> None:
+def test_flagged_variables(flags, flagged, amplitude, verdict):
     stars = alone([4.0], amplitude_mag=[amplitude], is_flagged_variable=[flagged])
     assert judge(stars, rules(variables=Variables(flags=flags))) == [verdict]
 
@@ -341,18 +333,18 @@ def test_flagged_variables(flags: str, flagged: bool, amplitude: float, verdict:
 # Count
 
 
-def test_of_equal_stars_the_lowest_numbers_stay() -> None:
+def test_of_equal_stars_the_lowest_numbers_stay():
     stars = alone([5.0, 3.0, 5.0, 5.0, 2.0])
     expected = ["kept", "kept", "beyond_count", "beyond_count", "kept"]
     assert judge(stars, rules(max_stars=3)) == expected
 
 
 @pytest.mark.parametrize("max_stars", [5, 6])
-def test_fewer_stars_than_allowed(max_stars: int) -> None:
+def test_fewer_stars_than_allowed(max_stars):
     assert judge(alone([5.0] * 5), rules(max_stars=max_stars)) == ["kept"] * 5
 
 
-def test_the_count_is_of_the_stars_that_are_left() -> None:
+def test_the_count_is_of_the_stars_that_are_left():
     stars = alone([1.0, 3.0, 4.0, 5.0], amplitude_mag=[2.0, np.nan, np.nan, np.nan])
     expected = ["variable", "kept", "kept", "beyond_count"]
     assert judge(stars, rules(max_stars=2)) == expected
@@ -361,7 +353,7 @@ def test_the_count_is_of_the_stars_that_are_left() -> None:
 # All together
 
 
-def test_the_first_reason_that_applies_is_the_verdict() -> None:
+def test_the_first_reason_that_applies_is_the_verdict():
     """One star more each time lacks the fault that stopped the one before."""
     ra = np.array([0, 0, 1, 1, 2, 2, 3, 4, 5, 6, 7]) * ALONE
     ra[[1, 3, 5]] += 0.01
@@ -395,7 +387,7 @@ def test_the_first_reason_that_applies_is_the_verdict() -> None:
     ]
 
 
-def test_steps_count_down_to_the_guide_stars() -> None:
+def test_steps_count_down_to_the_guide_stars():
     ra = [0.0, 0.01, 10.0, 20.0, 30.0, 40.0]
     amplitude = [np.nan, np.nan, np.nan, 1.0, np.nan, np.nan]
     stars = sky(ra, [5.0, 5.0, 6.5, 4.0, 4.0, 4.5], amplitude_mag=amplitude)
@@ -409,7 +401,7 @@ def test_steps_count_down_to_the_guide_stars() -> None:
     assert [step.name for step in without.steps] == ["magnitude", "doubles", "variables"]
 
 
-def test_stars_that_are_kept_are_kept_as_they_are() -> None:
+def test_stars_that_are_kept_are_kept_as_they_are():
     stars = alone([5.0, 7.0, 4.0])
     selected = select_guide_stars(stars, rules())
     assert selected.guide_stars.equals(stars.take([0, 2]))
@@ -448,7 +440,7 @@ def crowded_skies(draw: st.DrawFn) -> tuple[pa.Table, Selection]:
 
 
 @given(crowded_skies())
-def test_every_star_is_kept_or_rejected_and_never_both(case: tuple[pa.Table, Selection]) -> None:
+def test_every_star_is_kept_or_rejected_and_never_both(case):
     stars, selection = case
     selected = select_guide_stars(stars, selection)
     kept = selected.guide_stars["star_id"].to_pylist()
@@ -464,7 +456,7 @@ def test_every_star_is_kept_or_rejected_and_never_both(case: tuple[pa.Table, Sel
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("action", ["remove", "merge"])
-def test_a_turned_sky_has_the_same_verdicts(seed: int, action: str) -> None:
+def test_a_turned_sky_has_the_same_verdicts(seed, action):
     generator = np.random.default_rng(seed)
     ra, dec = generator.uniform(-0.3, 0.3, (2, 60))
     place = directions_from_radec(ra % 360.0, dec)

@@ -99,7 +99,7 @@ def tiny(folder: Path, old: str = "", new: str = "") -> DataSource:
 # The model
 
 
-def test_a_good_file_is_read(tmp_path: Path) -> None:
+def test_a_good_file_is_read(tmp_path):
     source = tiny(tmp_path)
     file = source.files[0]
     assert (source.kind, source.epoch_jyear, source.rows) == ("stars", None, None)
@@ -130,9 +130,7 @@ def test_a_good_file_is_read(tmp_path: Path) -> None:
         ('["tiny.dat"]', "[]", "files.0.file_names", "at least 1 item"),
     ],
 )
-def test_a_bad_file_is_refused_with_its_name_and_key(
-    tmp_path: Path, old: str, new: str, key: str, message: str
-) -> None:
+def test_a_bad_file_is_refused_with_its_name_and_key(tmp_path, old, new, key, message):
     with pytest.raises(ConfigError) as caught:
         tiny(tmp_path, old, new)
     assert str(caught.value).startswith("tiny.toml: ")
@@ -141,7 +139,7 @@ def test_a_bad_file_is_refused_with_its_name_and_key(
     assert (caught.value.key or "").endswith(key)
 
 
-def test_a_file_that_is_not_toml(tmp_path: Path) -> None:
+def test_a_file_that_is_not_toml(tmp_path):
     with pytest.raises(ConfigError, match=r"tiny\.toml is not a TOML file"):
         tiny(tmp_path, 'title = "Tiny"', "title =")
 
@@ -161,7 +159,7 @@ def test_a_file_that_is_not_toml(tmp_path: Path) -> None:
         ("<f4", False, False, None),
     ],
 )
-def test_formats(format_: str, is_text: bool, is_integer: bool, decimals: int | None) -> None:
+def test_formats(format_, is_text, is_integer, decimals):
     column = Column(name="x", format=format_)
     assert (column.is_text, column.is_integer, column.decimals) == (is_text, is_integer, decimals)
 
@@ -169,13 +167,13 @@ def test_formats(format_: str, is_text: bool, is_integer: bool, decimals: int | 
 @pytest.mark.parametrize(
     ("name", "nearest"), [("tycho3", "tycho"), ("hiparcos", "hipparcos"), ("2mas", "2mass")]
 )
-def test_unknown_source_suggests_the_nearest(name: str, nearest: str) -> None:
+def test_unknown_source_suggests_the_nearest(name, nearest):
     with pytest.raises(ConfigError, match=f"did you mean '{nearest}") as caught:
         data_source(name)
     assert (caught.value.key, caught.value.value) == ("source", name)
 
 
-def test_unknown_source_lists_all() -> None:
+def test_unknown_source_lists_all():
     with pytest.raises(ConfigError) as caught:
         data_source("xyzzy")
     assert "did you mean" not in str(caught.value)
@@ -185,12 +183,12 @@ def test_unknown_source_lists_all() -> None:
 # The seven files against themselves
 
 
-def test_seven_sources_ship() -> None:
+def test_seven_sources_ship():
     assert source_names() == SOURCES
 
 
 @pytest.mark.parametrize("name", SOURCES)
-def test_source_is_named_as_its_file_and_says_where_it_is_from(name: str) -> None:
+def test_source_is_named_as_its_file_and_says_where_it_is_from(name):
     source = data_source(name)
     assert source.name == name
     assert (source.kind == "stars") == bool(source.bands) == (source.frame != "none")
@@ -199,7 +197,7 @@ def test_source_is_named_as_its_file_and_says_where_it_is_from(name: str) -> Non
     assert all(column.description for file in source.files for column in file.columns)
 
 
-def test_rows_of_the_archives() -> None:
+def test_rows_of_the_archives():
     assert {name: data_source(name).rows for name in SOURCES} == {
         "2mass": 470_992_970,
         "gaia": 482_176,
@@ -211,13 +209,13 @@ def test_rows_of_the_archives() -> None:
     }
 
 
-def test_epoch_is_given_only_where_all_records_share_it() -> None:
+def test_epoch_is_given_only_where_all_records_share_it():
     epochs = {name: data_source(name).epoch_jyear for name in SOURCES}
     assert [name for name in SOURCES if epochs[name] is None] == ["2mass", "gcvs", "tycho2"]
     assert (epochs["sao"], epochs["hipparcos"], epochs["gaia"]) == (2000.0, 1991.25, 2016.0)
 
 
-def test_each_part_has_its_own_name_and_address() -> None:
+def test_each_part_has_its_own_name_and_address():
     for _, file in layouts():
         assert bool(file.parts) == ("{part}" in file.file_names[0])
         assert len(set(file.parts)) == len(file.parts)
@@ -226,9 +224,7 @@ def test_each_part_has_its_own_name_and_address() -> None:
 
 
 @pytest.mark.parametrize(("source", "file"), with_bytes())
-def test_columns_lie_within_the_record_in_order_and_do_not_overlap(
-    source: str, file: RecordFile
-) -> None:
+def test_columns_lie_within_the_record_in_order_and_do_not_overlap(source, file):
     owner: dict[int, str] = {}
     for column in file.columns:
         for byte in span(column):
@@ -242,14 +238,14 @@ def test_columns_lie_within_the_record_in_order_and_do_not_overlap(
 
 
 @pytest.mark.parametrize(("source", "file"), with_bytes())
-def test_format_is_as_wide_as_the_field(source: str, file: RecordFile) -> None:
+def test_format_is_as_wide_as_the_field(source, file):
     for column in file.columns:
         digits = column.format.lstrip("AIFDE<if").partition(".")[0]
         assert int(digits) == len(span(column)), (source, column.name)
 
 
 @pytest.mark.parametrize(("source", "file"), with_bytes())
-def test_separators_are_outside_the_columns(source: str, file: RecordFile) -> None:
+def test_separators_are_outside_the_columns(source, file):
     inside = {byte for column in file.columns for byte in span(column)}
     assert not inside & {int(position) for position in file.literals}
     assert set(file.literals.values()) <= {"|"}
@@ -266,16 +262,14 @@ def test_separators_are_outside_the_columns(source: str, file: RecordFile) -> No
         ("gaia", "gaia_merged", set()),
     ],
 )
-def test_every_byte_is_a_column_a_separator_or_blank(
-    source: str, name: str, blank: set[int]
-) -> None:
+def test_every_byte_is_a_column_a_separator_or_blank(source, name, blank):
     file = layout_of(source, name)
     known = {byte for column in file.columns for byte in span(column)}
     known |= {int(position) for position in file.literals}
     assert set(range(1, (file.record_bytes or 0) + 1)) - known == blank
 
 
-def test_twomass_has_60_columns_and_92_parts() -> None:
+def test_twomass_has_60_columns_and_92_parts():
     file = data_source("2mass").files[0]
     names = [column.name for column in file.columns]
     assert len(names) == 60
@@ -287,20 +281,20 @@ def test_twomass_has_60_columns_and_92_parts() -> None:
     assert {column.null for column in file.columns} == {("\\N",)}
 
 
-def test_twomass_columns_around_the_comma_that_others_lost() -> None:
+def test_twomass_columns_around_the_comma_that_others_lost():
     names = [column.name for column in data_source("2mass").files[0].columns]
     first = names.index("j_psfchi")
     assert names[first : first + 4] == ["j_psfchi", "h_psfchi", "k_psfchi", "j_m_stdap"]
 
 
-def test_parts_of_tycho2() -> None:
+def test_parts_of_tycho2():
     main, supplement = data_source("tycho2").files
     assert main.parts == tuple(f"{number:02}" for number in range(20))
     assert supplement.optional
     assert not main.optional
 
 
-def test_only_identifiers_and_delimited_positions_are_required() -> None:
+def test_only_identifiers_and_delimited_positions_are_required():
     required = {
         file.name: " ".join(column.name for column in file.columns if column.required)
         for _, file in layouts()
@@ -317,7 +311,7 @@ def test_only_identifiers_and_delimited_positions_are_required() -> None:
     }
 
 
-def test_values_that_mean_no_value() -> None:
+def test_values_that_mean_no_value():
     sao = data_source("sao").files[0]
     assert [c.name for c in sao.columns if c.null == ("99.9",)] == ["p_mag", "v_mag"]
     assert layout_of("tycho2", "tyc2").column("prox").null == ()
@@ -334,7 +328,7 @@ def test_values_that_mean_no_value() -> None:
         if layout_of(source, name).literals
     ],
 )
-def test_every_record_has_the_separators(catalogs: Path, source: str, name: str, path: str) -> None:
+def test_every_record_has_the_separators(catalogs, source, name, path):
     file = layout_of(source, name)
     bars = {int(position) for position in file.literals}
     lines = read(catalogs / path).splitlines()
@@ -346,8 +340,8 @@ def test_every_record_has_the_separators(catalogs: Path, source: str, name: str,
 
 @pytest.mark.parametrize(("source", "name", "path", "rows", "made"), EXCERPTS)
 def test_every_column_of_every_record_is_readable(
-    catalogs: Path, has_excerpts: bool, source: str, name: str, path: str, rows: int, made: int
-) -> None:
+    catalogs, has_excerpts, source, name, path, rows, made
+):
     records = parsed(catalogs / path, layout_of(source, name))
     assert records.problems == []
     assert len(records) == (rows if has_excerpts else made)
@@ -358,7 +352,7 @@ def parsed(path: Path, file: RecordFile) -> Records:
     return parse(read(path), file, [column.name for column in file.columns])
 
 
-def test_fields_of_genuine_records_are_what_they_should_be(catalogs: Path) -> None:
+def test_fields_of_genuine_records_are_what_they_should_be(catalogs):
     tycho2 = layout_of("tycho2", "tyc2")
     main = parsed(catalogs / "samples/tycho2_I259_records.txt", tycho2)
     assert main["pflag"].tolist() == [b" ", b" ", b"X"]
@@ -377,7 +371,7 @@ def test_fields_of_genuine_records_are_what_they_should_be(catalogs: Path) -> No
     assert (psc["k_psfchi"][0], psc["j_m_stdap"][0], psc["use_src"][0]) == (0.81, 12.481, 1.0)
 
 
-def test_sexagesimal_and_decimal_positions_of_hipparcos_agree(catalogs: Path) -> None:
+def test_sexagesimal_and_decimal_positions_of_hipparcos_agree(catalogs):
     hip = parsed(catalogs / "hip_main.dat.gz", layout_of("hipparcos", "hip_main"))
     degree, minute, second = np.array([text.split() for text in hip["de_dms"]], float).T
     size = abs(degree) + minute / 60.0 + second / 3600.0
@@ -390,7 +384,7 @@ def test_sexagesimal_and_decimal_positions_of_hipparcos_agree(catalogs: Path) ->
 
 
 @pytest.mark.parametrize("year", ["", "2000"])
-def test_sexagesimal_and_radian_positions_of_sao_agree(catalogs: Path, year: str) -> None:
+def test_sexagesimal_and_radian_positions_of_sao_agree(catalogs, year):
     sao = parsed(catalogs / "sao.dat.gz", layout_of("sao", "sao"))
     ra = sao[f"ra{year}_h"] + sao[f"ra{year}_m"] / 60.0 + sao[f"ra{year}_s"] / 3600.0
     dec = sao[f"de{year}_d"] + sao[f"de{year}_m"] / 60.0 + sao[f"de{year}_s"] / 3600.0
@@ -402,7 +396,7 @@ def test_sexagesimal_and_radian_positions_of_sao_agree(catalogs: Path, year: str
     assert abs(sign * np.radians(dec) - sao[f"de{year}_rad"]).max() < 3.1e-8
 
 
-def test_gcvs_flag_one_makes_the_minimum_an_amplitude(catalogs: Path, has_excerpts: bool) -> None:
+def test_gcvs_flag_one_makes_the_minimum_an_amplitude(catalogs, has_excerpts):
     gcvs = parsed(catalogs / "gcvs.tsv.gz", layout_of("gcvs", "gcvs"))
     by_name = {name.decode().strip(): k for k, name in enumerate(gcvs["name"])}
     k = by_name["WW And" if has_excerpts else "V100 Syn"]

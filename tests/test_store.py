@@ -98,12 +98,7 @@ def sao_record(number: int, mag: float) -> bytes:
 
 def test_repeated_records_are_judged_within_the_limit_of_the_build(tmp_path):
     """A record is repeated, or not, by what a build reads: as if it read the archive's file."""
-    lines = [
-        sao_record(1, 9.0),
-        sao_record(1, 5.0),
-        sao_record(2, 5.0),
-        sao_record(2, 6.0),
-    ]
+    lines = [sao_record(1, 9.0), sao_record(1, 5.0), sao_record(2, 5.0), sao_record(2, 6.0)]
     archive = tmp_path / "sao.dat"
     archive.write_bytes(b"\n".join(lines) + b"\n")
     made = ingest_to_store("sao", [archive], tmp_path / "store")

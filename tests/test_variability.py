@@ -54,7 +54,7 @@ def joined(stars: pa.Table, *tables: AmplitudeTable) -> pa.Table:
 
 
 @pytest.mark.parametrize("key", ["hip_number", "hd_number"])
-def test_join_by_number(key: str) -> None:
+def test_join_by_number(key):
     stars = stars_of("sao", 3, **{key: [30.0, np.nan, 10.0]})
     table = table_of([0.1, 0.2, 0.3], ["H6=1", None, "H6=2"], **{key: [10, 20, 30]})
     found, count = join_amplitudes(stars, table)
@@ -68,7 +68,7 @@ def test_join_by_number(key: str) -> None:
 
 
 @pytest.mark.parametrize("key", ["hip_number", "hd_number", "tyc", "gaia"])
-def test_no_number_matches_no_number(key: str) -> None:
+def test_no_number_matches_no_number(key):
     table = table_of([5.0, 5.0], ["x", "y"], **{key: [0, 0]})
     for catalog in ("sao", "tycho2", "gaia"):
         stars = stars_of(catalog, 4, hip_number=[0.0, np.nan, 0, 0], hd_number=[0.0, np.nan, 0, 0])
@@ -77,7 +77,7 @@ def test_no_number_matches_no_number(key: str) -> None:
         assert found.equals(stars)
 
 
-def test_several_records_of_one_number_give_the_largest_amplitude() -> None:
+def test_several_records_of_one_number_give_the_largest_amplitude():
     stars = stars_of("sao", 1, hd_number=[77.0])
     table = table_of([0.2, 0.9, np.nan, 0.4], ["a", None, "c", "a"], hd_number=[77, 77, 77, 77])
     found, count = join_amplitudes(stars, table)
@@ -86,14 +86,14 @@ def test_several_records_of_one_number_give_the_largest_amplitude() -> None:
     assert set(found["variable_flag"][0].as_py().split(";")) == {"hipparcos:a", "hipparcos:c"}
 
 
-def test_several_stars_of_one_number_all_get_it() -> None:
+def test_several_stars_of_one_number_all_get_it():
     stars = stars_of("sao", 3, hd_number=[77.0, 78.0, 77.0])
     found, count = join_amplitudes(stars, table_of([0.9], hd_number=[77]))
     assert count == 2
     assert found["amplitude_mag"].to_pylist() == [0.9, None, 0.9]
 
 
-def test_the_first_key_that_matches_is_the_star() -> None:
+def test_the_first_key_that_matches_is_the_star():
     stars = stars_of("sao", 2, hip_number=[1.0, np.nan], hd_number=[500.0, 500.0])
     table = table_of([0.1, 0.8], hip_number=[1, 2], hd_number=[400, 500])
     assert joined(stars, table)["amplitude_mag"].to_pylist() == [0.1, 0.8]
@@ -108,9 +108,7 @@ def test_the_first_key_that_matches_is_the_star() -> None:
         (np.nan, 0.2, 0.2, "hipparcos"),
     ],
 )
-def test_a_larger_amplitude_replaces_a_smaller(
-    own: float, other: float, expected: float, origin: str
-) -> None:
+def test_a_larger_amplitude_replaces_a_smaller(own, other, expected, origin):
     stars = stars_of(
         "tycho1",
         1,
@@ -124,7 +122,7 @@ def test_a_larger_amplitude_replaces_a_smaller(
 
 
 @pytest.mark.parametrize("is_reversed", [False, True])
-def test_two_sources_in_any_order_give_the_same_amplitude(is_reversed: bool) -> None:
+def test_two_sources_in_any_order_give_the_same_amplitude(is_reversed):
     stars = stars_of("sao", 2, hip_number=[1.0, 2.0], variable_flag=pa.array(["Rem=4", None]))
     first = table_of([0.3, 0.7], ["H6=2", "H6=3"], hip_number=[1, 2])
     second = table_of([0.4, np.nan], ["EA", "M"], source="gcvs", hip_number=[1, 2])
@@ -135,20 +133,20 @@ def test_two_sources_in_any_order_give_the_same_amplitude(is_reversed: bool) -> 
     assert codes == [{"Rem=4", "hipparcos:H6=2", "gcvs:EA"}, {"hipparcos:H6=3", "gcvs:M"}]
 
 
-def test_joining_twice_changes_nothing() -> None:
+def test_joining_twice_changes_nothing():
     stars = stars_of("sao", 2, hip_number=[1.0, 2.0])
     table = table_of([0.3, np.nan], ["H6=2", "H52=P"], hip_number=[1, 2])
     once = joined(stars, table)
     assert joined(once, table).equals(once)
 
 
-def test_tycho_numbers_join_only_tycho_stars() -> None:
+def test_tycho_numbers_join_only_tycho_stars():
     table = table_of([0.7], source="tycho1", tyc=[2])
     assert joined(stars_of("tycho2", 2), table)["amplitude_mag"].to_pylist() == [None, 0.7]
     assert joined(stars_of("sao", 2), table)["amplitude_mag"].null_count == 2
 
 
-def test_gaia_numbers_join_to_the_last_digit_and_only_gaia_stars() -> None:
+def test_gaia_numbers_join_to_the_last_digit_and_only_gaia_stars():
     number = np.array([4313918654563864191, 4313918654563864192])  # a float64 holds neither
     table = table_of([0.7], source="gcvs", gaia=[4313918654563864192])
     gaia = table_from_columns("stars", {"star_id": number, "catalog": "gaia"}, 2)
@@ -157,7 +155,7 @@ def test_gaia_numbers_join_to_the_last_digit_and_only_gaia_stars() -> None:
     assert joined(other, table)["amplitude_mag"].null_count == 2
 
 
-def test_a_star_that_gaia_lacks_joins_by_its_hipparcos_number() -> None:
+def test_a_star_that_gaia_lacks_joins_by_its_hipparcos_number():
     stars = table_from_columns(
         "stars",
         {"star_id": np.array([-32349]), "catalog": "gaia", "hip_number": np.array([32349.0])},
@@ -205,15 +203,13 @@ def gcvs(tmp_path: Path) -> Callable[..., AmplitudeTable]:
         ("1 SR 8.0 - 9.0", 1.0),
     ],
 )
-def test_amplitudes_of_gcvs(
-    gcvs: Callable[..., AmplitudeTable], record: str, amplitude: float | None
-) -> None:
+def test_amplitudes_of_gcvs(gcvs, record, amplitude):
     found = gcvs(record).amplitude_mag
     expected = np.nan if amplitude is None else amplitude
     np.testing.assert_allclose(found, [expected], rtol=0, atol=1e-12)
 
 
-def test_numbers_of_gcvs(gcvs: Callable[..., AmplitudeTable]) -> None:
+def test_numbers_of_gcvs(gcvs):
     found = gcvs("118218 M 1 0 2", "4313918654563864193 - 1 0 2")
     assert found.numbers["hip_number"].tolist() == [118218, 0]
     assert found.numbers["gaia"].tolist() == [0, 4313918654563864193]
@@ -223,9 +219,7 @@ def test_numbers_of_gcvs(gcvs: Callable[..., AmplitudeTable]) -> None:
 
 
 @pytest.mark.parametrize("ref", ["none", "0", "\u00b2\u00b3", "9" * 19, "\u0661", "-5", "1_0"])
-def test_a_record_of_gcvs_without_a_number_is_rejected(
-    gcvs: Callable[..., AmplitudeTable], ref: str
-) -> None:
+def test_a_record_of_gcvs_without_a_number_is_rejected(gcvs, ref):
     found = gcvs("118218 M 1 0 2", f"{ref} SR 1 0 2")
     assert found.numbers["hip_number"].tolist() == [118218]
     assert found.rejected == {"no_identity": 1}
@@ -233,27 +227,25 @@ def test_a_record_of_gcvs_without_a_number_is_rejected(
 
 
 @pytest.mark.parametrize("mag", ["nan", "inf", "1e308", "\u0665", "1_0"])
-def test_a_magnitude_of_gcvs_that_is_none_gives_no_amplitude(
-    gcvs: Callable[..., AmplitudeTable], mag: str
-) -> None:
+def test_a_magnitude_of_gcvs_that_is_none_gives_no_amplitude(gcvs, mag):
     found = gcvs(f"118218 M 8.0 0 {mag}")
     assert np.isnan(found.amplitude_mag).all()
 
 
-def test_a_malformed_record_of_gcvs(gcvs: Callable[..., AmplitudeTable]) -> None:
+def test_a_malformed_record_of_gcvs(gcvs):
     found = gcvs("1 M 1 0 2", "2 M 1 x 2", "3 M 1 0 2")
     assert found.rejected == {"malformed_record": 1}
     assert found.numbers["hip_number"].tolist() == [1, 3]
     assert found.files[0].rows == 3
 
 
-def test_another_file_is_not_taken_for_gcvs(tmp_path: Path) -> None:
+def test_another_file_is_not_taken_for_gcvs(tmp_path):
     (tmp_path / "gcvs.tsv").write_bytes(b"hello\nworld\n")
     with pytest.raises(ParseError, match="Is this the right archive"):
         read_amplitudes("gcvs", [tmp_path])
 
 
-def test_the_class_of_hipparcos_is_a_lower_bound(catalogs: Path, has_excerpts: bool) -> None:
+def test_the_class_of_hipparcos_is_a_lower_bound(catalogs, has_excerpts):
     table = read_amplitudes("hipparcos", [catalogs / "hip_main.dat.gz"])
     assert table.kept == (9_928 if has_excerpts else 8_642)
     assert table.rejected == {"no_position": 5}
@@ -265,7 +257,7 @@ def test_the_class_of_hipparcos_is_a_lower_bound(catalogs: Path, has_excerpts: b
     assert (table.amplitude_mag[middle] >= 0.06).all()
 
 
-def test_a_star_without_position_can_still_be_known_to_vary(tmp_path: Path, catalogs: Path) -> None:
+def test_a_star_without_position_can_still_be_known_to_vary(tmp_path, catalogs):
     layout = data_source("hipparcos").files[0]
     with gzip.open(catalogs / "hip_main.dat.gz") as file:
         lines = [bytearray(file.readline()), bytearray(file.readline())]
@@ -279,7 +271,7 @@ def test_a_star_without_position_can_still_be_known_to_vary(tmp_path: Path, cata
     assert table.amplitude_mag[row] > 0.6
 
 
-def test_tycho1_into_tycho2(tmp_path: Path, catalogs: Path) -> None:
+def test_tycho1_into_tycho2(tmp_path, catalogs):
     layout = data_source("tycho1").files[0]
     sample = (catalogs / "samples" / "tycho1_I239_records.txt").read_bytes().splitlines()
     line = bytearray(sample[0])  # TYC 1-13-1: VT 8.57 to 8.79
@@ -298,7 +290,7 @@ def test_tycho1_into_tycho2(tmp_path: Path, catalogs: Path) -> None:
     assert found["variable_flag"].to_pylist() == [None, "tycho1:T48=V", None]
 
 
-def test_strongly_variable_naked_eye_stars_of_sao(catalogs: Path, has_excerpts: bool) -> None:
+def test_strongly_variable_naked_eye_stars_of_sao(catalogs, has_excerpts):
     stars = ingest("sao", [catalogs / "sao.dat.gz"], neighbours=False).stars
     table = read_amplitudes("hipparcos", [catalogs / "hip_main.dat.gz"])
     found, count = join_amplitudes(stars, table)
@@ -308,7 +300,7 @@ def test_strongly_variable_naked_eye_stars_of_sao(catalogs: Path, has_excerpts: 
     assert len(found) == len(stars)
 
 
-def test_the_whole_gcvs(catalogs: Path, has_excerpts: bool) -> None:
+def test_the_whole_gcvs(catalogs, has_excerpts):
     table = read_amplitudes("gcvs", [catalogs / "gcvs.tsv.gz"])
     of_hipparcos, of_gaia = (6_892, 43_100) if has_excerpts else (209, 209)
     assert (table.kept, table.rejected) == (of_hipparcos + of_gaia, {})

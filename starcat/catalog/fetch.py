@@ -46,17 +46,16 @@ Status = Literal["downloaded", "resumed", "present"]
 _logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class FetchedFile:
+class FetchedFile(LockEntry):
     """One file that is in the folder and is what it should be."""
 
-    name: str
     path: Path
-    bytes: int  # as published, that is before unpacking
-    sha256: str
-    rows: int
-    url: str  # where it came from; empty for a file that somebody put there by hand
     status: Status
+
+    @property
+    def name(self) -> str:
+        """The name of the file in its folder."""
+        return self.path.name
 
 
 @dataclass(frozen=True)
@@ -172,7 +171,7 @@ def _take_present(expected: ExpectedFile, path: Path) -> FetchedFile:
     except SourceError as error:
         error.args = (f"{error} The file is {path}: move it away to fetch it again.",)
         raise
-    return _fetched(path, entry, entry.url, "present")
+    return FetchedFile(**entry.model_dump(), path=path, status="present")
 
 
 def _take_arrived(
@@ -190,8 +189,4 @@ def _take_arrived(
         raise
     rename(part, path)
     forget_part(own)
-    return _fetched(path, entry, url, status)
-
-
-def _fetched(path: Path, entry: LockEntry, url: str, status: Status) -> FetchedFile:
-    return FetchedFile(path.name, path, entry.bytes, entry.sha256, entry.rows, url, status)
+    return FetchedFile(**entry.model_dump() | {"url": url}, path=path, status=status)

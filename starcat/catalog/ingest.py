@@ -136,13 +136,6 @@ def ingest(
     Without a band it is the source's first, without an epoch every star stays at its own. Records
     fainter than the read limit are counted and never held; they are nobody's neighbour. Workers
     are threads; the result is the same for any number.
-
-    Raises
-    ------
-    ConfigError
-        If the source is not a star catalog or has no such band.
-    SourceError
-        If a file is missing, damaged, given twice, or not of this archive.
     """
     options = ingest_options(source_name, band, epoch_jyear, read_limit_mag)
     files = SourceFiles.find(data_source(source_name), paths)

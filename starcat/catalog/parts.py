@@ -206,12 +206,9 @@ class FileReading:
 
     @property
     def facts(self) -> FileFacts:
-        """What the manifest says of the file, which has been read to its end.
+        """What the manifest says of a file that was read to its end.
 
-        Raises
-        ------
-        ParseError
-            If it has no record, or more than 10 of them and 1 % are malformed.
+        `ParseError` where it has no record, or more than 10 of them and 1 % are malformed.
         """
         path, digest = self.file.path, self._digest
         if digest is None:

@@ -49,15 +49,10 @@ class SourceFiles:
 
     @classmethod
     def find(cls, source: DataSource, paths: Sequence[Path]) -> SourceFiles:
-        """Find the files that paths name, which are files or folders.
+        """Find the files that paths (files or folders) name.
 
-        Raises
-        ------
-        SourceMissing
-            If there is none, a path does not exist, or a folder lacks a file or a part that is
-            not optional.
-        SourceError
-            If a file of the archive is given twice.
+        `SourceMissing` where there is none, or a folder lacks a file that is not optional;
+        `SourceError` where a file of the archive is given twice.
         """
         found: list[InputFile] = []
         for path in paths:

@@ -38,9 +38,8 @@ def write_hats(stars: pa.Table, folder: Path, name: str, max_rows: int = MAX_ROW
     table, left_out = _with_pixels(stars, name)
     found, counts = np.unique(table[HEALPIX_COLUMN].to_numpy(), return_counts=True)
     partitions = partition_pixels(found, counts, MAX_ORDER, max_rows, name)
-    size = write_slices(table, partitions, folder, max_rows)
-    described = Described(name, "object", len(table), size, max_rows, partitions, {})
-    describe_catalog(folder, described, table.schema)
+    written = write_slices(table, partitions, folder, max_rows)
+    describe_catalog(folder, Described(name, "object", written, max_rows, {}), table.schema)
     order = max(pixel.order for pixel in partitions)
     return HatsCatalog(len(table), left_out, order, len(partitions))
 

@@ -92,17 +92,14 @@ class Matcher(Settings, _WithDatabase):
         max_steps: float = math.inf,
         time_limit_s: float = math.inf,
     ) -> Matcher:
-        """Open the database of an artifact, or an onboard image.
-
-        With an image everything is as in flight: the C library, and directions as they are rounded.
+        """Open the database of an artifact, or an onboard image with the C library, as in flight.
 
         Parameters
         ----------
         artifact : str or path-like
             The artifact's folder, or an image as `starcat export --to onboard` writes it.
         method : str, default "triangle"
-            A key of `METHODS`; None for the best one that the artifact's products allow. An
-            image has one method, which is used whatever is asked for.
+            A key of `METHODS`; None for the best that the products allow. An image has its own.
         tolerance_px, max_false_match_probability, selection, noise_px, noise_mag, engine, \
         min_share, max_steps, time_limit_s
             As the fields of `Settings`.
@@ -110,8 +107,7 @@ class Matcher(Settings, _WithDatabase):
         Raises
         ------
         ConfigError
-            If there is no such method or engine, both ``tolerance_px`` and ``noise_px`` are
-            given, or a noise is not a finite number above 0.
+            If there is no such method or engine, or a number is out of range.
         ProductError, SchemaVersionError
             If the artifact cannot be read, or lacks a product that the method needs.
         """

@@ -114,10 +114,9 @@ def _check_levels(stars: int, spec: BuildSpec) -> None:
         boresights += count
     if max(found, boresights) > MOST_FIELD_STARS:
         raise BuildError(
-            f"{spec.name}: the {boresights:,} fields of all levels may have {found:,.0f} stars, "
-            f"more than the {MOST_FIELD_STARS:,} that an estimate goes through; a smaller "
-            "boresights.count or products.levels.stars_per_field, or a larger "
-            "products.levels.max_ratio, and it is there"
+            f"{spec.name}: too dense to estimate: the {boresights:,} fields of all levels may have "
+            f"{found:,.0f} stars, limit {MOST_FIELD_STARS:,}; use a smaller boresights.count or "
+            "products.levels.stars_per_field, or a larger products.levels.max_ratio"
         )
 
 

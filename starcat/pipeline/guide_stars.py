@@ -88,10 +88,9 @@ def check_tiling(
     found = spec.boresights.count * in_field
     if found > most:
         raise BuildError(
-            f"{spec.name}: the {spec.boresights.count:,} fields of the tiling have about "
-            f"{found:,.0f} stars in all, more than the {most:,} that an estimate goes through; a "
-            "smaller boresights.count or fewer stars (selection.max_stars_per_field, a brighter "
-            "faint_limit_mag) give one"
+            f"{spec.name}: too dense to estimate: the {spec.boresights.count:,} fields of the "
+            f"tiling have about {found:,.0f} stars, limit {most:,}; use a brighter "
+            "faint_limit_mag, selection.max_stars_per_field, or a smaller boresights.count"
         )
 
 

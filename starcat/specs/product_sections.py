@@ -139,7 +139,10 @@ class Crossmatch(Product):
         description="standard deviation of the motion of a pair in which neither has one",
     )
     outlier_share: float = Field(
-        0.02, ge=0.0, le=0.99, description="share of the stars that are off by more than errors"
+        0.02,
+        ge=0.0,
+        le=0.99,
+        description="share of the stars that are off by more than their stated errors",
     )
     expected_delta_mag: Mag | None = Field(
         None, description="magnitude of the counterpart minus the star's; default: measured"

@@ -7,7 +7,7 @@ rejected, and what lies in which partition.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,27 +47,34 @@ class Described:
 
     name: str  # the name that it gets
     kind: str  # ``object`` or ``margin``
-    rows: int  # its stars
-    bytes: int  # size of its partitions
+    partitions: Sequence[tuple[Pixel, Facts]]  # rows and bytes of each, by place on the sky
     max_rows: int  # stars that a partition may hold
-    pixels: tuple[Pixel, ...]  # the partitions, by their place on the sky
     more: Mapping[str, Any]  # further properties
+
+    @property
+    def pixels(self) -> list[Pixel]:
+        """The parts of the sky that have a partition."""
+        return [pixel for pixel, _ in self.partitions]
+
+    def total(self, fact: str) -> int:
+        """Sum what is known of each partition."""
+        return sum(facts[fact] for _, facts in self.partitions)
 
 
 def write_slices(
     stars: pa.Table, partitions: Sequence[Pixel], folder: Path, row_group_rows: int
-) -> int:
-    """Write the partitions of a table that is held in memory."""
+) -> list[tuple[Pixel, Facts]]:
+    """Write the partitions of a table that is held in memory; return rows and bytes of each."""
     pixels = stars[HEALPIX_COLUMN].to_numpy()
-    size = 0
+    written: list[tuple[Pixel, Facts]] = []
     for pixel in partitions:
         begin, end = np.searchsorted(pixels, [pixel.first, pixel.end])
         path = folder / DATASET / pixel.path
         path.parent.mkdir(parents=True, exist_ok=True)
         rows = stars.slice(begin, end - begin)
         pq.write_table(rows, path, compression="zstd", row_group_size=row_group_rows)
-        size += path.stat().st_size
-    return size
+        written.append((pixel, {"rows": len(rows), "bytes": path.stat().st_size}))
+    return written
 
 
 def write_pixel_list(folder: Path, partitions: Sequence[Pixel]) -> None:
@@ -95,7 +102,7 @@ def _properties(catalog: Described) -> dict[str, Any]:
     return {
         "obs_collection": catalog.name,
         "dataproduct_type": catalog.kind,
-        "hats_nrows": catalog.rows,
+        "hats_nrows": catalog.total("rows"),
         "hats_col_ra": "ra_deg",
         "hats_col_dec": "dec_deg",
         "hats_col_healpix": HEALPIX_COLUMN,
@@ -103,7 +110,7 @@ def _properties(catalog: Described) -> dict[str, Any]:
         "hats_max_rows": catalog.max_rows,
         "hats_order": max((pixel.order for pixel in catalog.pixels), default=0),
         "hats_npix_suffix": ".parquet",
-        "hats_estsize": -(-catalog.bytes // 1024),
+        "hats_estsize": -(-catalog.total("bytes") // 1024),
         "hats_builder": f"starcat {__version__}",
         "hats_version": HATS_VERSION,
         **catalog.more,
@@ -195,7 +202,7 @@ def describe_store(
     schema = store_schema()
     full = [(pixel, facts) for pixel, facts in written.partitions if facts["rows"]]
     more = {"hats_skymap_order": SKYMAP_ORDER, **_provenance(manifest)}
-    described = _described(name, "object", full, options, more)
+    described = Described(name, "object", full, options.max_partition_rows, more)
     describe_catalog(folder / name, described, schema)
     counts = sum_maps(SKYMAP_ORDER, [facts["map"] for _, facts in full])
     write_skymap(folder / name / SKYMAP_NAME, SKYMAP_ORDER, counts)
@@ -206,24 +213,13 @@ def describe_store(
             "hats_primary_table_url": name,
             "hats_margin_threshold": options.margin_arcsec,
         }
-        described = _described(margin, "margin", written.margins, options, more)
+        described = replace(
+            described, name=margin, kind="margin", partitions=written.margins, more=more
+        )
         describe_catalog(folder / margin, described, schema)
         collection |= {"all_margins": margin, "default_margin": margin}
     write_properties(folder / COLLECTION_NAME, collection)
     (folder / MANIFEST_NAME).write_bytes(json_bytes(manifest))
-
-
-def _described(
-    name: str,
-    kind: str,
-    written: Sequence[tuple[Pixel, Facts]],
-    options: StoreOptions,
-    more: Facts,
-) -> Described:
-    rows = sum(facts["rows"] for _, facts in written)
-    size = sum(facts["bytes"] for _, facts in written)
-    pixels = tuple(pixel for pixel, _ in written)
-    return Described(name, kind, rows, size, options.max_partition_rows, pixels, more)
 
 
 def _provenance(manifest: Facts) -> Facts:

@@ -62,12 +62,8 @@ class Run:
     buckets: NDArray[np.int64]  # shape (BUCKETS + 1,): where each bucket begins in ``places``
 
 
-@dataclass(frozen=True)
-class Share:
-    """The batches of a run that a partition reads."""
-
-    stars: Path  # arrow file of the run
-    batches: tuple[int, ...]  # their numbers, ascending
+Share = tuple[Path, list[int]]
+"""What a partition reads of a run: its Arrow file, and the numbers of batches, ascending."""
 
 
 def places_of(stars: pa.Table) -> NDArray[np.int64]:
@@ -165,13 +161,14 @@ def read_shares(
 
 
 def _batches(share: Share, names: Sequence[str]) -> Iterator[tuple[pa.Table, dict[str, Any]]]:
-    with pa.OSFile(str(share.stars)) as source:
+    path, batches = share
+    with pa.OSFile(str(path)) as source:
         schema = pa.ipc.open_file(source).schema
         places = [k for k, name in enumerate(schema.names) if name in (HEALPIX_COLUMN, *names)]
         options = pa.ipc.IpcReadOptions(included_fields=places)
         reader = pa.ipc.open_file(source, options=options)
         constants = json.loads(schema.metadata[_CONSTANTS])
-        for number in share.batches:
+        for number in batches:
             yield pa.Table.from_batches([reader.get_batch(number)]), constants
 
 
@@ -243,7 +240,7 @@ class RunIndex:
         shares: list[Share] = []
         for run in np.unique(self.runs[rows]).tolist():
             batches = np.sort(self.batches[rows[self.runs[rows] == run]])
-            shares.append(Share(self.paths[run], tuple(batches.tolist())))
+            shares.append((self.paths[run], batches.tolist()))
         return shares
 
 
