@@ -127,11 +127,7 @@ def ingest(
     if to not in ("parquet", "hats"):
         raise ConfigError(f"--to {to}: choose parquet or hats", key="to", value=to)
     paths = locate(source, inputs_by_source(inputs, source))
-    how: dict[str, Any] = {
-        "band": band,
-        "epoch_jyear": epoch_jyear,
-        "read_limit_mag": read_limit_mag,
-    }
+    how: Any = {"band": band, "epoch_jyear": epoch_jyear, "read_limit_mag": read_limit_mag}
     if to == "parquet":
         from starcat.catalog.ingest import write_star_tables
         from starcat.store.reading import read_catalog
