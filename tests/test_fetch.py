@@ -201,8 +201,22 @@ def tiny_source(*urls: str, name: str = "tiny", **file_keys: Any) -> DataSource:
     )
 
 
+@pytest.fixture
+def tiny(archive: Archive) -> DataSource:
+    """The whole file at one address."""
+    return tiny_source(archive.serve("/tiny.dat", BODY))
+
+
 def fetch(source: DataSource, folder: Path, **keys: Any) -> FetchReport:
     return fetch_source(source, folder, **{"retries": 2, "timeout_s": 5, "backoff_s": 0.0} | keys)
+
+
+def break_off(archive: Archive, folder: Path, **keys: Any) -> str:
+    """Serve a file whose first download ends half way, and return its address."""
+    url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], **keys)
+    with pytest.raises(DownloadError):
+        fetch(tiny_source(url), folder, retries=0)
+    return url
 
 
 def names_in(folder: Path) -> set[str]:
@@ -226,8 +240,8 @@ def test_fetches_checks_and_reports(archive, tmp_path):
     assert archive.requests[0].encodings == "identity"
 
 
-def test_second_fetch_makes_no_request(archive, tmp_path):
-    source = tiny_source(archive.serve("/tiny.dat", BODY))
+def test_second_fetch_makes_no_request(archive, tiny, tmp_path):
+    source = tiny
     first = fetch(source, tmp_path).files[0]
     lock = (tmp_path / LOCK_NAME).stat()
     second = fetch(source, tmp_path).files[0]
@@ -338,9 +352,7 @@ def test_body_that_is_always_truncated_fails_and_the_part_serves_the_next_run(ar
 @pytest.mark.parametrize("heeds_if_range", [True, False])
 @pytest.mark.parametrize("body", [OTHER, OTHER[: 1500 * (RECORD + 1)], OTHER[: 5 * (RECORD + 1)]])
 def test_changed_remote_file_is_not_spliced(archive, tmp_path, body, heeds_if_range):
-    url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], heeds_if_range=heeds_if_range)
-    with pytest.raises(DownloadError):
-        fetch(tiny_source(url), tmp_path, retries=0)
+    url = break_off(archive, tmp_path, heeds_if_range=heeds_if_range)
     archive.remotes["/tiny.dat"].body = body
     file = fetch(tiny_source(url, rows=body.count(b"\n")), tmp_path, retries=0).files[0]
     assert archive.requests[1].range == f"bytes={HALF}-"
@@ -350,10 +362,7 @@ def test_changed_remote_file_is_not_spliced(archive, tmp_path, body, heeds_if_ra
 
 @pytest.mark.parametrize("rows", [ROWS - 1, ROWS + 1])
 def test_partial_answer_without_validator_must_agree_on_the_size(archive, tmp_path, rows):
-    keys = {"heeds_if_range": False, "validates_206": False}
-    url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], **keys)
-    with pytest.raises(DownloadError):
-        fetch(tiny_source(url), tmp_path, retries=0)
+    url = break_off(archive, tmp_path, heeds_if_range=False, validates_206=False)
     archive.remotes["/tiny.dat"].body = body = records(rows, factor=7907)
     assert fetch(tiny_source(url, rows=rows), tmp_path).files[0].status == "downloaded"
     assert [request.status for request in archive.requests] == [200, 206, 200]
@@ -385,21 +394,16 @@ def test_part_of_one_address_is_not_continued_from_another(archive, tmp_path):
     assert archive.requests[1].range is None
 
 
-def test_whole_part_that_was_not_renamed_is_taken(archive, tmp_path):
-    url = archive.serve("/tiny.dat", BODY, cut_after=[HALF])
-    with pytest.raises(DownloadError):
-        fetch(tiny_source(url), tmp_path, retries=0)
-    (tmp_path / "tiny.dat.part").write_bytes(BODY)
-    assert fetch(tiny_source(url), tmp_path).files[0].status == "resumed"
-    assert len(archive.requests) == 1
-
-
-def test_part_longer_than_the_remote_file_starts_over(archive, tmp_path):
-    url = archive.serve("/tiny.dat", BODY, cut_after=[HALF])
-    with pytest.raises(DownloadError):
-        fetch(tiny_source(url), tmp_path, retries=0)
-    (tmp_path / "tiny.dat.part").write_bytes(BODY + b"x")
-    assert fetch(tiny_source(url), tmp_path).files[0].status == "downloaded"
+@pytest.mark.parametrize(
+    ("part", "status", "requests"), [(BODY, "resumed", 1), (BODY + b"x", "downloaded", 3)]
+)
+def test_part_that_is_whole_is_taken_and_one_that_is_longer_is_not(
+    archive, tmp_path, part, status, requests
+):
+    url = break_off(archive, tmp_path)
+    (tmp_path / "tiny.dat.part").write_bytes(part)
+    assert fetch(tiny_source(url), tmp_path).files[0].status == status
+    assert len(archive.requests) == requests
     assert (tmp_path / "tiny.dat").read_bytes() == BODY
 
 
@@ -725,8 +729,8 @@ def test_gaia_comes_in_a_package(tmp_path):
         fetch(tiny_source(), tmp_path / "folder")
 
 
-def test_optional_file_without_address_is_passed_over(archive, tmp_path):
-    source = tiny_source(archive.serve("/tiny.dat", BODY))
+def test_optional_file_without_address_is_passed_over(archive, tiny, tmp_path):
+    source = tiny
     extra = source.files[0].model_copy(
         update={"name": "extra", "file_names": ("extra.dat",), "urls": (), "optional": True}
     )
@@ -871,8 +875,8 @@ def test_parallel_fetches_keep_each_others_entries(archive, tmp_path):
         assert names_in(folder) == {"0.dat", "1.dat", "2.dat", "3.dat", LOCK_NAME}
 
 
-def test_parallel_fetches_of_one_file_download_it_once(archive, tmp_path):
-    source = tiny_source(archive.serve("/tiny.dat", BODY))
+def test_parallel_fetches_of_one_file_download_it_once(archive, tiny, tmp_path):
+    source = tiny
     reports = in_parallel(*[partial(fetch, source, tmp_path)] * 4)
     statuses = sorted(report.files[0].status for report in reports)
     assert statuses == ["downloaded", "present", "present", "present"]
