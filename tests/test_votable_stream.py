@@ -1,10 +1,12 @@
-"""VOTables written as a stream: other readers get back what went in, and the status is told."""
+"""VOTables written as a stream: what they say of themselves, and how they end.
+
+What readers find in the rows is asked of all formats at once in test_exchange_formats.
+"""
 
 from __future__ import annotations
 
 import csv
 import io
-import math
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -16,12 +18,10 @@ from typing import Any, get_args
 import numpy as np
 import pyarrow as pa
 import pytest
-from astropy.io.votable import parse, validate
+from astropy.io.votable import parse
 from astropy.io.votable.tree import VOTableFile
-from hypothesis import given
-from hypothesis import strategies as st
+from table_formats import column_of
 
-from starcat.artifact.reader import open_artifact
 from starcat.errors import QueryLimitError, SchemaError
 from starcat.exchange import votable_stream
 from starcat.exchange.columns import Label
@@ -29,24 +29,6 @@ from starcat.exchange.votable_stream import Serialization, votable_chunks
 
 SERIALIZATIONS: tuple[Serialization, ...] = get_args(Serialization)
 both = pytest.mark.parametrize("serialization", SERIALIZATIONS)
-
-KINDS = {
-    "truth": (pa.bool_(), st.booleans()),
-    "byte": (pa.uint8(), st.integers(0, 255)),
-    "small": (pa.int8(), st.integers(-128, 127)),
-    "short": (pa.int16(), st.integers(-(2**15), 2**15 - 1)),
-    "unsigned": (pa.uint16(), st.integers(0, 2**16 - 1)),
-    "int": (pa.int32(), st.integers(-(2**31), 2**31 - 1)),
-    "long": (pa.int64(), st.integers(-(2**63), 2**63 - 1)),
-    "single": (pa.float32(), st.floats(width=32)),
-    "double": (pa.float64(), st.floats()),
-    "text": (pa.string(), st.text(st.characters(codec="utf-8", exclude_categories=["Cc"]))),
-}
-LISTS = {
-    "shorts": (pa.list_(pa.int16()), st.lists(st.integers(-(2**15), 2**15 - 1))),
-    "longs": (pa.list_(pa.int64()), st.lists(st.integers(-(2**63), 2**63 - 1))),
-    "doubles": (pa.list_(pa.float64()), st.lists(st.floats())),
-}
 
 
 def document(table: pa.Table, rows_a_batch: int = 1000, **options: Any) -> bytes:
@@ -59,107 +41,20 @@ def parsed(content: bytes) -> VOTableFile:
     return parse(io.BytesIO(content), verify="exception")
 
 
+def rows_of(content: bytes) -> list[tuple[Any, ...]]:
+    """Return rows as astropy reads them, with None for what is masked."""
+    found = parsed(content).get_first_table()
+    columns = [column_of(found.to_table(), field.ID) for field in found.fields]
+    return list(zip(*columns, strict=True))
+
+
 def statuses(content: bytes) -> list[tuple[str, str]]:
     """Return the values of QUERY_STATUS and their texts, in the order of the document."""
     infos = parsed(content).resources[0].infos
     return [(i.value, (i.content or "").strip()) for i in infos if i.name == "QUERY_STATUS"]
 
 
-def rows_of(content: bytes) -> list[tuple[Any, ...]]:
-    """Return rows as astropy reads them, with None for null and for NaN."""
-    found = parsed(content).get_first_table()
-    names = [field.ID for field in found.fields]
-    columns = []
-    for name in names:
-        values, masks = found.array[name].data, found.array[name].mask
-        columns.append([_plain(v, m) for v, m in zip(values, masks, strict=True)])
-    return list(zip(*columns, strict=True)) if columns and len(columns[0]) else []
-
-
-def _plain(value: Any, mask: Any) -> Any:
-    if isinstance(value, (list, tuple, np.ndarray)):
-        data = np.ma.getdata(value)
-        return [_plain(item, False) for item in data]
-    if np.all(mask) and not isinstance(value, str):
-        return None
-    value = value.item() if isinstance(value, np.generic) else value
-    return None if isinstance(value, float) and math.isnan(value) else value
-
-
-def wanted(table: pa.Table, serialization: Serialization) -> list[tuple[Any, ...]]:
-    """Return the rows as a VOTable can say them.
-
-    Of the text of a cell in TABLEDATA, astropy drops the blanks at both ends.
-    """
-    columns = []
-    for field, column in zip(table.schema, table.columns, strict=True):
-        values = column.to_pylist()
-        if pa.types.is_string(field.type):
-            values = [value or "" for value in values]
-            if serialization == "tabledata":
-                values = [value.strip() for value in values]
-        elif pa.types.is_list(field.type):
-            values = [[_plain(item, item is None) for item in value or []] for value in values]
-        else:
-            values = [_plain(value, value is None) for value in values]
-        columns.append(values)
-    return list(zip(*columns, strict=True)) if len(table) else []
-
-
-@st.composite
-def tables(draw: st.DrawFn, kinds: dict[str, Any]) -> pa.Table:
-    chosen = draw(st.lists(st.sampled_from(sorted(kinds)), min_size=1, max_size=12))
-    count = draw(st.integers(0, 5))
-    columns, fields = [], []
-    for number, name in enumerate(chosen):
-        kind, values = kinds[name]
-        cells = draw(st.lists(st.none() | values, min_size=count, max_size=count))
-        columns.append(pa.array(cells, kind))
-        fields.append(pa.field(f"{name}_{number}", kind))
-    return pa.Table.from_arrays(columns, schema=pa.schema(fields))
-
-
-# Round trips -------------------------------------------------------------------------------
-
-
-@both
-@given(data=st.data())
-def test_astropy_reads_back_every_value(serialization: Serialization, data: st.DataObject) -> None:
-    table = data.draw(tables({**KINDS, **LISTS}))
-    content = document(table, data.draw(st.integers(1, 6)), serialization=serialization)
-    found = rows_of(content)
-    assert found == wanted(table, serialization)
-    for field, again in zip(table.schema, parsed(content).get_first_table().fields, strict=True):
-        assert again.name == field.name
-
-
-@both
-def test_the_smallest_and_largest_numbers_are_exact(serialization: Serialization) -> None:
-    doubles = [5e-324, 1.7976931348623157e308, 0.1, 1 / 3, -0.0, 1e22, 123456789.12345679]
-    singles = np.array([1e-45, 3.4028235e38, 0.1, 1 / 3, 0.0, 1e22, 16777217], np.float32)
-    longs = [-(2**63), 2**63 - 1, 4472832130942575872, 0, -1, 2**53 + 1, 7]
-    table = pa.table({"a": doubles, "b": singles, "c": longs})
-    array = parsed(document(table, serialization=serialization)).get_first_table().array
-    assert array["a"].data.tobytes() == np.array(doubles).tobytes()
-    assert array["b"].data.tobytes() == singles.tobytes()
-    assert array["c"].tolist() == longs
-
-
-@both
-def test_infinite_and_missing_numbers(serialization: Serialization) -> None:
-    table = pa.table({"a": [math.inf, -math.inf, math.nan, None, 1.0], "b": [None, 2, 3, None, 5]})
-    array = parsed(document(table, serialization=serialization)).get_first_table().array
-    assert array["a"].data.tolist()[:2] == [math.inf, -math.inf]
-    assert np.isnan(array["a"].data.astype(float)[2])
-    assert array["b"].mask.tolist() == [True, False, False, True, False]
-    assert array["b"].data[[1, 2, 4]].tolist() == [2, 3, 5]
-
-
-@both
-def test_texts_of_all_planes_are_in_their_rows(serialization: Serialization) -> None:
-    texts = ["\U0001f52d", "", None, "α Cen", "a<b>&c]]>", "plain", "é\U0001f52dé", "  spaces "]
-    table = pa.table({"a": texts, "n": list(range(8)), "b": texts[::-1]})
-    assert rows_of(document(table, 3, serialization=serialization)) == wanted(table, serialization)
+# Rows --------------------------------------------------------------------------------------
 
 
 @both
@@ -210,70 +105,6 @@ def test_rows_go_on_from_step_to_step(
         if count:
             assert (array["k"].data == np.arange(count)).all()
             assert array["t"].data.tolist() == texts
-
-
-@both
-def test_batches_that_are_slices_of_larger_ones(serialization: Serialization) -> None:
-    table = pa.table(
-        {
-            "a": pa.array([1.5, None, 3.5, 4.5, 4.5, 4.5]),
-            "b": [True, None, False, True, True, True],
-            "c": ["x", "yy", None, "é", "é", "é"],
-            "d": [[1], [], None, [2, 3], [2], [4]],
-            "e": [7, 8, 9, 5, 5, 5],
-        }
-    )
-    for start in range(6):
-        part = table.slice(start, 3)
-        assert rows_of(document(part, serialization=serialization)) == wanted(part, serialization)
-
-
-@both
-def test_columns_that_do_not_change_are_in_every_row(serialization: Serialization) -> None:
-    table = pa.table(
-        {
-            "null": pa.nulls(5, pa.string()),
-            "same": ["<a>"] * 5,
-            "number": [2.0] * 5,
-            "differs": [1, 2, 3, 4, 5],
-            "truth": [True] * 5,
-            "none": pa.nulls(5, pa.float64()),
-        }
-    )
-    assert rows_of(document(table, serialization=serialization)) == wanted(table, serialization)
-    alike = table.drop_columns("differs")
-    assert rows_of(document(alike, serialization=serialization)) == wanted(alike, serialization)
-
-
-@both
-def test_wide_rows_have_as_many_bits_for_null_as_columns(serialization: Serialization) -> None:
-    for width in (1, 7, 8, 9, 16, 17, 100):
-        table = pa.table({f"c{k}": [None if k % 3 else k, k] for k in range(width)})
-        assert rows_of(document(table, serialization=serialization)) == wanted(table, serialization)
-
-
-@both
-def test_products_come_back(small_artifact: Path, serialization: Serialization) -> None:
-    artifact = open_artifact(small_artifact)
-    for name in artifact.products:
-        table = artifact.table(name).slice(0, 150)
-        content = document(table, 64, serialization=serialization, label=Label(name, "small", "1"))
-        again = parsed(content)
-        assert again.get_first_table().name == name
-        assert rows_of(content) == wanted(table, serialization)
-        for field, column in zip(table.schema, again.get_first_table().fields, strict=True):
-            said = {key.decode(): text.decode() for key, text in (field.metadata or {}).items()}
-            assert (column.description, column.ucd) == (said.get("description"), said.get("ucd"))
-
-
-@both
-def test_the_document_is_valid(
-    small_artifact: Path, tmp_path: Path, serialization: Serialization
-) -> None:
-    path = tmp_path / "stars.vot"
-    path.write_bytes(document(open_artifact(small_artifact).table("stars"), infos={"a": "<b>"}))
-    report = io.StringIO()
-    assert validate(path, output=report, xmllint=False), report.getvalue()
 
 
 @pytest.mark.slow
@@ -434,23 +265,7 @@ def test_a_text_that_no_xml_can_hold_ends_the_rows(serialization: Serialization)
             document(pa.table({f"a{bad}": [1]}), serialization=serialization)
 
 
-# Memory, order -----------------------------------------------------------------------------
-
-
-@both
-def test_the_table_is_never_held(serialization: Serialization) -> None:
-    held = []
-
-    def batches() -> Iterator[pa.RecordBatch]:
-        for k in range(40):
-            held.append(pa.total_allocated_bytes())
-            yield pa.record_batch({"a": pa.array(np.full(100_000, k, dtype=np.int64))})
-
-    before = pa.total_allocated_bytes()
-    reader = pa.RecordBatchReader.from_batches(pa.schema({"a": pa.int64()}), batches())
-    count = sum(map(len, votable_chunks(reader, serialization=serialization)))
-    assert count > 32e6
-    assert max(held) - before < 12e6  # the table is 32 MB, its text more
+# Threads, order -----------------------------------------------------------------------------
 
 
 @both
