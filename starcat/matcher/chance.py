@@ -42,6 +42,7 @@ from functools import partial
 import numpy as np
 
 from starcat.arrays import Array, Mask
+from starcat.geometry.attitude import determinant
 from starcat.geometry.camera import Camera
 
 _ALL_ATTITUDES = 8.0 * math.pi**2
@@ -82,7 +83,7 @@ def false_match_probability(
     n, stars = len(body), max(len(body), stars_in_frame)
     sums = _sums(body)
     gram = _gram(sums)
-    information = float(np.linalg.det(gram))
+    information = determinant(gram)
     if not information > 0.0 or (noise_px is not None and n < MIN_STARS):
         return 1.0
     most = n if noise_px is None else min(n_centroids, stars)

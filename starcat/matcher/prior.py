@@ -112,7 +112,7 @@ def search_near(
         stars = database.directions[candidates.stars]
         along = np.einsum("kni,kni->kn", predicted[candidates.centroids], stars)
         is_near = (along >= math.cos(min(math.pi, reach_rad))).all(axis=1)
-        verify(candidates[is_near], observation, database, best)
+        verify(candidates[is_near], observation, database, best, in_order=False)
         if best.is_certain:
             return
 
@@ -140,13 +140,14 @@ def anchored_pairs(
     for anchor in range(min(count, MOST_ANCHORS)):
         first = np.flatnonzero(cosine[anchor] >= least)
         first = first[np.argsort(-cosine[anchor, first], kind="stable")]
-        apart_rad = observation.separation_rad[anchor]
-        square = 2.0 - 2.0 * (stars[first] @ stars.T)
+        apart_rad, between = observation.separation_rad[anchor], stars[first] @ stars.T
         for other in dict.fromkeys((int(apart_rad.argmax()), (anchor + 1) % count)):
             observation.budget.spend(LOOKUP)
-            low, high = _squared_chords(float(apart_rad[other]), tolerance_rad)
-            place = stars[first] + (predicted[other] - predicted[anchor])
-            along = np.where((square >= low) & (square <= high), place @ stars.T, -math.inf)
+            low = math.cos(min(math.pi, float(apart_rad[other]) + tolerance_rad))
+            high = math.cos(max(0.0, float(apart_rad[other]) - tolerance_rad))
+            shift = predicted[other] - predicted[anchor]
+            place, along = stars[first] + shift, between + stars @ shift
+            along[(between < low) | (between > high)] = -math.inf
             second = along.argmax(axis=1)
             # A wrong attitude turns the two against each other by no more than their distance.
             slack_rad = 2.0 * (
@@ -156,12 +157,7 @@ def anchored_pairs(
             fits = np.flatnonzero(along[np.arange(len(first)), second] >= least_along)
             if len(fits):
                 pairs = near[np.column_stack([first[fits], second[fits]])]
-                yield Candidates(np.broadcast_to([anchor, other], pairs.shape), pairs)
-
-
-def _squared_chords(apart_rad: float, tolerance_rad: float) -> tuple[float, float]:
-    low, high = max(0.0, apart_rad - tolerance_rad), min(math.pi, apart_rad + tolerance_rad)
-    return 4.0 * math.sin(0.5 * low) ** 2, 4.0 * math.sin(0.5 * high) ** 2
+                yield Candidates(np.full(pairs.shape, [anchor, other]), pairs)
 
 
 def turn_of_noise_rad(camera: Camera, tolerance_px: float) -> float:

@@ -127,28 +127,33 @@ class BestOf:
 
 
 def verify(
-    candidates: Candidates, observation: Observation, database: Database, best: BestOf
+    candidates: Candidates,
+    observation: Observation,
+    database: Database,
+    best: BestOf,
+    *,
+    in_order: bool = True,
 ) -> None:
-    """Work out the agreements of a batch of candidates until one is certain."""
+    """Work out the agreements of a batch of candidates until one is certain.
+
+    With ``in_order`` the first one is the likeliest, and is tried before the others are counted;
+    where the focal length is not known, there are too many for that.
+    """
     for first in range(0, len(candidates), AT_ONCE):
         part = candidates[first : first + AT_ONCE]
-        for pose in _worth_trying(part, observation, database):
+        for pose in _worth_trying(part, observation, database, in_order):
             best.offer(agree(pose, observation, database, best.certain))
             if best.is_certain:
                 return
 
 
 def _worth_trying(
-    candidates: Candidates, observation: Observation, database: Database
+    candidates: Candidates, observation: Observation, database: Database, in_order: bool
 ) -> Iterator[Pose]:
-    """Return the first pose, then the others by how many centroids agree.
-
-    Where the focal length is not known, there are too many candidates for the first one to be
-    special.
-    """
+    """Return the first pose, then the others by how many centroids agree."""
     observation.budget.spend(len(candidates))
     alone = 0
-    if len(candidates) == 1 or not observation.fov_error:
+    if len(candidates) == 1 or (in_order and not observation.fov_error):
         matrices, factors = first_poses(candidates[:1], observation, database.directions)
         yield pose_at(matrices[0], float(factors[0]), observation)
         alone = 1
