@@ -11,6 +11,7 @@ import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,6 +21,7 @@ from hypothesis import settings
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from starcat.catalog.ingest import Ingested
     from starcat.geometry.camera import Camera
     from starcat.matcher.database import Database
 
@@ -78,6 +80,14 @@ def made_catalogs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def catalogs(request: pytest.FixtureRequest, has_excerpts: bool) -> Path:
     """The catalog excerpts where they are there, else files of the same names and layouts."""
     return Path(request.getfixturevalue("excerpts" if has_excerpts else "made_catalogs"))
+
+
+@pytest.fixture(scope="session")
+def ingested(catalogs: Path) -> Callable[[str, str], Ingested]:
+    """Ingest a file of `catalogs` as it is, once for all tests."""
+    from starcat.catalog.ingest import ingest
+
+    return cache(lambda source, name: ingest(source, [catalogs / name]))
 
 
 @pytest.fixture(scope="session")

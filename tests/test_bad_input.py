@@ -85,6 +85,20 @@ class Place:
     def ingest_file(self, source: str, path: Path) -> Call:
         return ["ingest", source, "--input", path, "-o", self.out / "stars.parquet"]
 
+    def ingest_with(self, row: int, line: bytes) -> Call:
+        """Ingest the stars with another line in place of one."""
+        return self.ingest([*self.lines[:row], line, *self.lines[row + 1 :]])
+
+    def image(self, shape: tuple[int, int] = (512, 512), name: str = "frame.fits") -> Path:
+        """A black image."""
+        write_image(self.folder / name, np.zeros(shape, dtype=np.uint16))
+        return self.folder / name
+
+    def table(self, content: dict[str, list[Any]]) -> Path:
+        """A Parquet file."""
+        pq.write_table(pa.table(content), self.folder / "stars.parquet")
+        return self.folder / "stars.parquet"
+
     def build(self, old: str = "", new: str = "", *more: object) -> Call:
         """Build the small spec from good stars, with one text of the spec replaced."""
         assert old in self.spec
@@ -99,6 +113,12 @@ class Place:
                 self.artifact, self.folder / self.artifact.name, copy_function=shutil.copyfile
             )
         )
+
+    def damaged(self, change: Callable[[Path], object], name: str) -> Path:
+        """A copy of a good artifact to a file of which something was done."""
+        folder = self.copy()
+        change(folder / name)
+        return folder
 
     def manifest(self, change: Callable[[dict[str, Any]], object]) -> Path:
         """A copy of a good artifact with a changed manifest."""
@@ -132,6 +152,10 @@ def case(kind: str, code: int) -> Callable[[Callable[[Place], Call]], Callable[[
     return add
 
 
+def check_later(folder: Path) -> Call:
+    return lambda: check_artifact(folder)
+
+
 def with_text(line: bytes, first_byte: int, text: bytes) -> bytes:
     """A record with other characters from a byte on, counted from 1 as the archives do."""
     return line[: first_byte - 1] + text + line[first_byte - 1 + len(text) :]
@@ -147,9 +171,9 @@ def flip(path: Path, at: float = 0.5) -> None:
 # Catalog files -----------------------------------------------------------------------------
 
 
-@case("gzip file cut off", 3)
-def _(place: Place) -> Call:
-    return place.ingest(gzip.compress(b"".join(place.lines))[:-400], "sao.dat.gz")
+case("gzip file cut off", 3)(
+    lambda place: place.ingest(gzip.compress(b"".join(place.lines))[:-400], "sao.dat.gz")
+)
 
 
 @case("gzip file damaged", 3)
@@ -159,52 +183,31 @@ def _(place: Place) -> Call:
     return place.ingest_file("sao", path)
 
 
-@case("gzip file with other bytes after its end", 3)
-def _(place: Place) -> Call:
-    return place.ingest(gzip.compress(b"".join(place.lines)) + b"<html>", "sao.dat.gz")
-
-
-@case("line ends CR LF", 0)
-def _(place: Place) -> Call:
-    return place.ingest([line.replace(b"\n", b"\r\n") for line in place.lines])
-
-
-@case("no line end after the last record", 0)
-def _(place: Place) -> Call:
-    return place.ingest(b"".join(place.lines).removesuffix(b"\n"))
-
-
-@case("one line too short", 0)
-def _(place: Place) -> Call:
-    return place.ingest([*place.lines[:9], place.lines[9][:150] + b"\n", *place.lines[10:]])
-
-
-@case("last line cut off", 0)
-def _(place: Place) -> Call:
-    return place.ingest(b"".join(place.lines)[:-100])
-
-
-@case("letters in a number", 0)
-def _(place: Place) -> Call:
-    wrong = with_text(place.lines[2], 81, b" x.2")
-    return place.ingest([*place.lines[:2], wrong, *place.lines[3:]])
-
-
-@case("required number blank", 0)
-def _(place: Place) -> Call:
-    wrong = with_text(place.lines[4], 1, b" " * 6)
-    return place.ingest([*place.lines[:4], wrong, *place.lines[5:]])
-
-
-@case("number that the column cannot hold", 0)
-def _(place: Place) -> Call:
-    wrong = with_text(place.lines[2], 194, b"1.60000000 ")
-    return place.ingest([*place.lines[:2], wrong, *place.lines[3:]])
-
-
-@case("field that is too long to print", 3)
-def _(place: Place) -> Call:
-    return place.ingest_file("2mass", place.write("psc_aaa", b"7" * 19_999 + b"x" + b"|1" * 59))
+case("gzip file with other bytes after its end", 3)(
+    lambda place: place.ingest(gzip.compress(b"".join(place.lines)) + b"<html>", "sao.dat.gz")
+)
+case("line ends CR LF", 0)(
+    lambda place: place.ingest([line.replace(b"\n", b"\r\n") for line in place.lines])
+)
+case("no line end after the last record", 0)(
+    lambda place: place.ingest(b"".join(place.lines).removesuffix(b"\n"))
+)
+case("one line too short", 0)(lambda place: place.ingest_with(9, place.lines[9][:150] + b"\n"))
+case("last line cut off", 0)(lambda place: place.ingest(b"".join(place.lines)[:-100]))
+case("letters in a number", 0)(
+    lambda place: place.ingest_with(2, with_text(place.lines[2], 81, b" x.2"))
+)
+case("required number blank", 0)(
+    lambda place: place.ingest_with(4, with_text(place.lines[4], 1, b" " * 6))
+)
+case("number that the column cannot hold", 0)(
+    lambda place: place.ingest_with(2, with_text(place.lines[2], 194, b"1.60000000 "))
+)
+case("field that is too long to print", 3)(
+    lambda place: place.ingest_file(
+        "2mass", place.write("psc_aaa", b"7" * 19_999 + b"x" + b"|1" * 59)
+    )
+)
 
 
 @case("value that no star can have", 0)
@@ -224,10 +227,9 @@ def _(place: Place) -> Call:
     return place.ingest([b"|".join(each) + b"\n" for each in (fields, second)], "psc_aaa", "2mass")
 
 
-@case("bytes that are no text", 0)
-def _(place: Place) -> Call:
-    wrong = with_text(place.lines[4], 115, b"\xff\xfe")
-    return place.ingest([*place.lines[:4], wrong, *place.lines[5:]])
+case("bytes that are no text", 0)(
+    lambda place: place.ingest_with(4, with_text(place.lines[4], 115, b"\xff\xfe"))
+)
 
 
 def parts(place: Place, **contents: bytes) -> Call:
@@ -240,14 +242,10 @@ def parts(place: Place, **contents: bytes) -> Call:
     return ["ingest", "2mass", *inputs, "-o", place.out / "stars.parquet"]
 
 
-@case("part of 2MASS given twice", 3)
-def _(place: Place) -> Call:
-    return parts(place, psc_aaa=PSC, psc_aab=PSC + b"\n", psc_aaa_gz=gzip.compress(PSC))
-
-
-@case("part of 2MASS under two names", 3)
-def _(place: Place) -> Call:
-    return parts(place, psc_aaa=PSC, psc_aab=PSC)
+case("part of 2MASS given twice", 3)(
+    lambda place: parts(place, psc_aaa=PSC, psc_aab=PSC + b"\n", psc_aaa_gz=gzip.compress(PSC))
+)
+case("part of 2MASS under two names", 3)(lambda place: parts(place, psc_aaa=PSC, psc_aab=PSC))
 
 
 @case("part of another release of 2MASS", 3)
@@ -269,26 +267,20 @@ def _(place: Place) -> Call:
     return parts(place, psc_aaa=PSC, psc_aab_gz=bytes(data))
 
 
-@case("the same star twice", 0)
-def _(place: Place) -> Call:
-    return place.ingest([*place.lines, place.lines[7]])
-
-
-@case("too many malformed records", 3)
-def _(place: Place) -> Call:
-    return place.ingest(place.lines[:300] + [line[:80] + b"\n" for line in place.lines[300:]])
-
-
-@case("another archive: longer records", 3)
-def _(place: Place) -> Call:
-    return place.ingest([b"H|" + line[:-1].ljust(448) + b"\n" for line in place.lines])
-
-
-@case("another archive: any text", 3)
-def _(place: Place) -> Call:
-    return place.ingest(
+case("the same star twice", 0)(lambda place: place.ingest([*place.lines, place.lines[7]]))
+case("too many malformed records", 3)(
+    lambda place: place.ingest(
+        place.lines[:300] + [line[:80] + b"\n" for line in place.lines[300:]]
+    )
+)
+case("another archive: longer records", 3)(
+    lambda place: place.ingest([b"H|" + line[:-1].ljust(448) + b"\n" for line in place.lines])
+)
+case("another archive: any text", 3)(
+    lambda place: place.ingest(
         b"<!DOCTYPE html>\n<html><head><title>404 Not Found</title></head></html>\n"
     )
+)
 
 
 @case("another archive: bytes without line ends", 3)
@@ -298,9 +290,9 @@ def _(place: Place) -> Call:
     return place.ingest_file("sao", path)
 
 
-@case("another archive: wrong magic of a binary file", 3)
-def _(place: Place) -> Call:
-    return place.ingest_file("gaia", place.write("gaia_merged.bin", place.lines))
+case("another archive: wrong magic of a binary file", 3)(
+    lambda place: place.ingest_file("gaia", place.write("gaia_merged.bin", place.lines))
+)
 
 
 @case("binary file with proper motions for magnitudes", 3)
@@ -318,24 +310,14 @@ def _(place: Place) -> Call:
         return place.ingest_file("gaia", place.write("gaia_merged.bin", sky.read(40_000)))
 
 
-@case("binary file with a damaged gzip header", 3)
-def _(place: Place) -> Call:
-    return place.ingest_file("gaia", place.write("gaia_merged.bin.gz", b"\x1f\x8b\x08\x00\x00"))
-
-
-@case("empty file", 3)
-def _(place: Place) -> Call:
-    return place.ingest(b"")
-
-
-@case("file of empty lines", 3)
-def _(place: Place) -> Call:
-    return place.ingest(b"\n" * 1000)
-
-
-@case("file missing", 3)
-def _(place: Place) -> Call:
-    return place.ingest_file("sao", place.folder / "sao.dat.gz")
+case("binary file with a damaged gzip header", 3)(
+    lambda place: place.ingest_file(
+        "gaia", place.write("gaia_merged.bin.gz", b"\x1f\x8b\x08\x00\x00")
+    )
+)
+case("empty file", 3)(lambda place: place.ingest(b""))
+case("file of empty lines", 3)(lambda place: place.ingest(b"\n" * 1000))
+case("file missing", 3)(lambda place: place.ingest_file("sao", place.folder / "sao.dat.gz"))
 
 
 @case("folder without the file", 3)
@@ -351,9 +333,9 @@ def _(place: Place) -> Call:
     return place.ingest_file("tycho2", place.folder / "archive")
 
 
-@case("no input named and none found", 3)
-def _(place: Place) -> Call:
-    return ["ingest", "sao", "-o", place.out / "stars.parquet"]
+case("no input named and none found", 3)(
+    lambda place: ["ingest", "sao", "-o", place.out / "stars.parquet"]
+)
 
 
 @case("no folder has all files", 3)
@@ -362,42 +344,26 @@ def _(place: Place) -> Call:
     return with_counterparts(place, '{ enabled = true, catalogs = ["tycho2"] }')
 
 
-@case("joined catalog missing", 3)
-def _(place: Place) -> Call:
-    return place.build("boresights", 'selection.variables.join = ["hipparcos"]\nboresights')
-
-
-@case("source unknown", 2)
-def _(place: Place) -> Call:
-    return ["ingest", "soa", "-o", place.out / "stars.parquet"]
-
-
-@case("source unknown, like no other", 2)
-def _(place: Place) -> Call:
-    return ["build", "--preset", "sao-12deg", "--input", "xyzzy=a.dat", "-o", place.out]
-
-
-@case("source is not a star catalog", 2)
-def _(place: Place) -> Call:
-    return place.ingest_file("gcvs", place.write("gcvs.tsv", b"1\n"))
-
-
-@case("band unknown", 2)
-def _(place: Place) -> Call:
-    return [*place.ingest(place.lines), "--band", "K"]
+case("joined catalog missing", 3)(
+    lambda place: place.build("boresights", 'selection.variables.join = ["hipparcos"]\nboresights')
+)
+case("source unknown", 2)(lambda place: ["ingest", "soa", "-o", place.out / "stars.parquet"])
+case("source unknown, like no other", 2)(
+    lambda place: ["build", "--preset", "sao-12deg", "--input", "xyzzy=a.dat", "-o", place.out]
+)
+case("source is not a star catalog", 2)(
+    lambda place: place.ingest_file("gcvs", place.write("gcvs.tsv", b"1\n"))
+)
+case("band unknown", 2)(lambda place: [*place.ingest(place.lines), "--band", "K"])
 
 
 # Specs and options -------------------------------------------------------------------------
 
 
-@case("--input without =", 2)
-def _(place: Place) -> Call:
-    return ["build", "--preset", "sao-12deg", "--input", "sao.dat.gz", "-o", place.out]
-
-
-@case("build of nothing", 2)
-def _(place: Place) -> Call:
-    return ["build", "-o", place.out]
+case("--input without =", 2)(
+    lambda place: ["build", "--preset", "sao-12deg", "--input", "sao.dat.gz", "-o", place.out]
+)
+case("build of nothing", 2)(lambda place: ["build", "-o", place.out])
 
 
 @case("--input that the spec does not use", 2)
@@ -406,97 +372,53 @@ def _(place: Place) -> Call:
     return ["build", "--preset", "gaia-12deg", "--input", f"sao={stars}", "-o", place.out]
 
 
-@case("spec and --preset", 2)
-def _(place: Place) -> Call:
-    return [*place.build(), "--preset", "sao-12deg"]
-
-
-@case("preset unknown", 2)
-def _(place: Place) -> Call:
-    return ["build", "--preset", "sao-12degs", "-o", place.out]
-
-
-@case("spec missing", 2)
-def _(place: Place) -> Call:
-    return ["build", place.folder / "camera.toml", "-o", place.out]
-
-
-@case("spec not TOML", 2)
-def _(place: Place) -> Call:
-    return place.build('name = "small"', "name: small")
-
-
-@case("spec with a key of endless parts", 2)
-def _(place: Place) -> Call:
-    return place.build('name = "small"', "a." * 300 + "a = 1")
-
-
-@case("spec of too many characters", 2)
-def _(place: Place) -> Call:
-    return place.build('name = "small"', 'name = "small"  ' + "#" * 100_000)
-
-
-@case("number of too many digits", 2)
-def _(place: Place) -> Call:
-    return place.build("boresights.count = 200", "boresights.count = 0x" + "f" * 5000)
-
-
-@case("doubles that are no doubles", 1)
-def _(place: Place) -> Call:
-    return [
+case("spec and --preset", 2)(lambda place: [*place.build(), "--preset", "sao-12deg"])
+case("preset unknown", 2)(lambda place: ["build", "--preset", "sao-12degs", "-o", place.out])
+case("spec missing", 2)(lambda place: ["build", place.folder / "camera.toml", "-o", place.out])
+case("spec not TOML", 2)(lambda place: place.build('name = "small"', "name: small"))
+case("spec with a key of endless parts", 2)(
+    lambda place: place.build('name = "small"', "a." * 300 + "a = 1")
+)
+case("spec of too many characters", 2)(
+    lambda place: place.build('name = "small"', 'name = "small"  ' + "#" * 100_000)
+)
+case("number of too many digits", 2)(
+    lambda place: place.build("boresights.count = 200", "boresights.count = 0x" + "f" * 5000)
+)
+case("doubles that are no doubles", 1)(
+    lambda place: [
         *("build", "--preset", "gaia-12deg", "--set", "selection.faint_limit_mag=10"),
         *("--set", "selection.doubles.min_separation_deg=10.0", "-o", place.out),
     ]
-
-
-@case("spec not text", 2)
-def _(place: Place) -> Call:
-    return ["build", place.write("spec.toml", b"name = \xff"), "-o", place.out]
-
-
-@case("key unknown", 2)
-def _(place: Place) -> Call:
-    return place.build("faint_limit_mag", "faint_limit_mga")
-
-
-@case("key missing", 2)
-def _(place: Place) -> Call:
-    return place.build("epoch_jyear = 2026.0", "")
-
-
-@case("value of the wrong type", 2)
-def _(place: Place) -> Call:
-    return place.build("faint_limit_mag = 6.0", 'faint_limit_mag = "six"')
-
-
-@case("value out of range", 2)
-def _(place: Place) -> Call:
-    return place.build("epoch_jyear = 2026.0", "epoch_jyear = 26.0")
-
-
-@case("version with leading zeros", 2)
-def _(place: Place) -> Call:
-    return place.build('version = "1.0.0"', 'version = "01.2.3"')
-
-
-@case("value not finite", 2)
-def _(place: Place) -> Call:
-    return place.build("faint_limit_mag = 6.0", "faint_limit_mag = nan")
-
-
-@case("limits swapped", 2)
-def _(place: Place) -> Call:
-    return place.build("boresights", "selection.bright_limit_mag = 7\nboresights")
-
-
-@case("camera described twice", 2)
-def _(place: Place) -> Call:
-    return place.build("fov_x_deg = 40.0", "fov_x_deg = 40.0, focal_length_mm = 30, pixel_um = 5")
-
-
-@case("band unknown in a spec", 2)
-def _(place: Place) -> Call:
-    return place.build('catalog.source = "sao"', 'catalog = { source = "sao", band = "K" }')
+)
+case("spec not text", 2)(
+    lambda place: ["build", place.write("spec.toml", b"name = \xff"), "-o", place.out]
+)
+case("key unknown", 2)(lambda place: place.build("faint_limit_mag", "faint_limit_mga"))
+case("key missing", 2)(lambda place: place.build("epoch_jyear = 2026.0", ""))
+case("value of the wrong type", 2)(
+    lambda place: place.build("faint_limit_mag = 6.0", 'faint_limit_mag = "six"')
+)
+case("value out of range", 2)(
+    lambda place: place.build("epoch_jyear = 2026.0", "epoch_jyear = 26.0")
+)
+case("version with leading zeros", 2)(
+    lambda place: place.build('version = "1.0.0"', 'version = "01.2.3"')
+)
+case("value not finite", 2)(
+    lambda place: place.build("faint_limit_mag = 6.0", "faint_limit_mag = nan")
+)
+case("limits swapped", 2)(
+    lambda place: place.build("boresights", "selection.bright_limit_mag = 7\nboresights")
+)
+case("camera described twice", 2)(
+    lambda place: place.build(
+        "fov_x_deg = 40.0", "fov_x_deg = 40.0, focal_length_mm = 30, pixel_um = 5"
+    )
+)
+case("band unknown in a spec", 2)(
+    lambda place: place.build('catalog.source = "sao"', 'catalog = { source = "sao", band = "K" }')
+)
 
 
 def with_counterparts(place: Place, section: str) -> Call:
@@ -504,19 +426,13 @@ def with_counterparts(place: Place, section: str) -> Call:
     return place.build(old, f"{old}\nproducts.crossmatch = {section}")
 
 
-@case("counterparts in no catalog", 2)
-def _(place: Place) -> Call:
-    return with_counterparts(place, "{ enabled = true }")
-
-
-@case("counterparts in the stars' own catalog", 2)
-def _(place: Place) -> Call:
-    return with_counterparts(place, '{ enabled = true, catalogs = ["sao"] }')
-
-
-@case("catalog of counterparts missing", 3)
-def _(place: Place) -> Call:
-    return with_counterparts(place, '{ enabled = true, catalogs = ["hipparcos"] }')
+case("counterparts in no catalog", 2)(lambda place: with_counterparts(place, "{ enabled = true }"))
+case("counterparts in the stars' own catalog", 2)(
+    lambda place: with_counterparts(place, '{ enabled = true, catalogs = ["sao"] }')
+)
+case("catalog of counterparts missing", 3)(
+    lambda place: with_counterparts(place, '{ enabled = true, catalogs = ["hipparcos"] }')
+)
 
 
 def with_motions(place: Place, catalogs: str) -> Call:
@@ -525,26 +441,16 @@ def with_motions(place: Place, catalogs: str) -> Call:
     )
 
 
-@case("motions of no catalog that has some", 2)
-def _(place: Place) -> Call:
-    return with_motions(place, '["2mass"]')
-
-
-@case("motions of one catalog twice", 2)
-def _(place: Place) -> Call:
-    return with_motions(place, '["tycho2", "tycho2"]')
-
-
-@case("motions of the stars' own catalog", 2)
-def _(place: Place) -> Call:
-    return place.build(
+case("motions of no catalog that has some", 2)(lambda place: with_motions(place, '["2mass"]'))
+case("motions of one catalog twice", 2)(lambda place: with_motions(place, '["tycho2", "tycho2"]'))
+case("motions of the stars' own catalog", 2)(
+    lambda place: place.build(
         'catalog.source = "sao"', 'catalog = { source = "tycho2", motions = ["tycho2"] }'
     )
-
-
-@case("catalog of motions missing", 3)
-def _(place: Place) -> Call:
-    return ["build", "--preset", "gaia-12deg-2026", "-o", place.out]
+)
+case("catalog of motions missing", 3)(
+    lambda place: ["build", "--preset", "gaia-12deg-2026", "-o", place.out]
+)
 
 
 def matched_with(place: Place, other: Path) -> Call:
@@ -552,19 +458,13 @@ def matched_with(place: Place, other: Path) -> Call:
     return ["crossmatch", place.artifact / "stars.parquet", other, "-o", place.out / "x.parquet"]
 
 
-@case("star table missing", 3)
-def _(place: Place) -> Call:
-    return matched_with(place, place.folder / "none.parquet")
-
-
-@case("star table that is no Parquet file", 3)
-def _(place: Place) -> Call:
-    return matched_with(place, place.write("stars.parquet", b"HIP 1"))
-
-
-@case("star table without a column", 4)
-def _(place: Place) -> Call:
-    return matched_with(place, place.artifact / "pairs.parquet")
+case("star table missing", 3)(lambda place: matched_with(place, place.folder / "none.parquet"))
+case("star table that is no Parquet file", 3)(
+    lambda place: matched_with(place, place.write("stars.parquet", b"HIP 1"))
+)
+case("star table without a column", 4)(
+    lambda place: matched_with(place, place.artifact / "pairs.parquet")
+)
 
 
 @case("star table with a column of another type", 4)
@@ -662,89 +562,59 @@ def _(place: Place) -> Call:
     return matched_with(place, place.artifact / "stars.parquet")
 
 
-@case("option of the wrong type", 2)
-def _(place: Place) -> Call:
-    return ["selftest", place.artifact, "--frames", "many"]
+case("option of the wrong type", 2)(lambda place: ["selftest", place.artifact, "--frames", "many"])
+case("values of a sweep that are no numbers", 2)(
+    lambda place: ["evaluate", place.artifact, "--noise-px", "0;1", "-o", place.out]
+)
+case("option out of range", 2)(
+    lambda place: ["identify", place.artifact, place.folder / "frame.csv", "--tolerance-px", "1e9"]
+)
+case("noise and tolerance of centroids", 2)(
+    lambda place: identify_at(place, "--tolerance-px", "2", "--noise-px", "0.5")
+)
 
 
-@case("values of a sweep that are no numbers", 2)
-def _(place: Place) -> Call:
-    return ["evaluate", place.artifact, "--noise-px", "0;1", "-o", place.out]
-
-
-@case("option out of range", 2)
-def _(place: Place) -> Call:
-    return ["identify", place.artifact, place.folder / "frame.csv", "--tolerance-px", "1e9"]
-
-
-@case("noise and tolerance of centroids", 2)
-def _(place: Place) -> Call:
-    frame = place.write("frame.csv", "x_px,y_px\n1,2\n")
-    return ["identify", place.artifact, frame, "--tolerance-px", "2", "--noise-px", "0.5"]
-
-
-def identify_at(place: Place, *options: str) -> Call:
+def identify_at(place: Place, *options: object) -> Call:
     return [*place.identify("x_px,y_px\n1,2\n"), *options]
 
 
-@case("error of a field that is no share", 2)
-def _(place: Place) -> Call:
-    return identify_at(place, "--fov-error", "2 deg")
+def calibrate(place: Place, *options: object) -> Call:
+    frame = place.write("frame.csv", "x_px,y_px\n1,2\n")
+    return ["calibrate", place.artifact, frame, *options, "-o", place.out]
 
 
-@case("error of a field for a method that needs it", 2)
-def _(place: Place) -> Call:
-    return identify_at(place, "--fov-error", "2%", "--method", "hausdorff_l1")
-
-
-@case("prior attitude without its error", 2)
-def _(place: Place) -> Call:
-    return identify_at(place, "--prior-q", "0,0,0,1")
-
-
-@case("prior attitude of three numbers", 2)
-def _(place: Place) -> Call:
-    return identify_at(place, "--prior-q", "0,0,1", "--prior-error-deg", "1")
-
-
-@case("prior attitude that is none", 2)
-def _(place: Place) -> Call:
-    return identify_at(place, "--prior-q", "0,0,0,0", "--prior-error-deg", "1")
-
-
-@case("error of a prior attitude out of range", 2)
-def _(place: Place) -> Call:
-    return identify_at(place, "--prior-q", "0,0,0,1", "--prior-error-deg", "30")
-
-
-@case("prior attitude of a sequence", 2)
-def _(place: Place) -> Call:
-    return identify_at(place, "--prior-q", "0,0,0,1", "--prior-error-deg", "1", "--track")
-
-
-@case("sequence with a time", 2)
-def _(place: Place) -> Call:
-    return identify_at(place, "--track", "--time", "2026-11-22T10:00:00")
-
-
-@case("time that is none", 2)
-def _(place: Place) -> Call:
-    return identify_at(place, "--time", "22 November")
-
-
-@case("range of fields beside the error of one", 2)
-def _(place: Place) -> Call:
-    return identify_at(place, "--fov", "10:50", "--fov-error", "2%")
-
-
-@case("size of a frame without a range of fields", 2)
-def _(place: Place) -> Call:
-    return identify_at(place, "--size", "512x512")
-
-
-@case("range of fields for a database of one", 5)
-def _(place: Place) -> Call:
-    return identify_at(place, "--fov", "10:50")
+case("error of a field that is no share", 2)(
+    lambda place: identify_at(place, "--fov-error", "2 deg")
+)
+case("error of a field for a method that needs it", 2)(
+    lambda place: identify_at(place, "--fov-error", "2%", "--method", "hausdorff_l1")
+)
+case("prior attitude without its error", 2)(
+    lambda place: identify_at(place, "--prior-q", "0,0,0,1")
+)
+case("prior attitude of three numbers", 2)(
+    lambda place: identify_at(place, "--prior-q", "0,0,1", "--prior-error-deg", "1")
+)
+case("prior attitude that is none", 2)(
+    lambda place: identify_at(place, "--prior-q", "0,0,0,0", "--prior-error-deg", "1")
+)
+case("error of a prior attitude out of range", 2)(
+    lambda place: identify_at(place, "--prior-q", "0,0,0,1", "--prior-error-deg", "30")
+)
+case("prior attitude of a sequence", 2)(
+    lambda place: identify_at(place, "--prior-q", "0,0,0,1", "--prior-error-deg", "1", "--track")
+)
+case("sequence with a time", 2)(
+    lambda place: identify_at(place, "--track", "--time", "2026-11-22T10:00:00")
+)
+case("time that is none", 2)(lambda place: identify_at(place, "--time", "22 November"))
+case("range of fields beside the error of one", 2)(
+    lambda place: identify_at(place, "--fov", "10:50", "--fov-error", "2%")
+)
+case("size of a frame without a range of fields", 2)(
+    lambda place: identify_at(place, "--size", "512x512")
+)
+case("range of fields for a database of one", 5)(lambda place: identify_at(place, "--fov", "10:50"))
 
 
 @case("levels no wider than the camera", 2)
@@ -753,19 +623,13 @@ def _(place: Place) -> Call:
     return place.build(old, f"products.levels.enabled = true\n{old}")
 
 
-@case("time beyond the ephemeris", 2)
-def _(place: Place) -> Call:
-    return identify_at(place, "--time", "2150-01-01T00:00:00")
-
-
-@case("velocity without a time", 2)
-def _(place: Place) -> Call:
-    return identify_at(place, "--velocity", "0,7.5,0")
-
-
-@case("velocity of two numbers", 2)
-def _(place: Place) -> Call:
-    return identify_at(place, "--time", "2026-11-22T10:00:00", "--velocity", "1,2")
+case("time beyond the ephemeris", 2)(
+    lambda place: identify_at(place, "--time", "2150-01-01T00:00:00")
+)
+case("velocity without a time", 2)(lambda place: identify_at(place, "--velocity", "0,7.5,0"))
+case("velocity of two numbers", 2)(
+    lambda place: identify_at(place, "--time", "2026-11-22T10:00:00", "--velocity", "1,2")
+)
 
 
 @case("velocity beside an orbit", 2)
@@ -774,21 +638,19 @@ def _(place: Place) -> Call:
     return identify_at(place, "--time", "2026-11-22T10:00:00", *both)
 
 
-@case("velocity above that of light", 2)
-def _(place: Place) -> Call:
-    return identify_at(place, "--time", "2026-11-22T10:00:00", "--velocity", "299900,0,0")
-
-
-@case("position that is no three numbers", 2)
-def _(place: Place) -> Call:
-    return lambda: Observer.at("2026-11-22T10:00:00", position_km=[7000.0])
-
-
-@case("barycentre without a position", 2)
-def _(place: Place) -> Call:
-    return lambda: Observer.at(
-        "2026-11-22T10:00:00", velocity_km_s=[0.0, 30.0, 0.0], origin="barycentre"
+case("velocity above that of light", 2)(
+    lambda place: identify_at(place, "--time", "2026-11-22T10:00:00", "--velocity", "299900,0,0")
+)
+case("position that is no three numbers", 2)(
+    lambda place: lambda: Observer.at("2026-11-22T10:00:00", position_km=[7000.0])
+)
+case("barycentre without a position", 2)(
+    lambda place: (
+        lambda: Observer.at(
+            "2026-11-22T10:00:00", velocity_km_s=[0.0, 30.0, 0.0], origin="barycentre"
+        )
     )
+)
 
 
 @case("origin unknown", 2)
@@ -796,19 +658,13 @@ def _(place: Place) -> Call:
     return lambda: Observer.at("2026-11-22T10:00:00", origin="moon")  # type: ignore[arg-type]
 
 
-@case("noise of centroids that is none", 2)
-def _(place: Place) -> Call:
-    return lambda: Matcher.open(place.artifact, noise_px=0.0)
-
-
-@case("noise of magnitudes that is none", 2)
-def _(place: Place) -> Call:
-    return lambda: Matcher.open(place.artifact, noise_mag=float("nan"))
-
-
-@case("option unknown", 2)
-def _(place: Place) -> Call:
-    return ["build", "--ouput", place.out]
+case("noise of centroids that is none", 2)(
+    lambda place: lambda: Matcher.open(place.artifact, noise_px=0.0)
+)
+case("noise of magnitudes that is none", 2)(
+    lambda place: lambda: Matcher.open(place.artifact, noise_mag=float("nan"))
+)
+case("option unknown", 2)(lambda place: ["build", "--ouput", place.out])
 
 
 @case("unknown unit in a data-source file", 2)
@@ -822,19 +678,13 @@ def _(place: Place) -> Call:
 # Builds ------------------------------------------------------------------------------------
 
 
-@case("no stars left", 1)
-def _(place: Place) -> Call:
-    return place.build("faint_limit_mag = 6.0", "faint_limit_mag = 1.0")
-
-
-@case("database that cannot identify", 1)
-def _(place: Place) -> Call:
-    return place.build("fov_x_deg = 40.0", "fov_x_deg = 4.0")
-
-
-@case("build that does not fit", 1)
-def _(place: Place) -> Call:
-    return [*place.build(), "--max-memory", "0.1"]
+case("no stars left", 1)(
+    lambda place: place.build("faint_limit_mag = 6.0", "faint_limit_mag = 1.0")
+)
+case("database that cannot identify", 1)(
+    lambda place: place.build("fov_x_deg = 40.0", "fov_x_deg = 4.0")
+)
+case("build that does not fit", 1)(lambda place: [*place.build(), "--max-memory", "0.1"])
 
 
 @case("output below a file", 1)
@@ -855,9 +705,9 @@ def _(place: Place) -> Call:
     return place.ingest(place.lines)
 
 
-@case("frame below a file", 1)
-def _(place: Place) -> Call:
-    return ["simulate", place.artifact, "-o", place.write("file", b"") / "frame.csv"]
+case("frame below a file", 1)(
+    lambda place: ["simulate", place.artifact, "-o", place.write("file", b"") / "frame.csv"]
+)
 
 
 @case("another artifact of that name", 1)
@@ -887,36 +737,23 @@ def _(place: Place) -> Call:
 # Artifacts and frames ----------------------------------------------------------------------
 
 
-@case("not an artifact", 3)
-def _(place: Place) -> Call:
-    return ["inspect", place.folder]
-
-
-@case("artifact to verify missing", 3)
-def _(place: Place) -> Call:
-    return ["verify", place.folder / "small-1.0.0"]
-
-
-@case("manifest not JSON", 5)
-def _(place: Place) -> Call:
-    path = place.copy() / "manifest.json"
-    path.write_bytes(path.read_bytes()[:500])
-    return ["inspect", path.parent]
-
-
-@case("manifest without a version", 5)
-def _(place: Place) -> Call:
-    return ["inspect", place.manifest(lambda content: content.pop("manifest_version"))]
-
-
-@case("manifest without its parts", 5)
-def _(place: Place) -> Call:
-    return ["inspect", place.manifest(lambda content: content.pop("products"))]
-
-
-@case("manifest of a newer starcat", 4)
-def _(place: Place) -> Call:
-    return ["inspect", place.manifest(lambda content: content.update(manifest_version="2.0.0"))]
+case("not an artifact", 3)(lambda place: ["inspect", place.folder])
+case("artifact to verify missing", 3)(lambda place: ["verify", place.folder / "small-1.0.0"])
+case("manifest not JSON", 5)(
+    lambda place: ["inspect", place.damaged(lambda path: os.truncate(path, 500), "manifest.json")]
+)
+case("manifest without a version", 5)(
+    lambda place: ["inspect", place.manifest(lambda content: content.pop("manifest_version"))]
+)
+case("manifest without its parts", 5)(
+    lambda place: ["inspect", place.manifest(lambda content: content.pop("products"))]
+)
+case("manifest of a newer starcat", 4)(
+    lambda place: [
+        "inspect",
+        place.manifest(lambda content: content.update(manifest_version="2.0.0")),
+    ]
+)
 
 
 @case("product of a newer schema", 4)
@@ -927,32 +764,16 @@ def _(place: Place) -> Call:
     return lambda: open_artifact(folder).schema("pairs")
 
 
-@case("Parquet file damaged", 5)
-def _(place: Place) -> Call:
-    folder = place.copy()
-    flip(folder / "pairs.parquet")
-    return lambda: check_artifact(folder)
-
-
-@case("one byte of the database changed", 5)
-def _(place: Place) -> Call:
-    folder = place.copy()
-    flip(folder / "database.h5")
-    return lambda: check_artifact(folder)
-
-
-@case("file of an artifact missing", 5)
-def _(place: Place) -> Call:
-    folder = place.copy()
-    (folder / "rejected.parquet").unlink()
-    return lambda: check_artifact(folder)
-
-
-@case("database cut off", 5)
-def _(place: Place) -> Call:
-    folder = place.copy()
-    os.truncate(folder / "database.h5", 20_000)
-    return ["selftest", folder]
+case("Parquet file damaged", 5)(lambda place: check_later(place.damaged(flip, "pairs.parquet")))
+case("one byte of the database changed", 5)(
+    lambda place: check_later(place.damaged(flip, "database.h5"))
+)
+case("file of an artifact missing", 5)(
+    lambda place: check_later(place.damaged(Path.unlink, "rejected.parquet"))
+)
+case("database cut off", 5)(
+    lambda place: ["selftest", place.damaged(lambda path: os.truncate(path, 20_000), "database.h5")]
+)
 
 
 @case("database that points to another file", 5)
@@ -972,73 +793,39 @@ def _(place: Place) -> Call:
     return ["selftest", folder]
 
 
-@case("no database", 3)
-def _(place: Place) -> Call:
-    return ["simulate", place.folder / "small-1.0.0", "-o", place.out / "frame.csv"]
-
-
-@case("frame of a kind that is not written", 2)
-def _(place: Place) -> Call:
-    return ["simulate", place.artifact, "-o", place.folder / "frame.gif"]
-
-
-@case("frame missing", 2)
-def _(place: Place) -> Call:
-    return ["identify", place.artifact, place.folder / "frame.csv"]
-
-
-@case("frame lacks columns", 2)
-def _(place: Place) -> Call:
-    return place.identify("x,y\n1,2\n")
-
-
-@case("frame with letters", 2)
-def _(place: Place) -> Call:
-    return place.identify("x_px,y_px\n1,2\n3,abc\n")
-
-
-@case("frame with a number that is not finite", 0)
-def _(place: Place) -> Call:
-    return place.identify("x_px,y_px\n1,2\n3,nan\n")
-
-
-@case("frame with a short line", 2)
-def _(place: Place) -> Call:
-    return place.identify("x_px,y_px\n1,2\n3\n")
-
-
-@case("frame that is no text", 2)
-def _(place: Place) -> Call:
-    return place.identify(b"\x89PNG\r\n\x1a\n")
+case("no database", 3)(
+    lambda place: ["simulate", place.folder / "small-1.0.0", "-o", place.out / "frame.csv"]
+)
+case("frame of a kind that is not written", 2)(
+    lambda place: ["simulate", place.artifact, "-o", place.folder / "frame.gif"]
+)
+case("frame missing", 2)(lambda place: ["identify", place.artifact, place.folder / "frame.csv"])
+case("frame lacks columns", 2)(lambda place: place.identify("x,y\n1,2\n"))
+case("frame with letters", 2)(lambda place: place.identify("x_px,y_px\n1,2\n3,abc\n"))
+case("frame with a number that is not finite", 0)(
+    lambda place: place.identify("x_px,y_px\n1,2\n3,nan\n")
+)
+case("frame with a short line", 2)(lambda place: place.identify("x_px,y_px\n1,2\n3\n"))
+case("frame that is no text", 2)(lambda place: place.identify(b"\x89PNG\r\n\x1a\n"))
 
 
 def json_frames(place: Place, text: str) -> Call:
     return ["identify", place.artifact, place.write("frames.json", text)]
 
 
-@case("frames that are no JSON", 2)
-def _(place: Place) -> Call:
-    return json_frames(place, "[1, 2")
-
-
-@case("frame of JSON without centroids", 2)
-def _(place: Place) -> Call:
-    return json_frames(place, '[{"centroids_px": []}, {"centroids": []}]')
-
-
-@case("frame of JSON with half a pair", 2)
-def _(place: Place) -> Call:
-    return json_frames(place, '{"centroids_px": [[1]]}')
-
-
-@case("frame of JSON with too few magnitudes", 2)
-def _(place: Place) -> Call:
-    return json_frames(place, '{"centroids_px": [[1, 2]], "mag": []}')
-
-
-@case("image that is none", 2)
-def _(place: Place) -> Call:
-    return ["identify", place.artifact, place.write("frame.png", b"no picture")]
+case("frames that are no JSON", 2)(lambda place: json_frames(place, "[1, 2"))
+case("frame of JSON without centroids", 2)(
+    lambda place: json_frames(place, '[{"centroids_px": []}, {"centroids": []}]')
+)
+case("frame of JSON with half a pair", 2)(
+    lambda place: json_frames(place, '{"centroids_px": [[1]]}')
+)
+case("frame of JSON with too few magnitudes", 2)(
+    lambda place: json_frames(place, '{"centroids_px": [[1, 2]], "mag": []}')
+)
+case("image that is none", 2)(
+    lambda place: ["identify", place.artifact, place.write("frame.png", b"no picture")]
+)
 
 
 @case("image that shows trails", 2)
@@ -1054,12 +841,15 @@ def _(place: Place) -> Call:
     return ["identify", place.artifact, path]
 
 
-@case("dark frame of another size", 2)
-def _(place: Place) -> Call:
-    image, dark = place.folder / "frame.fits", place.folder / "dark.fits"
-    write_image(image, np.zeros((512, 512), dtype=np.uint16))
-    write_image(dark, np.zeros((48, 64), dtype=np.uint16))
-    return ["identify", place.artifact, image, "--dark", dark]
+case("dark frame of another size", 2)(
+    lambda place: [
+        "identify",
+        place.artifact,
+        place.image(),
+        "--dark",
+        place.image((48, 64), "dark.fits"),
+    ]
+)
 
 
 @case("mask without a hole", 2)
@@ -1083,33 +873,19 @@ def _(place: Place) -> Call:
     return ["identify", place.artifact, path, "--plane", "7"]
 
 
-@case("image of another size than the camera", 2)
-def _(place: Place) -> Call:
-    path = place.folder / "frame.fits"
-    write_image(path, np.zeros((48, 64), dtype=np.uint16))
-    return ["identify", place.artifact, path]
-
-
-@case("WCS of centroids", 2)
-def _(place: Place) -> Call:
-    return [*place.identify("x_px,y_px\n1,2\n"), "--wcs", place.out / "copy.fits"]
-
-
-@case("WCS into a file of another kind", 2)
-def _(place: Place) -> Call:
-    return [*place.identify("x_px,y_px\n1,2\n"), "--wcs", place.out / "copy.png"]
-
-
-@case("WCS of an image that is not identified", 6)
-def _(place: Place) -> Call:
-    path = place.folder / "frame.fits"
-    write_image(path, np.zeros((512, 512), dtype=np.uint16))
-    return ["identify", place.artifact, path, "--wcs", place.folder / "copy.fits"]
-
-
-@case("frame not identified, with --fail-on-no-match", 6)
-def _(place: Place) -> Call:
-    return [*place.identify("x_px,y_px\n1,2\n"), "--fail-on-no-match"]
+case("image of another size than the camera", 2)(
+    lambda place: ["identify", place.artifact, place.image((48, 64))]
+)
+case("WCS of centroids", 2)(lambda place: identify_at(place, "--wcs", place.out / "copy.fits"))
+case("WCS into a file of another kind", 2)(
+    lambda place: identify_at(place, "--wcs", place.out / "copy.png")
+)
+case("WCS of an image that is not identified", 6)(
+    lambda place: ["identify", place.artifact, place.image(), "--wcs", place.folder / "copy.fits"]
+)
+case("frame not identified, with --fail-on-no-match", 6)(
+    lambda place: identify_at(place, "--fail-on-no-match")
+)
 
 
 @case("calibration of frames that are not identified", 1)
@@ -1118,37 +894,32 @@ def _(place: Place) -> Call:
     return ["calibrate", place.artifact, frame, "-o", place.out]
 
 
-@case("calibration of images of two cameras", 2)
-def _(place: Place) -> Call:
-    paths = [place.folder / "1.fits", place.folder / "2.fits"]
-    for path, side in zip(paths, (48, 64), strict=True):
-        write_image(path, np.zeros((side, 64), dtype=np.uint16))
-    return ["calibrate", place.artifact, *paths, "-o", place.out]
-
-
-@case("calibration of a camera of unknown field", 2)
-def _(place: Place) -> Call:
-    frame = place.write("frame.csv", "x_px,y_px\n1,2\n")
-    return ["calibrate", place.artifact, frame, "--size", "1280x960", "-o", place.out]
-
-
-@case("calibration of a camera of another size than the images", 2)
-def _(place: Place) -> Call:
-    path = place.folder / "1.fits"
-    write_image(path, np.zeros((48, 64), dtype=np.uint16))
-    return ["calibrate", place.artifact, path, "--size", "1280x960", "-o", place.out]
-
-
-@case("range of fields that is none", 2)
-def _(place: Place) -> Call:
-    frame = place.write("frame.csv", "x_px,y_px\n1,2\n")
-    return ["calibrate", place.artifact, frame, "--fov", "5-20", "-o", place.out]
-
-
-@case("range of fields that is swapped", 2)
-def _(place: Place) -> Call:
-    frame = place.write("frame.csv", "x_px,y_px\n1,2\n")
-    return ["calibrate", place.artifact, frame, "--fov", "20:5", "-o", place.out]
+case("calibration of images of two cameras", 2)(
+    lambda place: [
+        "calibrate",
+        place.artifact,
+        place.image((48, 64), "1.fits"),
+        place.image((64, 64), "2.fits"),
+        "-o",
+        place.out,
+    ]
+)
+case("calibration of a camera of unknown field", 2)(
+    lambda place: calibrate(place, "--size", "1280x960")
+)
+case("calibration of a camera of another size than the images", 2)(
+    lambda place: [
+        "calibrate",
+        place.artifact,
+        place.image((48, 64)),
+        "--size",
+        "1280x960",
+        "-o",
+        place.out,
+    ]
+)
+case("range of fields that is none", 2)(lambda place: calibrate(place, "--fov", "5-20"))
+case("range of fields that is swapped", 2)(lambda place: calibrate(place, "--fov", "20:5"))
 
 
 @case("camera and size of a calibration", 2)
@@ -1159,15 +930,10 @@ def _(place: Place) -> Call:
     return ["calibrate", place.artifact, frame, *known, "-o", place.out]
 
 
-@case("plot of residuals of a kind that is not drawn", 2)
-def _(place: Place) -> Call:
-    frame = place.write("frame.csv", "x_px,y_px\n1,2\n")
-    return ["calibrate", place.artifact, frame, "--plot", "left.pdf", "-o", place.out]
-
-
-@case("method unknown", 2)
-def _(place: Place) -> Call:
-    return [*place.identify("x_px,y_px\n1,2\n"), "--method", "triangles"]
+case("plot of residuals of a kind that is not drawn", 2)(
+    lambda place: calibrate(place, "--plot", "left.pdf")
+)
+case("method unknown", 2)(lambda place: identify_at(place, "--method", "triangles"))
 
 
 @case("method whose product is missing", 5)
@@ -1179,52 +945,30 @@ def _(place: Place) -> Call:
     return ["identify", artifact, frame, "--method", "grid"]
 
 
-@case("frame with a field without end", 2)
-def _(place: Place) -> Call:
-    return place.identify('x_px,y_px\n1,"' + "2" * 200_000)
-
-
-@case("frame without centroids", 0)
-def _(place: Place) -> Call:
-    return place.identify("x_px,y_px\n")
+case("frame with a field without end", 2)(
+    lambda place: place.identify('x_px,y_px\n1,"' + "2" * 200_000)
+)
+case("frame without centroids", 0)(lambda place: place.identify("x_px,y_px\n"))
 
 
 # Queries -----------------------------------------------------------------------------------
 
 
-@case("query about nothing", 2)
-def _(place: Place) -> Call:
-    return ["sql"]
-
-
-@case("query about what is not there", 3)
-def _(place: Place) -> Call:
-    return ["sql", "nosuch", "SELECT 1"]
-
-
-@case("query about a file of unknown kind", 2)
-def _(place: Place) -> Call:
-    return ["sql", place.write("notes.txt", "no stars"), "SELECT 1"]
-
-
-@case("query that is no SQL", 2)
-def _(place: Place) -> Call:
-    return ["sql", place.artifact, "SELEC 1"]
-
-
-@case("query that writes", 2)
-def _(place: Place) -> Call:
-    return ["sql", place.artifact, f"COPY stars TO '{place.out}/stars.csv'"]
-
-
-@case("query of another file", 2)
-def _(place: Place) -> Call:
-    return ["sql", place.artifact, "SELECT * FROM read_csv('/etc/passwd')"]
-
-
-@case("query of a column that is not there", 2)
-def _(place: Place) -> Call:
-    return ["sql", place.artifact, "SELECT magg FROM stars"]
+case("query about nothing", 2)(lambda place: ["sql"])
+case("query about what is not there", 3)(lambda place: ["sql", "nosuch", "SELECT 1"])
+case("query about a file of unknown kind", 2)(
+    lambda place: ["sql", place.write("notes.txt", "no stars"), "SELECT 1"]
+)
+case("query that is no SQL", 2)(lambda place: ["sql", place.artifact, "SELEC 1"])
+case("query that writes", 2)(
+    lambda place: ["sql", place.artifact, f"COPY stars TO '{place.out}/stars.csv'"]
+)
+case("query of another file", 2)(
+    lambda place: ["sql", place.artifact, "SELECT * FROM read_csv('/etc/passwd')"]
+)
+case("query of a column that is not there", 2)(
+    lambda place: ["sql", place.artifact, "SELECT magg FROM stars"]
+)
 
 
 @case("query that takes too long", 1)
@@ -1241,58 +985,36 @@ def _(place: Place) -> Call:
     return ["sql", place.artifact, large, "--memory-limit-gb", 0.5]
 
 
-@case("query that is nested too deeply", 2)
-def _(place: Place) -> Call:
-    return ["sql", place.artifact, "SELECT 1" + " + 1" * 2000]
-
-
-@case("query with an option of EXPLAIN unknown", 2)
-def _(place: Place) -> Call:
-    return ["sql", place.artifact, "EXPLAIN (FORMAT odd) SELECT 1"]
-
-
-@case("named query unknown", 2)
-def _(place: Place) -> Call:
-    return ["sql", place.artifact, "--named", "densest-feilds"]
+case("query that is nested too deeply", 2)(
+    lambda place: ["sql", place.artifact, "SELECT 1" + " + 1" * 2000]
+)
+case("query with an option of EXPLAIN unknown", 2)(
+    lambda place: ["sql", place.artifact, "EXPLAIN (FORMAT odd) SELECT 1"]
+)
+case("named query unknown", 2)(lambda place: ["sql", place.artifact, "--named", "densest-feilds"])
 
 
 NOBODY = ("--server", "http://127.0.0.1:9")
 """An address at which no service is."""
 
 
-@case("service at no address", 2)
-def _(place: Place) -> Call:
-    return ["--server", "localhost:8000", "sql", "small-1.0.0", "SELECT 1 AS one"]
-
-
-@case("service for a command that runs here", 2)
-def _(place: Place) -> Call:
-    return [*NOBODY, "releases", "registry"]
-
-
-@case("option that a service does not take", 2)
-def _(place: Place) -> Call:
-    return [*NOBODY, "sql", "small-1.0.0", "SELECT 1 AS one", "--memory-limit-gb", "1"]
-
-
-@case("service that does not answer", 1)
-def _(place: Place) -> Call:
-    return [*NOBODY, "sql", "small-1.0.0", "SELECT 1 AS one"]
-
-
-@case("question to a service without a query", 2)
-def _(place: Place) -> Call:
-    return [*NOBODY, "sql", "small-1.0.0"]
-
-
-@case("value of a named query of the wrong type", 2)
-def _(place: Place) -> Call:
-    return ["sql", place.artifact, "--named", "densest-fields", "--set", "count=many"]
-
-
-@case("answer in a format unknown", 2)
-def _(place: Place) -> Call:
-    return ["sql", place.artifact, "SELECT 1", "-o", place.folder / "answer.xls"]
+case("service at no address", 2)(
+    lambda place: ["--server", "localhost:8000", "sql", "small-1.0.0", "SELECT 1 AS one"]
+)
+case("service for a command that runs here", 2)(lambda place: [*NOBODY, "releases", "registry"])
+case("option that a service does not take", 2)(
+    lambda place: [*NOBODY, "sql", "small-1.0.0", "SELECT 1 AS one", "--memory-limit-gb", "1"]
+)
+case("service that does not answer", 1)(
+    lambda place: [*NOBODY, "sql", "small-1.0.0", "SELECT 1 AS one"]
+)
+case("question to a service without a query", 2)(lambda place: [*NOBODY, "sql", "small-1.0.0"])
+case("value of a named query of the wrong type", 2)(
+    lambda place: ["sql", place.artifact, "--named", "densest-fields", "--set", "count=many"]
+)
+case("answer in a format unknown", 2)(
+    lambda place: ["sql", place.artifact, "SELECT 1", "-o", place.folder / "answer.xls"]
+)
 
 
 @case("Parquet file cut off under a query", 5)
@@ -1318,9 +1040,9 @@ def _(place: Place) -> Call:
     return ["sql", path, "FROM odd"]
 
 
-@case("place in a table that has none", 2)
-def _(place: Place) -> Call:
-    return ["sql", place.artifact, "FROM cone(1, 2, 3, of := 'pairs')"]
+case("place in a table that has none", 2)(
+    lambda place: ["sql", place.artifact, "FROM cone(1, 2, 3, of := 'pairs')"]
+)
 
 
 def sky_store(place: Place, *numbers: int) -> Path:
@@ -1332,9 +1054,9 @@ def sky_store(place: Place, *numbers: int) -> Path:
     return store
 
 
-@case("store without a partition under a query", 5)
-def _(place: Place) -> Call:
-    return ["sql", sky_store(place), "FROM stars"]
+case("store without a partition under a query", 5)(
+    lambda place: ["sql", sky_store(place), "FROM stars"]
+)
 
 
 @case("store whose partition is cut off, under a query", 5)
@@ -1418,9 +1140,7 @@ def _(place: Place) -> Call:
     return to_store(place, "--resume")
 
 
-@case("too little memory for a store", 2)
-def _(place: Place) -> Call:
-    return to_store(place, "--memory", "0.5")
+case("too little memory for a store", 2)(lambda place: to_store(place, "--memory", "0.5"))
 
 
 @case("build from a store of another catalog", 2)
@@ -1432,44 +1152,30 @@ def _(place: Place) -> Call:
     return [f"hipparcos={place.folder / 'store'}" if str(a).startswith("sao=") else a for a in call]
 
 
-@case("build from a store of another band", 2)
-def _(place: Place) -> Call:
-    return build_from(place, nothing, "--set", "catalog.band=P")
-
-
-@case("build from a store at another epoch", 2)
-def _(place: Place) -> Call:
-    return build_from(place, nothing, epoch_jyear=1991.25)
-
-
-@case("build from a store with a brighter limit", 2)
-def _(place: Place) -> Call:
-    return build_from(place, nothing, read_limit_mag=5.0)
-
-
-@case("build from a store and files", 2)
-def _(place: Place) -> Call:
-    return build_from(place, nothing, "--input", f"sao={place.folder / 'sao.dat'}")
-
-
-@case("build from a store of a later starcat", 4)
-def _(place: Place) -> Call:
-    return build_from(place, account(lambda known: known.update(store_version="2.0.0")))
-
-
-@case("build from a store whose account is damaged", 5)
-def _(place: Place) -> Call:
-    return build_from(place, lambda store: (store / "store.json").write_text("{"))
-
-
-@case("build from a store without a partition", 5)
-def _(place: Place) -> Call:
-    return build_from(place, lambda store: part_of(store).unlink())
-
-
-@case("build from a store with a damaged partition", 5)
-def _(place: Place) -> Call:
-    return build_from(place, lambda store: part_of(store).write_bytes(b"PAR1 and no more"))
+case("build from a store of another band", 2)(
+    lambda place: build_from(place, nothing, "--set", "catalog.band=P")
+)
+case("build from a store at another epoch", 2)(
+    lambda place: build_from(place, nothing, epoch_jyear=1991.25)
+)
+case("build from a store with a brighter limit", 2)(
+    lambda place: build_from(place, nothing, read_limit_mag=5.0)
+)
+case("build from a store and files", 2)(
+    lambda place: build_from(place, nothing, "--input", f"sao={place.folder / 'sao.dat'}")
+)
+case("build from a store of a later starcat", 4)(
+    lambda place: build_from(place, account(lambda known: known.update(store_version="2.0.0")))
+)
+case("build from a store whose account is damaged", 5)(
+    lambda place: build_from(place, lambda store: (store / "store.json").write_text("{"))
+)
+case("build from a store without a partition", 5)(
+    lambda place: build_from(place, lambda store: part_of(store).unlink())
+)
+case("build from a store with a damaged partition", 5)(
+    lambda place: build_from(place, lambda store: part_of(store).write_bytes(b"PAR1 and no more"))
+)
 
 
 @case("build from a HATS catalog without magnitudes", 4)
@@ -1502,7 +1208,27 @@ def registry_of(place: Place) -> Path:
     return place.folder / "registry"
 
 
-def pull(place: Place, wanted: str = "small", *more: object, registry: bool = True) -> Call:
+def pull_damaged(change: Callable[[Path], object]) -> Callable[[Place], Call]:
+    """Pull from a registry that something was done to."""
+
+    def call(place: Place) -> Call:
+        change(registry_of(place))
+        return pull(place)
+
+    return call
+
+
+def pull_kept(*words: object) -> Callable[[Place], Call]:
+    """Pull from a sound registry."""
+
+    def call(place: Place) -> Call:
+        registry_of(place)
+        return pull(place, *words)
+
+    return call
+
+
+def pull(place: Place, wanted: object = "small", *more: object, registry: bool = True) -> Call:
     named = ["--registry", place.folder / "registry"] if registry else []
     return ["pull", wanted, *named, "-o", place.out, "--lock", place.folder / "lock", *more]
 
@@ -1525,14 +1251,12 @@ def blob(registry: Path, name: str) -> Path:
     return registry / "blobs" / "sha256" / digest[:2] / digest
 
 
-@case("publishing to an address", 2)
-def _(place: Place) -> Call:
-    return ["publish", place.artifact, "https://example.org/registry"]
-
-
-@case("registry at another kind of address", 2)
-def _(place: Place) -> Call:
-    return ["releases", "ftp://example.org/registry"]
+case("publishing to an address", 2)(
+    lambda place: ["publish", place.artifact, "https://example.org/registry"]
+)
+case("registry at another kind of address", 2)(
+    lambda place: ["releases", "ftp://example.org/registry"]
+)
 
 
 @case("published version with another content", 1)
@@ -1542,53 +1266,19 @@ def _(place: Place) -> Call:
     return ["publish", place.artifact, place.folder / "registry"]
 
 
-@case("publishing into a folder with other things", 1)
-def _(place: Place) -> Call:
-    return ["publish", place.artifact, place.write("home/thesis.tex", "text").parent]
-
-
-@case("publishing a damaged artifact", 5)
-def _(place: Place) -> Call:
-    folder = place.copy()
-    flip(folder / "pairs.parquet")
-    return ["publish", folder, place.folder / "registry"]
-
-
-@case("no registry there", 3)
-def _(place: Place) -> Call:
-    return ["releases", place.folder / "registry"]
-
-
-@case("artifact that a registry does not have", 3)
-def _(place: Place) -> Call:
-    registry_of(place)
-    return pull(place, "smaller")
-
-
-@case("version that a registry does not have", 3)
-def _(place: Place) -> Call:
-    registry_of(place)
-    return pull(place, "small@1.2.3")
-
-
-@case("name and version of another form", 2)
-def _(place: Place) -> Call:
-    return pull(place, "small@1.0")
-
-
-@case("pull of nothing", 2)
-def _(place: Place) -> Call:
-    return ["pull", "-o", place.out]
-
-
-@case("pull without a registry", 2)
-def _(place: Place) -> Call:
-    return pull(place, registry=False)
-
-
-@case("lock file that pins nothing", 2)
-def _(place: Place) -> Call:
-    return pull(place, "small", "--locked")
+case("publishing into a folder with other things", 1)(
+    lambda place: ["publish", place.artifact, place.write("home/thesis.tex", "text").parent]
+)
+case("publishing a damaged artifact", 5)(
+    lambda place: ["publish", place.damaged(flip, "pairs.parquet"), place.folder / "registry"]
+)
+case("no registry there", 3)(lambda place: ["releases", place.folder / "registry"])
+case("artifact that a registry does not have", 3)(pull_kept("smaller"))
+case("version that a registry does not have", 3)(pull_kept("small@1.2.3"))
+case("name and version of another form", 2)(lambda place: pull(place, "small@1.0"))
+case("pull of nothing", 2)(lambda place: ["pull", "-o", place.out])
+case("pull without a registry", 2)(lambda place: pull(place, registry=False))
+case("lock file that pins nothing", 2)(lambda place: pull(place, "small", "--locked"))
 
 
 def pinned(place: Place, old: str = "", new: str = "") -> None:
@@ -1635,35 +1325,21 @@ def _(place: Place) -> Call:
     return pull(place)
 
 
-@case("index of a registry damaged", 5)
-def _(place: Place) -> Call:
-    index = registry_of(place) / "index.json"
-    index.write_bytes(index.read_bytes()[:100])
-    return pull(place)
-
-
-@case("index with a name that leads elsewhere", 5)
-def _(place: Place) -> Call:
-    edit(registry_of(place) / "index.json", '"small"', '"../../small"')
-    return pull(place)
-
-
-@case("registry of a newer starcat", 4)
-def _(place: Place) -> Call:
-    edit(registry_of(place) / "index.json", '"registry_version": "1', '"registry_version": "2')
-    return pull(place)
-
-
-@case("file of a registry missing", 5)
-def _(place: Place) -> Call:
-    blob(registry_of(place), "pairs.parquet").unlink()
-    return pull(place)
-
-
-@case("file of a registry damaged", 5)
-def _(place: Place) -> Call:
-    flip(blob(registry_of(place), "pairs.parquet"))
-    return pull(place)
+case("index of a registry damaged", 5)(
+    pull_damaged(lambda root: os.truncate(root / "index.json", 100))
+)
+case("index with a name that leads elsewhere", 5)(
+    pull_damaged(lambda root: edit(root / "index.json", '"small"', '"../../small"'))
+)
+case("registry of a newer starcat", 4)(
+    pull_damaged(
+        lambda root: edit(root / "index.json", '"registry_version": "1', '"registry_version": "2')
+    )
+)
+case("file of a registry missing", 5)(
+    pull_damaged(lambda root: blob(root, "pairs.parquet").unlink())
+)
+case("file of a registry damaged", 5)(pull_damaged(lambda root: flip(blob(root, "pairs.parquet"))))
 
 
 @case("file of a registry that is a link", 5)
@@ -1683,10 +1359,7 @@ def put_manifest(place: Place, manifest: Path, data: bytes) -> None:
     edit(index, f'"bytes": {manifest.stat().st_size}', f'"bytes": {len(data)}')
 
 
-@case("larger than --max-bytes", 1)
-def _(place: Place) -> Call:
-    registry_of(place)
-    return pull(place, "small", "--max-bytes", 1000)
+case("larger than --max-bytes", 1)(pull_kept("small", "--max-bytes", 1000))
 
 
 @case("larger than the disk", 1)
@@ -1708,39 +1381,41 @@ def _(place: Place) -> Call:
 # Exports -----------------------------------------------------------------------------------
 
 
-@case("export of nothing", 2)
-def _(place: Place) -> Call:
-    return ["export", "--format", "fits", "-o", place.out]
-
-
-@case("export of what is not there", 3)
-def _(place: Place) -> Call:
-    return ["export", place.folder / "small-1.1.0", "-o", place.out]
-
-
-@case("export of a file that is not Parquet", 3)
-def _(place: Place) -> Call:
-    return ["export", place.write("stars.csv", "star_id\n1\n"), "--format", "fits", "-o", place.out]
-
-
-@case("format unknown", 2)
-def _(place: Place) -> Call:
-    return ["export", place.artifact, "--format", "xlsx", "-o", place.out]
-
-
-@case("format that the name of a file does not say", 2)
-def _(place: Place) -> Call:
-    return lambda: format_of(place.out / "stars.csv.gz")
-
-
-@case("product unknown", 2)
-def _(place: Place) -> Call:
-    return ["export", place.artifact, "--product", "star", "-o", place.out]
-
-
-@case("HATS of what are no stars", 2)
-def _(place: Place) -> Call:
-    return ["export", place.artifact, "--format", "hats", "--product", "pairs", "-o", place.out]
+case("export of nothing", 2)(lambda place: ["export", "--format", "fits", "-o", place.out])
+case("export of what is not there", 3)(
+    lambda place: ["export", place.folder / "small-1.1.0", "-o", place.out]
+)
+case("export of a file that is not Parquet", 3)(
+    lambda place: [
+        "export",
+        place.write("stars.csv", "star_id\n1\n"),
+        "--format",
+        "fits",
+        "-o",
+        place.out,
+    ]
+)
+case("format unknown", 2)(
+    lambda place: ["export", place.artifact, "--format", "xlsx", "-o", place.out]
+)
+case("format that the name of a file does not say", 2)(
+    lambda place: lambda: format_of(place.out / "stars.csv.gz")
+)
+case("product unknown", 2)(
+    lambda place: ["export", place.artifact, "--product", "star", "-o", place.out]
+)
+case("HATS of what are no stars", 2)(
+    lambda place: [
+        "export",
+        place.artifact,
+        "--format",
+        "hats",
+        "--product",
+        "pairs",
+        "-o",
+        place.out,
+    ]
+)
 
 
 @case("another file of that name", 1)
@@ -1749,42 +1424,31 @@ def _(place: Place) -> Call:
     return ["export", place.artifact, "-o", place.out]
 
 
-@case("file in place of the folder", 1)
-def _(place: Place) -> Call:
-    return ["export", place.artifact, "-o", place.write("out", "mine")]
-
-
-@case("text that a format cannot hold", 4)
-def _(place: Place) -> Call:
-    path = place.folder / "stars.parquet"
-    pq.write_table(pa.table({"designation": ["α Centauri"]}), path)
-    return ["export", path, "--format", "fits", "-o", place.out]
-
-
-@case("name that a format has no room for", 4)
-def _(place: Place) -> Call:
-    path = place.folder / "stars.parquet"
-    pq.write_table(pa.table({"x" * 69: [1]}), path)
-    return ["export", path, "--format", "fits", "-o", place.out]
-
-
-@case("column without a name", 4)
-def _(place: Place) -> Call:
-    path = place.folder / "stars.parquet"
-    pq.write_table(pa.table({"": [1]}), path)
-    return ["export", path, "--format", "fits", "-o", place.out]
-
-
-@case("type that no format can hold", 4)
-def _(place: Place) -> Call:
-    path = place.folder / "stars.parquet"
-    pq.write_table(pa.table({"code": [b"x"]}), path)
-    return ["export", path, "--format", "csv", "-o", place.out]
-
-
-@case("peer unknown", 2)
-def _(place: Place) -> Call:
-    return ["export", place.artifact, "--from-peer", "lost", "-o", place.out]
+case("file in place of the folder", 1)(
+    lambda place: ["export", place.artifact, "-o", place.write("out", "mine")]
+)
+case("text that a format cannot hold", 4)(
+    lambda place: [
+        "export",
+        place.table({"designation": ["α Centauri"]}),
+        "--format",
+        "fits",
+        "-o",
+        place.out,
+    ]
+)
+case("name that a format has no room for", 4)(
+    lambda place: ["export", place.table({"x" * 69: [1]}), "--format", "fits", "-o", place.out]
+)
+case("column without a name", 4)(
+    lambda place: ["export", place.table({"": [1]}), "--format", "fits", "-o", place.out]
+)
+case("type that no format can hold", 4)(
+    lambda place: ["export", place.table({"code": [b"x"]}), "--format", "csv", "-o", place.out]
+)
+case("peer unknown", 2)(
+    lambda place: ["export", place.artifact, "--from-peer", "lost", "-o", place.out]
+)
 
 
 @case("peer's database damaged", 3)
@@ -1828,34 +1492,29 @@ def onboard(place: Place, *more: object) -> Call:
     return ["export", place.artifact, "--to", "onboard", "-o", place.out / "db.img", *more]
 
 
-@case("onboard image that cannot be so small", 1)
-def _(place: Place) -> Call:
-    return onboard(place, "--max-bytes", "9000")
-
-
-@case("onboard image for a method that has none", 2)
-def _(place: Place) -> Call:
-    return onboard(place, "--method", "grid")
-
-
-@case("byte order unknown", 2)
-def _(place: Place) -> Call:
-    return onboard(place, "--endian", "middle")
-
-
-@case("option of an onboard image for tables", 2)
-def _(place: Place) -> Call:
-    return ["export", place.artifact, "--to", "fits", "--max-bytes", "9000", "-o", place.out]
-
-
-@case("option of tables for an onboard image", 2)
-def _(place: Place) -> Call:
-    return onboard(place, "--product", "stars")
-
-
-@case("option of HATS for another format", 2)
-def _(place: Place) -> Call:
-    return ["export", place.artifact, "--to", "csv", "--max-partition-rows", "9", "-o", place.out]
+case("onboard image that cannot be so small", 1)(
+    lambda place: onboard(place, "--max-bytes", "9000")
+)
+case("onboard image for a method that has none", 2)(
+    lambda place: onboard(place, "--method", "grid")
+)
+case("byte order unknown", 2)(lambda place: onboard(place, "--endian", "middle"))
+case("option of an onboard image for tables", 2)(
+    lambda place: ["export", place.artifact, "--to", "fits", "--max-bytes", "9000", "-o", place.out]
+)
+case("option of tables for an onboard image", 2)(lambda place: onboard(place, "--product", "stars"))
+case("option of HATS for another format", 2)(
+    lambda place: [
+        "export",
+        place.artifact,
+        "--to",
+        "csv",
+        "--max-partition-rows",
+        "9",
+        "-o",
+        place.out,
+    ]
+)
 
 
 @case("onboard image of an artifact without triangles", 2)
@@ -1889,39 +1548,23 @@ def _(place: Place) -> Call:
     return onboard(place)
 
 
-@case("C source under another name", 2)
-def _(place: Place) -> Call:
-    return ["export", place.artifact, "--to", "c", "-o", place.out / "db"]
-
-
-@case("name too long for an onboard image", 2)
-def _(place: Place) -> Call:
-    return lambda: make_image(three_stars("x" * 97))
-
-
-@case("onboard image missing", 3)
-def _(place: Place) -> Call:
-    return lambda: read_image(place.folder / "db.img")
-
-
-@case("folder read as an onboard image", 5)
-def _(place: Place) -> Call:
-    return lambda: read_image(place.folder)
-
-
-@case("file that is no onboard image", 5)
-def _(place: Place) -> Call:
-    return ["inspect", place.write("db.img", "star_id\n1\n")]
-
-
-@case("onboard image cut off", 5)
-def _(place: Place) -> Call:
-    return ["inspect", image_of(place, lambda image: image[:5000])]
-
-
-@case("onboard image cut off in its header", 5)
-def _(place: Place) -> Call:
-    return ["inspect", image_of(place, lambda image: image[:100])]
+case("C source under another name", 2)(
+    lambda place: ["export", place.artifact, "--to", "c", "-o", place.out / "db"]
+)
+case("name too long for an onboard image", 2)(
+    lambda place: lambda: make_image(three_stars("x" * 97))
+)
+case("onboard image missing", 3)(lambda place: lambda: read_image(place.folder / "db.img"))
+case("folder read as an onboard image", 5)(lambda place: lambda: read_image(place.folder))
+case("file that is no onboard image", 5)(
+    lambda place: ["inspect", place.write("db.img", "star_id\n1\n")]
+)
+case("onboard image cut off", 5)(
+    lambda place: ["inspect", image_of(place, lambda image: image[:5000])]
+)
+case("onboard image cut off in its header", 5)(
+    lambda place: ["inspect", image_of(place, lambda image: image[:100])]
+)
 
 
 @case("onboard image with a damaged block", 5)
@@ -1931,24 +1574,18 @@ def _(place: Place) -> Call:
     return ["inspect", path]
 
 
-@case("onboard image of another version", 4)
-def _(place: Place) -> Call:
-    return ["inspect", image_of(place, with_word(12, 2))]
-
-
-@case("onboard image with a number that cannot be", 5)
-def _(place: Place) -> Call:
-    return ["inspect", image_of(place, with_word(28, 7))]
-
-
-@case("onboard image with a section that cannot be", 5)
-def _(place: Place) -> Call:
-    return ["inspect", image_of(place, with_word(256 + 8, 24))]
-
-
-@case("artifact held against an artifact", 2)
-def _(place: Place) -> Call:
-    return ["verify", place.artifact, "--against", place.artifact]
+case("onboard image of another version", 4)(
+    lambda place: ["inspect", image_of(place, with_word(12, 2))]
+)
+case("onboard image with a number that cannot be", 5)(
+    lambda place: ["inspect", image_of(place, with_word(28, 7))]
+)
+case("onboard image with a section that cannot be", 5)(
+    lambda place: ["inspect", image_of(place, with_word(256 + 8, 24))]
+)
+case("artifact held against an artifact", 2)(
+    lambda place: ["verify", place.artifact, "--against", place.artifact]
+)
 
 
 # The service -------------------------------------------------------------------------------
@@ -1967,19 +1604,15 @@ def service_with_a_token(place: Place) -> Path:
     return root
 
 
-@case("service for others without a token", 2)
-def _(place: Place) -> Call:
-    return ["serve", "--root", place.folder / "service", "--host", "0.0.0.0"]
-
-
-@case("service with an unknown setting", 2)
-def _(place: Place) -> Call:
-    return ["serve", "--root", place.write("service/service.toml", "portt = 8000").parent]
-
-
-@case("token with a name that none can have", 2)
-def _(place: Place) -> Call:
-    return ["token", "create", "a b", "--role", "reader", "--root", place.folder / "service"]
+case("service for others without a token", 2)(
+    lambda place: ["serve", "--root", place.folder / "service", "--host", "0.0.0.0"]
+)
+case("service with an unknown setting", 2)(
+    lambda place: ["serve", "--root", place.write("service/service.toml", "portt = 8000").parent]
+)
+case("token with a name that none can have", 2)(
+    lambda place: ["token", "create", "a b", "--role", "reader", "--root", place.folder / "service"]
+)
 
 
 @case("token with the name of another", 2)
@@ -1988,14 +1621,10 @@ def _(place: Place) -> Call:
     return ["token", "create", "anna", "--role", "reader", "--root", root]
 
 
-@case("token that is not there", 3)
-def _(place: Place) -> Call:
-    return ["token", "revoke", "bert", "--root", service_with_a_token(place)]
-
-
-@case("tokens of no service", 3)
-def _(place: Place) -> Call:
-    return ["token", "list", "--root", place.folder / "service"]
+case("token that is not there", 3)(
+    lambda place: ["token", "revoke", "bert", "--root", service_with_a_token(place)]
+)
+case("tokens of no service", 3)(lambda place: ["token", "list", "--root", place.folder / "service"])
 
 
 # The tests ---------------------------------------------------------------------------------
@@ -2042,7 +1671,7 @@ def run_call(place: Place, call: Call, starcat: Any) -> tuple[int, str]:
 
 
 @pytest.mark.parametrize("given", CASES, ids=[case.kind for case in CASES])
-def test_bad_input(given: Case, place: Place, starcat: Any) -> None:
+def test_bad_input(given, place, starcat):
     call = given.call(place)
     before = files_below(place.folder)
     code, text = run_call(place, call, starcat)
@@ -2073,7 +1702,7 @@ def check_json(given: Case, call: Call, pattern: str, starcat: Any) -> None:
     assert error["hint"] is None or error["hint"] in error["message"] or given.code == 2
 
 
-def test_the_page_lists_exactly_these_kinds() -> None:
+def test_the_page_lists_exactly_these_kinds():
     assert {kind: code for kind, (_, code) in page_rows().items()} == {
         given.kind: given.code for given in CASES
     }
@@ -2083,7 +1712,7 @@ def test_the_page_lists_exactly_these_kinds() -> None:
 @pytest.mark.parametrize(
     "kind", ["file missing", "key unknown", "not an artifact", "no stars left"]
 )
-def test_exit_codes_reach_the_shell(kind: str, place: Place) -> None:
+def test_exit_codes_reach_the_shell(kind, place):
     given = next(entry for entry in CASES if entry.kind == kind)
     code, text = run_apart(place, given.call(place))
     assert code == given.code
@@ -2091,7 +1720,7 @@ def test_exit_codes_reach_the_shell(kind: str, place: Place) -> None:
     assert text.count("\n") == 1
 
 
-def test_line_ends_do_not_change_the_stars(place: Place, starcat: Any) -> None:
+def test_line_ends_do_not_change_the_stars(place, starcat):
     tables = []
     for end in (b"\n", b"\r\n"):
         assert starcat(place.ingest([line.replace(b"\n", end) for line in place.lines])).code == 0
@@ -2100,7 +1729,7 @@ def test_line_ends_do_not_change_the_stars(place: Place, starcat: Any) -> None:
     assert len(tables[0]) == len(place.lines)
 
 
-def test_a_malformed_record_costs_only_itself(place: Place, starcat: Any) -> None:
+def test_a_malformed_record_costs_only_itself(place, starcat):
     wrong = [*place.lines]
     wrong[2] = with_text(wrong[2], 81, b" x.2")
     wrong[9] = wrong[9][:150] + b"\n"
@@ -2113,7 +1742,7 @@ def test_a_malformed_record_costs_only_itself(place: Place, starcat: Any) -> Non
     assert "bytes 81-84, v_mag" in rejected["detail"][0].as_py()
 
 
-def test_bytes_that_are_no_text_cost_one_number_of_a_delimited_file() -> None:
+def test_bytes_that_are_no_text_cost_one_number_of_a_delimited_file():
     layout = data_source("gcvs").files[0]
     good = b"\t".join([b"1234", b"R And", b"M\xff", b"5.8", b"0", b"15.2", *[b""] * 6])
     records = parse_delimited(

@@ -52,13 +52,13 @@ def fits(text: str) -> bool:
 # Help ---------------------------------------------------------------------------------------
 
 
-def test_commands() -> None:
+def test_commands():
     expected = "build coverage fetch identify ingest inspect presets selftest simulate sources"
     assert set(COMMANDS) >= set(expected.split())
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_each_command_has_help_with_an_example(name: str, starcat: Run) -> None:
+def test_each_command_has_help_with_an_example(name, starcat):
     run = starcat([*name.split(), "--help"])
     assert run.code == 0
     assert re.search(rf"Example: starcat {name}\b", run.out)
@@ -66,24 +66,24 @@ def test_each_command_has_help_with_an_example(name: str, starcat: Run) -> None:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_each_option_says_what_it_does(name: str) -> None:
+def test_each_option_says_what_it_does(name):
     for parameter in EVERY[name].params:
         assert getattr(parameter, "help", None), f"{name} {parameter.name}"
 
 
-def test_help_lists_every_command(starcat: Run) -> None:
+def test_help_lists_every_command(starcat):
     run = starcat(["--help"])
     assert run.code == 0
     assert all(re.search(rf"^  {name.split()[0]} ", run.out, re.MULTILINE) for name in COMMANDS)
 
 
-def test_no_command_shows_the_help(starcat: Run) -> None:
+def test_no_command_shows_the_help(starcat):
     run = starcat([])
     assert "Commands:" in run.out + run.err
     assert run.code == 2
 
 
-def test_version(starcat: Run) -> None:
+def test_version(starcat):
     ours, matcher = starcat(["--version"]).out.splitlines()
     assert ours == f"starcat {package.__version__}"
     library = library_version()
@@ -93,13 +93,13 @@ def test_version(starcat: Run) -> None:
 @pytest.mark.parametrize(
     "arguments", [["biuld"], ["build", "--ouput", "x"], ["inspect"], ["identify", "x"]]
 )
-def test_usage_errors_exit_with_2(arguments: list[str], starcat: Run) -> None:
+def test_usage_errors_exit_with_2(arguments, starcat):
     run = starcat(arguments)
     assert (run.code, run.out) == (2, "")
     assert "Usage: starcat" in run.err
 
 
-def test_the_module_is_the_command() -> None:
+def test_the_module_is_the_command():
     run = subprocess.run(
         [sys.executable, "-m", "starcat", "--version"], capture_output=True, text=True, check=True
     )
@@ -109,7 +109,7 @@ def test_the_module_is_the_command() -> None:
 # Lists --------------------------------------------------------------------------------------
 
 
-def test_sources(starcat: Run) -> None:
+def test_sources(starcat):
     run = starcat(["sources"])
     assert run.code == 0
     assert fits(run.out)
@@ -117,7 +117,7 @@ def test_sources(starcat: Run) -> None:
     assert "not found" in run.out
 
 
-def test_sources_as_json(starcat: Run, stars: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sources_as_json(starcat, stars, monkeypatch):
     monkeypatch.setenv("STARCAT_CATALOGS", str(stars.parent))
     found = {entry["name"]: entry for entry in json.loads(starcat(["sources", "--json"]).out)}
     assert tuple(sorted(found)) == source_names()
@@ -131,14 +131,14 @@ def test_sources_as_json(starcat: Run, stars: Path, monkeypatch: pytest.MonkeyPa
     assert found["sao"]["rows"] == 258_997
 
 
-def test_presets(starcat: Run) -> None:
+def test_presets(starcat):
     run = starcat(["presets"])
     assert run.code == 0
     assert fits(run.out)
     assert all(re.search(rf"^{name} ", run.out, re.MULTILINE) for name in preset_names())
 
 
-def test_presets_as_json(starcat: Run) -> None:
+def test_presets_as_json(starcat):
     specs = json.loads(starcat(["presets", "--json"]).out)
     assert [spec["name"] for spec in specs] == list(preset_names())
     assert all(spec["selection"]["faint_limit_mag"] > 0 for spec in specs)
@@ -147,7 +147,7 @@ def test_presets_as_json(starcat: Run) -> None:
 # Ingest -------------------------------------------------------------------------------------
 
 
-def test_ingest_writes_a_star_table(starcat: Run, stars: Path, tmp_path: Path) -> None:
+def test_ingest_writes_a_star_table(starcat, stars, tmp_path):
     out = tmp_path / "made" / "out.parquet"
     run = starcat(["ingest", "sao", "--input", stars, "-o", out, "--epoch-jyear", "2026"])
     assert run.code == 0
@@ -161,9 +161,7 @@ def test_ingest_writes_a_star_table(starcat: Run, stars: Path, tmp_path: Path) -
     assert sorted(path.name for path in out.parent.iterdir()) == ["out.parquet"]
 
 
-def test_ingest_writes_the_rejected_rows_beside_it(
-    starcat: Run, stars: Path, tmp_path: Path
-) -> None:
+def test_ingest_writes_the_rejected_rows_beside_it(starcat, stars, tmp_path):
     out = tmp_path / "out.parquet"
     stars.write_bytes(stars.read_bytes() + b"short\n")
     run = starcat(["ingest", "sao", "--input", stars, "-o", out, "--read-limit-mag", "6.0"])
@@ -183,7 +181,7 @@ def test_ingest_writes_the_rejected_rows_beside_it(
     assert not (tmp_path / "out.rejected.parquet").exists()
 
 
-def test_ingest_as_json(starcat: Run, stars: Path, tmp_path: Path) -> None:
+def test_ingest_as_json(starcat, stars, tmp_path):
     out = tmp_path / "out.parquet"
     run = starcat(["ingest", "sao", "--input", stars, "-o", out, "--json", "--band", "V"])
     facts = json.loads(run.out)
@@ -194,7 +192,7 @@ def test_ingest_as_json(starcat: Run, stars: Path, tmp_path: Path) -> None:
     assert (facts["stars"], facts["rejected_rows"], facts["problems"]) == (str(out), None, [])
 
 
-def test_ingest_of_several_files(starcat: Run, sao_lines: list[bytes], tmp_path: Path) -> None:
+def test_ingest_of_several_files(starcat, sao_lines, tmp_path):
     parts = [tmp_path / "a.dat", tmp_path / "b.dat"]
     parts[0].write_bytes(b"".join(sao_lines[:300]))
     parts[1].write_bytes(b"".join(sao_lines[300:]))
@@ -207,7 +205,7 @@ def test_ingest_of_several_files(starcat: Run, sao_lines: list[bytes], tmp_path:
     assert table["source_line"][300].as_py() == 1
 
 
-def test_ingest_of_the_excerpt(starcat: Run, catalogs: Path, tmp_path: Path) -> None:
+def test_ingest_of_the_excerpt(starcat, catalogs, tmp_path):
     out = tmp_path / "out.parquet"
     archive = catalogs / "sao.dat.gz"
     run = starcat(
@@ -220,9 +218,7 @@ def test_ingest_of_the_excerpt(starcat: Run, catalogs: Path, tmp_path: Path) -> 
 # Build, inspect, identify -------------------------------------------------------------------
 
 
-def test_build_prints_what_it_made(
-    starcat: Run, stars: Path, small_spec: str, tmp_path: Path
-) -> None:
+def test_build_prints_what_it_made(starcat, stars, small_spec, tmp_path):
     spec = tmp_path / "spec.toml"
     spec.write_text(small_spec)
     arguments = ["build", spec, "--input", f"sao={stars}", "-o", tmp_path / "dist"]
@@ -249,7 +245,7 @@ def test_build_prints_what_it_made(
     assert made["self_test"][0]["identified_share"] == 1.0
 
 
-def test_inspect(starcat: Run, small_artifact: Path) -> None:
+def test_inspect(starcat, small_artifact):
     run = starcat(["inspect", small_artifact])
     assert run.code == 0
     assert fits(run.out)
@@ -263,7 +259,7 @@ def test_inspect(starcat: Run, small_artifact: Path) -> None:
         assert words in run.out
 
 
-def test_inspect_as_json_is_the_manifest(starcat: Run, small_artifact: Path) -> None:
+def test_inspect_as_json_is_the_manifest(starcat, small_artifact):
     manifest = json.loads(starcat(["inspect", small_artifact, "--json"]).out)
     assert manifest == json.loads((small_artifact / "manifest.json").read_bytes())
     table = pq.read_table(small_artifact / "stars.parquet")
@@ -271,9 +267,7 @@ def test_inspect_as_json_is_the_manifest(starcat: Run, small_artifact: Path) -> 
     assert manifest["products"]["stars"]["content_sha256"] == digest
 
 
-def test_simulate_depends_on_the_seed(
-    starcat: Run, frame: Path, small_artifact: Path, tmp_path: Path
-) -> None:
+def test_simulate_depends_on_the_seed(starcat, frame, small_artifact, tmp_path):
     assert frame.read_text().startswith("x_px,y_px,mag\n")
     texts = []
     for seed in ("7", "8"):
@@ -283,9 +277,7 @@ def test_simulate_depends_on_the_seed(
     assert texts[0] == frame.read_text() != texts[1]
 
 
-def test_simulate_tells_the_truth_as_json(
-    starcat: Run, small_artifact: Path, tmp_path: Path
-) -> None:
+def test_simulate_tells_the_truth_as_json(starcat, small_artifact, tmp_path):
     path = tmp_path / "frame.csv"
     made = ["simulate", small_artifact, "-o", path, "--seed", "7", "--false-stars", "2"]
     truth = json.loads(starcat([*made, "--json"]).out)
@@ -297,13 +289,11 @@ def test_simulate_tells_the_truth_as_json(
 
 
 @pytest.mark.parametrize("name", [name for name in COMMANDS if name != "work"])  # has no result
-def test_each_command_has_json(name: str) -> None:
+def test_each_command_has_json(name):
     assert "--json" in [option for parameter in EVERY[name].params for option in parameter.opts]
 
 
-def test_a_frame_of_an_unknown_kind_is_not_written(
-    starcat: Run, small_artifact: Path, tmp_path: Path
-) -> None:
+def test_a_frame_of_an_unknown_kind_is_not_written(starcat, small_artifact, tmp_path):
     for name in ("f.gif", "f", "f.json", "f.csv.gz"):
         run = starcat(["simulate", small_artifact, "-o", tmp_path / name])
         assert (run.code, run.out) == (2, "")
@@ -313,7 +303,7 @@ def test_a_frame_of_an_unknown_kind_is_not_written(
         assert starcat(["simulate", small_artifact, "-o", tmp_path / name]).code == 0
 
 
-def test_a_jpeg_frame_is_an_image(starcat: Run, small_artifact: Path, tmp_path: Path) -> None:
+def test_a_jpeg_frame_is_an_image(starcat, small_artifact, tmp_path):
     path = tmp_path / "frame.JPG"
     assert starcat(["simulate", small_artifact, "-o", path, "--seed", 3]).code == 0
     assert path.read_bytes()[:3] == b"\xff\xd8\xff"
@@ -322,7 +312,7 @@ def test_a_jpeg_frame_is_an_image(starcat: Run, small_artifact: Path, tmp_path: 
     assert "identified" in run.out
 
 
-def test_centroids_may_count_y_upwards(starcat: Run, small_artifact: Path, tmp_path: Path) -> None:
+def test_centroids_may_count_y_upwards(starcat, small_artifact, tmp_path):
     path = tmp_path / "frame.csv"
     assert starcat(["simulate", small_artifact, "-o", path, "--seed", 3]).code == 0
     rows = [line.split(",") for line in path.read_text().splitlines()[1:]]
@@ -334,9 +324,7 @@ def test_centroids_may_count_y_upwards(starcat: Run, small_artifact: Path, tmp_p
     assert '"identified"' not in starcat(["identify", small_artifact, path, "--json"]).out
 
 
-def test_a_build_of_nothing_lists_the_presets(
-    starcat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_build_of_nothing_lists_the_presets(starcat, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = starcat(["build"])
     assert (run.code, run.out) == (2, "")
@@ -344,15 +332,13 @@ def test_a_build_of_nothing_lists_the_presets(
     assert not list(tmp_path.iterdir())
 
 
-def test_ingest_takes_its_input_as_the_other_commands_do(
-    starcat: Run, stars: Path, tmp_path: Path
-) -> None:
+def test_ingest_takes_its_input_as_the_other_commands_do(starcat, stars, tmp_path):
     for text in (stars, f"sao={stars}"):
         out = tmp_path / "out.parquet"
         assert starcat(["ingest", "sao", "--input", text, "-o", out]).code == 0
 
 
-def test_a_simulated_frame_is_identified(starcat: Run, frame: Path, small_artifact: Path) -> None:
+def test_a_simulated_frame_is_identified(starcat, frame, small_artifact):
     run = starcat(["identify", small_artifact, frame])
     assert run.code == 0
     assert fits(run.out)
@@ -364,7 +350,7 @@ def test_a_simulated_frame_is_identified(starcat: Run, frame: Path, small_artifa
     )
 
 
-def test_identify_as_json(starcat: Run, frame: Path, small_artifact: Path) -> None:
+def test_identify_as_json(starcat, frame, small_artifact):
     [answer] = json.loads(starcat(["identify", small_artifact, frame, "--json"]).out)
     assert list(answer) == [
         "frame", "status", "origin", "n_matched",
@@ -385,9 +371,7 @@ def test_identify_as_json(starcat: Run, frame: Path, small_artifact: Path) -> No
     assert all(value > 0.0 for value in np.diagonal(answer["covariance_arcsec2"]))
 
 
-def test_an_image_is_searched_identified_and_drawn(
-    starcat: Run, small_artifact: Path, tmp_path: Path
-) -> None:
+def test_an_image_is_searched_identified_and_drawn(starcat, small_artifact, tmp_path):
     image, picture = tmp_path / "frame.fits", tmp_path / "frame.png"
     assert starcat(["simulate", small_artifact, "-o", image, "--seed", "7"]).code == 0
     run = starcat(["identify", small_artifact, image, "--json", "--picture", picture])
@@ -399,9 +383,7 @@ def test_an_image_is_searched_identified_and_drawn(
     assert "--no-flip" in upside_down.err
 
 
-def test_many_frames_of_one_file(
-    starcat: Run, frame: Path, small_artifact: Path, tmp_path: Path
-) -> None:
+def test_many_frames_of_one_file(starcat, frame, small_artifact, tmp_path):
     rows = [line.split(",") for line in frame.read_text().splitlines()[1:]]
     pixels = [[float(x), float(y)] for x, y, _ in rows]
     frames = [
@@ -424,9 +406,7 @@ def test_many_frames_of_one_file(
     assert np.abs(one[0] - one[1]).max() < 1e-3
 
 
-def test_the_camera_of_a_file_is_used(
-    starcat: Run, frame: Path, small_artifact: Path, tmp_path: Path
-) -> None:
+def test_the_camera_of_a_file_is_used(starcat, frame, small_artifact, tmp_path):
     camera = tmp_path / "camera.toml"
     camera.write_text("width_px = 512\nheight_px = 512\nfov_x_deg = 40.0\n")
     arguments = ["identify", small_artifact, frame, "--json", "--camera", camera]
@@ -436,18 +416,14 @@ def test_the_camera_of_a_file_is_used(
 
 
 @pytest.mark.parametrize("method", list(METHODS))
-def test_every_method_is_there(
-    starcat: Run, frame: Path, small_artifact: Path, method: str
-) -> None:
+def test_every_method_is_there(starcat, frame, small_artifact, method):
     run = starcat(["identify", small_artifact, frame, "--json", "--method", method])
     assert run.code == 0
     assert json.loads(run.out)[0]["status"] in {"identified", "no_match"}
     assert re.search(rf"^{method} +\w", starcat(["methods"]).out, re.MULTILINE)
 
 
-def test_a_frame_of_no_stars_is_not_identified(
-    starcat: Run, small_artifact: Path, tmp_path: Path
-) -> None:
+def test_a_frame_of_no_stars_is_not_identified(starcat, small_artifact, tmp_path):
     frame = tmp_path / "frame.csv"
     places = ["10,10", "500,20", "30,480", "250,250", "400,333"]
     frame.write_text("\n".join(["x_px,y_px", *places]) + "\n")
@@ -460,9 +436,7 @@ def test_a_frame_of_no_stars_is_not_identified(
     assert [star["star"] for star in answer["stars"]] == [None] * 5
 
 
-def test_centroid_files_of_spreadsheets_are_read(
-    starcat: Run, frame: Path, small_artifact: Path
-) -> None:
+def test_centroid_files_of_spreadsheets_are_read(starcat, frame, small_artifact):
     before = without_time(starcat(["identify", small_artifact, frame, "--json"]).out)
     lines = frame.read_text().splitlines()
     rows = [",".join(["flux", *lines[0].split(",")]), *(f"1,{line}" for line in lines[1:])]
@@ -476,7 +450,7 @@ def without_time(text: str) -> list[dict[str, Any]]:
     return [{**answer, "time_s": None} for answer in json.loads(text)]
 
 
-def test_selftest(starcat: Run, small_artifact: Path) -> None:
+def test_selftest(starcat, small_artifact):
     arguments = ["selftest", small_artifact, "--frames", "20", "--seed", "3"]
     run = starcat(arguments)
     assert run.code == 0
@@ -490,12 +464,12 @@ def test_selftest(starcat: Run, small_artifact: Path) -> None:
     assert all(rate["wrong"] == 0 for rate in rates)
 
 
-def test_progress_is_drawn_for_terminals_only(starcat: Run, small_artifact: Path) -> None:
+def test_progress_is_drawn_for_terminals_only(starcat, small_artifact):
     run = starcat(["selftest", small_artifact, "--frames", "5"])
     assert run.err == ""
 
 
-def test_progress_is_drawn_on_a_terminal(small_artifact: Path) -> None:
+def test_progress_is_drawn_on_a_terminal(small_artifact):
     pty = pytest.importorskip("pty")
     import os
 
@@ -513,7 +487,7 @@ def test_progress_is_drawn_on_a_terminal(small_artifact: Path) -> None:
     assert "Simulated fields" in run.stdout.decode()
 
 
-def test_a_closed_pipe_is_no_traceback(small_artifact: Path) -> None:
+def test_a_closed_pipe_is_no_traceback(small_artifact):
     run = subprocess.Popen(
         [sys.executable, "-m", "starcat", "inspect", str(small_artifact), "--json"],
         stdout=subprocess.PIPE,

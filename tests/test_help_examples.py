@@ -90,7 +90,7 @@ def run_example(name: str, starcat: Run) -> Any:
 
 
 @pytest.mark.parametrize("name", [n for n in COMMANDS if n not in (*SLOW, *NETWORK, *LASTING)])
-def test_an_example_runs_as_printed(name: str, starcat: Run, here: Path) -> None:
+def test_an_example_runs_as_printed(name, starcat, here):
     if name == "crossmatch":
         table = ["ingest", "gaia", "-o", "gaia.parquet", "--read-limit-mag", "5"]
         assert starcat(table).code == 0
@@ -104,15 +104,13 @@ def test_an_example_runs_as_printed(name: str, starcat: Run, here: Path) -> None
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_the_examples_of_a_whole_build_run_as_printed(
-    starcat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_examples_of_a_whole_build_run_as_printed(starcat, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in SLOW:
         run = run_example(name, starcat)
         assert run.code == 0, run.err
 
 
-def test_what_is_not_run_is_known_and_still_there() -> None:
+def test_what_is_not_run_is_known_and_still_there():
     assert set(NETWORK) | set(SLOW) | set(LASTING) <= set(COMMANDS)
     assert examples()["fetch"].startswith("starcat fetch ")

@@ -8,6 +8,7 @@ import io
 import json
 import shutil
 import tomllib
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from starcat.artifact.other_catalogs import OUTCOMES, motion_problems
 from starcat.artifact.reader import Artifact, open_artifact
 from starcat.artifact.verify import verify_artifact
 from starcat.catalog.archives.gaia import embedded_sky
-from starcat.catalog.ingest import Ingested, ingest
+from starcat.catalog.ingest import Ingested
 from starcat.catalog.source import data_source
 from starcat.catalog.stars import floats_of, with_columns
 from starcat.catalog.verdict import Quality
@@ -132,11 +133,10 @@ def joined(artifact: Artifact) -> tuple[pa.Table, pa.Table]:
     return stars.filter(chosen), table.filter(chosen)
 
 
-def entries(table: pa.Table, inputs: dict[str, list[Path]]) -> pa.Table:
+def entries(table: pa.Table, ingested: Callable[[str, str], Ingested]) -> pa.Table:
     """The entries of the catalogs that the motions are of, by the order of the table."""
-    read = {
-        name: ingest(name, inputs[name], neighbours=False).stars for name in ("tycho2", "hipparcos")
-    }
+    files = {"tycho2": "tyc2.dat.gz", "hipparcos": "hip_main.dat.gz"}
+    read = {source: ingested(source, name).stars for source, name in files.items()}
     place = {
         (name, number): (name, row)
         for name, stars in read.items()
@@ -150,7 +150,7 @@ def entries(table: pa.Table, inputs: dict[str, list[Path]]) -> pa.Table:
 # Where the stars are -------------------------------------------------------------------------
 
 
-def test_stars_are_where_astropy_takes_them(artifact, inputs, sky):
+def test_stars_are_where_astropy_takes_them(artifact, ingested, sky):
     stars, table = joined(artifact)
     assert len(stars) > 1_500
     assert set(stars["epoch_jyear"].to_pylist()) == {2026.0}
@@ -158,7 +158,7 @@ def test_stars_are_where_astropy_takes_them(artifact, inputs, sky):
     assert set(before["epoch_jyear"].to_pylist()) == {2016.0}
     # The motions that the archives print for J2000 and J1991.25, as they are in 2016: that of
     # 61 Cygni has turned by 0.02 deg, which is 22 mas in ten years.
-    then = at(coordinates(entries(table, inputs)), 2016.0)
+    then = at(coordinates(entries(table, ingested)), 2016.0)
     there = at(coordinates(before, then), 2026.0)
     off = there.separation(coordinates(stars)).to_value(units.mas)
     assert off.max() < 1.0
@@ -167,11 +167,11 @@ def test_stars_are_where_astropy_takes_them(artifact, inputs, sky):
     assert way.max() > 9.0
 
 
-def test_fast_stars_are_where_hipparcos_has_them(artifact, inputs, excerpts):
+@pytest.mark.usefixtures("excerpts")
+def test_fast_stars_are_where_hipparcos_has_them(artifact, ingested):
     """Stars with a motion of Tycho-2 against Hipparcos, 35 years after its epoch."""
     stars, table = joined(artifact)
-    hipparcos = ingest("hipparcos", inputs["hipparcos"], neighbours=False).stars
-    now = at(coordinates(hipparcos), 2026.0)
+    now = at(coordinates(ingested("hipparcos", "hip_main.dat.gz").stars), 2026.0)
     fast = np.flatnonzero(
         (floats_of(table, "moved_arcsec") > 10.0 * FAST_MAS_YR / 1000.0)
         & (np.array(table["catalog"].to_pylist()) == "tycho2")

@@ -166,7 +166,7 @@ def test_the_command(copy, stars, starcat, capsys):
     assert [change["file"] for change in content["changes"]] == ["pairs.parquet"]
     capsys.readouterr()
     changes = (FileChange("pairs.parquet", "changed since it was built"),)
-    print_rebuilt(Rebuilt("a-1.0.0", 9, changes, (Change("numpy", "1", "2"),)), as_json=False)
+    print_rebuilt(Rebuilt("a-1.0.0", 9, changes, (Change("numpy", "1", "2"),)))
     printed = capsys.readouterr().out
     assert "a-1.0.0: 1 of 9 files differ" in printed
     assert "changed since it was built" in printed

@@ -179,7 +179,7 @@ def manifest_of(registry: Path) -> Path:
 # Round trips --------------------------------------------------------------------------------
 
 
-def test_a_folder_gives_back_every_byte(small_artifact: Path, registry: Path) -> None:
+def test_a_folder_gives_back_every_byte(small_artifact, registry):
     events: list[tuple[str, int, int | None]] = []
     pulled = pull_wanted(
         "small@1.0.0",
@@ -198,9 +198,7 @@ def test_a_folder_gives_back_every_byte(small_artifact: Path, registry: Path) ->
 
 
 @pytest.mark.parametrize("heeds_ranges", [True, False])
-def test_an_address_gives_back_every_byte(
-    small_artifact: Path, registry: Path, heeds_ranges: bool
-) -> None:
+def test_an_address_gives_back_every_byte(small_artifact, registry, heeds_ranges):
     with serving(registry, heeds_ranges=heeds_ranges) as server:
         pulled = pull("small@latest", server.url + "/")
         assert files_below(pulled.folder) == files_below(small_artifact)
@@ -211,9 +209,7 @@ def test_an_address_gives_back_every_byte(
     assert pin.registry == server.url
 
 
-def test_blobs_are_named_by_their_content_and_shared(
-    artifact_version: Version, registry: Path
-) -> None:
+def test_blobs_are_named_by_their_content_and_shared(artifact_version, registry):
     before = files_below(registry / "blobs")
     published = publish_artifact(artifact_version("1.0.1"), "registry")
     after = files_below(registry / "blobs")
@@ -225,7 +221,7 @@ def test_blobs_are_named_by_their_content_and_shared(
     assert published.new_bytes == sum(len(after[name]) for name in after.keys() - before.keys())
 
 
-def test_pulled_files_are_copies_that_can_only_be_read(registry: Path) -> None:
+def test_pulled_files_are_copies_that_can_only_be_read(registry):
     folder = pull("small", registry).folder
     for path in folder.rglob("*"):
         assert path.is_dir() or path.stat().st_nlink == 1
@@ -234,8 +230,8 @@ def test_pulled_files_are_copies_that_can_only_be_read(registry: Path) -> None:
 
 
 def test_an_artifact_of_the_builder_itself_in_two_versions(
-    tmp_path: Path, sao_lines: list[bytes], small_spec: str, starcat: Any
-) -> None:
+    tmp_path, sao_lines, small_spec, starcat
+):
     (tmp_path / "sao.dat").write_bytes(b"".join(sao_lines))
     for version in ("1.9.0", "1.10.0"):
         Path("spec.toml").write_text(small_spec.replace("1.0.0", version))
@@ -251,7 +247,7 @@ def test_an_artifact_of_the_builder_itself_in_two_versions(
     assert starcat(["verify", "out/small-1.10.0"]).code == 0
 
 
-def test_tables_fit(registry: Path, starcat: Any, artifact_version: Version) -> None:
+def test_tables_fit(registry, starcat, artifact_version):
     for arguments, outcome in (
         (["publish", artifact_version("1.0.1"), "registry"], "published: small-1.0.1 in registry"),
         (["publish", artifact_version("1.0.1"), "registry"], "unchanged: small-1.0.1 in registry"),
@@ -279,16 +275,14 @@ triples = st.tuples(*[st.integers(0, 10**17)] * 3)
 
 
 @given(st.lists(triples, min_size=1, unique=True))
-def test_latest_is_the_highest_version(versions: list[tuple[int, int, int]]) -> None:
+def test_latest_is_the_highest_version(versions):
     texts = [".".join(map(str, version)) for version in versions]
     releases = read_index(index_bytes(listed(text) for text in texts), "")
     assert [r.version for r in releases] == [".".join(map(str, v)) for v in sorted(versions)]
     assert choose(releases, "small", None, "").version == ".".join(map(str, max(versions)))
 
 
-def test_latest_is_not_the_newest_nor_the_last_of_the_alphabet(
-    artifact_version: Version, registry: Path
-) -> None:
+def test_latest_is_not_the_newest_nor_the_last_of_the_alphabet(artifact_version, registry):
     for version in ("1.10.0", "1.9.0", "1.9.10"):
         publish_artifact(artifact_version(version), "registry")
     assert pull("small@latest", registry).release.version == "1.10.0"
@@ -300,7 +294,7 @@ def test_latest_is_not_the_newest_nor_the_last_of_the_alphabet(
     ]
 
 
-def test_the_order_of_publishing_does_not_show(artifact_version: Version) -> None:
+def test_the_order_of_publishing_does_not_show(artifact_version):
     for folder, versions in (("a", ("1.0.1", "1.0.2")), ("b", ("1.0.2", "1.0.1"))):
         for version in versions:
             publish_artifact(artifact_version(version), folder)
@@ -312,17 +306,17 @@ def test_the_order_of_publishing_does_not_show(artifact_version: Version) -> Non
     ["", "@1.0.0", "small@", "small@1.0", "small@1.0.0-rc1", "small@01.0.0", "Small@1.0.0",
      "../small@1.0.0", "small@1.0.0\n", "small@../1", "small@1.0.0@latest", "small@１.0.0"],
 )  # fmt: skip
-def test_what_is_no_name_and_version(text: str) -> None:
+def test_what_is_no_name_and_version(text):
     with pytest.raises(ConfigError, match="is not NAME@VERSION"):
         parse_wanted(text)
 
 
-def test_names_and_versions() -> None:
+def test_names_and_versions():
     assert parse_wanted("gaia-12deg@1.10.0") == ("gaia-12deg", "1.10.0")
     assert parse_wanted("small@latest") == parse_wanted("small") == ("small", None)
 
 
-def test_what_a_registry_does_not_have(registry: Path, artifact_version: Version) -> None:
+def test_what_a_registry_does_not_have(registry, artifact_version):
     publish_artifact(artifact_version("1.9.0"), "registry")
     with pytest.raises(SourceMissing, match=r"no version 2\.0\.0 of small; it has 1\.0\.0, 1\.9"):
         pull("small@2.0.0", registry)
@@ -340,7 +334,7 @@ def test_what_a_registry_does_not_have(registry: Path, artifact_version: Version
 
 
 @pytest.mark.parametrize("text", ["ftp://host/registry", "file:///registry", "https://host/?a=b"])
-def test_other_kinds_of_address(text: str, small_artifact: Path) -> None:
+def test_other_kinds_of_address(text, small_artifact):
     with pytest.raises(ConfigError, match="expected a folder, or an address"):
         open_registry(text)
     with pytest.raises(ConfigError, match="expected a folder, or an address"):
@@ -367,7 +361,7 @@ def changed(artifact: Path, folder: Path) -> Path:
     return made
 
 
-def test_the_same_again_is_unchanged(small_artifact: Path, registry: Path) -> None:
+def test_the_same_again_is_unchanged(small_artifact, registry):
     times = {path: path.stat().st_mtime_ns for path in registry.rglob("*") if path.is_file()}
     again = publish_artifact(small_artifact, "registry")
     assert (again.outcome, again.new_blobs, again.new_bytes) == ("unchanged", 0, 0)
@@ -375,7 +369,7 @@ def test_the_same_again_is_unchanged(small_artifact: Path, registry: Path) -> No
     assert all(path.stat().st_mtime_ns == time for path, time in times.items())
 
 
-def test_a_version_never_changes(small_artifact: Path, registry: Path, tmp_path: Path) -> None:
+def test_a_version_never_changes(small_artifact, registry, tmp_path):
     other = changed(small_artifact, tmp_path / "other")
     before = files_below(registry)
     with pytest.raises(OutputError, match=r"has small-1.0.0 already, with another content"):
@@ -384,8 +378,8 @@ def test_a_version_never_changes(small_artifact: Path, registry: Path, tmp_path:
 
 
 def test_a_version_whose_name_is_taken_at_the_last_moment(
-    small_artifact: Path, registry: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    small_artifact, registry, tmp_path, monkeypatch
+):
     other = changed(small_artifact, tmp_path / "other")
     record = registry / "versions/small/1.0.0.json"
     content = record.read_bytes()
@@ -402,9 +396,7 @@ def test_a_version_whose_name_is_taken_at_the_last_moment(
     assert record.read_bytes() == content
 
 
-def test_a_file_system_without_hard_links(
-    small_artifact: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_system_without_hard_links(small_artifact, tmp_path, monkeypatch):
     def refuse(*_: object) -> None:
         raise OSError(errno.EPERM, "Operation not permitted")
 
@@ -417,8 +409,8 @@ def test_a_file_system_without_hard_links(
 
 
 def test_an_index_written_late_has_what_came_meanwhile(
-    small_artifact: Path, artifact_version: Version, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    small_artifact, artifact_version, monkeypatch
+):
     """Another publisher, on a file system without locks, comes and goes in the middle."""
 
     def no_locks(*_: object) -> None:
@@ -435,9 +427,7 @@ def test_an_index_written_late_has_what_came_meanwhile(
     assert [r.version for r in open_registry("registry").releases()] == ["1.0.0", "1.0.1"]
 
 
-def test_a_different_artifact_at_the_final_name_stays(
-    small_artifact: Path, registry: Path, tmp_path: Path
-) -> None:
+def test_a_different_artifact_at_the_final_name_stays(small_artifact, registry, tmp_path):
     other = changed(small_artifact, tmp_path / "out")
     before = files_below(tmp_path / "out")
     with pytest.raises(OutputError, match=r"already exists and is not small-1.0.0 of the registry"):
@@ -452,7 +442,7 @@ def test_a_different_artifact_at_the_final_name_stays(
     assert (other / "pairs.parquet").read_bytes() == b"damaged"
 
 
-def test_only_whole_artifacts_are_published(small_artifact: Path, tmp_path: Path) -> None:
+def test_only_whole_artifacts_are_published(small_artifact, tmp_path):
     copy = Path(shutil.copytree(small_artifact, tmp_path / "copy", copy_function=shutil.copyfile))
     (copy / "pairs.parquet").write_bytes(b"damaged")
     with pytest.raises(ProductError, match=r"pairs.parquet"):
@@ -461,13 +451,13 @@ def test_only_whole_artifacts_are_published(small_artifact: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize("version", ["01.0.0", "1.00.0"])
-def test_versions_that_are_not_semantic(artifact_version: Version, version: str) -> None:
+def test_versions_that_are_not_semantic(artifact_version, version):
     with pytest.raises(ProductError, match=f"version '{version}': cannot be published"):
         publish_artifact(artifact_version(version), "registry")
     assert not Path("registry").exists()
 
 
-def test_links_are_not_published(small_artifact: Path, tmp_path: Path) -> None:
+def test_links_are_not_published(small_artifact, tmp_path):
     copy = Path(shutil.copytree(small_artifact, tmp_path / "copy", copy_function=shutil.copyfile))
     (copy / "pairs.parquet").unlink()
     (copy / "pairs.parquet").symlink_to(small_artifact / "pairs.parquet")
@@ -475,7 +465,7 @@ def test_links_are_not_published(small_artifact: Path, tmp_path: Path) -> None:
         publish_artifact(copy, "registry")
 
 
-def test_a_folder_with_other_things_is_no_registry(small_artifact: Path, tmp_path: Path) -> None:
+def test_a_folder_with_other_things_is_no_registry(small_artifact, tmp_path):
     write(tmp_path / "home" / "thesis.tex", "text")
     with pytest.raises(OutputError, match="neither empty nor a registry"):
         publish_artifact(small_artifact, "home")
@@ -487,9 +477,7 @@ def test_a_folder_with_other_things_is_no_registry(small_artifact: Path, tmp_pat
 # The lock file ------------------------------------------------------------------------------
 
 
-def test_the_lock_file_is_sorted_and_the_same_every_time(
-    registry: Path, artifact_version: Version
-) -> None:
+def test_the_lock_file_is_sorted_and_the_same_every_time(registry, artifact_version):
     publish_artifact(artifact_version("1.0.1"), "registry")
     pull("small@1.0.0", registry)
     first = Path("starcat.lock").read_bytes()
@@ -506,9 +494,7 @@ def test_the_lock_file_is_sorted_and_the_same_every_time(
     assert entry["manifest"]["sha256"] == manifest_of(registry).name != sha256(manifest)
 
 
-def test_locked_pulls_what_is_pinned_whatever_the_index_says(
-    registry: Path, artifact_version: Version
-) -> None:
+def test_locked_pulls_what_is_pinned_whatever_the_index_says(registry, artifact_version):
     pull("small@1.0.0", registry)
     publish_artifact(artifact_version("1.0.1"), "registry")
     write(registry / "index.json", "damaged")
@@ -524,9 +510,7 @@ def test_locked_pulls_what_is_pinned_whatever_the_index_says(
     assert lock.read_bytes() == before
 
 
-def test_locked_works_from_another_folder_and_another_registry(
-    registry: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_locked_works_from_another_folder_and_another_registry(registry, tmp_path, monkeypatch):
     lock = Path("project/starcat.lock")
     pull_wanted("small", "registry", Path("out"), lock)
     assert read_pins(lock)["small"].registry == "../registry"
@@ -541,9 +525,7 @@ def test_locked_works_from_another_folder_and_another_registry(
     assert read_pins(lock)["small"].registry == str(tmp_path / "moved")
 
 
-def test_without_a_registry_the_pinned_one_is_asked(
-    registry: Path, artifact_version: Version
-) -> None:
+def test_without_a_registry_the_pinned_one_is_asked(registry, artifact_version):
     lock = Path("starcat.lock")
     with pytest.raises(ConfigError, match=r"starcat.lock does not pin small.*--registry"):
         pull_wanted("small", None, Path("out"), lock)
@@ -553,9 +535,7 @@ def test_without_a_registry_the_pinned_one_is_asked(
     assert read_pins(lock)["small"].version == "1.0.1"
 
 
-def test_a_registry_that_was_made_anew_is_noticed(
-    small_artifact: Path, registry: Path, tmp_path: Path
-) -> None:
+def test_a_registry_that_was_made_anew_is_noticed(small_artifact, registry, tmp_path):
     pull("small", registry)
     shutil.rmtree(registry)
     publish_artifact(changed(small_artifact, tmp_path / "other"), "registry")
@@ -574,7 +554,7 @@ def test_a_registry_that_was_made_anew_is_noticed(
         ('{"format": "starcat-lock", "lock_version": "1.0.0"}', "artifacts: Field required"),
     ],
 )
-def test_damaged_lock_files(registry: Path, text: str, message: str) -> None:
+def test_damaged_lock_files(registry, text, message):
     Path("starcat.lock").write_text(text)
     for call in (
         lambda: pull("small", registry),
@@ -586,7 +566,7 @@ def test_damaged_lock_files(registry: Path, text: str, message: str) -> None:
     assert not Path("out").exists()
 
 
-def test_lock_file_of_a_newer_starcat_and_an_empty_one(registry: Path) -> None:
+def test_lock_file_of_a_newer_starcat_and_an_empty_one(registry):
     newer = {"format": "starcat-lock", "lock_version": "2.0.0", "pins": []}
     Path("starcat.lock").write_text(json.dumps(newer))
     with pytest.raises(SchemaVersionError, match=r"lock version 2\.0\.0"):
@@ -595,7 +575,7 @@ def test_lock_file_of_a_newer_starcat_and_an_empty_one(registry: Path) -> None:
         pull_pinned(None, None, Path("out"), Path("none.lock"))
 
 
-def test_a_lock_file_below_a_file(registry: Path) -> None:
+def test_a_lock_file_below_a_file(registry):
     Path("file").write_text("")
     with pytest.raises(OutputError, match="choose another file with --lock"):
         pull_wanted("small", "registry", Path("out"), Path("file/starcat.lock"))
@@ -714,7 +694,7 @@ DAMAGE: dict[str, tuple[Damage, str]] = {
 
 
 @pytest.mark.parametrize("kind", DAMAGE)
-def test_a_damaged_folder_is_refused_and_nothing_is_left(kind: str, registry: Path) -> None:
+def test_a_damaged_folder_is_refused_and_nothing_is_left(kind, registry):
     damage, message = DAMAGE[kind]
     damage(registry)
     before = files_below(Path())
@@ -725,7 +705,7 @@ def test_a_damaged_folder_is_refused_and_nothing_is_left(kind: str, registry: Pa
 
 
 @pytest.mark.parametrize("kind", DAMAGE)
-def test_a_damaged_address_is_refused(kind: str, registry: Path, tmp_path: Path) -> None:
+def test_a_damaged_address_is_refused(kind, registry, tmp_path):
     damage, message = DAMAGE[kind]
     damage(registry)
     with serving(registry) as server, pytest.raises((ProductError, DownloadError)) as caught:
@@ -745,7 +725,7 @@ def test_a_damaged_address_is_refused(kind: str, registry: Path, tmp_path: Path)
      "./x", ".hidden", "report/.x", "a\\..\\x", "C:x", "x\n", "x\0", "manifest.json",
      "report/index.html/x", "~/x", "-x", "é", "x" * 200, "a/" * 20 + "x"],
 )  # fmt: skip
-def test_file_names_that_lead_out(registry: Path, name: str) -> None:
+def test_file_names_that_lead_out(registry, name):
     add_file(registry, name)
     before = files_below(Path())
     with pytest.raises(ProductError, match="no plain path within an artifact; nothing was"):
@@ -755,7 +735,7 @@ def test_file_names_that_lead_out(registry: Path, name: str) -> None:
 
 
 @given(st.text())
-def test_whatever_the_name_it_stays_inside(name: str) -> None:
+def test_whatever_the_name_it_stays_inside(name):
     facts = {"sha256": "0" * 64, "bytes": 0}
     try:
         (found,) = files_of({"files": {name: facts}}, "x")
@@ -767,7 +747,7 @@ def test_whatever_the_name_it_stays_inside(name: str) -> None:
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
-def test_a_blob_that_is_no_file_is_refused(registry: Path, make: Callable[[Path], None]) -> None:
+def test_a_blob_that_is_no_file_is_refused(registry, make):
     blob = blob_of(registry)
     blob.unlink()
     make(blob)
@@ -775,15 +755,13 @@ def test_a_blob_that_is_no_file_is_refused(registry: Path, make: Callable[[Path]
         pull("small", registry)
 
 
-def test_a_blob_that_is_a_link_is_refused(registry: Path) -> None:
+def test_a_blob_that_is_a_link_is_refused(registry):
     link_to_copy(blob_of(registry))
     with pytest.raises(ProductError, match="a symbolic link; expected a file"):
         pull("small", registry)
 
 
-def test_links_in_the_output_folder_are_not_followed(
-    small_artifact: Path, registry: Path, tmp_path: Path
-) -> None:
+def test_links_in_the_output_folder_are_not_followed(small_artifact, registry, tmp_path):
     digest = manifest_of(registry).name[:12]
     outside = tmp_path / "outside"
     outside.mkdir()
@@ -796,7 +774,7 @@ def test_links_in_the_output_folder_are_not_followed(
         shutil.rmtree("out")
 
 
-def test_a_damaged_registry_is_not_built_upon(registry: Path, artifact_version: Version) -> None:
+def test_a_damaged_registry_is_not_built_upon(registry, artifact_version):
     blob = blob_of(registry)
     change_byte(blob)
     with pytest.raises(ProductError, match="remove that blob and publish again"):
@@ -807,7 +785,7 @@ def test_a_damaged_registry_is_not_built_upon(registry: Path, artifact_version: 
     assert pull("small@1.0.0", registry).outcome == "pulled"
 
 
-def test_a_damaged_release_file_is_refused(registry: Path, artifact_version: Version) -> None:
+def test_a_damaged_release_file_is_refused(registry, artifact_version):
     record = registry / "versions/small/1.0.0.json"
     good = record.read_bytes()
     write(record.with_name("1.0.7.json"), good)
@@ -819,7 +797,7 @@ def test_a_damaged_release_file_is_refused(registry: Path, artifact_version: Ver
         publish_artifact(artifact_version("1.0.1"), "registry")
 
 
-def test_a_lost_index_is_made_again(registry: Path, small_artifact: Path) -> None:
+def test_a_lost_index_is_made_again(registry, small_artifact):
     index = (registry / "index.json").read_bytes()
     for damage in (lambda: (registry / "index.json").unlink(), lambda: first(name="x")(registry)):
         damage()
@@ -827,7 +805,7 @@ def test_a_lost_index_is_made_again(registry: Path, small_artifact: Path) -> Non
         assert (registry / "index.json").read_bytes() == index
 
 
-def test_a_registry_of_a_newer_starcat(registry: Path, published: Path) -> None:
+def test_a_registry_of_a_newer_starcat(registry, published):
     edit_index(registry, lambda index: index.update(registry_version="2.0.0", releases={}))
     with pytest.raises(SchemaVersionError, match=r"registry version 2\.0\.0; this starcat reads"):
         pull("small", registry)
@@ -840,9 +818,7 @@ def test_a_registry_of_a_newer_starcat(registry: Path, published: Path) -> None:
 
 
 @pytest.mark.parametrize("heeds_ranges", [True, False])
-def test_an_interrupted_download_goes_on(
-    small_artifact: Path, registry: Path, heeds_ranges: bool
-) -> None:
+def test_an_interrupted_download_goes_on(small_artifact, registry, heeds_ranges):
     blob = blob_of(registry, "database.h5")
     path, size = f"/{blob.relative_to(registry).as_posix()}", blob.stat().st_size
     with serving(registry, heeds_ranges=heeds_ranges) as server:
@@ -860,7 +836,7 @@ def test_an_interrupted_download_goes_on(
     assert {path.name for path in Path("out").iterdir()} == {"small-1.0.0"}
 
 
-def test_a_killed_download_goes_on(small_artifact: Path, registry: Path) -> None:
+def test_a_killed_download_goes_on(small_artifact, registry):
     blob = blob_of(registry, "database.h5")
     path, size = f"/{blob.relative_to(registry).as_posix()}", blob.stat().st_size
     part = Path("out") / f".small-1.0.0.{manifest_of(registry).name[:12]}.partial"
@@ -892,7 +868,7 @@ def test_a_killed_download_goes_on(small_artifact: Path, registry: Path) -> None
     assert files_below(pulled.folder) == files_below(small_artifact)
 
 
-def test_a_part_is_continued_from_another_address(small_artifact: Path, registry: Path) -> None:
+def test_a_part_is_continued_from_another_address(small_artifact, registry):
     blob = blob_of(registry, "database.h5")
     path, size = f"/{blob.relative_to(registry).as_posix()}", blob.stat().st_size
     with serving(registry) as server, serving(registry) as mirror:
@@ -906,9 +882,7 @@ def test_a_part_is_continued_from_another_address(small_artifact: Path, registry
 
 @pytest.mark.parametrize("over_http", [True, False])
 @pytest.mark.parametrize("length", [1000, None, 1 << 26])
-def test_a_wrong_part_is_not_built_upon(
-    small_artifact: Path, registry: Path, over_http: bool, length: int | None
-) -> None:
+def test_a_wrong_part_is_not_built_upon(small_artifact, registry, over_http, length):
     blob = blob_of(registry, "database.h5")
     place = Path("out") / f".small-1.0.0.{manifest_of(registry).name[:12]}.partial"
     length = blob.stat().st_size if length is None else length
@@ -920,7 +894,7 @@ def test_a_wrong_part_is_not_built_upon(
     assert files_below(pulled.folder) == files_below(small_artifact)
 
 
-def test_a_server_that_sends_more_or_other_than_it_should(registry: Path) -> None:
+def test_a_server_that_sends_more_or_other_than_it_should(registry):
     blob = blob_of(registry)
     size = blob.stat().st_size
     opened = open_registry("http://127.0.0.1:9", QUICK)
@@ -947,9 +921,7 @@ def limited(most: int, call: Callable[[], object]) -> None:
 
 
 @pytest.mark.parametrize("over_http", [True, False])
-def test_a_full_disk_ends_a_pull_which_goes_on_later(
-    small_artifact: Path, registry: Path, over_http: bool
-) -> None:
+def test_a_full_disk_ends_a_pull_which_goes_on_later(small_artifact, registry, over_http):
     with serving(registry) as server:
         address = server.url if over_http else registry
         limited(1_000_000, lambda: pull("small", address))
@@ -960,7 +932,7 @@ def test_a_full_disk_ends_a_pull_which_goes_on_later(
         assert any(start == 1_000_000 for _, start, _ in server.sent)
 
 
-def test_a_full_disk_ends_a_publication_which_goes_on_later(small_artifact: Path) -> None:
+def test_a_full_disk_ends_a_publication_which_goes_on_later(small_artifact):
     limited(1_000_000, lambda: publish_artifact(small_artifact, "registry"))
     there = files_below(Path("registry"))
     assert "index.json" not in there
@@ -973,7 +945,7 @@ def test_a_full_disk_ends_a_publication_which_goes_on_later(small_artifact: Path
     assert [*Path("registry/.incoming").iterdir()] == []
 
 
-def test_a_registry_that_may_only_be_read(registry: Path) -> None:
+def test_a_registry_that_may_only_be_read(registry):
     for folder in [registry, *registry.rglob("*")]:
         folder.chmod(0o555 if folder.is_dir() else 0o444)
     try:
@@ -983,7 +955,7 @@ def test_a_registry_that_may_only_be_read(registry: Path) -> None:
             folder.chmod(0o755)
 
 
-def test_output_below_a_file(registry: Path) -> None:
+def test_output_below_a_file(registry):
     Path("file").write_text("")
     with pytest.raises(OutputError, match="file: writing failed"):
         pull("small", registry, "file")

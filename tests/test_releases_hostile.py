@@ -15,7 +15,6 @@ from collections import namedtuple
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -110,7 +109,7 @@ leaves_sockets = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExce
 
 @leaves_sockets
 @pytest.mark.parametrize("answer", ANSWERS)
-def test_nonsense_of_a_server_is_an_error_of_starcat(answer: str, tmp_path: Path) -> None:
+def test_nonsense_of_a_server_is_an_error_of_starcat(answer, tmp_path):
     with answering(ANSWERS[answer]) as address, pytest.raises(StarcatError) as caught:
         open_registry(address, ONCE).releases()
     text = str(caught.value)
@@ -121,7 +120,7 @@ def test_nonsense_of_a_server_is_an_error_of_starcat(answer: str, tmp_path: Path
 
 @leaves_sockets
 @pytest.mark.parametrize("answer", ANSWERS)
-def test_nonsense_in_place_of_a_blob_is_an_error_of_starcat(answer: str, tmp_path: Path) -> None:
+def test_nonsense_in_place_of_a_blob_is_an_error_of_starcat(answer, tmp_path):
     with answering(ANSWERS[answer]) as address, pytest.raises(StarcatError):
         open_registry(address, ONCE).bring(
             Blob(sha256="0" * 64, bytes=10), tmp_path / "blob", lambda *_: None
@@ -129,7 +128,7 @@ def test_nonsense_in_place_of_a_blob_is_an_error_of_starcat(answer: str, tmp_pat
     gc.collect()
 
 
-def test_nonsense_where_a_part_goes_on(tmp_path: Path) -> None:
+def test_nonsense_where_a_part_goes_on(tmp_path):
     part_of(tmp_path / "blob").write_bytes(b"12345")
     ranges = ["bytes 5-9/" + "9" * 5000, "bytes ٥-9/10", "bytes 5-9/10/11", "bytes */*", "x"]
     for text in ranges:
@@ -143,7 +142,7 @@ def test_nonsense_where_a_part_goes_on(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("fixed", [None, 100])
-def test_a_body_without_end_is_not_read_on(fixed: int | None, tmp_path: Path) -> None:
+def test_a_body_without_end_is_not_read_on(fixed, tmp_path):
     endless = head() + b"x" * (1 << 22)
     options = DownloadOptions(retries=0, fixed_bytes=fixed, most_bytes=1 << 20)
     with answering(endless) as address, pytest.raises(DownloadError, match="longer than"):
@@ -163,7 +162,7 @@ def test_a_body_without_end_is_not_read_on(fixed: int | None, tmp_path: Path) ->
         "https:///x",
     ],
 )
-def test_addresses_that_are_none(address: str) -> None:
+def test_addresses_that_are_none(address):
     with pytest.raises(ConfigError, match="expected a folder, or an address"):
         open_registry(address)
 
@@ -204,7 +203,7 @@ def put_manifest(registry: Path, data: bytes, declared: int | None = None) -> No
     (registry / "index.json").write_bytes(json_bytes(index))
 
 
-def test_more_than_the_disk_has_room_for_is_not_begun(registry: Path) -> None:
+def test_more_than_the_disk_has_room_for_is_not_begun(registry):
     declare(registry, 10**15)
     with pytest.raises(
         OutputError, match=r"1,000,000,00\d,\d+,\d+ bytes are still to come, and out"
@@ -213,9 +212,7 @@ def test_more_than_the_disk_has_room_for_is_not_begun(registry: Path) -> None:
     assert not list(Path("out").rglob("database.h5*"))
 
 
-def test_what_is_there_already_needs_no_room(
-    registry: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_there_already_needs_no_room(registry, monkeypatch):
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(0, 0, 1000))
     with pytest.raises(OutputError, match="has room for 1,000;"):
@@ -230,7 +227,7 @@ def test_what_is_there_already_needs_no_room(
     assert pull(registry).name == "small-1.0.0"
 
 
-def test_the_user_says_how_much(registry: Path, starcat: Any) -> None:
+def test_the_user_says_how_much(registry, starcat):
     ran = starcat(["pull", "small", "--registry", "registry", "-o", "out", "--max-bytes", 1000])
     assert ran.code == 1
     assert "bytes; --max-bytes allows 1,000. Allow more if you trust the registry" in ran.err
@@ -244,13 +241,13 @@ def test_the_user_says_how_much(registry: Path, starcat: Any) -> None:
         pull_pinned(None, None, Path("other"), Path("starcat.lock"), max_bytes=1000)
 
 
-def test_a_manifest_too_large_to_be_one_is_not_brought(registry: Path) -> None:
+def test_a_manifest_too_large_to_be_one_is_not_brought(registry):
     put_manifest(registry, b"{}", MAX_MANIFEST_BYTES + 1)
     with pytest.raises(ProductError, match="a manifest of 67,108,865 bytes"):
         pull(registry)
 
 
-def test_an_index_too_large_to_be_one_is_not_read(registry: Path) -> None:
+def test_an_index_too_large_to_be_one_is_not_read(registry):
     os.truncate(registry / "index.json", MAX_INDEX_BYTES + 1)
     with pytest.raises(ProductError, match="longer than"):
         FolderRegistry(registry).releases()
@@ -273,7 +270,7 @@ def test_an_index_too_large_to_be_one_is_not_read(registry: Path) -> None:
         "9" * 19 + ".0.0",
     ],
 )
-def test_a_spec_and_a_registry_refuse_the_same_versions(version: str, small_spec: str) -> None:
+def test_a_spec_and_a_registry_refuse_the_same_versions(version, small_spec):
     content = tomllib.loads(small_spec) | {"version": version}
     with pytest.raises(ConfigError, match="version"):
         spec_from_dict(content, "spec.toml")
@@ -282,7 +279,7 @@ def test_a_spec_and_a_registry_refuse_the_same_versions(version: str, small_spec
 
 
 @pytest.mark.parametrize("version", ["0.0.0", "1.10.0", "10.20.30", "9" * 18 + ".0.0"])
-def test_a_spec_and_a_registry_take_the_same_versions(version: str, small_spec: str) -> None:
+def test_a_spec_and_a_registry_take_the_same_versions(version, small_spec):
     content = tomllib.loads(small_spec) | {"version": version}
     assert spec_from_dict(content, "spec.toml").version == version
     assert parse_wanted(f"small@{version}") == ("small", version)
@@ -307,7 +304,7 @@ print(pull_wanted("small", "registry", Path("out"), Path("starcat.lock")).outcom
 """
 
 
-def test_publish_and_pull_without_what_posix_has(small_artifact: Path, tmp_path: Path) -> None:
+def test_publish_and_pull_without_what_posix_has(small_artifact, tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", WITHOUT_POSIX, str(small_artifact)],
         cwd=tmp_path,
@@ -320,9 +317,7 @@ def test_publish_and_pull_without_what_posix_has(small_artifact: Path, tmp_path:
     assert (tmp_path / "starcat.lock").is_file()
 
 
-def test_links_are_refused_where_the_system_cannot_refuse_them(
-    registry: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_links_are_refused_where_the_system_cannot_refuse_them(registry, monkeypatch):
     monkeypatch.setattr(files, "_WITHOUT_LINKS", 0)
     blob = max(registry.glob("blobs/sha256/*/*"), key=lambda path: path.stat().st_size)
     blob.rename("elsewhere")
@@ -331,7 +326,7 @@ def test_links_are_refused_where_the_system_cannot_refuse_them(
         pull(registry)
 
 
-def test_a_file_that_grows_is_not_copied_on(tmp_path: Path) -> None:
+def test_a_file_that_grows_is_not_copied_on(tmp_path):
     source, part = tmp_path / "source", tmp_path / "part"
     source.write_bytes(b"x" * 100)
     blob = Blob(sha256=file_sha256(source), bytes=100)

@@ -312,18 +312,14 @@ def _rounds(
 
 
 @pytest.mark.slow
-def test_8_rounds_with_random_kills(
-    workers: Workers, artifact_version: Version, tmp_path: Path
-) -> None:
+def test_8_rounds_with_random_kills(workers, artifact_version, tmp_path):
     kills = publish_and_pull(8, 8, workers, artifact_version, tmp_path)
     assert kills.hits >= 2, kills
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_50_rounds_with_random_kills(
-    workers: Workers, artifact_version: Version, tmp_path: Path
-) -> None:
+def test_50_rounds_with_random_kills(workers, artifact_version, tmp_path):
     kills = publish_and_pull(50, 50, workers, artifact_version, tmp_path)
     assert kills.hits >= 12, kills
 
@@ -344,9 +340,7 @@ def some_steps(folder: Path, run: Callable[[int], int], points: int) -> list[int
 
 
 @pytest.mark.parametrize("points", POINTS)
-def test_a_publisher_killed_between_any_two_steps(
-    workers: Workers, artifact_version: Version, tmp_path: Path, points: int
-) -> None:
+def test_a_publisher_killed_between_any_two_steps(workers, artifact_version, tmp_path, points):
     before, artifact = str(artifact_version("1.0.1")), str(artifact_version("1.0.2"))
     count = str(tmp_path / "steps")
     workers.run(publish=before, registry=str(tmp_path / "clean"))
@@ -369,9 +363,7 @@ def test_a_publisher_killed_between_any_two_steps(
 
 
 @pytest.mark.parametrize("points", POINTS)
-def test_a_pull_killed_between_any_two_steps(
-    workers: Workers, artifact_version: Version, tmp_path: Path, points: int
-) -> None:
+def test_a_pull_killed_between_any_two_steps(workers, artifact_version, tmp_path, points):
     artifact, output, count = artifact_version("1.0.1"), tmp_path / "out", str(tmp_path / "steps")
     order = {"pull": "small", "registry": str(tmp_path / "registry"), "output": str(output)}
     workers.run(publish=str(artifact), registry=order["registry"])
@@ -396,9 +388,7 @@ def test_a_pull_killed_between_any_two_steps(
 
 
 @pytest.mark.parametrize("without_locks", [False, True])
-def test_publishers_at_once_lose_nothing(
-    workers: Workers, artifact_version: Version, tmp_path: Path, without_locks: bool
-) -> None:
+def test_publishers_at_once_lose_nothing(workers, artifact_version, tmp_path, without_locks):
     keys = {"registry": str(tmp_path / "registry"), "without_locks": without_locks}
     artifacts = [artifact_version(f"2.0.{k}") for k in range(4)]
     pids = [workers.start(publish=str(a), **keys) for a in artifacts for _ in range(2)]
@@ -410,9 +400,7 @@ def test_publishers_at_once_lose_nothing(
     assert [*(tmp_path / "registry/.incoming").iterdir()] == []
 
 
-def test_publishers_at_once_of_which_some_are_killed(
-    workers: Workers, artifact_version: Version, tmp_path: Path
-) -> None:
+def test_publishers_at_once_of_which_some_are_killed(workers, artifact_version, tmp_path):
     registry, dice = str(tmp_path / "registry"), random.Random(3)
     for k in range(4):
         mine, others = artifact_version(f"3.{k}.0"), artifact_version(f"3.{k}.1")
@@ -424,9 +412,7 @@ def test_publishers_at_once_of_which_some_are_killed(
         assert {f"small@3.{k}.0", f"small@3.{k}.1"} <= there
 
 
-def test_pulls_at_once_into_one_folder(
-    workers: Workers, artifact_version: Version, tmp_path: Path
-) -> None:
+def test_pulls_at_once_into_one_folder(workers, artifact_version, tmp_path):
     registry, output = str(tmp_path / "registry"), tmp_path / "out"
     artifact = artifact_version("2.0.0")
     workers.run(publish=str(artifact), registry=registry)
@@ -440,9 +426,7 @@ def test_pulls_at_once_into_one_folder(
     assert {path.name for path in output.iterdir()} == {artifact.name}
 
 
-def test_pins_of_pulls_at_once_are_all_kept(
-    workers: Workers, artifact_version: Version, tmp_path: Path
-) -> None:
+def test_pins_of_pulls_at_once_are_all_kept(workers, artifact_version, tmp_path):
     registry = tmp_path / "registry"
     workers.run(publish=str(artifact_version("2.0.0")), registry=str(registry))
     order = {"pull": "small", "registry": str(registry), "output": str(tmp_path / "out")}

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -33,13 +35,28 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(("source", "name", "max_rows"), CASES)
-def test_a_store_holds_what_ingest_returns(source, name, max_rows, catalogs, tmp_path):
-    paths = [catalogs / name]
-    read = ingest(source, paths)
+@dataclass(frozen=True)
+class Made:
+    """A file of an archive, and the store that was made of it."""
+
+    source: str
+    path: Path
+    folder: Path
+    manifest: dict[str, Any]
+
+
+@pytest.fixture(scope="module", params=CASES, ids=lambda case: case[0])
+def made(request, catalogs, tmp_path_factory):
+    source, name, max_rows = request.param
+    folder, path = tmp_path_factory.mktemp(source) / "store", catalogs / name
     options = StoreOptions(max_partition_rows=max_rows)
-    made = ingest_to_store(source, paths, tmp_path / "store", options=options)
-    stars = stars_of(tmp_path / "store")
+    manifest = ingest_to_store(source, [path], folder, options=options).manifest
+    return Made(source, path, folder, manifest)
+
+
+def test_a_store_holds_what_ingest_returns(made, ingested):
+    read = ingested(made.source, made.path.name)
+    stars = stars_of(made.folder)
     assert stars.drop_columns(HEALPIX_COLUMN).equals(read.stars)
     assert stars[HEALPIX_COLUMN].to_numpy().tolist() == (
         healpix_29(stars["ra_deg"].to_numpy(), stars["dec_deg"].to_numpy()).tolist()
@@ -50,15 +67,10 @@ def test_a_store_holds_what_ingest_returns(source, name, max_rows, catalogs, tmp
 
 
 @pytest.mark.parametrize("limit", [None, pytest.param(9.0, marks=pytest.mark.slow)])
-@pytest.mark.parametrize(("source", "name", "max_rows"), CASES)
-def test_a_build_reads_from_a_store_what_it_reads_from_files(
-    source, name, max_rows, limit, catalogs, tmp_path
-):
-    paths = [catalogs / name]
-    options = StoreOptions(max_partition_rows=max_rows)
-    ingest_to_store(source, paths, tmp_path / "store", options=options)
+def test_a_build_reads_from_a_store_what_it_reads_from_files(made, limit):
     how = {"epoch_jyear": 2026.5, "read_limit_mag": limit}
-    files, store = ingest(source, paths, **how), read_catalog(source, [tmp_path / "store"], **how)
+    files = ingest(made.source, [made.path], **how)
+    store = read_catalog(made.source, [made.folder], **how)
     assert store.stars.equals(files.stars)
     assert store.rejected.equals(files.rejected)
     assert store.rejected_by_reason == files.rejected_by_reason
@@ -76,8 +88,8 @@ def test_a_store_with_a_limit_counts_what_it_left_out(catalogs, tmp_path):
     assert store.stars.equals(files.stars)
 
 
-def test_a_hats_catalog_of_others_is_read_with_what_it_has(catalogs, tmp_path):
-    read = ingest("hipparcos", [catalogs / "hip_main.dat.gz"])
+def test_a_hats_catalog_of_others_is_read_with_what_it_has(catalogs, ingested, tmp_path):
+    read = ingested("hipparcos", "hip_main.dat.gz")
     some = ["star_id", "ra_deg", "dec_deg", "epoch_jyear", "mag", "pm_ra_cosdec_mas_yr"]
     write_hats(read.stars.select([*some, "pm_dec_mas_yr"]), tmp_path / "theirs", "theirs", 500)
     how = {"epoch_jyear": 2026.0, "read_limit_mag": 8.0}

@@ -245,8 +245,13 @@ def test_another_file_is_not_taken_for_gcvs(tmp_path):
         read_amplitudes("gcvs", [tmp_path])
 
 
-def test_the_class_of_hipparcos_is_a_lower_bound(catalogs, has_excerpts):
-    table = read_amplitudes("hipparcos", [catalogs / "hip_main.dat.gz"])
+@pytest.fixture(scope="module")
+def of_hipparcos(catalogs: Path) -> AmplitudeTable:
+    return read_amplitudes("hipparcos", [catalogs / "hip_main.dat.gz"])
+
+
+def test_the_class_of_hipparcos_is_a_lower_bound(of_hipparcos, has_excerpts):
+    table = of_hipparcos
     assert table.kept == (9_928 if has_excerpts else 8_642)
     assert table.rejected == {"no_position": 5}
     codes = np.array([str(flag) for flag in table.flag])
@@ -290,10 +295,9 @@ def test_tycho1_into_tycho2(tmp_path, catalogs):
     assert found["variable_flag"].to_pylist() == [None, "tycho1:T48=V", None]
 
 
-def test_strongly_variable_naked_eye_stars_of_sao(catalogs, has_excerpts):
-    stars = ingest("sao", [catalogs / "sao.dat.gz"], neighbours=False).stars
-    table = read_amplitudes("hipparcos", [catalogs / "hip_main.dat.gz"])
-    found, count = join_amplitudes(stars, table)
+def test_strongly_variable_naked_eye_stars_of_sao(of_hipparcos, ingested, has_excerpts):
+    stars = ingested("sao", "sao.dat.gz").stars
+    found, count = join_amplitudes(stars, of_hipparcos)
     assert count == (9_916 if has_excerpts else 8_647)
     is_strong = (floats_of(found, "mag") <= 6.0) & (floats_of(found, "amplitude_mag") > 0.6)
     assert is_strong.sum() == (34 if has_excerpts else 30)

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from starcat.cli.builds import print_artifact, print_coverage_table
-from starcat.cli.console import print_json, print_table, progress_bars, say
-from starcat.cli.options import (
-    Input,
-    Json,
-    inputs_by_source,
+from starcat.cli.console import (
+    print_json,
+    print_table,
+    print_things,
+    progress_bars,
+    say,
+    show,
+    warn,
 )
+from starcat.cli.options import Input, Json, inputs_by_source
 from starcat.errors import ConfigError, ProductError
 
 if TYPE_CHECKING:
@@ -42,11 +46,13 @@ def inspect(
         from starcat.cli.exchange import print_image
         from starcat.onboard.reading import read_image
 
-        print_image(read_image(artifact), as_json=json)
+        image = read_image(artifact)
+        show(json, image.as_dict(), print_image, image)
         return
     from starcat.artifact.reader import open_artifact
 
-    print_artifact(open_artifact(artifact), as_json=json)
+    opened = open_artifact(artifact)
+    show(json, opened.manifest, print_artifact, opened)
 
 
 @app.command()
@@ -92,7 +98,7 @@ def verify(
         from starcat.artifact.verify import verify_artifact
 
         found = verify_artifact(artifact)
-    print_verification(found, as_json=json)
+    show(json, found.as_dict(), print_verification, found)
     if found.findings:
         raise typer.Exit(ProductError.exit_code)
 
@@ -111,7 +117,8 @@ def diff(
     from starcat.artifact.reader import open_artifact
 
     found = diff_artifacts(open_artifact(a), open_artifact(b))
-    print_difference(found, (a.resolve().name, b.resolve().name), as_json=json)
+    names = {"a": a.resolve().name, "b": b.resolve().name}
+    show(json, {**names, **found.as_dict()}, print_difference, found, *names.values())
 
 
 @app.command()
@@ -134,7 +141,7 @@ def rebuild(
     given = inputs_by_source(inputs)
     with progress_bars() as progress:
         rebuilt = build_again(artifact, given, output, progress)
-    print_rebuilt(rebuilt, as_json=json)
+    show(json, rebuilt.as_dict(), print_rebuilt, rebuilt)
     if not rebuilt.is_identical:
         raise typer.Exit(ProductError.exit_code)
 
@@ -143,38 +150,29 @@ MAX_STARS = 20
 """Stars of each kind that a table shows; JSON has all."""
 
 
-def print_verification(found: Verification, *, as_json: bool) -> None:
+def print_verification(found: Verification) -> None:
     """Print what a verification found."""
-    if as_json:
-        print_json(found.as_dict())
-        return
     name, count = found.folder.resolve().name, len(found.findings)
     outcome = f"{count} problem{'s' * (count != 1)}" if count else "sound"
     title = f"{name}: {outcome} ({found.checks} checks)"
     if not count:
         print_table("", (title,), [])
         return
-    rows = [(f.file, f.product, f.problem) for f in found.findings]
-    print_table(title, ("file", "product", "problem"), rows)
+    columns = {"file": "{0.file}", "product": "{0.product}", "problem": "{0.problem}"}
+    print_things(title, found.findings, columns)
 
 
-def print_difference(found: Difference, names: tuple[str, str], *, as_json: bool) -> None:
+def print_difference(found: Difference, name_a: str, name_b: str) -> None:
     """Print what differs between two artifacts."""
-    if as_json:
-        print_json({"a": names[0], "b": names[1], **found.as_dict()})
-        return
-    for title, changes in (
-        ("Spec", found.spec),
-        ("Sources", found.sources),
-        ("Software", found.software),
-    ):
-        _print_changes(title, changes)
+    _print_changes("Spec", found.spec)
+    _print_changes("Sources", found.sources)
+    _print_changes("Software", found.software)
     _print_one_sided(f"{len(found.came):,} stars came", found.came)
     _print_one_sided(f"{len(found.went):,} stars went", found.went)
     _print_moved(found.moved)
     print_table(
         "Products",
-        ("product", f"rows of {names[0]}", f"rows of {names[1]}", "content"),
+        ("product", f"rows of {name_a}", f"rows of {name_b}", "content"),
         [
             (p.product, _count(p.rows_a), _count(p.rows_b), "same" if p.is_same else "differs")
             for p in found.products
@@ -183,34 +181,37 @@ def print_difference(found: Difference, names: tuple[str, str], *, as_json: bool
     )
 
 
-def _print_changes(title: str, changes: Sequence[Change]) -> None:
+def _print_changes(title: str, changes: Sequence[Change], a: str = "A", b: str = "B") -> None:
     if changes:
         rows = [(change.name, _value(change.a), _value(change.b)) for change in changes]
-        print_table(title, ("", "A", "B"), rows)
+        print_table(title, ("", a, b), rows)
 
 
 def _print_one_sided(title: str, stars: Sequence[OneSided]) -> None:
-    if stars:
-        rows = [(star.designation, _mag(star.mag), star.reason) for star in stars[:MAX_STARS]]
-        heading = ("star", "mag", "in the other")
-        print_table(_capped(title, len(stars)), heading, rows, numbers=(1,))
+    columns = {"star": "{0.designation}", "mag": "{0.mag:.2f}", "in the other": "{0.reason}"}
+    _print_stars(title, stars, columns, numbers=(1,))
 
 
 def _print_moved(stars: Sequence[Moved]) -> None:
+    columns = {
+        "star": "{0.designation}",
+        "arcsec": "{0.moved_arcsec:.4f}",
+        "mag A": "{0.mag_a:.2f}",
+        "mag B": "{0.mag_b:.2f}",
+    }
+    _print_stars(f"{len(stars):,} stars moved", stars, columns, numbers=(1, 2, 3))
+
+
+def _print_stars(
+    title: str, stars: Sequence[Any], columns: Mapping[str, str], numbers: Sequence[int]
+) -> None:
     if stars:
-        rows = [
-            (star.designation, f"{star.moved_arcsec:.4f}", _mag(star.mag_a), _mag(star.mag_b))
-            for star in stars[:MAX_STARS]
-        ]
-        title = _capped(f"{len(stars):,} stars moved", len(stars))
-        print_table(title, ("star", "arcsec", "mag A", "mag B"), rows, numbers=(1, 2, 3))
+        more = f" (first {MAX_STARS})" if len(stars) > MAX_STARS else ""
+        print_things(title + more, stars[:MAX_STARS], columns, numbers, nothing="-")
 
 
-def print_rebuilt(rebuilt: Rebuilt, *, as_json: bool) -> None:
+def print_rebuilt(rebuilt: Rebuilt) -> None:
     """Print the outcome of a rebuild."""
-    if as_json:
-        print_json(rebuilt.as_dict())
-        return
     if rebuilt.is_identical:
         print_table("", (f"{rebuilt.name}: {rebuilt.files} files, every byte the same",), [])
         return
@@ -219,13 +220,7 @@ def print_rebuilt(rebuilt: Rebuilt, *, as_json: bool) -> None:
         ("file", "what differs"),
         [(change.file, change.what) for change in rebuilt.changes],
     )
-    rows = [(change.name, _value(change.a), _value(change.b)) for change in rebuilt.software]
-    if rows:
-        print_table("Software", ("", "then", "now"), rows)
-
-
-def _capped(title: str, count: int) -> str:
-    return title if count <= MAX_STARS else f"{title} (first {MAX_STARS})"
+    _print_changes("Software", rebuilt.software, "then", "now")
 
 
 def _value(value: Any) -> str:
@@ -236,10 +231,6 @@ def _value(value: Any) -> str:
 
 def _count(rows: int | None) -> str:
     return "-" if rows is None else f"{rows:,}"
-
-
-def _mag(mag: float | None) -> str:
-    return "-" if mag is None else f"{mag:.2f}"
 
 
 _BARS, _BAR_WIDTH = 20, 50
@@ -256,9 +247,8 @@ def print_coverage(artifact: Artifact, folder: Path | None, *, as_json: bool) ->
     else:
         print_coverage_table(report)
         print_table("", ("stars in a field", "fields", ""), histogram_rows(report), numbers=(1,))
-    warning = holes_warning(report.gap)
-    if warning:
-        say(f"warning: {warning}")
+    if warning := holes_warning(report.gap):
+        warn([warning])
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         title = f"{artifact.manifest['name']}-{artifact.manifest['version']}"

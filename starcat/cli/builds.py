@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from starcat.cli.catalogs import print_problems, record_rows
-from starcat.cli.console import print_json, print_table, progress_bars, say
+from starcat.cli.console import (
+    print_facts,
+    print_json,
+    print_table,
+    print_things,
+    progress_bars,
+    say,
+    warn,
+)
 from starcat.cli.options import (
     Changes,
     Input,
@@ -25,7 +33,6 @@ from starcat.errors import BuildError
 if TYPE_CHECKING:
     from starcat.artifact.reader import Artifact
     from starcat.pipeline.build import Built
-    from starcat.pipeline.cost import Cost
     from starcat.report.report import CoverageReport
     from starcat.simulation.selftest import Rates
     from starcat.specs.build_spec import BuildSpec
@@ -71,11 +78,13 @@ def build(
         with progress_bars() as progress:
             built = run_build(
                 chosen, given, output, replace=replace, workers=workers, progress=progress,
-                announce=print_cost, max_memory_bytes=most,
+                announce=lambda cost: say(cost.in_words), max_memory_bytes=most,
             )  # fmt: skip
     except BuildError as error:
         if isinstance(error.built, Built):
-            print_refused(error.built, as_json=json)
+            warn(error.built.warnings)
+            if not json:
+                _print_contents(error.built)
         raise
     print_built(built, as_json=json)
 
@@ -93,8 +102,7 @@ def _build_remotely(
         database = str(job["result"]["database"])
         folder, outcome = client.download(database, output, progress)
     report = client.report(database)
-    for warning in report["warnings"]:
-        say(f"warning: {warning}")
+    warn(report["warnings"])
     artifact = open_artifact(folder)
     if as_json:
         kept = ("filters", "coverage", "self_test", "warnings")
@@ -110,8 +118,8 @@ def _build_remotely(
             }
         )
         return
-    print_artifact(artifact, as_json=False)
-    print_rates(list(map(rates_of, report["self_test"])), as_json=False)
+    print_artifact(artifact)
+    print_rates(list(map(rates_of, report["self_test"])))
     say(f"{outcome}: {folder}")
     say(f"database {database} of {client.url}")
 
@@ -119,8 +127,7 @@ def _build_remotely(
 def print_built(built: Built, *, as_json: bool) -> None:
     """Print what a build made."""
     manifest, report = built.manifest, built.folder / "report" / "index.html"
-    for warning in built.warnings:
-        say(f"warning: {warning}")
+    warn(built.warnings)
     if as_json:
         print_json(
             {
@@ -144,47 +151,30 @@ def print_built(built: Built, *, as_json: bool) -> None:
     say(f"report: {report}")
 
 
-def print_refused(built: Built, *, as_json: bool) -> None:
-    """Print what a build made that failed its self-test, and what it warns of."""
-    for warning in built.warnings:
-        say(f"warning: {warning}")
-    if not as_json:
-        _print_contents(built)
-
-
 def _print_contents(built: Built) -> None:
     """Print what went into a build, what it made and how that identifies."""
     manifest = built.manifest
     for source in manifest["sources"]:
-        print_table(
-            f"{source['source']} ({source['role']})",
-            ("records", "rows"),
-            record_rows(source),
-            numbers=(1,),
-        )
-    print_table(
+        _print_records(f"{source['source']} ({source['role']})", source)
+    print_things(
         "What each filter leaves in the fields of the tiling",
-        ("after", "stars", "median a field", "fewest", "fields below 4"),
-        [
-            (
-                step.step,
-                f"{step.stars:,}",
-                f"{step.median_per_field:g}",
-                step.min_per_field,
-                f"{step.share_below_4:.2%}",
-            )
-            for step in built.filters
-        ],
+        built.filters,
+        {
+            "after": "{0.step}",
+            "stars": "{0.stars:,}",
+            "median a field": "{0.median_per_field:g}",
+            "fewest": "{0.min_per_field}",
+            "fields below 4": "{0.share_below_4:.2%}",
+        },
         numbers=(1, 2, 3, 4),
     )
     print_products(manifest)
     print_coverage_table(built.coverage)
-    print_rates(built.rates, as_json=False)
+    print_rates(built.rates)
 
 
-def print_cost(cost: Cost) -> None:
-    """Print on stderr what a build will cost."""
-    say(cost.in_words)
+def _print_records(title: str, source: dict[str, Any]) -> None:
+    print_table(title, ("records", "rows"), record_rows(source), numbers=(1,))
 
 
 def print_products(manifest: dict[str, Any]) -> None:
@@ -204,61 +194,44 @@ def print_products(manifest: dict[str, Any]) -> None:
     print_table("Products", ("product", "schema", "rows", "bytes", ""), rows, numbers=(2, 3))
 
 
-def print_rates(rates: Sequence[Rates], *, as_json: bool) -> None:
+def print_rates(rates: Sequence[Rates]) -> None:
     """Print the rates of a self-test."""
-    if as_json:
-        print_json([rate.as_dict() for rate in rates])
-        return
-    print_table(
+    print_things(
         "Simulated fields, with noise of position (px) and of magnitude",
-        ("fields", "px", "mag", "dropped", "false", "tried", "4+ stars", "right", "wrong", "rate"),
-        [
-            (
-                rate.name,
-                f"{rate.noise_px:g}",
-                "" if rate.noise_mag is None else f"{rate.noise_mag:g}",
-                f"{rate.drop_probability:.0%}",
-                rate.false_stars,
-                rate.frames,
-                rate.identifiable,
-                rate.identified,
-                rate.wrong,
-                f"{rate.identified_share:.1%}",
-            )
-            for rate in rates
-            if rate.frames
-        ],
-        numbers=tuple(range(1, 10)),
+        [rate for rate in rates if rate.frames],
+        {
+            "fields": "{0.name}",
+            "px": "{0.noise_px:g}",
+            "mag": "{0.noise_mag:g}",
+            "dropped": "{0.drop_probability:.0%}",
+            "false": "{0.false_stars}",
+            "tried": "{0.frames}",
+            "4+ stars": "{0.identifiable}",
+            "right": "{0.identified}",
+            "wrong": "{0.wrong}",
+            "rate": "{0.identified_share:.1%}",
+        },
+        numbers=range(1, 10),
     )
 
 
-def print_artifact(artifact: Artifact, *, as_json: bool) -> None:
+def print_artifact(artifact: Artifact) -> None:
     """Print what an artifact holds."""
     from starcat.specs.build_spec import CameraSpec
 
     manifest = artifact.manifest
-    if as_json:
-        print_json(manifest)
-        return
     spec = manifest["spec"]
-    camera = CameraSpec.model_validate(spec["camera"]).camera()
-    selection = spec["selection"]
-    print_table(
-        f"{manifest['name']}-{manifest['version']}",
-        ("", ""),
-        [
-            ("description", spec["description"]),
-            ("frame, epoch", f"{manifest['frame']}, J{manifest['epoch_jyear']:g}"),
-            ("camera", camera.in_words),
-            ("faint limit", f"{selection['faint_limit_mag']:g} mag"),
-            ("made by", ", ".join(f"{k} {v}" for k, v in manifest["software"].items())),
-        ],
-    )
+    facts = {
+        "description": spec["description"],
+        "frame, epoch": f"{manifest['frame']}, J{manifest['epoch_jyear']:g}",
+        "camera": CameraSpec.model_validate(spec["camera"]).camera().in_words,
+        "faint limit": f"{spec['selection']['faint_limit_mag']:g} mag",
+        "made by": ", ".join(f"{k} {v}" for k, v in manifest["software"].items()),
+    }
+    print_facts(f"{manifest['name']}-{manifest['version']}", facts)
     for source in manifest["sources"]:
         files = ", ".join(f"{file['name']} ({file['sha256'][:12]})" for file in source["files"])
-        print_table(
-            f"{source['source']} from {files}", ("records", "rows"), record_rows(source), (1,)
-        )
+        _print_records(f"{source['source']} from {files}", source)
     print_products(manifest)
 
 
@@ -268,26 +241,20 @@ def print_coverage_table(report: CoverageReport) -> None:
 
     summary, gap = report.summary, report.gap
     spreads = {"stars": summary.stars, "pairs": summary.pairs, "triangles": summary.triangles}
-    rows = [
-        (
-            kind,
-            f"{spread.minimum:,}",
-            f"{spread.one_percent:,}",
-            f"{spread.median:,}",
-            f"{spread.mean:,.1f}",
-            f"{spread.maximum:,}",
-        )
-        for kind, spread in spreads.items()
-    ]
-    heads = ("in a field", "fewest", "1 %", "median", "mean", "most")
-    print_table(f"Coverage: {summary.fields:,} fields", heads, rows, numbers=(1, 2, 3, 4, 5))
+    columns = {
+        "in a field": "{0[0]}",
+        "fewest": "{0[1].minimum:,}",
+        "1 %": "{0[1].one_percent:,}",
+        "median": "{0[1].median:,}",
+        "mean": "{0[1].mean:,.1f}",
+        "most": "{0[1].maximum:,}",
+    }
+    title = f"Coverage: {summary.fields:,} fields"
+    print_things(title, spreads.items(), columns, numbers=(1, 2, 3, 4, 5))
     worst = f"RA {summary.worst_ra_deg:.3f}, Dec {summary.worst_dec_deg:+.3f} deg"
     covering, tile = np.degrees([gap.covering_radius_rad, gap.tile_radius_rad])
-    print_table(
-        "",
-        ("", ""),
-        [
-            ("fewest stars", f"boresight {summary.worst_boresight}, {worst}"),
-            ("farthest from all boresights", f"{covering:.3f} deg; a field reaches {tile:.3f} deg"),
-        ],
-    )
+    facts = {
+        "fewest stars": f"boresight {summary.worst_boresight}, {worst}",
+        "farthest from all boresights": f"{covering:.3f} deg; a field reaches {tile:.3f} deg",
+    }
+    print_facts("", facts)

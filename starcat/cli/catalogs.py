@@ -8,16 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starcat.cli.console import print_json, print_table, progress_bars, say
+from starcat.cli.console import print_json, print_table, print_things, progress_bars, say, show
 from starcat.cli.options import Json, Scheduler, Workers, inputs_by_source
 from starcat.errors import SourceError
 
 if TYPE_CHECKING:
-    from starcat.catalog.fetch import FetchReport
     from starcat.catalog.ingest import Ingested
     from starcat.pipeline.match_summary import Summary
     from starcat.store.ingest import Stored
-    from starcat.store.plan import StoreOptions
 
 app = typer.Typer()
 
@@ -28,7 +26,8 @@ def sources(json: Json = False) -> None:
 
     Example: starcat sources
     """
-    print_sources(as_json=json)
+    found = _source_facts()
+    show(json, found, _print_sources, found)
 
 
 @app.command()
@@ -59,7 +58,18 @@ def fetch(
             retries=retries,
             progress=lambda name, done, total: progress(f"fetch {name}", done, total),
         )
-    print_fetched(report, as_json=json)
+    rows = [
+        {name: getattr(file, name) for name in ("name", "status", "rows", "bytes", "sha256")}
+        | {"path": str(file.path)}
+        for file in report.files
+    ]
+    columns = {
+        "file": "{0[name]}",
+        "status": "{0[status]}",
+        "rows": "{0[rows]:,}",
+        "bytes": "{0[bytes]:,}",
+    }
+    show(json, rows, print_things, report.source, rows, columns, (2, 3))
 
 
 ToFormat = Annotated[
@@ -117,53 +127,29 @@ def ingest(
     if to not in ("parquet", "hats"):
         raise ConfigError(f"--to {to}: choose parquet or hats", key="to", value=to)
     paths = locate(source, inputs_by_source(inputs, source))
-    how = {"band": band, "epoch_jyear": epoch_jyear, "read_limit_mag": read_limit_mag}
-    if to == "hats":
-        options = StoreOptions(
-            max_partition_rows=max_partition_rows,
-            memory_bytes=int(memory_gib * 2**30),
-            workers=workers,
-            scheduler=scheduler,
-            resume=resume,
-            replace=replace,
-        )
-        _ingest_to_store(source, paths, output, how, options, as_json=json)
-    else:
-        _ingest_to_file(source, paths, output, how, workers, as_json=json)
+    how: Any = {"band": band, "epoch_jyear": epoch_jyear, "read_limit_mag": read_limit_mag}
+    if to == "parquet":
+        from starcat.catalog.ingest import write_star_tables
+        from starcat.store.reading import read_catalog
 
-
-def _ingest_to_store(
-    source: str,
-    paths: Sequence[Path],
-    output: Path,
-    how: dict[str, Any],
-    options: StoreOptions,
-    *,
-    as_json: bool,
-) -> None:
+        with progress_bars() as progress:
+            read = read_catalog(source, paths, **how, workers=workers, progress=progress)
+            write_star_tables(read, output)
+        print_ingested(read, output, as_json=json)
+        return
     from starcat.store.ingest import ingest_to_store
 
+    options = StoreOptions(
+        max_partition_rows=max_partition_rows,
+        memory_bytes=int(memory_gib * 2**30),
+        workers=workers,
+        scheduler=scheduler,
+        resume=resume,
+        replace=replace,
+    )
     with progress_bars() as progress:
         stored = ingest_to_store(source, paths, output, **how, options=options, progress=progress)
-    print_stored(stored, as_json=as_json)
-
-
-def _ingest_to_file(
-    source: str,
-    paths: Sequence[Path],
-    output: Path,
-    how: dict[str, Any],
-    workers: int,
-    *,
-    as_json: bool,
-) -> None:
-    from starcat.catalog.ingest import write_star_tables
-    from starcat.store.reading import read_catalog
-
-    with progress_bars() as progress:
-        read = read_catalog(source, paths, **how, workers=workers, progress=progress)
-        write_star_tables(read, output)
-    print_ingested(read, output, as_json=as_json)
+    print_stored(stored, as_json=json)
 
 
 @app.command()
@@ -200,11 +186,13 @@ def crossmatch(
             found = match_on_cluster(a, b, output, wanted, workers, scheduler, progress)
     else:
         found = match_files(a, b, output, wanted)
-    print_crossmatch(found, (a.stem, b.stem), output, as_json=json)
+    names = {"a": a.stem, "b": b.stem}
+    facts = {**names, **found.as_dict(), "output": str(output)}
+    show(json, facts, print_crossmatch, found, *names.values(), output)
 
 
-def print_sources(*, as_json: bool) -> None:
-    """Print the data sources and where each would be read from."""
+def _source_facts() -> list[dict[str, Any]]:
+    """Return the data sources and where each would be read from."""
     from starcat.catalog.source import data_source, source_names
     from starcat.catalog.source_files import locate
 
@@ -228,44 +216,21 @@ def print_sources(*, as_json: bool) -> None:
                 "found_at": place or None,
             }
         )
-    if as_json:
-        print_json(found)
-        return
-    print_table(
-        "",
-        ("source", "identifier", "rows", "bands", "read from"),
-        [
-            (
-                entry["name"],
-                entry["identifier"],
-                f"{entry['rows']:,}" if entry["rows"] else "",
-                " ".join(entry["bands"]) or "(joined)",
-                entry["found_at"] or "not found",
-            )
-            for entry in found
-        ],
-        numbers=(2,),
-    )
+    return found
 
 
-def print_fetched(report: FetchReport, *, as_json: bool) -> None:
-    """Print what was fetched."""
+def _print_sources(found: Sequence[dict[str, Any]]) -> None:
     rows = [
-        {
-            "name": file.name,
-            "status": file.status,
-            "rows": file.rows,
-            "bytes": file.bytes,
-            "sha256": file.sha256,
-            "path": str(file.path),
-        }
-        for file in report.files
+        (
+            entry["name"],
+            entry["identifier"],
+            f"{entry['rows']:,}" if entry["rows"] else "",
+            " ".join(entry["bands"]) or "(joined)",
+            entry["found_at"] or "not found",
+        )
+        for entry in found
     ]
-    if as_json:
-        print_json(rows)
-        return
-    cells = [(r["name"], r["status"], f"{r['rows']:,}", f"{r['bytes']:,}") for r in rows]
-    print_table(f"{report.source}", ("file", "status", "rows", "bytes"), cells, numbers=(2, 3))
+    print_table("", ("source", "identifier", "rows", "bands", "read from"), rows, numbers=(2,))
 
 
 def print_ingested(read: Ingested, output: Path, *, as_json: bool) -> None:
@@ -330,14 +295,8 @@ MEANINGS = {
 """What the verdicts on a star's likeliest candidate mean."""
 
 
-def print_crossmatch(
-    found: Summary, names: tuple[str, str], output: Path, *, as_json: bool
-) -> None:
+def print_crossmatch(found: Summary, a: str, b: str, output: Path) -> None:
     """Print the summary of a cross-identification."""
-    if as_json:
-        print_json({"a": names[0], "b": names[1], **found.as_dict(), "output": str(output)})
-        return
-    a, b = names
     rows = [(f"stars of {a}", found.stars, ""), ("matched", found.matched, f"a counterpart in {b}")]
     rows += [(f"  {name}", found.verdicts[name], MEANINGS[name]) for name in list(MEANINGS)[:3]]
     rows.append(("unmatched", found.unmatched, ""))

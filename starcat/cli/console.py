@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from string import Formatter
 from typing import TYPE_CHECKING, Any
 
 from starcat.failures import AT_STAGE
@@ -30,6 +31,14 @@ def print_json(content: Any) -> None:
     sys.stdout.write(json.dumps(content, indent=2, ensure_ascii=False) + "\n")
 
 
+def show(as_json: bool, facts: Any, print_tables: Callable[..., object], *shown: Any) -> None:
+    """Print facts as JSON, or what is shown of them as tables."""
+    if as_json:
+        print_json(facts)
+    else:
+        print_tables(*shown)
+
+
 def print_json_line(content: Any) -> None:
     """Print a value as JSON on a line of its own, and see that it arrives at once."""
     sys.stdout.write(json.dumps(content, ensure_ascii=False) + "\n")
@@ -51,6 +60,40 @@ def print_table(
     for row in rows:
         table.add_row(*(Text(str(cell)) for cell in row))
     out().print(table)
+
+
+def print_facts(title: str, facts: Mapping[str, Any]) -> None:
+    """Print names and values as a table of two columns."""
+    print_table(title, ("", ""), list(facts.items()))
+
+
+class _Cells(Formatter):
+    """Formats of cells, with a text for None."""
+
+    def __init__(self, nothing: str) -> None:
+        self.nothing = nothing
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        return self.nothing if value is None else str(super().format_field(value, format_spec))
+
+
+def print_things(
+    title: str,
+    things: Iterable[Any],
+    columns: Mapping[str, str],
+    numbers: Sequence[int] = (),
+    nothing: str = "",
+) -> None:
+    """Print a table with a row a thing; a column is a heading and the format of its cells."""
+    cells = _Cells(nothing)
+    rows = [[cells.format(text, thing) for text in columns.values()] for thing in things]
+    print_table(title, list(columns), rows, numbers)
+
+
+def warn(texts: Iterable[str]) -> None:
+    """Print warnings on stderr."""
+    for text in texts:
+        say(f"warning: {text}")
 
 
 def say(text: str) -> None:

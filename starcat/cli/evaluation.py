@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starcat.cli.console import print_json, print_table, progress_bars, say
+from starcat.cli.console import print_table, progress_bars, say, show
 from starcat.cli.options import Input, Json, inputs_by_source
 from starcat.errors import ConfigError
 
@@ -122,10 +122,8 @@ def evaluate(
 
 def print_evaluation(evaluation: Evaluation, *, as_json: bool) -> None:
     """Print what was measured."""
-    if as_json:
-        print_json(list(evaluation.contents))
-    else:
-        _print_tables(evaluation.contents)
+    contents = evaluation.contents
+    show(as_json, list(contents), _print_tables, contents)
     say(f"wrote {evaluation.page}")
 
 

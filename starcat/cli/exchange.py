@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starcat.cli.console import print_json, print_table, say
+from starcat.cli.console import print_facts, print_table, print_things, say, show
 from starcat.cli.options import Json
 from starcat.errors import ConfigError
 from starcat.exchange.formats import EXPORT_FORMATS, ONBOARD_FORMATS
 
 if TYPE_CHECKING:
-    from starcat.exchange.export import Exported, NamedTables
+    from starcat.exchange.export import Exported
     from starcat.exchange.onboard import ExportedImage
     from starcat.onboard.reading import OnboardImage
 
@@ -79,42 +79,35 @@ def export(
 
     Example: starcat export dist/gaia-12deg-1.0.0 --to fits -o fits
     """
-    of_images: dict[str, object] = {"method": method, "endian": endian, "max_bytes": max_bytes}
+    of_images: dict[str, Any] = {"method": method, "endian": endian, "max_bytes": max_bytes}
     of_tables: dict[str, object] = {"product": product, "from_peer": from_peer}
     of_hats: dict[str, object] = {"max_partition_rows": max_partition_rows}
     if form in ONBOARD_FORMATS:
+        from starcat.exchange.onboard import export_image
+
         _refuse(form, of_tables | of_hats)
-        _export_image(source, form, output, of_images, replace=replace, as_json=json)
+        given = {name: value for name, value in of_images.items() if value is not None}
+        image = export_image(_named(source), form, output, replace=replace, **given)
+        _say_left_out(image)
+        show(json, image.as_dict(), print_exported_image, image)
         return
     _refuse(form, of_images if form == "hats" else of_images | of_hats)
-    from starcat.exchange.export import export_tables
+    from starcat.exchange.export import export_tables, tables_of
     from starcat.exchange.hats import MAX_ROWS
+    from starcat.exchange.peers import peer_tables
 
     exported = export_tables(
-        _tables(source, from_peer),
+        peer_tables(from_peer, source) if from_peer is not None else tables_of(_named(source)),
         form,
         output or Path("export"),
         products=product,
         replace=replace,
         max_partition_rows=max_partition_rows or MAX_ROWS,
     )
-    print_exported(exported, as_json=json)
-
-
-def _export_image(
-    source: Path | None,
-    form: str,
-    output: Path | None,
-    options: dict[str, Any],
-    *,
-    replace: bool,
-    as_json: bool,
-) -> None:
-    from starcat.exchange.onboard import export_image
-
-    given = {name: value for name, value in options.items() if value is not None}
-    exported = export_image(_named(source), form, output, replace=replace, **given)
-    print_exported_image(exported, as_json=as_json)
+    for file in exported.files:
+        if file.left_out:
+            say(f"{file.product}: {file.left_out:,} rows without a position are left out")
+    show(json, exported.as_dict(), print_exported, exported)
 
 
 def _refuse(form: str, options: Mapping[str, object]) -> None:
@@ -131,30 +124,18 @@ def _named(source: Path | None) -> Path:
     return source
 
 
-def _tables(source: Path | None, peer: str | None) -> NamedTables:
-    from starcat.exchange.export import tables_of
-    from starcat.exchange.peers import peer_tables
-
-    if peer is not None:
-        return peer_tables(peer, source)
-    return tables_of(_named(source))
-
-
-def print_exported(exported: Exported, *, as_json: bool) -> None:
-    """Print what was written where; rows left out are told on stderr."""
+def print_exported(exported: Exported) -> None:
+    """Print what was written where."""
     from starcat.exchange.export import COLUMNS_NAME
 
-    for file in exported.files:
-        if file.left_out:
-            say(f"{file.product}: {file.left_out:,} rows without a position are left out")
-    if as_json:
-        print_json(exported.as_dict())
-        return
-    rows = [
-        (file.product, file.name, f"{file.rows:,}", f"{file.bytes:,}") for file in exported.files
-    ]
+    columns = {
+        "product": "{0.product}",
+        "file": "{0.name}",
+        "rows": "{0.rows:,}",
+        "bytes": "{0.bytes:,}",
+    }
     title = f"{exported.source} as {exported.file_format}"
-    print_table(title, ("product", "file", "rows", "bytes"), rows, numbers=(2, 3))
+    print_things(title, exported.files, columns, numbers=(2, 3))
     beside = f", {COLUMNS_NAME} says what the columns are" if exported.has_columns else ""
     print_table("", (f"in {exported.folder}{beside}",), [])
 
@@ -163,8 +144,7 @@ LIBRARY_STARS = 192
 """Stars in a field that the onboard library holds unless it is told otherwise."""
 
 
-def print_exported_image(exported: ExportedImage, *, as_json: bool) -> None:
-    """Print what was written, and say what was left out on stderr."""
+def _say_left_out(exported: ExportedImage) -> None:
     fitted, made = exported.fitted, exported.made
     noun = _features(fitted.contents.method)
     if fitted.features < fitted.features_before:
@@ -179,39 +159,38 @@ def print_exported_image(exported: ExportedImage, *, as_json: bool) -> None:
             f"a field may have {made.most_near} stars: compile the onboard library with "
             f"-DSTARCAT_MAX_STARS={made.most_near}, as it holds {LIBRARY_STARS} otherwise"
         )
-    if as_json:
-        print_json(exported.as_dict())
-        return
+
+
+def print_exported_image(exported: ExportedImage) -> None:
+    """Print what an image that was written holds."""
+    fitted, method = exported.fitted, exported.fitted.contents.method
     rows = [
-        ("method, byte order", f"{fitted.contents.method}, {exported.byte_order}-endian"),
+        ("method, byte order", f"{method}, {exported.byte_order}-endian"),
         ("stars", f"{fitted.stars:,} of {fitted.stars_before:,}"),
-        (noun, f"{fitted.features:,} of {fitted.features_before:,}"),
-        ("image", f"{len(made.data):,} bytes"),
+        (_features(method), f"{fitted.features:,} of {fitted.features_before:,}"),
+        ("image", f"{len(exported.made.data):,} bytes"),
         *(("file", str(path)) for path in exported.files),
     ]
     print_table(f"{fitted.contents.name} as {exported.file_format}", ("", ""), rows)
 
 
-def print_image(image: OnboardImage, *, as_json: bool) -> None:
+def print_image(image: OnboardImage) -> None:
     """Print what an image holds."""
-    if as_json:
-        print_json(image.as_dict())
-        return
     from starcat.onboard.layout import DIRECTION_SCALE
 
     header, arcsec = image.header, 206264.80624709636 / DIRECTION_SCALE
-    rows = [
-        ("format", f"{image.version}, {image.byte_order}-endian"),
-        ("epoch", f"J{header['epoch_jyear']:g}"),
-        ("camera", image.camera.in_words),
-        ("method", image.method),
-        ("stars", f"{header['n_stars']:,}, at most {header['most_near']} near a field"),
-        (_features(image.method), f"{header['n_features']:,}"),
-        ("quantum", f"{arcsec:.2g} arcsec, 0.001 mag"),
-        ("manifest", f"sha256 {image.manifest_sha256}"),
-        ("image", f"{len(image.data):,} bytes"),
-    ]
-    print_table(image.name, ("", ""), rows)
+    facts = {
+        "format": f"{image.version}, {image.byte_order}-endian",
+        "epoch": f"J{header['epoch_jyear']:g}",
+        "camera": image.camera.in_words,
+        "method": image.method,
+        "stars": f"{header['n_stars']:,}, at most {header['most_near']} near a field",
+        _features(image.method): f"{header['n_features']:,}",
+        "quantum": f"{arcsec:.2g} arcsec, 0.001 mag",
+        "manifest": f"sha256 {image.manifest_sha256}",
+        "image": f"{len(image.data):,} bytes",
+    }
+    print_facts(image.name, facts)
     sections = [
         (name, f"{len(part):,}", f"{part.nbytes:,}") for name, part in image.sections.items()
     ]

@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from starcat.cli.console import print_json, print_json_line, print_table
+from starcat.cli.console import print_json, print_json_line, print_table, print_things
 from starcat.errors import NotIdentifiedError
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.images.solve_files import FrameAnswer, facts
 from starcat.matcher.database import Database
-from starcat.matcher.methods.table import METHODS
 from starcat.simulation.simulate import Frame
 from starcat.sky.in_time import SkyInTime
 
@@ -171,75 +170,47 @@ def print_sky_in_time(known: Sequence[tuple[str, SkyInTime]]) -> None:
     """Print true attitudes, exclusion angles and the bodies of frames by name."""
     if not known:
         return
-    print_table(
-        f"With aberration, at {known[0][1].time}",
-        ("frame", "RA deg", "Dec deg", "roll deg", "corrected arcsec", "rms arcsec", "Sun deg",
-         "Moon deg", "Earth limb deg"),
-        [(name, *_angles(sky)) for name, sky in known],
-        numbers=(1, 2, 3, 4, 5, 6, 7, 8),
-    )  # fmt: skip
+    columns = {
+        "frame": "{0[0]}",
+        "RA deg": "{0[1].boresight_ra_deg:.5f}",
+        "Dec deg": "{0[1].boresight_dec_deg:.5f}",
+        "roll deg": "{0[1].roll_deg:.5f}",
+        "corrected arcsec": "{0[1].correction_arcsec:.2f}",
+        "rms arcsec": "{0[1].residual_arcsec:.2f}",
+        "Sun deg": "{0[1].sun_angle_deg:.2f}",
+        "Moon deg": "{0[1].moon_angle_deg:.2f}",
+        "Earth limb deg": "{0[1].earth_limb_angle_deg:.2f}",
+    }
+    title = f"With aberration, at {known[0][1].time}"
+    print_things(title, known, columns, numbers=range(1, 9))
     bodies = [
-        (
-            name,
-            body.name,
-            f"{body.x_px:.1f}",
-            f"{body.y_px:.1f}",
-            f"{body.mag:.1f}",
-            f"{body.from_boresight_deg:.2f}",
-            "yes" if body.row is not None else "no",
-        )
+        (name, body, "no" if body.row is None else "yes")
         for name, sky in known
         for body in sky.bodies
     ]
     if bodies:
-        heads = ("frame", "body", "x px", "y px", "mag", "from boresight deg", "spot")
-        print_table("Planets in the frame", heads, bodies, numbers=(2, 3, 4, 5))
-
-
-def _angles(sky: SkyInTime) -> tuple[str, ...]:
-    limb = sky.earth_limb_angle_deg
-    return (
-        f"{sky.boresight_ra_deg:.5f}",
-        f"{sky.boresight_dec_deg:.5f}",
-        f"{sky.roll_deg:.5f}",
-        f"{sky.correction_arcsec:.2f}",
-        f"{sky.residual_arcsec:.2f}",
-        f"{sky.sun_angle_deg:.2f}",
-        f"{sky.moon_angle_deg:.2f}",
-        "" if limb is None else f"{limb:.2f}",
-    )
-
-
-def print_simulated(frame: Frame, output: Path, *, as_json: bool) -> None:
-    """Print the truth about a simulated frame, as JSON; nothing for people, who want to guess."""
-    if not as_json:
-        return
-    ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(frame.matrix)
-    print_json(
-        {
-            "file": str(output),
-            "centroids": len(frame.centroids_px),
-            "guide_stars": frame.n_stars,
-            "false_stars": int(frame.is_false.sum()),
-            "boresight_ra_deg": float(ra_deg),
-            "boresight_dec_deg": float(dec_deg),
-            "roll_deg": float(roll_deg),
-            "q_body_from_icrs": quaternion_from_matrix(frame.matrix).tolist(),
+        columns = {
+            "frame": "{0[0]}",
+            "body": "{0[1].name}",
+            "x px": "{0[1].x_px:.1f}",
+            "y px": "{0[1].y_px:.1f}",
+            "mag": "{0[1].mag:.1f}",
+            "from boresight deg": "{0[1].from_boresight_deg:.2f}",
+            "spot": "{0[2]}",
         }
-    )
+        print_things("Planets in the frame", bodies, columns, numbers=(2, 3, 4, 5))
 
 
-def print_methods(*, as_json: bool) -> None:
-    """Print the ways to identify stars."""
-    rows = [
-        {"method": name, "needs": list(method.products), "description": method.description}
-        for name, method in METHODS.items()
-    ]
-    if as_json:
-        print_json(rows)
-        return
-    print_table(
-        "Methods",
-        ("method", "needs", "how"),
-        [(row["method"], ", ".join(row["needs"]), row["description"]) for row in rows],
-    )
+def simulated_facts(frame: Frame, output: Path) -> dict[str, Any]:
+    """Return the truth about a simulated frame."""
+    ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(frame.matrix)
+    return {
+        "file": str(output),
+        "centroids": len(frame.centroids_px),
+        "guide_stars": frame.n_stars,
+        "false_stars": int(frame.is_false.sum()),
+        "boresight_ra_deg": float(ra_deg),
+        "boresight_dec_deg": float(dec_deg),
+        "roll_deg": float(roll_deg),
+        "q_body_from_icrs": quaternion_from_matrix(frame.matrix).tolist(),
+    }

@@ -84,9 +84,16 @@ def methods(json: Json = False) -> None:
 
     Example: starcat methods
     """
-    from starcat.cli.matches import print_methods
+    from starcat.cli.console import print_things, show
+    from starcat.matcher.methods.table import METHODS
 
-    print_methods(as_json=json)
+    rows = [
+        {"method": name, "needs": list(method.products), "description": method.description}
+        for name, method in METHODS.items()
+    ]
+    cells = [(row["method"], ", ".join(row["needs"]), row["description"]) for row in rows]
+    columns = {"method": "{0[0]}", "needs": "{0[1]}", "how": "{0[2]}"}
+    show(json, rows, print_things, "Methods", cells, columns)
 
 
 @app.command()
@@ -102,7 +109,8 @@ def simulate(
 
     Example: starcat simulate dist/gaia-12deg-1.0.0 -o frame.csv --seed 7
     """
-    from starcat.cli.matches import print_simulated
+    from starcat.cli.console import print_json
+    from starcat.cli.matches import simulated_facts
     from starcat.images.render import write_simulated
     from starcat.matcher.database import open_database
     from starcat.simulation.simulate import Noise, simulate_frames
@@ -112,7 +120,8 @@ def simulate(
     eye = database.camera
     frame = next(simulate_frames(database.directions, eye, 1, noise, seed, mag=database.mag))
     write_simulated(output, frame, eye, seed)
-    print_simulated(frame, output, as_json=json)
+    if json:  # people want to guess
+        print_json(simulated_facts(frame, output))
 
 
 @app.command()
@@ -278,11 +287,11 @@ def selftest(
     Example: starcat selftest dist/gaia-12deg-1.0.0 --frames 100
     """
     from starcat.cli.builds import print_rates
-    from starcat.cli.console import progress_bars
+    from starcat.cli.console import progress_bars, show
     from starcat.matcher.matcher import Matcher
     from starcat.simulation.selftest import self_test
 
     matcher = Matcher.open(artifact, method, tolerance_px=max(0.5, 4.0 * noise_px))
     with progress_bars() as progress:
         rates = self_test(matcher, frames, noise_px, seed, progress)
-    print_rates(rates, as_json=json)
+    show(json, [rate.as_dict() for rate in rates], print_rates, rates)

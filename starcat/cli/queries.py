@@ -15,11 +15,10 @@ from typing import TYPE_CHECKING, Any
 from starcat.cli.console import MAX_WIDTH, print_json, print_table, progress_bars, say
 from starcat.errors import QueryError, StarcatError
 from starcat.query.gallery import gallery, guessed, macros, named_query
-from starcat.query.session import Limits, Session, open_session, preamble_of
+from starcat.query.session import Limits, Session, open_session
 
 if TYPE_CHECKING:
     from starcat.query.result import ResultTable
-    from starcat.query.session import Session
     from starcat.query.targets import Target, View
 
 
@@ -39,7 +38,7 @@ def answer(targets: Sequence[str], wish: Wish, limits: Limits, rows: int) -> Non
     """Answer a question, or ask for questions where there is none."""
     form = format_of_wish(wish)
     query, values = _query(wish, len(targets))
-    with _opened(targets, limits) as session:
+    with opened(targets, limits) as session:
         if query is not None:
             _give(session, query, values, form, wish.output, rows)
         elif sys.stdin.isatty():
@@ -52,19 +51,8 @@ def answer(targets: Sequence[str], wish: Wish, limits: Limits, rows: int) -> Non
                 _give(session, text, values, form, wish.output, rows)
 
 
-def show(targets: Sequence[str], limits: Limits, *, as_json: bool) -> None:
-    """Print the views of targets."""
-    with _opened(targets, limits) as session:
-        print_views(session, as_json=as_json)
-
-
-def print_preamble(targets: Sequence[str]) -> None:
-    """Print the SQL that makes the views and macros, for any DuckDB."""
-    sys.stdout.write(preamble_of(targets) + "\n")
-
-
 @contextmanager
-def _opened(targets: Sequence[str], limits: Limits) -> Iterator[Session]:
+def opened(targets: Sequence[str], limits: Limits) -> Iterator[Session]:
     """Open a session, with bars while archive files are read and none afterwards."""
     with ExitStack() as stack:
         with progress_bars() as progress:
@@ -202,9 +190,7 @@ def _row_count(session: Session, view: str) -> int:
 
 def print_macros(*, as_json: bool) -> None:
     """Print the macros, each with an example."""
-    from starcat.query.gallery import macros
-
-    listed = sorted((m for m in macros()), key=lambda m: (m.is_table, m.name))
+    listed = sorted(macros(), key=lambda m: (m.is_table, m.name))
     if as_json:
         facts = ("name", "arguments", "is_table", "help", "example")
         print_json([{fact: getattr(macro, fact) for fact in facts} for macro in listed])
@@ -222,8 +208,6 @@ def _print_entry(title: str, paragraphs: Sequence[str]) -> None:
 
 def print_gallery(*, as_json: bool) -> None:
     """Print the named queries with their values."""
-    from starcat.query.gallery import gallery
-
     queries = gallery().values()
     if as_json:
         print_json([asdict(query) for query in queries])

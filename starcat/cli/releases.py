@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starcat.cli.console import print_json, print_table, progress_bars, say
+from starcat.cli.console import print_things, progress_bars, say, show
 from starcat.cli.options import Json
 from starcat.errors import ConfigError
 
 if TYPE_CHECKING:
     from starcat.releases.publishing import Published
     from starcat.releases.pulling import Pulled
-    from starcat.releases.tree import Listed
 
 app = typer.Typer()
 
@@ -36,7 +35,7 @@ def publish(
 
     with progress_bars() as progress:
         published = publish_artifact(artifact, registry, progress)
-    print_published(published, as_json=json)
+    show(json, published.as_dict(), print_published, published)
 
 
 @app.command()
@@ -78,7 +77,7 @@ def pull(
             pulled = [pull_wanted(wanted, registry, output, lock, options, progress, max_bytes)]
         else:
             raise ConfigError("pull what? Name it, NAME@VERSION, or say --locked for all pins")
-    print_pulled(pulled, as_json=json)
+    show(json, [one.as_dict() for one in pulled], print_pulled, pulled)
 
 
 @app.command()
@@ -94,70 +93,49 @@ def releases(
     from starcat.releases.registry import open_registry
     from starcat.storage.download import DownloadOptions
 
-    opened = open_registry(registry, DownloadOptions(retries))
-    print_releases(opened.releases(), as_json=json)
+    listed = open_registry(registry, DownloadOptions(retries)).releases()
+    highest = {release.name: release for release in listed}
+    facts = [r.model_dump() | {"is_latest": highest[r.name] is r} for r in listed]
+    show(json, facts, print_releases, facts)
 
 
-DIGEST_LETTERS = 16
-"""Letters of a digest that a table shows; JSON has all."""
-
-
-def print_published(published: Published, *, as_json: bool) -> None:
+def print_published(published: Published) -> None:
     """Print what became of a publication."""
-    release = published.release
-    if as_json:
-        print_json(published.as_dict())
-        return
-    row = (
-        release.name,
-        release.version,
-        release.files,
-        f"{release.bytes:,}",
-        published.new_blobs,
-        f"{published.new_bytes:,}",
-        release.manifest.sha256[:DIGEST_LETTERS],
-    )
-    columns = ("artifact", "version", "files", "bytes", "new files", "new bytes", "manifest")
-    print_table("", columns, [row], numbers=(2, 3, 4, 5))
-    say(f"{published.outcome}: {release.title} in {published.registry}")
+    columns = {
+        "artifact": "{0.release.name}",
+        "version": "{0.release.version}",
+        "files": "{0.release.files}",
+        "bytes": "{0.release.bytes:,}",
+        "new files": "{0.new_blobs}",
+        "new bytes": "{0.new_bytes:,}",
+        "manifest": "{0.release.manifest.sha256:.16}",
+    }
+    print_things("", [published], columns, numbers=(2, 3, 4, 5))
+    say(f"{published.outcome}: {published.release.title} in {published.registry}")
 
 
-def print_pulled(pulled: Sequence[Pulled], *, as_json: bool) -> None:
+def print_pulled(pulled: Sequence[Pulled]) -> None:
     """Print what became of pulls."""
-    if as_json:
-        print_json([one.as_dict() for one in pulled])
-        return
-    rows = [
-        (
-            one.release.name,
-            one.release.version,
-            one.release.manifest.sha256[:DIGEST_LETTERS],
-            str(one.folder),
-        )
-        for one in pulled
-    ]
-    print_table("", ("artifact", "version", "manifest", "folder"), rows)
+    columns = {
+        "artifact": "{0.release.name}",
+        "version": "{0.release.version}",
+        "manifest": "{0.release.manifest.sha256:.16}",
+        "folder": "{0.folder}",
+    }
+    print_things("", pulled, columns)
     for one in pulled:
         say(f"{one.outcome}: {one.folder}")
 
 
-def print_releases(releases: Sequence[Listed], *, as_json: bool) -> None:
+def print_releases(listed: Sequence[dict[str, Any]]) -> None:
     """Print what a registry lists."""
-    highest = {release.name: release for release in releases}
-    if as_json:
-        marked = [r.model_dump() | {"is_latest": highest[r.name] is r} for r in releases]
-        print_json(marked)
-        return
-    rows = [
-        (
-            release.name,
-            release.version,
-            "latest" if highest[release.name] is release else "",
-            release.files,
-            f"{release.bytes:,}",
-            release.manifest.sha256[:DIGEST_LETTERS],
-        )
-        for release in releases
-    ]
-    columns = ("artifact", "version", "", "files", "bytes", "manifest")
-    print_table("", columns, rows, numbers=(3, 4))
+    columns = {
+        "artifact": "{0[name]}",
+        "version": "{0[version]}",
+        "": "{0[mark]}",
+        "files": "{0[files]}",
+        "bytes": "{0[bytes]:,}",
+        "manifest": "{0[manifest][sha256]:.16}",
+    }
+    marked = [facts | {"mark": "latest" if facts["is_latest"] else ""} for facts in listed]
+    print_things("", marked, columns, numbers=(3, 4))

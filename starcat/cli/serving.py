@@ -107,7 +107,7 @@ def list_tokens(root: Root = Path("service"), json: Json = False) -> None:
     Example: starcat token list --root service
     """
     with _tokens_of(root) as store:
-        _print_tokens(store.all(), as_json=json)
+        _show_tokens(store.all(), as_json=json)
 
 
 @tokens.command()
@@ -121,18 +121,16 @@ def revoke(
     Example: starcat token revoke anna --root service
     """
     with _tokens_of(root) as store:
-        _print_tokens(store.revoke(name), as_json=json)
+        _show_tokens(store.revoke(name), as_json=json)
 
 
-def _print_tokens(found: Sequence[Token], *, as_json: bool) -> None:
-    from starcat.cli.console import print_json, print_table
+def _show_tokens(found: Sequence[Token], *, as_json: bool) -> None:
+    from starcat.cli.console import print_table, show
 
     rows = [token.as_dict() for token in found]
-    if as_json:
-        print_json(rows)
-        return
     columns = ("id", "name", "role", "state", "created", "expires")
-    print_table("", columns, [[row[column] or "never" for column in columns] for row in rows])
+    cells = [[row[column] or "never" for column in columns] for row in rows]
+    show(as_json, rows, print_table, "", columns, cells)
 
 
 @contextmanager

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from starcat.cli.console import out, print_json, print_table, progress_bars, say
+from starcat.cli.console import (
+    out,
+    print_facts,
+    print_json,
+    print_things,
+    progress_bars,
+    say,
+    show,
+    warn,
+)
 from starcat.cli.options import (
     Changes,
     Input,
@@ -43,16 +52,25 @@ def presets(
     Example: starcat presets gaia-12deg --toml
     """
     from starcat.specs.keys import spec_toml
-    from starcat.specs.reading import preset
+    from starcat.specs.reading import preset, preset_names
 
     if toml:
         if name is None:
             raise ConfigError("--toml prints one preset: name it, as 'presets sao-12deg --toml'")
         typer.echo(spec_toml(preset(name)), nl=False)
     elif name is not None:
-        print_preset(preset(name), as_json=json)
+        chosen = preset(name)
+        show(json, chosen.model_dump(mode="json"), print_preset, chosen)
     else:
-        print_presets(as_json=json)
+        specs = [preset(name) for name in preset_names()]
+        columns = {
+            "preset": "{0.name}",
+            "version": "{0.version}",
+            "source": "{0.catalog.source}",
+            "what it is": "{0.description}",
+        }
+        facts = [spec.model_dump(mode="json") for spec in specs]
+        show(json, facts, print_things, "", specs, columns)
 
 
 @app.command()
@@ -117,35 +135,20 @@ def init(
     print_starter(starter, file, as_json=json)
 
 
-def print_presets(*, as_json: bool) -> None:
-    """Print the presets."""
-    from starcat.specs.reading import preset, preset_names
-
-    specs = [preset(name) for name in preset_names()]
-    if as_json:
-        print_json([spec.model_dump(mode="json") for spec in specs])
-        return
-    rows = [(spec.name, spec.version, spec.catalog.source, spec.description) for spec in specs]
-    print_table("", ("preset", "version", "source", "what it is"), rows)
-
-
-def print_preset(spec: BuildSpec, *, as_json: bool) -> None:
+def print_preset(spec: BuildSpec) -> None:
     """Print one preset in a few lines."""
-    if as_json:
-        print_json(spec.model_dump(mode="json"))
-        return
     camera, limits = spec.camera.camera(), spec.selection
-    rows = [
-        ("what it is", spec.description),
-        ("sources", ", ".join(spec.sources)),
-        ("limits", f"{limits.bright_limit_mag:g} to {limits.faint_limit_mag:g} mag"),
-        ("camera", f"{camera.width_px} x {camera.height_px} px"),
-        ("field", f"{camera.fov_x_deg:.4g} x {camera.fov_y_deg:.4g} deg"),
-        ("boresights", f"{spec.boresights.count:,}"),
-        ("epoch", f"J{spec.epoch_jyear:g}"),
-        ("every key", f"starcat presets {spec.name} --toml"),
-    ]
-    print_table(f"{spec.name} {spec.version}", ("", ""), rows)
+    facts = {
+        "what it is": spec.description,
+        "sources": ", ".join(spec.sources),
+        "limits": f"{limits.bright_limit_mag:g} to {limits.faint_limit_mag:g} mag",
+        "camera": f"{camera.width_px} x {camera.height_px} px",
+        "field": f"{camera.fov_x_deg:.4g} x {camera.fov_y_deg:.4g} deg",
+        "boresights": f"{spec.boresights.count:,}",
+        "epoch": f"J{spec.epoch_jyear:g}",
+        "every key": f"starcat presets {spec.name} --toml",
+    }
+    print_facts(f"{spec.name} {spec.version}", facts)
 
 
 def print_starter(starter: Starter, path: Path, *, as_json: bool) -> None:
@@ -166,21 +169,18 @@ def print_starter(starter: Starter, path: Path, *, as_json: bool) -> None:
         )
         return
     camera = starter.spec.camera.camera()
-    rows = [
-        (
-            f"{row.faint_limit_mag:g}" + (" *" if row is starter.own else ""),
-            f"{row.guide_stars:,}",
-            f"{row.stars.minimum:,}",
-            f"{row.stars.one_percent:,}",
-            f"{row.stars.median:,}",
-            f"{row.stars.maximum:,}",
-        )
-        for row in starter.limits
-    ]
-    heads = ("faint limit, G", "guide stars", "fewest", "1 %", "median", "most")
+    columns = {
+        "faint limit, G": "{0[0]:g}{0[1]}",
+        "guide stars": "{0[2].guide_stars:,}",
+        "fewest": "{0[2].stars.minimum:,}",
+        "1 %": "{0[2].stars.one_percent:,}",
+        "median": "{0[2].stars.median:,}",
+        "most": "{0[2].stars.maximum:,}",
+    }
+    limits = [(r.faint_limit_mag, " *" if r is starter.own else "", r) for r in starter.limits]
     field = f"{camera.fov_x_deg:.4g} x {camera.fov_y_deg:.4g} deg"
     title = f"Stars in a field of {field} (* the spec's limit)"
-    print_table(title, heads, rows, numbers=(0, 1, 2, 3, 4, 5))
+    print_things(title, limits, columns, numbers=range(6))
     thinned = starter.thinned
     out().print(
         f"\nThe {STARS_A_FIELD} brightest of every field are kept: {thinned.guide_stars:,} guide "
@@ -189,8 +189,7 @@ def print_starter(starter: Starter, path: Path, *, as_json: bool) -> None:
         "\nA frame needs 4 stars. A limit is good when 1 % of the fields have about "
         f"{ENOUGH_STARS}:\nsome are left where spots are missing, and the database stays small."
     )
-    for text in told:
-        say(f"warning: {text}")
+    warn(told)
     say(starter.cost.in_words)
     say(f"wrote {path}; change it as you like, then: starcat build {path}")
 
@@ -216,13 +215,13 @@ def print_estimate(found: Estimate, *, as_json: bool) -> None:
         return
     rows = {**cost.rows, "stars": cost.stars, "boresights": cost.fields}
     rows["rejected"] = sum(found.rejected.values())
-    lines = [
-        (name, _count(rows.get(name.removesuffix(".parquet"))), f"{size:,}")
-        for name, size in cost.files.items()
+    files = [
+        (name, rows.get(name.removesuffix(".parquet")), size) for name, size in cost.files.items()
     ]
-    lines.append(("all files", "", f"{found.total_bytes:,}"))
+    files.append(("all files", None, found.total_bytes))
     title = f"{found.spec.name}-{found.spec.version}, by estimate"
-    print_table(title, ("file", "rows", "bytes"), lines, numbers=(1, 2))
+    columns = {"file": "{0[0]}", "rows": "{0[1]:,}", "bytes": "{0[2]:,}"}
+    print_things(title, files, columns, numbers=(1, 2))
     most = found.spec.boresights.brightest
     say(
         f"{cost.stars:,} guide stars; {cost.fields:,} fields have {stars.minimum} to "
@@ -233,11 +232,6 @@ def print_estimate(found: Estimate, *, as_json: bool) -> None:
         f"{found.build_seconds:,.0f} s to build, {cost.memory_bytes / 2**30:.1f} GiB of memory; "
         "the stars are as the build will have them"
     )
-    for text in found.warnings:
-        say(f"warning: {text}")
+    warn(found.warnings)
     for text in found.refusals:
         say(f"the build will be refused: {text}")
-
-
-def _count(rows: int | None) -> str:
-    return "" if rows is None else f"{rows:,}"

@@ -81,15 +81,16 @@ def sql(
     from starcat.query.engine import warm_up
 
     warm_up()  # it starts while the rest is imported
-    from starcat.cli.queries import Wish, answer, print_preamble, show
-    from starcat.query.session import Limits
+    from starcat.cli.queries import Wish, answer, opened, print_views
+    from starcat.query.session import Limits, preamble_of
 
     limits = Limits(time_limit_s, memory_limit_gb)
     targets, query = _split(arguments or [], named)
     if preamble:
-        print_preamble(targets)
+        typer.echo(preamble_of(targets))
     elif show_views:
-        show(targets, limits, as_json=json)
+        with opened(targets, limits) as session:
+            print_views(session, as_json=json)
     else:
         wish = Wish(query, named, dict(_set(values)), form or ("json" if json else None), output)
         answer(targets, wish, limits, rows)

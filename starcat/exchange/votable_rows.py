@@ -28,36 +28,30 @@ _ESCAPES = (("&", "&amp;"), ("<", "&lt;"), (">", "&gt;"))
 _NULL_IS_EMPTY = {"null_handling": "replace", "null_replacement": ""}
 
 
-class Binary2:
-    """What writes batches of a table as BINARY2."""
-
-    def __init__(self, columns: Sequence[VotableColumn]) -> None:
-        self._columns = tuple(columns)
-
-    def rows(self, cells: Sequence[Cells], count: int) -> bytes:
-        """Return rows."""
-        if not count:
-            return b""
-        parts: list[pa.Array] = []
+def binary2_rows(columns: Sequence[VotableColumn], cells: Sequence[Cells], count: int) -> bytes:
+    """Return the rows of a batch as BINARY2."""
+    if not count:
+        return b""
+    parts: list[pa.Array] = []
+    run = _Run()
+    run.add(f"V{(len(cells) + 7) // 8}", _null_bits(cells, count))
+    for column, found in zip(columns, cells, strict=True):
+        if not (column.is_text or column.is_list):
+            run.add(_big_endian(column), _fixed(column, found))
+            continue
+        same = _constant(column, found)
+        lengths, content = _variable(column, same or found)
+        run.add(">u4", lengths)
+        if same is not None:
+            # A text that is the same in all rows is of fixed width.
+            text = content[0].as_py()
+            run.add(f"V{len(text)}", np.void(text))
+            continue
+        parts += [run.bytes(count), content]
         run = _Run()
-        run.add(f"V{(len(cells) + 7) // 8}", _null_bits(cells, count))
-        for column, found in zip(self._columns, cells, strict=True):
-            if not (column.is_text or column.is_list):
-                run.add(_big_endian(column), _fixed(column, found))
-                continue
-            same = _constant(column, found)
-            lengths, content = _variable(column, same or found)
-            run.add(">u4", lengths)
-            if same is not None:
-                # A text that is the same in all rows is of fixed width.
-                text = content[0].as_py()
-                run.add(f"V{len(text)}", np.void(text))
-                continue
-            parts += [run.bytes(count), content]
-            run = _Run()
-        parts.append(run.bytes(count))
-        _, joined = text_bytes(pc.binary_join_element_wise(*parts, b""))
-        return bytes(joined.data)
+    parts.append(run.bytes(count))
+    _, joined = text_bytes(pc.binary_join_element_wise(*parts, b""))
+    return bytes(joined.data)
 
 
 class _Run:
@@ -150,32 +144,26 @@ def _binary(offsets: NDArray[np.int64], content: NDArray[np.uint8]) -> pa.Array:
     return pa.BinaryArray.from_buffers(pa.binary(), len(offsets) - 1, [None, places, held])
 
 
-class Tabledata:
-    """What writes batches of a table as TABLEDATA."""
-
-    def __init__(self, columns: Sequence[VotableColumn]) -> None:
-        self._columns = tuple(columns)
-
-    def rows(self, cells: Sequence[Cells], count: int) -> bytes:
-        """Return rows."""
-        if not count:
-            return b""
-        parts: list[pa.Array | str] = []
-        for column, found in zip(self._columns, cells, strict=True):
-            text = _texts(column, found)
-            # What is the same in all rows is put between the columns that differ, as one text.
-            if isinstance(text, str) and parts and isinstance(parts[-1], str):
-                parts[-1] += _BETWEEN + text
-            else:
-                parts.append(text)
-        last = parts.pop()
-        if isinstance(last, str):
-            last = pa.repeat(last, count)
-        # The end of a row and the beginning of the next go with the last cell.
-        last = pc.binary_join_element_wise(last, _ROW_ENDS + _ROW_BEGINS, "", **_NULL_IS_EMPTY)
-        joined = pc.binary_join_element_wise(*parts, last, _BETWEEN, **_NULL_IS_EMPTY)
-        _, content = text_bytes(joined)
-        return b"".join([_ROW_BEGINS.encode(), content.data[: -len(_ROW_BEGINS)]])
+def tabledata_rows(columns: Sequence[VotableColumn], cells: Sequence[Cells], count: int) -> bytes:
+    """Return the rows of a batch as TABLEDATA."""
+    if not count:
+        return b""
+    parts: list[pa.Array | str] = []
+    for column, found in zip(columns, cells, strict=True):
+        text = _texts(column, found)
+        # What is the same in all rows is put between the columns that differ, as one text.
+        if isinstance(text, str) and parts and isinstance(parts[-1], str):
+            parts[-1] += _BETWEEN + text
+        else:
+            parts.append(text)
+    last = parts.pop()
+    if isinstance(last, str):
+        last = pa.repeat(last, count)
+    # The end of a row and the beginning of the next go with the last cell.
+    last = pc.binary_join_element_wise(last, _ROW_ENDS + _ROW_BEGINS, "", **_NULL_IS_EMPTY)
+    joined = pc.binary_join_element_wise(*parts, last, _BETWEEN, **_NULL_IS_EMPTY)
+    _, content = text_bytes(joined)
+    return b"".join([_ROW_BEGINS.encode(), content.data[: -len(_ROW_BEGINS)]])
 
 
 def _texts(column: VotableColumn, cells: Cells) -> pa.Array | str:

@@ -11,7 +11,6 @@ from binascii import b2a_base64
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
 from itertools import chain, islice
 from pathlib import Path
 from typing import Literal
@@ -31,7 +30,7 @@ from starcat.exchange.votable_fields import (
     info,
     votable_columns,
 )
-from starcat.exchange.votable_rows import Binary2, Tabledata
+from starcat.exchange.votable_rows import binary2_rows, tabledata_rows
 
 Serialization = Literal["binary2", "tabledata"]
 
@@ -124,8 +123,13 @@ def _row_chunks(
 
     What goes wrong with reading the batches is raised after the rows before it were given.
     """
-    writer = Binary2(columns) if serialization == "binary2" else Tabledata(columns)
-    encode = partial(_encoded, schema=schema, columns=columns, rows=writer.rows)
+    rows = binary2_rows if serialization == "binary2" else tabledata_rows
+
+    def encode(batch: pa.RecordBatch) -> bytes:
+        plain = plain_batch(batch, schema)
+        cells = [cells_of(column, values) for column, values in zip(columns, plain, strict=True)]
+        return rows(columns, cells, plain.num_rows) if columns else b""
+
     texts = _in_order(encode, _steps(batches))
     if serialization == "tabledata":
         yield from texts
@@ -174,18 +178,6 @@ def _steps(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
         rows = min(_STEP_ROWS, max(1, _STEP_BYTES // per_row))
         for start in range(0, batch.num_rows, rows):
             yield batch.slice(start, rows)
-
-
-def _encoded(
-    batch: pa.RecordBatch,
-    *,
-    schema: pa.Schema,
-    columns: Sequence[VotableColumn],
-    rows: Callable[..., bytes],
-) -> bytes:
-    plain = plain_batch(batch, schema)
-    cells = [cells_of(column, values) for column, values in zip(columns, plain, strict=True)]
-    return rows(cells, plain.num_rows) if columns else b""
 
 
 def _in_order(

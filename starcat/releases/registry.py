@@ -5,7 +5,6 @@ from __future__ import annotations
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
 from urllib.parse import urlsplit
 
 from starcat.errors import ConfigError, DownloadError, ProductError, SourceMissing, reason
@@ -16,43 +15,21 @@ from starcat.storage.digests import file_sha256
 from starcat.storage.download import DownloadOptions, NotFound, download, forget_part, part_of
 
 
-class Registry(Protocol):
-    """What a registry can be asked for."""
-
-    @property
-    def address(self) -> str:
-        """Folder or URL, for messages and the lock file."""
-        ...
-
-    def releases(self) -> list[Listed]:
-        """Return what the index lists, by name, then by version."""
-        ...
-
-    def bring(self, blob: Blob, path: Path, progress: Progress) -> None:
-        """Bring content, checked, to the part of a path (`part_of`)."""
-        ...
-
-
 @dataclass(frozen=True)
 class FolderRegistry:
     """A registry on disk."""
 
-    root: Path  # its folder
-
-    @property
-    def address(self) -> str:
-        """The folder as it was given."""
-        return str(self.root)
+    address: str  # its folder, as it was given
 
     def releases(self) -> list[Listed]:
-        """Return what the index lists."""
-        path = self.root / INDEX_NAME
+        """Return what the index lists, by name, then by version."""
+        path = Path(self.address, INDEX_NAME)
         try:
             with path.open("rb") as file:
                 data = file.read(MAX_INDEX_BYTES + 1)
         except OSError as error:
             raise SourceMissing(
-                f"{self.root}: no registry, {INDEX_NAME} cannot be read ({reason(error)}); "
+                f"{self.address}: no registry, {INDEX_NAME} cannot be read ({reason(error)}); "
                 "'starcat publish' makes one",
                 path=path,
             ) from error
@@ -63,9 +40,9 @@ class FolderRegistry:
         return read_index(data, str(path))
 
     def bring(self, blob: Blob, path: Path, progress: Progress) -> None:
-        """Copy content, going on where an earlier copy ended."""
+        """Copy content, checked, to the part of a path; go on where an earlier copy ended."""
         try:
-            copy_to_part(self.root / blob.path, blob, part_of(path), progress)
+            copy_to_part(Path(self.address, blob.path), blob, part_of(path), progress)
         except ProductError as error:
             error.args = (
                 f"{error}. The registry is damaged: remove that blob if it is there, and "
@@ -78,30 +55,27 @@ class FolderRegistry:
 class HttpRegistry:
     """A registry that a web server offers as files."""
 
-    root: str  # its address, without a slash at the end
-    options: DownloadOptions  # how to download
-
-    @property
-    def address(self) -> str:
-        """The address."""
-        return self.root
+    address: str  # without a slash at the end
+    options: DownloadOptions
 
     def releases(self) -> list[Listed]:
         """Return what the index lists."""
-        url = f"{self.root}/{INDEX_NAME}"
+        url = f"{self.address}/{INDEX_NAME}"
         with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
             path = Path(folder) / INDEX_NAME
             try:
                 download(url, path, replace(self.options, most_bytes=MAX_INDEX_BYTES))
             except NotFound as error:
-                raise SourceMissing(f"{self.root}: no registry, {INDEX_NAME}: {error}") from error
+                raise SourceMissing(
+                    f"{self.address}: no registry, {INDEX_NAME}: {error}"
+                ) from error
             except DownloadError as error:
                 raise DownloadError(f"{url}: {error}. Try again later") from error
             return read_index(part_of(path).read_bytes(), url)
 
     def bring(self, blob: Blob, path: Path, progress: Progress) -> None:
         """Download content, going on where an earlier download ended."""
-        url = f"{self.root}/{blob.path}"
+        url = f"{self.address}/{blob.path}"
         options = replace(self.options, fixed_bytes=blob.bytes, progress=progress)
         arrival = "resumed"
         # What is wrong in a part of an earlier attempt may be the part.
@@ -126,11 +100,14 @@ class HttpRegistry:
         )
 
 
+Registry = FolderRegistry | HttpRegistry
+
+
 def open_registry(text: str, options: DownloadOptions | None = None) -> Registry:
     """Return the registry at a folder or an address; nothing is read yet."""
     if is_address(text):
         return HttpRegistry(text.rstrip("/"), options or DownloadOptions())
-    return FolderRegistry(Path(text))
+    return FolderRegistry(str(Path(text)))
 
 
 def is_address(text: str) -> bool:
