@@ -203,19 +203,6 @@ def test_no_pixels(camera):
 # The field of view ----------------------------------------------------------------------------
 
 
-def test_the_fields_of_view_are_the_angles_between_the_edges():
-    edges = np.array([[0.0, 384.0], [1024.0, 384.0], [512.0, 0.0], [512.0, 768.0]])
-    left, right, top, bottom = WIDE.directions_from_pixels(edges)
-    assert WIDE.fov_x_deg == pytest.approx(np.degrees(separation(left, right)), rel=1e-14)
-    assert WIDE.fov_y_deg == pytest.approx(np.degrees(separation(top, bottom)), rel=1e-14)
-
-
-def test_the_diagonal_is_the_angle_between_the_corners():
-    one, other = WIDE.directions_from_pixels(np.array([[0.0, 0.0], [1024.0, 768.0]]))
-    assert WIDE.diagonal_rad == pytest.approx(float(separation(one, other)), rel=1e-14)
-    assert WIDE.radius_rad == pytest.approx(math.atan(640.0 / 2000.0), rel=1e-15)
-
-
 @given(sides, sides, st.floats(0.1, 170.0))
 def test_a_camera_of_a_field_has_that_field(width_px, height_px, fov_deg):
     camera = Camera(width_px, height_px, fov_x_deg=fov_deg)
@@ -304,20 +291,14 @@ def test_the_formula_by_hand():
 
 
 @given(cameras(), unit_shares, unit_shares)
-def test_projection_is_the_formula(camera, x_share, y_share):
-    pixel = (x_share * camera.width_px, y_share * camera.height_px)
+def test_projection_is_the_formula_and_directions_are_those_of_a_search(camera, x_share, y_share):
+    pixel = np.array([x_share * camera.width_px, y_share * camera.height_px])
     body = direction_by_search(camera, pixel)
+    assert separation(camera.directions_from_pixels(pixel[None])[0], body) < 1e-12
     found = camera.pixels_from_directions(3.0 * body[None])[0]
     # Some ten roundings of a number as large as the offset of the principal point.
     assert np.abs(found - pixel_by_formula(camera, body)).max() < 1e-10
     assert np.abs(found - pixel).max() < 1e-9
-
-
-@given(cameras(), unit_shares, unit_shares)
-def test_directions_are_those_that_a_search_finds(camera, x_share, y_share):
-    pixel = np.array([x_share * camera.width_px, y_share * camera.height_px])
-    found = camera.directions_from_pixels(pixel[None])[0]
-    assert separation(found, direction_by_search(camera, pixel)) < 1e-12
 
 
 @given(cameras())

@@ -24,7 +24,7 @@ from astropy.io.votable import parse
 from astropy.table import Table
 from fastapi.testclient import TestClient
 from pyvo.dal import DALQueryError, conesearch
-from shelved import DATABASE, shelve
+from shelved import DATABASE, client_of, shelve
 
 from starcat.artifact.reader import open_artifact
 from starcat.errors import ConfigError
@@ -59,7 +59,7 @@ def root(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Path
 
 @pytest.fixture(scope="module")
 def client(root: Path) -> Iterator[TestClient]:
-    with TestClient(make_app(Settings(root=root)), base_url="http://127.0.0.1:8000") as client:
+    with client_of(root) as client:
         yield client
 
 
@@ -261,8 +261,7 @@ def test_a_catalog_that_is_not_there(client: TestClient, catalog: str) -> None:
 
 
 def test_who_may_not_read_gets_nothing(root: Path) -> None:
-    app = make_app(Settings(root=root, anonymous="none"))
-    with TestClient(app, base_url="http://127.0.0.1:8000") as client:
+    with client_of(root, anonymous="none") as client:
         assert ask(client).status_code == 401
 
 

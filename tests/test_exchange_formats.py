@@ -214,12 +214,6 @@ def test_votable_is_valid(products: dict[str, pa.Table], tmp_path: Path, form: s
     assert validate(path, output=report, xmllint=False), report.getvalue()
 
 
-def test_fits_is_valid(products: dict[str, pa.Table], tmp_path: Path) -> None:
-    for product in ("stars", "neighbours", "rejected"):
-        with fits.open(written(products[product], tmp_path, "fits")) as file:
-            file.verify("exception")
-
-
 def test_parquet_is_the_product(products: dict[str, pa.Table], tmp_path: Path) -> None:
     for table in products.values():
         path = written(table, tmp_path, "parquet", rows_a_batch=777)

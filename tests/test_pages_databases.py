@@ -22,7 +22,7 @@ from shelved import DATABASE, LOCAL, client_of, shelve, waiting_build
 from starcat.errors import QueryError
 from starcat.query.gallery import gallery, named_query
 from starcat.query.session import open_session
-from starcat.report import coverage_map, sky_map
+from starcat.report import coverage_map
 from starcat.report.coverage_map import project
 from starcat.service.pages.rendering import time_text
 
@@ -155,8 +155,8 @@ def test_the_map_has_the_colour_of_each_field_at_its_boresight(client, small_art
         *(np.array(content[name]) for name in ("ra_deg", "dec_deg", "stars", "stars", "stars"))
     )
     x, y = project(fields.ra_deg, fields.dec_deg)
-    column = ((x / sky_map.HALF_WIDTH + 1.0) * 0.5 * width).astype(int).clip(0, width - 1)
-    row = ((1.0 - y / sky_map.HALF_HEIGHT) * 0.5 * height).astype(int).clip(0, height - 1)
+    column = ((x / coverage_map.HALF_WIDTH + 1.0) * 0.5 * width).astype(int).clip(0, width - 1)
+    row = ((1.0 - y / coverage_map.HALF_HEIGHT) * 0.5 * height).astype(int).clip(0, height - 1)
     bins = coverage_map.bins_of(fields.stars)
     inside = pixels[row, column, 3] > 0
     assert inside.mean() > 0.95  # some lie in the last pixel of the edge

@@ -21,8 +21,7 @@ from starcat.errors import ConfigError
 from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.matcher.centroids import read_frames
 from starcat.matcher.database import open_database
-from starcat.service.pages.centroid_text import centroid_file
-from starcat.service.pages.identify import NOISE_PX
+from starcat.service.pages.identify import NOISE_PX, centroid_file
 from starcat.simulation.simulate import Noise, simulate_frames
 
 LOCAL = "http://127.0.0.1:8000"

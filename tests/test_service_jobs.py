@@ -18,11 +18,11 @@ import pytest
 pytest.importorskip("fastapi")
 
 from fastapi.testclient import TestClient
+from shelved import client_of
 
 from starcat.artifact.verify import verify_artifact
 from starcat.errors import ConfigError, SourceMissing, TargetMissing
 from starcat.service.access import Principal, Role
-from starcat.service.app import make_app
 from starcat.service.jobs import job_states
 from starcat.service.jobs.job import Job
 from starcat.service.jobs.job_states import (
@@ -51,7 +51,6 @@ from starcat.specs.keys import spec_toml
 from starcat.specs.reading import spec_from_dict
 from starcat.storage.locks import locked
 
-LOCAL = "http://127.0.0.1:8000"
 JOBS = "/api/v1/jobs"
 ANNE, BOB = Principal("anne", Role.BUILDER), Principal("bob", Role.BUILDER)
 CHIEF = Principal("chief", Role.PUBLISHER)
@@ -399,8 +398,7 @@ def settled(service: Service, job_id: str, seconds: float = 50.0) -> Job:
 
 
 def test_a_build_is_done_and_watched_over_http(archive, tmp_path, small_spec):
-    settings = Settings(root=tmp_path / "service", anonymous="publisher")
-    with TestClient(make_app(settings), base_url=LOCAL) as client:
+    with client_of(tmp_path / "service", workers=1, anonymous="publisher") as client:
         answer = client.post(JOBS, json={"kind": "build", "spec": small_spec})
         job = answer.json()
         assert (answer.status_code, job["state"]) == (201, "queued")
@@ -447,8 +445,7 @@ def sent_events(text: str) -> list[tuple[str, int, dict[str, Any]]]:
 
 @pytest.fixture
 def client(archive: Path, tmp_path: Path) -> Iterator[TestClient]:
-    settings = Settings(root=tmp_path / "service", anonymous="builder", workers=0)
-    with TestClient(make_app(settings), base_url=LOCAL) as client:
+    with client_of(tmp_path / "service", anonymous="builder") as client:
         yield client
 
 
@@ -511,8 +508,7 @@ def test_jobs_are_listed_by_what_they_are(client, small_spec):
 
 
 def test_readers_watch_and_do_nothing_else(archive, tmp_path):
-    settings = Settings(root=tmp_path / "service", anonymous="reader", workers=0)
-    with TestClient(make_app(settings), base_url=LOCAL) as client:
+    with client_of(tmp_path / "service", anonymous="reader") as client:
         job = submit_ingest(client.app.state.service, "sao", "anne").job
         for path in ("", f"/{job.id}", f"/{job.id}/events.json", f"/{job.id}/log"):
             assert client.get(f"{JOBS}{path}").status_code == 200

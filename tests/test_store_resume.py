@@ -43,17 +43,12 @@ def make(parts, folder: Path, **options):
     return ingest_to_store("2mass", parts, folder, options=StoreOptions(**{**SMALL, **options}))
 
 
-@pytest.mark.parametrize("workers", [1, 3])
-def test_any_number_of_workers_writes_the_same_bytes(workers, parts, whole, tmp_path):
-    made = make(parts, tmp_path / "store", workers=workers)
+@pytest.mark.parametrize("options", [{"workers": 1, "memory_bytes": 1 << 30}, {"workers": 3}])
+def test_any_workers_and_memory_write_the_same_bytes(options, parts, whole, tmp_path):
+    made = make(parts, tmp_path / "store", **options)
     assert bytes_of(tmp_path / "store") == whole
     assert made.outcome == "written"
     assert [path.name for path in tmp_path.iterdir()] == ["store"]
-
-
-def test_memory_is_no_part_of_the_bytes(parts, whole, tmp_path):
-    make(parts, tmp_path / "store", memory_bytes=1 << 30)
-    assert bytes_of(tmp_path / "store") == whole
 
 
 @pytest.fixture

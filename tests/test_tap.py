@@ -19,7 +19,7 @@ from astropy.io.votable import from_table, parse_single_table
 from astropy.table import MaskedColumn, Table
 from fastapi.testclient import TestClient
 from httpx2 import Response
-from shelved import shelve
+from shelved import LOCAL, client_of, shelve
 
 from starcat.errors import QueryError
 from starcat.exchange.formats import response_format
@@ -33,7 +33,6 @@ from starcat.service.settings import Settings
 from starcat.service.vo.tap import ClientGone, Spool
 from starcat.vo.parameters import Question
 
-LOCAL = "http://127.0.0.1:8000"
 BRIGHT = "SELECT star_id, ra_deg, mag FROM small.stars WHERE mag < 2.5 ORDER BY star_id"
 SLOW = "SELECT COUNT(*) AS n FROM small.pairs a, small.pairs b, small.pairs c WHERE a.i < b.j + c.i"
 UWS = {"uws": "http://www.ivoa.net/xml/UWS/v1.0", "xlink": "http://www.w3.org/1999/xlink"}
@@ -48,8 +47,7 @@ def root(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Path
 
 @pytest.fixture(scope="module")
 def client(root: Path) -> Iterator[TestClient]:
-    settings = Settings(root=root, upload_mib=0.5, max_rows=1_000_000)
-    with TestClient(make_app(settings), base_url=LOCAL) as opened:
+    with client_of(root, upload_mib=0.5, max_rows=1_000_000) as opened:
         yield opened
 
 
@@ -159,8 +157,7 @@ def test_what_is_wrong_is_told_as_dali_has_it(client, parameters, status, told):
 
 def test_who_reads_slowly_keeps_nobody_waiting(root):
     """More clients than places begin to read large answers and stop; the next is answered."""
-    settings = Settings(root=root, queries=2)
-    with TestClient(make_app(settings), base_url=LOCAL) as client:
+    with client_of(root, queries=2) as client:
         service = client.app.state.service
         asked = Question("SELECT * FROM small.pairs", response_format("csv"), 1_000_000)
         spools = []
@@ -191,8 +188,7 @@ def test_what_fails_halfway_is_raised_behind_what_was_made(tmp_path):
 
 
 def test_a_query_ends_when_its_client_goes(root):
-    settings = Settings(root=root, queries=1)
-    with TestClient(make_app(settings), base_url=LOCAL) as client:
+    with client_of(root, queries=1) as client:
         service = client.app.state.service
         gone = threading.Event()
 
@@ -586,7 +582,7 @@ def test_jobs_outlive_the_server(tmp_path, small_artifact, bright):
 def test_databases_and_catalogs_are_seen_as_they_come(tmp_path, small_artifact):
     root = tmp_path / "service"
     stars = small_artifact / "stars.parquet"
-    with TestClient(make_app(Settings(root=root)), base_url=LOCAL) as client:
+    with client_of(root) as client:
 
         def names() -> list[str]:
             query = "SELECT schema_name FROM tap_schema.schemas ORDER BY schema_index"
@@ -612,7 +608,6 @@ def test_databases_and_catalogs_are_seen_as_they_come(tmp_path, small_artifact):
 
 
 def test_without_a_role_nothing_is_told(tmp_path):
-    settings = Settings(root=tmp_path, anonymous="none")
-    with TestClient(make_app(settings), base_url=LOCAL) as client:
+    with client_of(tmp_path, anonymous="none") as client:
         for path in ("sync?QUERY=x", "async", "tables", "examples", f"async/{'0' * 32}"):
             assert client.get(f"/tap/{path}").status_code == 401

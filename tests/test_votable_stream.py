@@ -245,13 +245,6 @@ def test_a_query_that_fails_midway_is_told_at_the_end(serialization: Serializati
 
 
 @both
-def test_a_query_that_fails_at_once_is_raised(serialization: Serialization) -> None:
-    chunks = votable_chunks(failing(0, QueryLimitError("late")), serialization=serialization)
-    with pytest.raises(QueryLimitError, match="late"):
-        next(chunks)
-
-
-@both
 def test_a_text_that_no_xml_can_hold_ends_the_rows(serialization: Serialization) -> None:
     batches = [pa.record_batch({"a": [text]}) for text in ("x", "y", "\x01", "z")]
     reader = pa.RecordBatchReader.from_batches(batches[0].schema, batches)

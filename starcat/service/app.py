@@ -24,7 +24,7 @@ from starcat.service.jobs.slots import JobSlots
 from starcat.service.pages.rendering import add_missing_page
 from starcat.service.problems import REFUSALS, add_problem_handlers
 from starcat.service.removal import keep_removing
-from starcat.service.security import metrics, signing
+from starcat.service.security import metrics
 from starcat.service.security.auth import Authentication, Identities
 from starcat.service.security.middleware import Defects, Refusals, RequestContext, SafeHeaders
 from starcat.service.security.origin import Origins
@@ -50,7 +50,7 @@ RESOURCES: tuple[APIRouter, ...] = (
 OTHERS: tuple[APIRouter, ...] = (
     releases.registry_router,
     metrics.router,
-    signing.router,
+    pages.home.sign_in_router,
     cone_search.router,
     tap.router,
     tap_async.router,

@@ -15,15 +15,9 @@ JOB_ID = re.compile(r"[0-9a-f]{32}")
 
 @dataclass(frozen=True)
 class ServicePaths:
-    """Files and folders of a service.
+    """Files and folders of a service."""
 
-    Attributes
-    ----------
-    root : Path
-        Its folder, in full.
-    """
-
-    root: Path
+    root: Path  # its folder, in full
 
     @property
     def records(self) -> Path:

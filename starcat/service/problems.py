@@ -171,19 +171,26 @@ def add_problem_handlers(app: FastAPI) -> None:
         return problem_response(error, request)
 
 
-REFUSALS: dict[int | str, dict[str, Any]] = {
-    status: {"model": ProblemDetails, "content": {MEDIA_TYPE: {}}, "description": text}
-    for status, text in (
-        (400, "The request cannot be understood."),
-        (401, "A token is needed."),
-        (403, "The token has not the role that is needed."),
-        (404, "There is no such thing."),
-        (409, "It contradicts what is there."),
-        (413, "Too large."),
-        (415, "The content is of a type that is not taken here."),
-        (422, "Something in the request is wrong."),
-        (429, "Too many requests; ``Retry-After`` says when to ask again."),
-        (503, "Too much is done at the same time; ``Retry-After`` says when to ask again."),
-    )
-}
+def refusals(texts: Mapping[int, str]) -> dict[int | str, dict[str, Any]]:
+    """Return for ``responses=`` what refusals mean, by status."""
+    return {
+        status: {"model": ProblemDetails, "content": {MEDIA_TYPE: {}}, "description": text}
+        for status, text in texts.items()
+    }
+
+
+REFUSALS = refusals(
+    {
+        400: "The request cannot be understood.",
+        401: "A token is needed.",
+        403: "The token has not the role that is needed.",
+        404: "There is no such thing.",
+        409: "It contradicts what is there.",
+        413: "Too large.",
+        415: "The content is of a type that is not taken here.",
+        422: "Something in the request is wrong.",
+        429: "Too many requests; ``Retry-After`` says when to ask again.",
+        503: "Too much is done at the same time; ``Retry-After`` says when to ask again.",
+    }
+)
 """For ``responses=`` of routers: how they refuse."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import shutil
 import signal
 import socket
@@ -11,13 +12,13 @@ from contextlib import ExitStack, contextmanager
 
 import uvicorn
 from fastapi import FastAPI
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from starcat.errors import ConfigError, OutputError, reason
 from starcat.service.access import Role
 from starcat.service.app import make_app
 from starcat.service.jobs.slots import JobSlots
 from starcat.service.paths import ServicePaths
-from starcat.service.security.header_timeout import HeaderTimeout
 from starcat.service.security.logs import log_settings
 from starcat.service.security.request_limits import MOST_HEADER_BYTES, MOST_TARGET_BYTES
 from starcat.service.security.tokens import TokenStore
@@ -38,6 +39,54 @@ FIRST = "operator"
 
 Announce = Callable[[str], None]
 """Takes the address that people open, when the server listens."""
+
+
+HEAD_S = 15.0
+"""Seconds in which the head of a request has to be there, and what is left of the one before."""
+
+
+class HeaderTimeout(H11Protocol):
+    """The protocol of the server, with an end to its patience between requests.
+
+    While a request is answered its handler decides how long that takes; `Bodies` sees to the time
+    of what it reads.
+    """
+
+    _waiting: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Begin to wait for the first request."""
+        super().connection_made(transport)
+        self._watch()
+
+    def data_received(self, data: bytes) -> None:
+        """Take what has come."""
+        super().data_received(data)
+        self._watch()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Wait no longer."""
+        self._forget()
+        super().connection_lost(exc)
+
+    def _watch(self) -> None:
+        if self._is_answering():
+            self._forget()
+        elif self._waiting is None:
+            self._waiting = self.loop.call_later(HEAD_S, self._lose)
+
+    def _is_answering(self) -> bool:
+        return self.cycle is not None and not self.cycle.response_complete
+
+    def _forget(self) -> None:
+        if self._waiting is not None:
+            self._waiting.cancel()
+            self._waiting = None
+
+    def _lose(self) -> None:
+        self._waiting = None
+        if not self._is_answering() and not self.transport.is_closing():
+            self.transport.close()
 
 
 def run_server(settings: Settings, announce: Announce) -> None:

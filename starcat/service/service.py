@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from typing import Annotated
 
 from fastapi import Depends, Request
@@ -17,38 +16,29 @@ from starcat.service.records import Records
 from starcat.service.sandbox.sandbox import Sandbox
 from starcat.service.settings import Settings
 from starcat.service.vo.tap_jobs import QueryJobs
-from starcat.service.vo.tap_queries import TapQueries
-from starcat.service.vo.tap_tables import TapTables
+from starcat.service.vo.tap_queries import TapQueries, TapTables
 from starcat.vo.documents import ServiceLimits
 
 GIB = 2**30
-
-
 DAY_S = 86_400
 
 
 class Tap:
     """The parts of TAP: what is granted, what there is to be asked, and what answers."""
 
-    def __init__(
-        self,
-        settings: Settings,
-        paths: ServicePaths,
-        records: Records,
-        library: Library,
-        query_pool: QueryPool,
-        sandbox: Sandbox,
-        wake_slots: Callable[[], None],
-    ) -> None:
+    def __init__(self, service: Service) -> None:
+        settings, paths, query_pool = service.settings, service.paths, service.query_pool
         self.limits = ServiceLimits(
             run_s=int(settings.job_time_s),
             keep_s=int(settings.keep_results_days * DAY_S),
             rows=settings.max_rows,
             upload_bytes=int(settings.upload_mib * 2**20),
         )
-        self.tables = TapTables(paths, library, query_pool)
-        self.queries = TapQueries(paths, self.tables, query_pool, sandbox, settings.max_rows)
-        self.jobs = QueryJobs(records, paths, self.limits, self.queries, wake_slots)
+        self.tables = TapTables(paths, service.library, query_pool)
+        self.queries = TapQueries(
+            paths, self.tables, query_pool, service.sandbox, settings.max_rows
+        )
+        self.jobs = QueryJobs(service.records, paths, self.limits, self.queries, service.wake_slots)
 
 
 class Service:
@@ -64,15 +54,7 @@ class Service:
         self.job_queued = threading.Condition()  # notified when a job waits
         self.query_pool = QueryPool(settings)
         self.sandbox = Sandbox(settings, self.paths.scratch)
-        self.tap = Tap(
-            settings,
-            self.paths,
-            self.records,
-            self.library,
-            self.query_pool,
-            self.sandbox,
-            self.wake_slots,
-        )
+        self.tap = Tap(self)
         self.catalogs = Catalogs(round(settings.job_memory_gib * GIB))
         self.stopping = threading.Event()
 

@@ -24,7 +24,7 @@ from starcat.exchange.columns import FirstRows
 from starcat.exchange.formats import FILE_FORMATS, FORMATS
 from starcat.releases.tree import Blob
 from starcat.service.paths import ServicePaths
-from starcat.service.problems import MEDIA_TYPE, Problem, ProblemDetails
+from starcat.service.problems import Problem, refusals
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -64,11 +64,7 @@ FILE: dict[int | str, dict[str, Any]] = {
     200: {"content": CONTENTS, "description": "The file."},
     206: {"content": CONTENTS, "description": "The range that was asked for."},
     304: {"description": "The same as you have (``If-None-Match``)."},
-    416: {
-        "model": ProblemDetails,
-        "content": {MEDIA_TYPE: {}},
-        "description": "The range lies outside of the file.",
-    },
+    **refusals({416: "The range lies outside of the file."}),
 }
 """For ``responses=`` of what answers with files."""
 
@@ -130,6 +126,11 @@ def has_already(request: Request, sha256: str) -> bool:
     given = request.headers.get("if-none-match", "")
     tags = [tag.strip().removeprefix("W/") for tag in given.split(",")]
     return "*" in tags or f'"{sha256}"' in tags
+
+
+def body_type(request: Request) -> str:
+    """Return the content type of a request's body without parameters; empty if not given."""
+    return request.headers.get("content-type", "").partition(";")[0].strip().lower()
 
 
 def type_of(file_name: str) -> str:

@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from starcat.service.service import Service
 
 DATABASE = "0123456789abcdef"
-
-
 LOCAL = "http://127.0.0.1:8000"
 
 
 @contextmanager
-def client_of(root: Path, address: str = LOCAL, **settings: Any) -> Iterator[TestClient]:
-    """Run a service without workers, and give a client of it."""
-    app = make_app(Settings(root=root, workers=0, **settings))
+def client_of(
+    root: Path, address: str = LOCAL, workers: int = 0, **settings: Any
+) -> Iterator[TestClient]:
+    """Run a service, without workers if nothing else is said, and give a client of it."""
+    app = make_app(Settings(root=root, workers=workers, **settings))
     with TestClient(app, base_url=address) as client:
         yield client
 

@@ -9,7 +9,9 @@ from fastapi import APIRouter, Path, Query, Request
 from fastapi.responses import JSONResponse, Response, StreamingResponse
 from pydantic import BaseModel, Field
 
+from starcat.artifact.diff import Difference, diff_artifacts
 from starcat.artifact.manifest import MANIFEST_NAME
+from starcat.artifact.reader import Artifact
 from starcat.errors import TargetMissing
 from starcat.releases.tree import Blob
 from starcat.service.access import Publisher, Reader
@@ -174,12 +176,14 @@ async def difference(
     return await service.query_pool.run(_difference, service, database, other, most)
 
 
-def _difference(service: Service, one: str, other: str, most: int) -> dict[str, Any]:
-    from starcat.artifact.diff import diff_artifacts
-    from starcat.artifact.reader import open_artifact
+def difference_of(service: Service, database: str, other: str) -> Difference:
+    """Return what differs between two databases."""
+    sides = (service.library.database(one) for one in (database, other))
+    return diff_artifacts(*(Artifact(one.folder, one.manifest) for one in sides))
 
-    a, b = (open_artifact(service.library.database(name).folder) for name in (one, other))
-    content = diff_artifacts(a, b).as_dict()
+
+def _difference(service: Service, database: str, other: str, most: int) -> dict[str, Any]:
+    content = difference_of(service, database, other).as_dict()
     stars = ("came", "went", "moved")
     counts = {name: len(content[name]) for name in stars}
     return {**content, **{name: content[name][:most] for name in stars}, "counts": counts}

@@ -20,19 +20,15 @@ from starlette.datastructures import UploadFile
 from starcat.failures import validation_message
 from starcat.images.solve_files import IMAGE_SUFFIXES, IdentifyOptions
 from starcat.service.access import Reader
-from starcat.service.problems import MEDIA_TYPE, Problem, ProblemDetails
+from starcat.service.problems import Problem, refusals
 from starcat.service.service import Service, TheService
-from starcat.service.transfers import safe_name, scratch_folder, type_of
+from starcat.service.transfers import body_type, safe_name, scratch_folder, type_of
 
-UNKNOWN_TYPE: dict[int | str, dict[str, Any]] = {
-    415: {
-        "model": ProblemDetails,
-        "content": {MEDIA_TYPE: {}},
-        "description": "The content is of another type.",
-    }
-}
-
-router = APIRouter(prefix="/identify", tags=["identify"], responses=UNKNOWN_TYPE)
+router = APIRouter(
+    prefix="/identify",
+    tags=["identify"],
+    responses=refusals({415: "The content is of another type."}),
+)
 
 MIB = 2**20
 SUFFIXES = (*IMAGE_SUFFIXES, ".csv", ".json")
@@ -180,7 +176,7 @@ async def _sent(
     request: Request, most_mib: float
 ) -> AsyncIterator[tuple[FrameUpload, IdentifyOptions]]:
     """Give what a request brought; its file is closed afterwards."""
-    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    kind = body_type(request)
     if kind == "multipart/form-data":
         async with request.form(max_files=1, max_fields=4) as form:
             upload = form.get("file")

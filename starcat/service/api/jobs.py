@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from starcat.errors import ConfigError
 from starcat.service.access import Builder, Reader
+from starcat.service.api.specs import GivenSpec
 from starcat.service.jobs.job import Event, Job, Kind, State
 from starcat.service.jobs.submission import (
     Submitted,
@@ -27,7 +28,6 @@ from starcat.service.jobs.submission import (
 )
 from starcat.service.service import Service, TheService
 from starcat.specs.build_spec import BuildSpec
-from starcat.specs.reading import content_of_toml, preset, spec_from_dict
 
 router = APIRouter(prefix="/jobs", tags=["jobs"])
 
@@ -222,14 +222,13 @@ def _submitted(service: Service, wish: AnyWish, owner: str) -> Submitted:
 def _spec_of(wish: BuildWish) -> BuildSpec:
     if (wish.spec is None) == (wish.preset is None):
         raise ConfigError("say what to build: give either spec or preset", key="spec")
-    if wish.preset is not None:
-        return preset(wish.preset, wish.changes)
-    if wish.changes:
+    if wish.preset is None and wish.changes:
         raise ConfigError("changes go with a preset; change the spec itself", key="changes")
-    content = wish.spec
-    if isinstance(content, str):
-        content = content_of_toml(content, "spec")
-    return spec_from_dict(content or {}, "spec")
+    toml, keys = (wish.spec, None) if isinstance(wish.spec, str) else (None, wish.spec)
+    given = GivenSpec.model_construct(
+        toml=toml, spec=keys, preset=wish.preset, changes=wish.changes
+    )
+    return given.checked()
 
 
 @router.get("", summary="List jobs")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import re
-from typing import Annotated, Literal
+import time
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Request
 from fastapi.responses import Response
@@ -15,7 +16,7 @@ from starcat.releases.publishing import publish_artifact, recorded
 from starcat.releases.tree import INDEX_NAME, Listed
 from starcat.service.access import Publisher, Reader
 from starcat.service.problems import REFUSALS
-from starcat.service.publications import Publication, Publications
+from starcat.service.records import Records
 from starcat.service.service import Service, TheService
 from starcat.service.transfers import FILE, IMMUTABLE, REVALIDATED, file_answer, has_already
 from starcat.specs.section import NAME_PATTERN, VERSION_PATTERN
@@ -30,6 +31,14 @@ RELEASE = re.compile(
 )
 
 MAX_NOTE = 4000
+
+
+def publications(records: Records) -> dict[tuple[str, str], dict[str, Any]]:
+    """Return by name and version which database a release was, who published it, when and why."""
+    with records.reading() as connection:
+        rows = connection.execute("SELECT * FROM publications").fetchall()
+    told = ("database", "note", "owner", "published_s")
+    return {(row["name"], row["version"]): {key: row[key] for key in told} for row in rows}
 
 
 class ReleaseFacts(BaseModel):
@@ -84,7 +93,7 @@ class PublishedRelease(ReleaseFacts):
 @router.get("", summary="All releases")
 def all_releases(service: TheService, reader: Reader) -> Releases:
     """Return all releases, by name and then by version."""
-    known = Publications(service.records).all()
+    known = publications(service.records)
     return Releases(releases=[_facts(service, one, known) for one in _listed(service)])
 
 
@@ -98,7 +107,7 @@ def one_release(
     """Return what is known of a release."""
     for one in _listed(service):
         if (one.name, one.version) == (name, version):
-            return _facts(service, one, Publications(service.records).all())
+            return _facts(service, one, publications(service.records))
     raise TargetMissing(
         f"no release {name[:80]!r} {version[:80]!r}; /api/v1/releases lists what there is"
     )
@@ -126,9 +135,14 @@ def publish(
 def _publish(service: Service, wanted: ToPublish, owner: str) -> PublishedRelease:
     database = service.library.database(wanted.database)
     published = publish_artifact(database.folder, str(service.paths.registry))
-    publications = Publications(service.records)
-    publications.add(published, database.id, wanted.note, owner)
-    facts = _facts(service, published.release, publications.all())
+    release = published.release
+    with service.records.writing() as connection:  # one that is known keeps its first note
+        connection.execute(
+            "INSERT OR IGNORE INTO publications "
+            "(name, version, database, note, owner, published_s) VALUES (?, ?, ?, ?, ?, ?)",
+            (release.name, release.version, database.id, wanted.note, owner, time.time()),
+        )
+    facts = _facts(service, release, publications(service.records))
     return PublishedRelease(
         **facts.model_dump(),
         outcome=published.outcome,
@@ -144,9 +158,8 @@ def _listed(service: Service) -> list[Listed]:
 
 
 def _facts(
-    service: Service, release: Listed, known: dict[tuple[str, str], Publication]
+    service: Service, release: Listed, known: dict[tuple[str, str], dict[str, Any]]
 ) -> ReleaseFacts:
-    told = known.get((release.name, release.version))
     settings = service.settings
     address = settings.public_url or f"http://{settings.host}:{settings.port}"
     return ReleaseFacts(
@@ -156,12 +169,9 @@ def _facts(
         manifest_sha256=release.manifest.sha256,
         files=release.files,
         bytes=release.bytes,
-        database=told.database if told else None,
-        note=told.note if told else None,
-        owner=told.owner if told else None,
-        published_s=told.published_s if told else None,
         pull=f"starcat pull {release.name}@{release.version} --registry "
         f"{address.rstrip('/')}/registry",
+        **known.get((release.name, release.version), {}),
     )
 
 

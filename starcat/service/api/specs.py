@@ -28,8 +28,9 @@ from starcat.service.api.spec_models import (
     preset_facts,
     starter_answer,
 )
-from starcat.service.problems import MEDIA_TYPE, Problem, ProblemDetails
+from starcat.service.problems import Problem, refusals
 from starcat.service.service import TheService
+from starcat.service.transfers import body_type
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import (
     MOST_CHARACTERS,
@@ -107,7 +108,7 @@ async def _body_of(request: Request) -> bytes:
 
 def _spec_of(request: Request, body: Annotated[bytes, Depends(_body_of)]) -> BuildSpec:
     """Return the spec that a request brings, checked; in a thread of its own."""
-    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    kind = body_type(request)
     if kind.startswith(TOML_TYPES):
         return GivenSpec(toml=_text(body)).checked()
     if kind != "application/json":
@@ -169,21 +170,8 @@ SPEC_BODY: dict[str, Any] = {
 }
 """``openapi_extra=`` of an operation with `SpecOfRequest`."""
 
-
-KIND: dict[int | str, dict[str, Any]] = {
-    415: {
-        "model": ProblemDetails,
-        "content": {MEDIA_TYPE: {}},
-        "description": "Neither TOML nor JSON.",
-    }
-}
-BUSY: dict[int | str, dict[str, Any]] = {
-    503: {
-        "model": ProblemDetails,
-        "content": {MEDIA_TYPE: {}},
-        "description": "A catalog is being read; ``Retry-After`` says when to ask again.",
-    },
-}
+KIND = refusals({415: "Neither TOML nor JSON."})
+BUSY = refusals({503: "A catalog is being read; ``Retry-After`` says when to ask again."})
 SVG: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/svg+xml": {"schema": {"type": "string"}}}, "description": "The map."}
 }

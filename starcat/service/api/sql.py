@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query
-from fastapi.responses import JSONResponse, Response
+from fastapi.responses import JSONResponse, Response, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
+from starcat.errors import QueryError
 from starcat.exchange.formats import FILE_FORMATS, FORMATS, FileFormat
-from starcat.query.gallery import gallery, macros
+from starcat.query.gallery import gallery, macros, named_query
+from starcat.query.result import ResultTable
 from starcat.query.targets import View
 from starcat.service.access import Reader
 from starcat.service.problems import Problem
 from starcat.service.service import Service, TheService
-from starcat.service.sql import SqlQuery, named_text, result_file, result_table
+from starcat.service.transfers import chunks_of, scratch_folder, write_rows
 
 router = APIRouter(prefix="/sql", tags=["sql"])
 
@@ -124,6 +128,50 @@ class ViewFacts(BaseModel):
     columns: list[ViewColumn]
 
 
+@dataclass(frozen=True)
+class SqlQuery:
+    """A query and its limits."""
+
+    targets: Sequence[str]  # as `Library.target` takes them
+    text: str
+    values: Mapping[str, Any]  # of the ``$name`` in it
+    max_rows: int
+    time_s: float
+
+
+def result_table(service: Service, query: SqlQuery) -> ResultTable:
+    """Return the first rows of a result."""
+    paths = [service.library.target(name) for name in query.targets]
+    with (
+        service.query_pool.session(paths, query.time_s) as session,
+        session.ask(query.text, query.values) as running,
+    ):
+        found: ResultTable = running.table(query.max_rows)
+    return found
+
+
+def result_file(
+    service: Service, query: SqlQuery, form: str, stem: str
+) -> tuple[StreamingResponse, int, bool]:
+    """Return a result as a file, its rows, and whether there are more; ``stem`` has no suffix."""
+    paths = [service.library.target(name) for name in query.targets]
+    with scratch_folder(service.paths) as folder:
+        source, target = folder / "rows.arrow", folder / "result"
+        with (
+            service.query_pool.session(paths, query.time_s) as session,
+            session.ask(query.text, query.values) as running,
+        ):
+            count, is_cut = write_rows(running.batches(), source, query.max_rows)
+        service.sandbox.convert(source, target, form)
+        chunks, size = chunks_of(target.open("rb")), target.stat().st_size
+    headers = {
+        "Content-Length": str(size),
+        "Content-Disposition": f'attachment; filename="{stem}{FORMATS[form].suffix}"',
+    }
+    answer = StreamingResponse(chunks, media_type=FORMATS[form].media_type, headers=headers)
+    return answer, count, is_cut
+
+
 @router.post(
     "",
     summary="Ask a question",
@@ -186,7 +234,11 @@ def _checked(service: Service, question: SqlQuestion) -> SqlQuery:
         default, most = min(1000, most), min(MAX_SHOWN, most)
     count = len(question.targets)
     if question.named is not None:
-        text, values = named_text(question.named, question.values, count)
+        named = named_query(question.named)
+        if named.targets != count:
+            raise QueryError(f"{named.name} is about {named.targets} targets; {count} given")
+        text = named.text
+        values = named.with_values({key: str(one) for key, one in question.values.items()})
     else:
         text, values = question.query or "", dict(question.values)  # type: ignore[arg-type]
     time_s = min(question.time_limit_s or settings.query_time_s, settings.query_time_s)
@@ -199,9 +251,9 @@ def _rows(service: Service, query: SqlQuery) -> Response:
 
 
 def _file(service: Service, query: SqlQuery, form: str) -> Response:
-    found = result_file(service, query, form)
-    counts = {"X-Starcat-Rows": str(found.rows), "X-Starcat-Cut": str(found.is_cut).lower()}
-    return found.response("answer", counts)
+    answer, rows, is_cut = result_file(service, query, form, "answer")
+    answer.headers.update({"X-Starcat-Rows": str(rows), "X-Starcat-Cut": str(is_cut).lower()})
+    return answer
 
 
 def _views(service: Service, targets: list[str]) -> list[ViewFacts]:

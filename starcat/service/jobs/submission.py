@@ -141,8 +141,14 @@ def retry_job(service: Service, job_id: str, principal: Principal) -> Job:
     return service.jobs.get(job_id)
 
 
+def may_change(job: Job, principal: Principal) -> bool:
+    """Return whether somebody may end a job, or have it done again."""
+    needed = Role.BUILDER if principal.name == job.owner else Role.PUBLISHER
+    return principal.role >= needed
+
+
 def _check_may(job: Job, principal: Principal) -> None:
-    if principal.name != job.owner and principal.role < Role.PUBLISHER:
+    if not may_change(job, principal):
         raise Problem(
             403,
             f"job {job.id} is of {job.owner}, and {principal.name} may not change it; ask them, or "

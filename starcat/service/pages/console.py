@@ -16,11 +16,11 @@ from starcat.exchange.formats import FORMATS, PAGE_FORMATS, PageFormat
 from starcat.query.gallery import NamedQuery, gallery, guessed, macros, named_query
 from starcat.query.result import ResultTable
 from starcat.service.access import Reader
+from starcat.service.api.sql import SqlQuery, result_file, result_table
 from starcat.service.pages.facts import database_row, products_of
 from starcat.service.pages.rendering import page_router, render
 from starcat.service.problems import Problem, ProblemDetails, problem_of
 from starcat.service.service import Service, TheService
-from starcat.service.sql import SqlQuery, result_file, result_table
 
 router = page_router()
 
@@ -101,8 +101,8 @@ async def answer_file(
     """Give all rows of an answer as a file."""
     database = service.library.database(database_id)
     query = _checked(service, database.id, asked, service.settings.max_rows)
-    found = await service.query_pool.run(result_file, service, query, form)
-    return found.response(database.title, {})
+    found = await service.query_pool.run(result_file, service, query, form, database.title)
+    return found[0]
 
 
 def _rows(service: Service, database_id: str, form: ConsoleForm) -> ResultTable:

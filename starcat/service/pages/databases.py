@@ -11,13 +11,13 @@ from fastapi import Query, Request
 from fastapi.responses import JSONResponse, RedirectResponse, Response
 from starlette.concurrency import run_in_threadpool
 
-from starcat.artifact.diff import Difference, diff_artifacts
-from starcat.artifact.reader import Artifact
+from starcat.artifact.diff import Difference
 from starcat.errors import ProductError, TargetMissing
 from starcat.geometry.sphere import directions_from_radec
 from starcat.matcher.methods.table import METHODS
 from starcat.report.coverage_map import Fields, field_at, nearest_raster, raster_png, sky_map
 from starcat.service.access import Builder, Reader, Role
+from starcat.service.api.databases import difference_of
 from starcat.service.jobs.submission import submit_evaluation
 from starcat.service.library import Database
 from starcat.service.pages.facts import (
@@ -190,13 +190,8 @@ async def compare(
     difference = None
     if other:
         # In its turn among the queries: it reads whole tables.
-        difference = await service.query_pool.run(_difference, service, database_id, other)
+        difference = await service.query_pool.run(difference_of, service, database_id, other)
     return await run_in_threadpool(_comparison, request, service, database_id, other, difference)
-
-
-def _difference(service: Service, database_id: str, other: str) -> Difference:
-    sides = (service.library.database(one) for one in (database_id, other))
-    return diff_artifacts(*(Artifact(one.folder, one.manifest) for one in sides))
 
 
 def _comparison(

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from fastapi import Query, Request
-from fastapi.responses import Response
+from fastapi import APIRouter, Form, Query, Request
+from fastapi.responses import RedirectResponse, Response
 
 from starcat.service.access import Reader
 from starcat.service.api import releases as api
@@ -14,6 +14,9 @@ from starcat.service.jobs.job import ENDED
 from starcat.service.pages.facts import database_rows
 from starcat.service.pages.releases import address_of
 from starcat.service.pages.rendering import page_router, render
+from starcat.service.security import request_limits
+from starcat.service.security.auth import Identities, network_of
+from starcat.service.security.login_sessions import cookie_name, session_in
 from starcat.service.service import TheService
 
 router = page_router()
@@ -69,6 +72,55 @@ def own_path(address: str) -> str:
     """
     is_own = address.startswith("/") and not address.startswith("//") and "\\" not in address
     return address if is_own and address.isprintable() else "/"
+
+
+sign_in_router = APIRouter(include_in_schema=False)
+"""What the form is sent to; its errors are no pages."""
+
+NOT_VALID = "this token is not valid: unknown, expired or revoked"
+
+
+@sign_in_router.post("/sign-in")
+def sign_in(
+    request: Request,
+    service: TheService,
+    token: Annotated[str, Form(max_length=200)],
+    next_address: Annotated[str, Form(alias="next", max_length=2000)] = "/",
+) -> Response:
+    """Begin a session, if the token is valid."""
+    identities: Identities = request.app.state.identities
+    found = identities.of_token(token.strip())
+    if found is None:
+        wait_s = identities.guessed.take(network_of(request_limits.address_of(request.scope)))
+        form = sign_in_form(request, next_address, NOT_VALID, 429 if wait_s else 401)
+        form.headers.update(request_limits.later(wait_s) if wait_s else {})
+        return form
+    answer = RedirectResponse(own_path(next_address), 303)
+    answer.set_cookie(
+        cookie_name(service.settings),
+        identities.sessions.open(found),
+        max_age=round(service.settings.session_hours * 3600),
+        secure=service.settings.is_secure,
+        httponly=True,
+        samesite="strict",
+    )
+    return answer
+
+
+@sign_in_router.post("/sign-out")
+def sign_out(request: Request, service: TheService) -> Response:
+    """End the session."""
+    secret = session_in(request.headers.get("cookie", ""), service.settings)
+    if secret is not None:
+        request.app.state.identities.sign_out(secret)
+    answer = RedirectResponse("/", 303)
+    answer.delete_cookie(
+        cookie_name(service.settings),
+        secure=service.settings.is_secure,
+        httponly=True,
+        samesite="strict",
+    )
+    return answer
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import base64
 import io
 import math
+import re
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fastapi import Query, Request
 from fastapi.responses import Response
@@ -14,7 +15,7 @@ from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData, UploadFile
 
-from starcat.errors import StarcatError
+from starcat.errors import ConfigError, StarcatError, quoted
 from starcat.failures import validation_message
 from starcat.images.render import write_simulated
 from starcat.images.solve_files import IdentifyOptions
@@ -23,7 +24,6 @@ from starcat.matcher.methods.table import METHODS
 from starcat.service.access import Reader
 from starcat.service.api.identify import MIB, SUFFIXES, FrameUpload, identify_upload
 from starcat.service.library import Database
-from starcat.service.pages.centroid_text import centroid_file
 from starcat.service.pages.rendering import page_router, render
 from starcat.service.problems import Problem, problem_of
 from starcat.service.service import Service, TheService
@@ -214,3 +214,71 @@ def write_frame(path: Path, database: Database, seed: int) -> None:
         simulate_frames(stars.directions, stars.camera, 1, Noise(NOISE_PX), seed, mag=stars.mag)
     )
     write_simulated(path, frame, stars.camera, seed)
+
+
+Brightness = Literal["light", "mag"]
+
+MAX_LINES = 20_000
+
+_SEPARATORS = re.compile(r"[\s,;]+")
+
+
+def centroid_file(text: str, brightness: Brightness = "light") -> tuple[str, str]:
+    r"""Return pasted centroids as a centroid file.
+
+    Examples
+    --------
+    >>> centroid_file("10.5 20 3000\n30, 40, 1200")
+    ('.csv', 'x_px,y_px,flux\n10.5,20,3000\n30,40,1200\n')
+    """
+    stripped = text.strip()
+    if stripped[:1] in ("{", "["):
+        return ".json", stripped
+    if "x_px" in stripped.partition("\n")[0]:
+        return ".csv", stripped + "\n"
+    rows = _rows(text)
+    if not rows:
+        raise ConfigError(
+            "no centroid was pasted; give a line 'x y' or 'x y brightness' for each, in pixels",
+            key="centroids",
+        )
+    third = {"light": "flux", "mag": "mag"}[brightness]
+    names = ("x_px", "y_px", third)[: len(rows[0])]
+    return ".csv", "\n".join(map(",".join, (names, *rows))) + "\n"
+
+
+def _rows(text: str) -> list[list[str]]:
+    rows: list[list[str]] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = _SEPARATORS.sub(" ", line.partition("#")[0]).split()
+        if not words:
+            continue
+        if len(rows) == MAX_LINES:
+            raise ConfigError(
+                f"line {number}: more than {MAX_LINES:,} centroids; a frame of so many is no "
+                "frame of stars. Leave out the faint ones",
+                key="centroids",
+            )
+        if not (2 <= len(words) <= 3 and all(map(_is_number, words))):
+            raise ConfigError(
+                f"line {number}: {quoted(line.strip())}; expected two or three numbers, 'x y' or "
+                "'x y brightness'",
+                key="centroids",
+                value=line.strip()[:80],
+            )
+        if rows and len(words) != len(rows[0]):
+            raise ConfigError(
+                f"line {number}: {len(words)} numbers, the lines before have {len(rows[0])}; "
+                "give all of them a brightness, or none",
+                key="centroids",
+            )
+        rows.append(words)
+    return rows
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

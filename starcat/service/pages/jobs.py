@@ -12,9 +12,9 @@ from fastapi import Query, Request
 from fastapi.responses import RedirectResponse, Response
 
 from starcat.progress import BYTE_STAGES
-from starcat.service.access import Builder, Principal, Reader, Role
+from starcat.service.access import Builder, Reader
 from starcat.service.jobs.job import Event, Job, State
-from starcat.service.jobs.submission import cancel_job, retry_job
+from starcat.service.jobs.submission import cancel_job, may_change, retry_job
 from starcat.service.pages.draft import draft_of_content, without_defaults
 from starcat.service.pages.rendering import count_text, page_router, render, size_text
 from starcat.service.service import TheService
@@ -112,12 +112,6 @@ def retry(service: TheService, who: Builder, job_id: str) -> Response:
     """Have a job done once more, and show it."""
     retry_job(service, job_id, who)
     return RedirectResponse(f"/jobs/{job_id}", 303)
-
-
-def may_change(job: Job, who: Principal) -> bool:
-    """Return whether somebody may end a job, or have it done again."""
-    is_own = who.name == job.owner and who.role >= Role.BUILDER
-    return is_own or who.role >= Role.PUBLISHER
 
 
 def took_s(job: Job) -> float | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from tempfile import SpooledTemporaryFile
 
@@ -16,6 +15,7 @@ from starcat.exchange.writers import result_chunks
 from starcat.service.access import Reader
 from starcat.service.problems import Problem, RenderingRoute, as_json, problem_of
 from starcat.service.service import Service, TheService
+from starcat.service.transfers import chunks_of
 from starcat.store.layout import is_store
 from starcat.vo.cone import (
     MEDIA_TYPE,
@@ -49,8 +49,6 @@ _VOTABLE = {"Content-Type": MEDIA_TYPE}
 _STARS = "stars.parquet"
 _HELD_BYTES = 4 << 20
 """What an answer may take of the memory; a larger one is held in a file without a name."""
-
-_CHUNK_BYTES = 1 << 18
 PARAMETERS = {
     "parameters": [
         {
@@ -98,7 +96,7 @@ async def search(catalog: str, request: Request, service: TheService, reader: Re
     """
     asked = cone_request(request.query_params.multi_items())
     found = await service.query_pool.run(_answer, service, catalog, asked)
-    return StreamingResponse(_chunks(found), headers={"Content-Type": asked.media_type})
+    return StreamingResponse(chunks_of(found), headers={"Content-Type": asked.media_type})
 
 
 def target_of(service: Service, name: str) -> tuple[Path, Label]:
@@ -144,9 +142,3 @@ def _answer(service: Service, name: str, asked: ConeRequest) -> SpooledTemporary
                 raise
     held.seek(0)
     return held
-
-
-def _chunks(held: SpooledTemporaryFile[bytes]) -> Iterator[bytes]:
-    with held:
-        while chunk := held.read(_CHUNK_BYTES):
-            yield chunk

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from starlette.exceptions import HTTPException
 from starcat.errors import ConfigError, StarcatError
 from starcat.service.problems import Problem, RenderingRoute, as_json, problem_of
 from starcat.service.service import Service, service_of
+from starcat.service.transfers import body_type
 from starcat.vo.documents import VOTABLE_TYPE, error_votable
 from starcat.vo.parameters import MAX_UPLOADS, Parameters
 
@@ -68,8 +70,6 @@ FORM: dict[str, Any] = {
 }
 """For ``openapi_extra=``: the parameters of TAP in a form."""
 
-_COPIED_BYTES = 1 << 20
-
 
 class TapRoute(RenderingRoute):
     """A route whose errors are VOTables, but for those of who may do what."""
@@ -98,8 +98,7 @@ class TapRequest:
             kept[name] = folder / f"upload-{number}.vot"
             upload.file.seek(0)
             with kept[name].open("wb") as stream:
-                while part := upload.file.read(_COPIED_BYTES):
-                    stream.write(part)
+                shutil.copyfileobj(upload.file, stream)
         return kept
 
 
@@ -107,7 +106,7 @@ async def tap_request(request: Request) -> AsyncIterator[TapRequest]:
     """Give what a request says; its files are there while it is answered."""
     service = service_of(request)
     given = list(request.query_params.multi_items())
-    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    kind = body_type(request)
     if request.method != "POST" or not kind:
         yield TapRequest(Parameters(given), {})
         return
