@@ -17,10 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from starcat.errors import ConfigError, ProductError, SchemaVersionError
-from starcat.geometry.attitude import (
-    matrix_from_quaternion,
-    matrix_from_radec_roll,
-)
+from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
 from starcat.matcher.c_engine import FEATURES, is_compiled
@@ -76,11 +73,6 @@ def frames(
 ) -> list[Frame]:
     u, camera = database.directions, database.camera
     return list(simulate_frames(u, camera, count, noise or Noise(), seed, database.mag))
-
-
-def impatient(matcher: Matcher) -> Matcher:
-    """Return a matcher that gives up soon, as that in numpy needs seconds for hopeless frames."""
-    return matcher if matcher.engine == "c" else replace(matcher, max_batches=25)
 
 
 def observed(frame: Frame, magnitudes: bool = False) -> Observation:
@@ -260,10 +252,8 @@ def test_a_false_spot_beside_a_far_star_does_not_take_it(sky_of, random_directio
 
 def test_the_agreement_of_a_cluster_alone_is_refused(sky_of, random_directions):
     # The stars outside are seen elsewhere: no attitude near this one explains them.
-    database, matrix = (
-        cluster_sky(sky_of, random_directions),
-        matrix_from_radec_roll(0.0, 90.0, 30.0),
-    )
+    database = cluster_sky(sky_of, random_directions)
+    matrix = matrix_from_radec_roll(0.0, 90.0, 30.0)
     place = CAMERA.pixels_from_directions(database.directions @ matrix.T)
     stars = np.flatnonzero(CAMERA.contains(place))
     outside = stars[stars < 1200]
@@ -509,10 +499,8 @@ def test_a_stricter_limit_withholds_the_answer(matcher):
 
 def test_no_batch_no_match(matcher):
     frame = frames(matcher.database, 1)[0]
-    assert (
-        replace(matcher, max_batches=0, engine="numpy").identify(frame.centroids_px).status
-        == "no_match"
-    )
+    none = replace(matcher, max_batches=0, engine="numpy").identify(frame.centroids_px)
+    assert none.status == "no_match"
 
 
 def test_the_tolerance_is_how_far_centroids_may_err(triangles):
@@ -590,18 +578,11 @@ def test_an_answer_is_right_within_the_tolerance(triangles, shift_px, is_right):
     # A tilt moves a star at the edge, 10 deg off the axis, 6 % farther than one in the middle.
     angle = shift_px / CAMERA.focal_length_px
     tilt = np.array([[1.0, 0.0, angle], [0.0, 1.0, 0.0], [-angle, 0.0, 1.0]])
-    moved = replace(
-        triangles.identify(frame.centroids_px),
-        matrix=tilt @ frame.matrix,
-    )
+    moved = replace(triangles.identify(frame.centroids_px), matrix=tilt @ frame.matrix)
     assert answers_rightly(moved, frame, triangles) == is_right
 
 
 # --- The database
-
-
-def everything(artifact: Path) -> Database:
-    return open_database(artifact, products_in(artifact))
 
 
 def mapping_under(array: np.ndarray) -> object:
@@ -612,7 +593,7 @@ def mapping_under(array: np.ndarray) -> object:
 
 
 def test_arrays_are_read_only_views_of_the_file(small_artifact):
-    database = everything(small_artifact)
+    database = open_database(small_artifact, products_in(small_artifact))
     arrays = {
         (name, key): array
         for name, product in database.products.items()

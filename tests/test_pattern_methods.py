@@ -7,14 +7,7 @@ import pytest
 from frames import observe
 from hypothesis import given
 from hypothesis import strategies as st
-from pattern_skies import (
-    CAMERA,
-    GRID,
-    RADIUS_RAD,
-    SECTORS,
-    database,
-    frames,
-)
+from pattern_skies import CAMERA, GRID, RADIUS_RAD, SECTORS, database, frames
 
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.patterns import cell_of, cyclic_shifts
@@ -43,8 +36,14 @@ def sky(random_directions) -> Database:
     return database(random_directions(2500, 1))
 
 
+def rank_by_angles(observation, sky, reference, tolerance=None):
+    tolerance = tolerance or Tolerance(observation.side_tolerance_rad)
+    found, scores = dynamic_angle.rank_stars(observation, sky, reference, tolerance)
+    return found.stars[:, 0], scores
+
+
 RANK = {
-    "dynamic_angle": dynamic_angle.rank_stars,
+    "dynamic_angle": rank_by_angles,
     "grid": rank_by_cells,
     "radial": rank_by_rings,
 }
@@ -309,7 +308,7 @@ def test_the_score_is_that_of_the_merge_walk(random_directions):
                 if starts(one, other):
                     n = merge_walk(one, other, eps_angle_rad, eps_distance_rad)
                     expected[star] = max(expected.get(star, 0.0), n / len(around))
-    stars, scores = dynamic_angle.rank_stars(observation, few, reference, tolerance=tolerance)
+    stars, scores = rank_by_angles(observation, few, reference, tolerance)
     assert len(expected) > 100
     assert len(set(expected.values())) > 2
     assert sorted(stars.tolist()) == sorted(expected)
@@ -334,7 +333,7 @@ def test_the_angle_to_a_near_neighbour_may_be_off_by_more():
     turned = polar(0.5, np.degrees(1.9 / (np.radians(0.5) * CAMERA.focal_length_px)))
     body = np.array([star, last, turned, polar(7, 60)]) @ matrix.T
     observation = observe(CAMERA.pixels_from_directions(body), CAMERA, 2.0)
-    stars, scores = dynamic_angle.rank_stars(observation, few, int(references(observation)[0]))
+    stars, scores = rank_by_angles(observation, few, int(references(observation)[0]))
     assert stars[0] == 0
     assert scores[0] == pytest.approx(2.0 / 3.0)
 
@@ -348,7 +347,7 @@ def test_false_stars_between_all_neighbours_are_passed_over(monkeypatch):
     body = np.array([star, *around, *false]) @ matrix.T
     observation = observe(CAMERA.pixels_from_directions(body), CAMERA, 2.0)
     middle = int(references(observation)[0])
-    stars, _ = dynamic_angle.rank_stars(observation, few, middle)
+    stars, _ = rank_by_angles(observation, few, middle)
     assert 0 not in stars
     monkeypatch.setattr(dynamic_angle, "bases", lambda observation, database: iter(()))
     assert (middle, 0) in proposed("dynamic_angle", observation, few)

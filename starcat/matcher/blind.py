@@ -9,7 +9,7 @@ from each in turn, until one agreement is certain.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -41,7 +41,7 @@ from starcat.matcher.settings import (
     certainty,
     check_scale_free,
 )
-from starcat.matcher.verification import AT_ONCE, Agreement, BestOf, agree, agreeing_centroids
+from starcat.matcher.verification import AT_ONCE, BestOf, agree, agreeing_centroids
 
 MOST_CENTROIDS = 40
 """Brightest centroids of a frame that are compared with a level, which has about 20 stars a field
@@ -223,8 +223,6 @@ def identify_blind(
 ) -> MatchResult:
     """Identify a frame of a camera of which only a range of fields of view is known.
 
-    Notes
-    -----
     The false-match probability of an answer is that of its level times the number of levels that
     were searched. The bound of one level counts all attitudes and all focal lengths of its part
     of the range (`false_match_probability`), with the number of its own stars in the frame. The
@@ -250,7 +248,12 @@ def identify_blind(
     for other in searches[1:]:
         if other.best.found is not None and other.best.found.is_better_than(best.best.found):
             best = other
-    found = None if best.best.found is None else _of_the_artifact(best, len(parts))
+    found = best.best.found
+    if found is not None:
+        rows = np.append(best.part.level.rows, -1)  # a centroid without a star has row -1
+        index = np.full(len(best.whole), -1, dtype=np.int32)
+        index[: len(found.star_index)] = rows[found.star_index]
+        found = replace(found, star_index=index, chance=min(1.0, len(parts) * found.chance))
     return answer_of(found, best.whole, limit)
 
 
@@ -268,27 +271,21 @@ def _begun(part: Part, settings: Settings, frame: Frame, budget: Budget, certain
 
 def _run(searches: Sequence[_Search]) -> Limit | None:
     """Search a batch of each part in turn, and return the limit that ended it."""
-    waiting = [(search, _steps(search)) for search in searches]
+    waiting = [(search, proposals(search.used, search.part.level.database)) for search in searches]
     try:
         while waiting:
             left = []
-            for search, steps in waiting:
-                if next(steps, None) is None:
+            for search, batches in waiting:
+                if (candidates := next(batches, None)) is None:
                     continue
+                _verify(candidates, search)
                 if search.best.is_certain:
                     return None
-                left.append((search, steps))
+                left.append((search, batches))
             waiting = left
     except BudgetSpentError as spent:
         return spent.limit
     return None
-
-
-def _steps(search: _Search) -> Iterator[bool]:
-    """Verify a batch of candidates each time that the next value is asked for."""
-    for candidates in proposals(search.used, search.part.level.database):
-        _verify(candidates, search)
-        yield True
 
 
 def _verify(candidates: Candidates, search: _Search) -> None:
@@ -326,14 +323,3 @@ def _standing_out(count: NDArray[np.int64]) -> int:
         more += 1
         term *= mean / more
     return max(MIN_STARS, _OWN + more)
-
-
-def _of_the_artifact(search: _Search, parts: int) -> Agreement:
-    """Return the best agreement with rows of the artifact, and the chance of all parts."""
-    found = search.best.found
-    if found is None:
-        raise ValueError("a search that came to nothing has no agreement")
-    index = np.full(len(search.whole), -1, dtype=np.int32)
-    has_star = np.flatnonzero(found.star_index >= 0)
-    index[has_star] = search.part.level.rows[found.star_index[has_star]]
-    return replace(found, star_index=index, chance=min(1.0, parts * found.chance))

@@ -195,8 +195,6 @@ def log_assignments(n: int, n_centroids: int, stars: int) -> float:
 def log_compatible_assignments(most: int, compatible: Mask) -> Array:
     """Bound the logarithms of the numbers of assignments of 0 to ``most`` compatible stars.
 
-    Notes
-    -----
     Two bounds are taken from the centroids, two from the stars, and the least is returned. Let
     centroid i have c_i compatible stars. If each centroid of a choice took any of its stars, even
     one that is taken, the product of their c_i would count the ways; its sum over all choices of n
@@ -209,8 +207,6 @@ def log_compatible_assignments(most: int, compatible: Mask) -> Array:
     ``e_n(g_1, ..., g_N) (M!)^((M - n)/M) / (M - n)!`` at the most, with ``g_i = (c_i!)^(1/c_i)``
     (0 where c_i is). If all are compatible, this is the number of `log_assignments`.
 
-    References
-    ----------
     Bregman 1973, "Some properties of nonnegative matrices and their permanents".
 
     Examples

@@ -137,8 +137,6 @@ def focal_length_error_px(
 def _student(free: int) -> float:
     """Return the quantile of Student's t that three sigma are of the normal distribution.
 
-    References
-    ----------
     Abramowitz and Stegun 1964, 26.7.5.
     """
     z = _THREE_SIGMA
@@ -178,8 +176,6 @@ def explained_fraction(
 def information(directions: Array, *, with_scale: bool = False) -> Array:
     """Return the information matrix of an attitude that the centroids of stars determine.
 
-    References
-    ----------
     Shuster and Oh 1981, "Three-axis attitude determination from vector observations".
     """
     of_angles = len(directions) * _UNIT - directions.T @ directions
@@ -198,8 +194,6 @@ def information(directions: Array, *, with_scale: bool = False) -> Array:
 def weighted_share(covariance: Array, directions: Array) -> float:
     """Return which share of the stars of a frame an attitude explains, by their weight.
 
-    Notes
-    -----
     The weight of a star is the variance of its position, given the matched stars. The weights
     of the matched stars themselves add up to three, the number of angles, wherever they are, or
     to four where the scale is free.
@@ -241,8 +235,6 @@ def corner_deviation(covariance: Array, camera: Camera) -> float:
 def is_scaled(predicted_px: Pixels, centroids_px: Pixels, observation: Observation) -> bool:
     """Return whether a frame differs in scale from the stars that it matches.
 
-    Notes
-    -----
     A frame of another scale means that the camera's focal length is wrong. The attitude may be
     right, but towards the edge of the frame stars are taken for their neighbours.
     """

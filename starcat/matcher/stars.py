@@ -128,8 +128,6 @@ def attitude_covariance(
     square arcseconds; NaN where the stars determine no attitude. The noise of a centroid, where it
     is not stated, is that of the residuals, of whose 2n numbers three went into the attitude.
 
-    Notes
-    -----
     The attitude is that of Wahba's problem with equal weights, whose error is
     ``A^-1 sum(b x db)``: A is the `information` of the directions b, and the errors db of these
     are those of the pixels by the derivative of the camera. With a camera of a narrow field

@@ -42,8 +42,6 @@ def consistent_candidates(
     support and all names that agree with both and with each other. Then every pair follows by
     falling support, and among equal ones by falling separation.
 
-    Notes
-    -----
     The support of a name is the number of other centroids with a name that agrees with it. True
     names agree with each other and false ones rarely do, however many there are. The support
     of a pair is the sum of the support of both names.
@@ -73,8 +71,6 @@ def consistent(centroid: Rows, star: Rows, observation: Observation, database: D
 
     False for two names of one centroid and for one star at two centroids.
 
-    Notes
-    -----
     The bounds on the separation are compared as squared chords, ``2 - 2 u.v``, which one
     matrix product yields to 4e-16: 4 mas at separation 0 and less beyond.
     """

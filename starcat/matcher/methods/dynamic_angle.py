@@ -48,16 +48,12 @@ class Tolerance:
 def candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
     """Propose what a reference star and the farthest neighbour that agrees are.
 
-    At the end three stars each are proposed, of all pairs of the frame.
-
-    References
-    ----------
-    Sun et al. 2021 (S2).
+    At the end three stars each are proposed, of all pairs of the frame (Sun et al. 2021, S2).
     """
     tolerance = Tolerance(observation.side_tolerance_rad)
 
     def propose(steps: tuple[int, ...]) -> Callable[[int], Candidates]:
-        return lambda reference: _ranked(observation, database, reference, tolerance, steps)[0]
+        return lambda reference: rank_stars(observation, database, reference, tolerance, steps)[0]
 
     yield from by_reference(observation, propose((1,)), propose(PASSED_OVER))
     yield from bases(observation, database)
@@ -67,38 +63,14 @@ def rank_stars(
     observation: Observation,
     database: Database,
     reference: int,
-    *,
-    tolerance: Tolerance | None = None,
-) -> tuple[Rows, Array]:
-    """Rank the stars that a reference star may be by the neighbours that agree.
-
-    Returns
-    -------
-    stars : ndarray of int, shape (K,)
-        Rows of the database's stars, the best first; of equal ones those with fewer
-        neighbours. Stars that share no pair of successive neighbours are not among them.
-    scores : ndarray of float64, shape (K,)
-        S2's S (eq. 9), the share of the observed neighbours that agree: 0 to 1.
-
-    References
-    ----------
-    Sun et al. 2021 (S2), whose answer is the best star of the first of `references`.
-    """
-    tolerance = tolerance or Tolerance(observation.side_tolerance_rad)
-    found, scores = _ranked(observation, database, reference, tolerance)
-    return found.stars[:, 0].astype(np.intp), scores
-
-
-def _ranked(
-    observation: Observation,
-    database: Database,
-    reference: int,
     tolerance: Tolerance,
     steps: tuple[int, ...] = (1,),
 ) -> tuple[Candidates, Array]:
-    """Return the stars that a reference star may be and their scores, the best first.
+    """Return the stars that a reference star may be, the best first, and their scores.
 
-    Each comes with the farthest neighbour that agrees: the baseline of the attitude.
+    Each comes with the farthest neighbour that agrees: the baseline of the attitude. A score is
+    S2's S (eq. 9), the share of the observed neighbours that agree; of equal stars those with
+    fewer neighbours come first. S2's answer is the best star of the first of `references`.
     """
     product = database.products["neighbours"]
     # The radius is not among the product's numbers; its largest separation does as well.

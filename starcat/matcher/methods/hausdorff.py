@@ -66,13 +66,9 @@ def angular_candidates(observation: Observation, database: Database) -> Iterator
 
     Then follow, for each centroid and many more names, those whose neighbours agree.
 
-    Notes
-    -----
     The paper counts every difference in full, so that one false or missing star outweighs all
     that agree. Here a difference counts as ``side_tolerance_rad`` at the most.
 
-    References
-    ----------
     Rotation-invariant feature with modified Hausdorff distance (S5).
     """
     cap_rad = observation.side_tolerance_rad
@@ -100,27 +96,11 @@ def rank_by_separations(
 ) -> tuple[Rows, Array]:
     """Rank the stars for every centroid by the directed, averaged Hausdorff distance.
 
-    Parameters
-    ----------
-    observation : Observation
-        The frame.
-    database : Database
-        With the product ``hausdorff_angular``.
-    cap_rad : float
-        Largest value that a difference counts as.
-    count : int
-        Number of stars to return for each centroid.
-    first : int, optional
-        Number of the first centroids to use; all by default.
-
-    Returns
-    -------
-    stars : ndarray of int, shape (N, count)
-        Rows of the database's stars, the nearest set first; -1 where there are no more.
-    scores : ndarray of float64, shape (N, count)
-        Mean of the smallest differences from a member of the set, over those separations of the
-        centroid from others that lie within the radius of the reference sets; radians, ``inf``
-        where there are no more. A centroid without such separations has no stars.
+    A difference counts as ``cap_rad`` at the most; only the ``first`` centroids take part. Rows of
+    stars of shape (N, count), the nearest set first, -1 where there are no more; and scores, the
+    mean of the smallest differences from a member of the set, over those separations of the
+    centroid that lie within the radius of the reference sets; radians, ``inf`` where there are no
+    more. A centroid without such separations has no stars.
     """
     product = database.products["hausdorff_angular"]
     sets = database.cached(_separation_sets)
@@ -157,15 +137,11 @@ def _separation_sets(database: Database) -> ReferenceSets:
 def ratio_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
     """Propose what a reference star and two of its neighbours are.
 
-    Notes
-    -----
     The paper divides by the smallest distance and takes the best star. Here the best of
     many become candidates, and later rounds divide by the second and third smallest too, of
     the frame as of the star, so that the nearest may err, be false or be missing. Differences
     of ratios count in units of what they may err, and 1 at the most.
 
-    References
-    ----------
     Wang et al. 2020 (S1).
     """
     product = database.products["hausdorff_l2"]
@@ -187,8 +163,6 @@ def likely_stars(
     ``divisors`` says how many of the nearest, of the frame and of each star, are divided by, 3 at
     the most; ``count`` how many stars there are for each pair of divisors.
 
-    Notes
-    -----
     Distances d err by e each, so d/d' errs by ``e/d' sqrt(1 + (d/d')^2)``: that is where a
     difference ceases to count for more.
     """
@@ -239,8 +213,6 @@ def _ratio_sets(database: Database) -> tuple[ReferenceSets, ...]:
 def point_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
     """Propose what a reference star and two of its neighbours are, if the roll is 0.
 
-    References
-    ----------
     Wang et al. 2020 (S1), whose baseline it is.
     """
     product = database.products["hausdorff_l2"]
@@ -257,23 +229,14 @@ def rank_by_points(
 ) -> tuple[Rows, Array]:
     """Rank the stars for a reference star, the nearest to the centre of the frame by default.
 
-    Returns
-    -------
-    stars : ndarray of int, shape (count,)
-        Rows of the database's stars, the best first; -1 where there are no more.
-    scores : ndarray of float64, shape (count,)
-        Mean over the centroids around the reference star, within the radius of the reference
-        sets, of the smallest L1 distance to a neighbour of the star, in units of the focal
-        length; ``inf`` where there are no more.
+    Rows of stars, shape (count,), the best first, -1 where there are no more; and scores, the mean
+    over the centroids around it, within the radius of the reference sets, of the smallest L1
+    distance to a neighbour of the star, in units of the focal length; ``inf`` where no more.
 
-    Notes
-    -----
     The image's up is taken for north at the reference star. That is exact in its centre;
     elsewhere the meridians converge, the more the nearer to a pole. Every centroid is compared
     with the neighbours of all stars, so the time grows with the product of the two numbers.
 
-    References
-    ----------
     Wang et al. 2020 (S1), eq. 6; Dubuisson and Jain 1994, "A modified Hausdorff distance for
     object matching", whose directed distance is averaged.
     """
@@ -369,13 +332,9 @@ def means_of_minima(differences: Iterable[Array], offsets: NDArray[np.int64]) ->
 def within_reach(sets: ReferenceSets, numbers: Array, reach: Array) -> tuple[Rows, Rows, Array]:
     """Return the stars whose sets come nearer to observed numbers than the reach of each.
 
-    Returns
-    -------
-    number, star : ndarray of int, shape (T,)
-        Row of the number, ascending, and of the star.
-    gain : ndarray of float64, shape (T,)
-        The reach less the smallest difference from a member; 0 where the entry's member is
-        not its star's nearest, so that gains may be summed.
+    Of each find the row of the number, ascending, of the star, and its gain: the reach less the
+    smallest difference from a member; 0 where the entry's member is not its star's nearest, so
+    that gains may be summed.
     """
     start = np.searchsorted(sets.value, numbers - reach, side="left")
     stop = np.searchsorted(sets.value, numbers + reach, side="right")

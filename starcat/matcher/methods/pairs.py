@@ -24,8 +24,6 @@ from starcat.matcher.settings import LOOKUP
 def pair_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
     """Propose triangles of stars, one batch an observed triangle.
 
-    References
-    ----------
     Zhang, Jiang et al. 2006, the improved triangle algorithm, a baseline of S2 and S4.
     """
     for triangle, stars in _triangles(observation, database):
@@ -35,8 +33,6 @@ def pair_candidates(observation: Observation, database: Database) -> Iterator[Ca
 def pyramid_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
     """Propose pyramids, four stars each, with the first centroid that makes one of a triangle.
 
-    References
-    ----------
     Mortari, Samaan, Bruccoleri and Junkins 2004, "The pyramid star identification technique",
     Navigation 51, 171.
     """

@@ -47,8 +47,6 @@ _TOUCHES = np.array([[0, 0], [-1, -1], [-1, 1], [1, -1], [1, 1]])
 def grid_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
     """Propose what a reference star and its alignment neighbour are, as far apart as the centroids.
 
-    References
-    ----------
     Padgett and Kreutz-Delgado 1997, "A grid algorithm for autonomous star identification",
     IEEE Transactions on Aerospace and Electronic Systems 33, 202.
     """
@@ -154,8 +152,6 @@ def radial_candidates(observation: Observation, database: Database) -> Iterator[
     First of the few centroids nearest to the centre of the frame and their best names, then of more
     centroids and names.
 
-    References
-    ----------
     Zhang, Wei and Jiang 2008, "Full-sky autonomous star identification based on radial and
     cyclic features of star pattern", Image and Vision Computing 26, 891.
     """
@@ -176,16 +172,10 @@ def rank_by_rings(
 ) -> tuple[Rows, Array]:
     """Rank the stars that a reference star may be by the rings and sectors in common.
 
-    Returns
-    -------
-    stars : ndarray of int, shape (K,)
-        Rows of the database's stars, the best first. None without a neighbour.
-    scores : ndarray of float64, shape (K,)
-        Twice the weight of the rings in common over the weight of the rings of both, 0 to 1,
-        less `SECTORS` times the share of the sectors of both that differ.
+    The best first; none without a neighbour. A score is twice the weight of the rings in common
+    over the weight of the rings of both, 0 to 1, less `SECTORS` times the share of the sectors of
+    both that differ.
 
-    Notes
-    -----
     Centroids err: a ring that only a tolerance touches counts half. The cyclic pattern as the
     smallest of its shifts changes altogether with one sector, so the sectors are compared in
     all positions and the best counts. The best star of the reference star nearest to the centre is

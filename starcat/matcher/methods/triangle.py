@@ -51,8 +51,6 @@ _ORDERS = np.array(list(permutations(range(3))), dtype=np.intp)
 def candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
     """Propose triangles of stars of the same handedness as the centroids.
 
-    References
-    ----------
     Liao and Zhang 2024 (S4), sections 2 and 3.
     """
     triangles = select_triangles(observation)
