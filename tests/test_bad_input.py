@@ -27,6 +27,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from astropy.io import fits
+from folder_bytes import bytes_of
 from genuine_records import PSC
 from hats_stores import write_catalog, write_facts
 
@@ -1641,10 +1642,6 @@ def page_rows() -> dict[str, tuple[str, int]]:
     return {kind.replace("`", ""): (says.replace("`", ""), int(code)) for kind, says, code in rows}
 
 
-def files_below(folder: Path) -> dict[Path, bytes]:
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 def run_apart(place: Place, call: Call) -> tuple[int, str]:
     """Run in another process, which may have to do with small files: as on a full disk."""
     assert isinstance(call, list)
@@ -1673,7 +1670,7 @@ def run_call(place: Place, call: Call, starcat: Any) -> tuple[int, str]:
 @pytest.mark.parametrize("given", CASES, ids=[case.kind for case in CASES])
 def test_bad_input(given, place, starcat):
     call = given.call(place)
-    before = files_below(place.folder)
+    before = bytes_of(place.folder)
     code, text = run_call(place, call, starcat)
     assert code == given.code, text
     assert "Traceback" not in text
@@ -1683,7 +1680,7 @@ def test_bad_input(given, place, starcat):
     if code and isinstance(call, list) and not place.file_limit_bytes:
         check_json(given, call, pattern, starcat)
     if code:
-        assert files_below(place.folder) == before
+        assert bytes_of(place.folder) == before
 
 
 def check_json(given: Case, call: Call, pattern: str, starcat: Any) -> None:

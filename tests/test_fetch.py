@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from served import in_background
 
 import starcat
 from starcat.catalog.fetch import FetchReport, fetch_source
@@ -169,12 +170,8 @@ class Archive(ThreadingHTTPServer):
 @pytest.fixture
 def archive(monkeypatch: pytest.MonkeyPatch) -> Iterator[Archive]:
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
-    with Archive() as server:
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
-        thread.start()
+    with Archive() as server, in_background(server):
         yield server
-        server.shutdown()
-        thread.join()
 
 
 def tiny_source(*urls: str, name: str = "tiny", **file_keys: Any) -> DataSource:
@@ -814,12 +811,9 @@ class FtpHandler(socketserver.StreamRequestHandler):
 
 @pytest.fixture
 def ftp_address() -> Iterator[str]:
-    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), FtpHandler) as server:
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
-        thread.start()
+    server = socketserver.ThreadingTCPServer(("127.0.0.1", 0), FtpHandler)
+    with server, in_background(server):
         yield f"ftp://127.0.0.1:{server.server_address[1]}"
-        server.shutdown()
-        thread.join()
 
 
 def test_ftp(archive, ftp_address, tmp_path):

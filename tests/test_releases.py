@@ -26,8 +26,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from folder_bytes import bytes_of
 from hypothesis import given
 from hypothesis import strategies as st
+from served import in_background
 
 import starcat
 from starcat.artifact.verify import verify_artifact
@@ -62,14 +64,6 @@ QUICK = DownloadOptions(retries=1, timeout_s=5.0, backoff_s=0.0)
 
 def sha256(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
-
-
-def files_below(folder: Path) -> dict[str, bytes]:
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in folder.rglob("*")
-        if path.is_file()
-    }
 
 
 def write(path: Path, data: bytes | str) -> None:
@@ -138,14 +132,8 @@ class Handler(http.server.SimpleHTTPRequestHandler):
 
 @contextmanager
 def serving(folder: Path, *, heeds_ranges: bool = True) -> Iterator[Served]:
-    with Served(folder, heeds_ranges) as server:
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
-        thread.start()
-        try:
-            yield server
-        finally:
-            server.shutdown()
-            thread.join()
+    with Served(folder, heeds_ranges) as server, in_background(server):
+        yield server
 
 
 @pytest.fixture(autouse=True)
@@ -189,7 +177,7 @@ def test_a_folder_gives_back_every_byte(small_artifact, registry):
         progress=lambda *event: events.append(event),
     )
     assert (pulled.outcome, pulled.folder) == ("pulled", Path("out/small-1.0.0"))
-    assert files_below(pulled.folder) == files_below(small_artifact)
+    assert bytes_of(pulled.folder) == bytes_of(small_artifact)
     assert verify_artifact(pulled.folder).findings == ()
     assert {path.name for path in Path("out").iterdir()} == {"small-1.0.0"}
     done = [done for _, done, _ in events]
@@ -201,7 +189,7 @@ def test_a_folder_gives_back_every_byte(small_artifact, registry):
 def test_an_address_gives_back_every_byte(small_artifact, registry, heeds_ranges):
     with serving(registry, heeds_ranges=heeds_ranges) as server:
         pulled = pull("small@latest", server.url + "/")
-        assert files_below(pulled.folder) == files_below(small_artifact)
+        assert bytes_of(pulled.folder) == bytes_of(small_artifact)
         sent = len(server.sent)
         assert pull("small@latest", server.url).outcome == "unchanged"
         assert [path for path, *_ in server.sent[sent:]] == ["/index.json"]
@@ -210,9 +198,9 @@ def test_an_address_gives_back_every_byte(small_artifact, registry, heeds_ranges
 
 
 def test_blobs_are_named_by_their_content_and_shared(artifact_version, registry):
-    before = files_below(registry / "blobs")
+    before = bytes_of(registry / "blobs")
     published = publish_artifact(artifact_version("1.0.1"), "registry")
-    after = files_below(registry / "blobs")
+    after = bytes_of(registry / "blobs")
     assert all(Path(name).name == sha256(data) for name, data in after.items())
     assert all(name == f"sha256/{Path(name).name[:2]}/{Path(name).name}" for name in after)
     tables = len([*artifact_version("1.0.1").glob("*.parquet")])
@@ -298,7 +286,7 @@ def test_the_order_of_publishing_does_not_show(artifact_version):
     for folder, versions in (("a", ("1.0.1", "1.0.2")), ("b", ("1.0.2", "1.0.1"))):
         for version in versions:
             publish_artifact(artifact_version(version), folder)
-    assert files_below(Path("a")) == files_below(Path("b"))
+    assert bytes_of(Path("a")) == bytes_of(Path("b"))
 
 
 @pytest.mark.parametrize(
@@ -371,10 +359,10 @@ def test_the_same_again_is_unchanged(small_artifact, registry):
 
 def test_a_version_never_changes(small_artifact, registry, tmp_path):
     other = changed(small_artifact, tmp_path / "other")
-    before = files_below(registry)
+    before = bytes_of(registry)
     with pytest.raises(OutputError, match=r"has small-1.0.0 already, with another content"):
         publish_artifact(other, "registry")
-    assert files_below(registry) == before
+    assert bytes_of(registry) == before
 
 
 def test_a_version_whose_name_is_taken_at_the_last_moment(
@@ -429,10 +417,10 @@ def test_an_index_written_late_has_what_came_meanwhile(
 
 def test_a_different_artifact_at_the_final_name_stays(small_artifact, registry, tmp_path):
     other = changed(small_artifact, tmp_path / "out")
-    before = files_below(tmp_path / "out")
+    before = bytes_of(tmp_path / "out")
     with pytest.raises(OutputError, match=r"already exists and is not small-1.0.0 of the registry"):
         pull("small", registry)
-    assert files_below(tmp_path / "out") == before
+    assert bytes_of(tmp_path / "out") == before
     shutil.rmtree(other)
     pull("small", registry)
     (other / "pairs.parquet").chmod(0o644)
@@ -469,7 +457,7 @@ def test_a_folder_with_other_things_is_no_registry(small_artifact, tmp_path):
     write(tmp_path / "home" / "thesis.tex", "text")
     with pytest.raises(OutputError, match="neither empty nor a registry"):
         publish_artifact(small_artifact, "home")
-    assert files_below(tmp_path / "home") == {"thesis.tex": b"text"}
+    assert bytes_of(tmp_path / "home") == {"thesis.tex": b"text"}
     with pytest.raises(ConfigError, match=r"only be read; publish into a folder.*upload"):
         publish_artifact(small_artifact, "https://example.org/registry")
 
@@ -616,6 +604,17 @@ def add_file(registry: Path, name: str) -> None:
     edit_manifest(registry, lambda content: content["files"].update({name: blob.model_dump()}))
 
 
+def database_of(registry: Path) -> tuple[str, int]:
+    """Where a server has the largest file, and its size."""
+    blob = blob_of(registry, "database.h5")
+    return f"/{blob.relative_to(registry).as_posix()}", blob.stat().st_size
+
+
+def place_of(registry: Path) -> Path:
+    """Where what arrives is kept until all is there."""
+    return Path("out") / f".small-1.0.0.{manifest_of(registry).name[:12]}.partial"
+
+
 def blob_of(registry: Path, name: str = "pairs.parquet") -> Path:
     manifest = json.loads(manifest_of(registry).read_bytes())
     return registry / Blob(**manifest["files"][name]).path
@@ -633,6 +632,18 @@ def link_to_copy(path: Path) -> None:
     path.symlink_to(Path("copy").resolve())
 
 
+def of_index(change: Callable[[dict[str, Any]], object]) -> Damage:
+    return lambda registry: edit_index(registry, change)
+
+
+def of_manifest(change: Callable[[dict[str, Any]], object]) -> Damage:
+    return lambda registry: edit_manifest(registry, change)
+
+
+def index_of(text: str) -> Damage:
+    return lambda registry: write(registry / "index.json", text)
+
+
 def first(**values: object) -> Damage:
     return lambda registry: edit_index(registry, lambda index: index["releases"][0].update(values))
 
@@ -647,61 +658,59 @@ DAMAGE: dict[str, tuple[Damage, str]] = {
     "manifest not JSON": (lambda r: put_manifest(r, b"{"), "not a starcat manifest"),
     "manifest of deep lists": (lambda r: put_manifest(r, b"[" * 100_000), "registry is damaged"),
     "manifest without files": (
-        lambda r: edit_manifest(r, lambda content: content.pop("files")), "no files"
+        of_manifest(lambda content: content.pop("files")),
+        "no files",
     ),
     "manifest of another name": (
-        lambda r: edit_manifest(r, lambda content: content.update(name="other")),
+        of_manifest(lambda content: content.update(name="other")),
         "its manifest is that of other-1.0.0",
     ),
     "manifest of another version": (
-        lambda r: edit_manifest(r, lambda content: content.update(version="2.0.0")),
+        of_manifest(lambda content: content.update(version="2.0.0")),
         r"its manifest is that of small-2\.0\.0",
     ),
     "manifest with a strange digest": (
-        lambda r: edit_manifest(
-            r, lambda c: c["files"]["pairs.parquet"].update(sha256="../" * 21 + "x")
-        ),
+        of_manifest(lambda c: c["files"]["pairs.parquet"].update(sha256="../" * 21 + "x")),
         "files.pairs.parquet.sha256: String should match pattern",
     ),
     "manifest with a size that is none": (
-        lambda r: edit_manifest(r, lambda c: c["files"]["pairs.parquet"].update(bytes=1e99)),
+        of_manifest(lambda c: c["files"]["pairs.parquet"].update(bytes=1e99)),
         "files.pairs.parquet.bytes is '1e\\+99'",
     ),
     "no whole artifact": (
-        lambda r: edit_manifest(r, lambda content: content["files"].pop("pairs.parquet")),
+        of_manifest(lambda content: content["files"].pop("pairs.parquet")),
         "not a whole artifact: .*pairs.parquet is not among the files",
     ),
-    "index not JSON": (lambda r: write(r / "index.json", "<html>"), "not what starcat writes"),
-    "index empty": (lambda r: write(r / "index.json", ""), "not what starcat writes"),
-    "index of deep lists": (
-        lambda r: write(r / "index.json", "[" * 100_000), "not what starcat writes"
-    ),
-    "index of something else": (lambda r: write(r / "index.json", "{}"), "format: Field required"),
+    "index not JSON": (index_of("<html>"), "not what starcat writes"),
+    "index empty": (index_of(""), "not what starcat writes"),
+    "index of deep lists": (index_of("[" * 100_000), "not what starcat writes"),
+    "index of something else": (index_of("{}"), "format: Field required"),
     "index with a release twice": (
-        lambda r: edit_index(r, lambda index: index["releases"].append(index["releases"][0])),
+        of_index(lambda index: index["releases"].append(index["releases"][0])),
         "lists small-1.0.0 twice",
     ),
     "index with a name that leads out": (first(name="../../x"), "releases.0.name: String should"),
     "index with a version that leads out": (first(version="../../../x"), "releases.0.version"),
     "index with a digest that leads out": (
-        first(manifest={"sha256": "../../x", "bytes": 1}), "releases.0.manifest.sha256"
+        first(manifest={"sha256": "../../x", "bytes": 1}),
+        "releases.0.manifest.sha256",
     ),
     "index with a wrong size": (
-        lambda r: edit_index(r, lambda index: index["releases"][0]["manifest"].update(bytes=7)),
+        of_index(lambda index: index["releases"][0]["manifest"].update(bytes=7)),
         r"bytes; expected 7",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("kind", DAMAGE)
 def test_a_damaged_folder_is_refused_and_nothing_is_left(kind, registry):
     damage, message = DAMAGE[kind]
     damage(registry)
-    before = files_below(Path())
+    before = bytes_of(Path())
     with pytest.raises(ProductError, match=message) as caught:
         pull("small", registry)
     assert caught.value.exit_code == 5
-    assert files_below(Path()) == before
+    assert bytes_of(Path()) == before
 
 
 @pytest.mark.parametrize("kind", DAMAGE)
@@ -727,10 +736,10 @@ def test_a_damaged_address_is_refused(kind, registry, tmp_path):
 )  # fmt: skip
 def test_file_names_that_lead_out(registry, name):
     add_file(registry, name)
-    before = files_below(Path())
+    before = bytes_of(Path())
     with pytest.raises(ProductError, match="no plain path within an artifact; nothing was"):
         pull("small", registry)
-    assert files_below(Path()) == before
+    assert bytes_of(Path()) == before
     assert not Path("/tmp/starcat-x").exists()
 
 
@@ -762,14 +771,13 @@ def test_a_blob_that_is_a_link_is_refused(registry):
 
 
 def test_links_in_the_output_folder_are_not_followed(small_artifact, registry, tmp_path):
-    digest = manifest_of(registry).name[:12]
     outside = tmp_path / "outside"
     outside.mkdir()
-    place = tmp_path / "out" / f".small-1.0.0.{digest}.partial"
+    place = tmp_path / place_of(registry)
     for planted in (place, place / "artifact", place / "artifact" / "report", place / "parts"):
         planted.parent.mkdir(parents=True, exist_ok=True)
         planted.symlink_to(outside)
-        assert files_below(pull("small", registry).folder) == files_below(small_artifact)
+        assert bytes_of(pull("small", registry).folder) == bytes_of(small_artifact)
         assert [*outside.iterdir()] == []
         shutil.rmtree("out")
 
@@ -819,15 +827,14 @@ def test_a_registry_of_a_newer_starcat(registry, published):
 
 @pytest.mark.parametrize("heeds_ranges", [True, False])
 def test_an_interrupted_download_goes_on(small_artifact, registry, heeds_ranges):
-    blob = blob_of(registry, "database.h5")
-    path, size = f"/{blob.relative_to(registry).as_posix()}", blob.stat().st_size
+    path, size = database_of(registry)
     with serving(registry, heeds_ranges=heeds_ranges) as server:
         server.cut_after[path] = [size // 2, 0]
         with pytest.raises(DownloadError, match=r"received \d+ of .* pull again to go on"):
             pull("small", server.url)
         before, server.sent = server.sent, []
         assert not Path("out/small-1.0.0").exists()
-        assert files_below(pull("small", server.url).folder) == files_below(small_artifact)
+        assert bytes_of(pull("small", server.url).folder) == bytes_of(small_artifact)
     came = [name for name, *_ in before if name != "/index.json"]
     assert not {name for name, *_ in server.sent} & {*came[: came.index(path)]}
     (rest,) = [(start, sent) for name, start, sent in server.sent if name == path]
@@ -837,10 +844,8 @@ def test_an_interrupted_download_goes_on(small_artifact, registry, heeds_ranges)
 
 
 def test_a_killed_download_goes_on(small_artifact, registry):
-    blob = blob_of(registry, "database.h5")
-    path, size = f"/{blob.relative_to(registry).as_posix()}", blob.stat().st_size
-    part = Path("out") / f".small-1.0.0.{manifest_of(registry).name[:12]}.partial"
-    part = part / "parts" / f"{blob.name}.part"
+    path, size = database_of(registry)
+    part = place_of(registry) / "parts" / f"{Path(path).name}.part"
     command = ["pull", "small", "-o", "out", "--registry"]
     with serving(registry) as server:
         server.cut_after[path], server.stall = [size // 2], threading.Event()
@@ -864,34 +869,33 @@ def test_a_killed_download_goes_on(small_artifact, registry):
     ]
     # Each other blob came once: in all, every byte was sent once.
     blobs = [sent for sent in server.sent if sent[0] != "/index.json"]
-    assert sum(length for *_, length in blobs) == sum(map(len, files_below(pulled.folder).values()))
-    assert files_below(pulled.folder) == files_below(small_artifact)
+    assert sum(length for *_, length in blobs) == sum(map(len, bytes_of(pulled.folder).values()))
+    assert bytes_of(pulled.folder) == bytes_of(small_artifact)
 
 
 def test_a_part_is_continued_from_another_address(small_artifact, registry):
-    blob = blob_of(registry, "database.h5")
-    path, size = f"/{blob.relative_to(registry).as_posix()}", blob.stat().st_size
+    path, size = database_of(registry)
     with serving(registry) as server, serving(registry) as mirror:
         server.cut_after[path] = [1000, 0]
         with pytest.raises(DownloadError):
             pull("small", server.url)
         pulled = pull("small", mirror.url)
         assert (path, 1000, size - 1000) in mirror.sent
-    assert files_below(pulled.folder) == files_below(small_artifact)
+    assert bytes_of(pulled.folder) == bytes_of(small_artifact)
 
 
 @pytest.mark.parametrize("over_http", [True, False])
 @pytest.mark.parametrize("length", [1000, None, 1 << 26])
 def test_a_wrong_part_is_not_built_upon(small_artifact, registry, over_http, length):
     blob = blob_of(registry, "database.h5")
-    place = Path("out") / f".small-1.0.0.{manifest_of(registry).name[:12]}.partial"
+    place = place_of(registry)
     length = blob.stat().st_size if length is None else length
     write(place / "parts" / f"{blob.name}.part", b"x" * length)
     write(place / "artifact" / "pairs.parquet", b"x" * blob_of(registry).stat().st_size)
     write(place / "artifact" / "not-listed", b"x")
     with serving(registry) as server:
         pulled = pull("small", server.url if over_http else registry)
-    assert files_below(pulled.folder) == files_below(small_artifact)
+    assert bytes_of(pulled.folder) == bytes_of(small_artifact)
 
 
 def test_a_server_that_sends_more_or_other_than_it_should(registry):
@@ -927,14 +931,14 @@ def test_a_full_disk_ends_a_pull_which_goes_on_later(small_artifact, registry, o
         limited(1_000_000, lambda: pull("small", address))
         assert not Path("out/small-1.0.0").exists()
         assert not Path("starcat.lock").exists()
-        assert files_below(pull("small", address).folder) == files_below(small_artifact)
+        assert bytes_of(pull("small", address).folder) == bytes_of(small_artifact)
     if over_http:
         assert any(start == 1_000_000 for _, start, _ in server.sent)
 
 
 def test_a_full_disk_ends_a_publication_which_goes_on_later(small_artifact):
     limited(1_000_000, lambda: publish_artifact(small_artifact, "registry"))
-    there = files_below(Path("registry"))
+    there = bytes_of(Path("registry"))
     assert "index.json" not in there
     assert not [name for name in there if name.startswith("versions")]
     database = sha256((small_artifact / "database.h5").read_bytes())

@@ -9,7 +9,6 @@ import shutil
 import socketserver
 import subprocess
 import sys
-import threading
 import tomllib
 from collections import namedtuple
 from collections.abc import Iterator
@@ -17,6 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from served import in_background
 
 from starcat.errors import ConfigError, DownloadError, OutputError, ProductError, StarcatError
 from starcat.releases import files
@@ -49,12 +49,8 @@ def answering(*answers: bytes) -> Iterator[str]:
         def handle_error(self, *_: object) -> None:
             """The client has gone: that is what is tested."""
 
-    with Server(("127.0.0.1", 0), Handler) as server:
-        thread = threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True)
-        thread.start()
+    with Server(("127.0.0.1", 0), Handler) as server, in_background(server):
         yield f"http://127.0.0.1:{server.server_address[1]}"
-        server.shutdown()
-        thread.join()
 
 
 def head(status: str = "200 OK", **fields: str) -> bytes:

@@ -17,7 +17,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -26,6 +25,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from folder_bytes import bytes_of
+from served import in_background
 
 import starcat
 from starcat.artifact.verify import verify_artifact
@@ -186,20 +187,12 @@ class Reader:
             assert blobs[facts["sha256"]].stat().st_size == facts["bytes"]
 
 
-def files_below(folder: Path) -> dict[str, str]:
-    return {
-        path.relative_to(folder).as_posix(): digest(path)
-        for path in folder.rglob("*")
-        if path.is_file()
-    }
-
-
 def check_output(output: Path, artifact: Path) -> bool:
     """Return whether the artifact is at its final name; it is whole or not there at all."""
     final = output / artifact.name
     if not final.exists():
         return False
-    assert files_below(final) == files_below(artifact)
+    assert bytes_of(final) == bytes_of(artifact)
     return True
 
 
@@ -221,14 +214,9 @@ class Server(http.server.ThreadingHTTPServer):
 
 @contextmanager
 def serving(folder: Path) -> Iterator[str]:
-    with Server(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder))) as server:
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
-        thread.start()
-        try:
-            yield f"http://127.0.0.1:{server.server_port}"
-        finally:
-            server.shutdown()
-            thread.join()
+    handler = functools.partial(Quiet, directory=str(folder))
+    with Server(("127.0.0.1", 0), handler) as server, in_background(server):
+        yield f"http://127.0.0.1:{server.server_port}"
 
 
 # Random kills -------------------------------------------------------------------------------

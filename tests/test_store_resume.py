@@ -173,7 +173,7 @@ def test_too_little_memory_says_what_it_takes(parts, tmp_path):
 
 def test_a_cluster_that_is_not_there_is_told(parts, tmp_path, monkeypatch):
     monkeypatch.setattr("starcat.store.cluster._CONNECT_S", 0.5)
-    with pytest.raises(ConfigError, match=r"--scheduler tcp://127.0.0.1:9: nobody answers"):
+    with pytest.raises(ConfigError, match=r"--scheduler tcp://127.0.0.1:9: no scheduler answers"):
         make(parts, tmp_path / "store", scheduler="tcp://127.0.0.1:9")
 
 

@@ -8,39 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starcat.cli.options import (
-    Dark,
-    FailOnNoMatch,
-    FieldRange,
-    FovError,
-    FrameSize,
-    Json,
-    JsonLines,
-    Mask,
-    MaxSteps,
-    MethodName,
-    MinShare,
-    Mosaic,
-    MostSpots,
-    NoisePx,
-    Orbit,
-    Plane,
-    PriorAttitude,
-    PriorErrorDeg,
-    PsfSigmaPx,
-    Threshold,
-    Time,
-    TimeLimit,
-    Track,
-    Velocity,
-    WcsFile,
-    chosen_prior,
-    field_range,
-    observer_of_options,
-    share_of_percent,
-    size_in_px,
-    unknown_field,
-)
+from starcat.cli import options as opt
 
 if TYPE_CHECKING:
     from starcat.cli.matches import Tally
@@ -79,7 +47,7 @@ Picture = Annotated[
 
 
 @app.command()
-def methods(json: Json = False) -> None:
+def methods(json: opt.Json = False) -> None:
     """List the ways to identify stars, and the products that each needs.
 
     Example: starcat methods
@@ -101,9 +69,9 @@ def simulate(
     artifact: Folder,
     output: Annotated[Path, typer.Option("--output", "-o", help="CSV, FITS, PNG, TIFF, JPEG.")],
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same frame.")] = 0,
-    noise_px: NoisePx = 0.5,
+    noise_px: opt.NoisePx = 0.5,
     false_stars: Annotated[int, typer.Option(min=0, help="Spots that are no stars.")] = 0,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Write one simulated frame, centroids or image, to try 'starcat identify' with.
 
@@ -129,37 +97,37 @@ def identify(
     context: typer.Context,
     artifact: Folder,
     file: FrameFile,
-    method: MethodName = None,
+    method: opt.MethodName = None,
     camera: CameraFile = None,
     tolerance_px: TolerancePx = None,
     noise_px: CentroidNoise = None,
     noise_mag: MagnitudeNoise = None,
     max_false_match_probability: Certainty = 1e-9,
-    fov_error: FovError = None,
-    fov: FieldRange = None,
-    size: FrameSize = None,
-    min_share: MinShare = None,
-    max_steps: MaxSteps = None,
-    time_limit_s: TimeLimit = None,
+    fov_error: opt.FovError = None,
+    fov: opt.FieldRange = None,
+    size: opt.FrameSize = None,
+    min_share: opt.MinShare = None,
+    max_steps: opt.MaxSteps = None,
+    time_limit_s: opt.TimeLimit = None,
     flip: Flip = None,
-    psf_sigma_px: PsfSigmaPx = None,
-    threshold: Threshold = 5.0,
-    most_spots: MostSpots = 200,
-    plane: Plane = None,
-    bayer: Mosaic = False,
-    dark: Dark = None,
-    mask: Mask = None,
+    psf_sigma_px: opt.PsfSigmaPx = None,
+    threshold: opt.Threshold = 5.0,
+    most_spots: opt.MostSpots = 200,
+    plane: opt.Plane = None,
+    bayer: opt.Mosaic = False,
+    dark: opt.Dark = None,
+    mask: opt.Mask = None,
     picture: Picture = None,
-    time: Time = None,
-    velocity: Velocity = None,
-    orbit: Orbit = None,
-    wcs: WcsFile = None,
-    prior_q: PriorAttitude = None,
-    prior_error_deg: PriorErrorDeg = None,
-    track: Track = False,
-    fail_on_no_match: FailOnNoMatch = False,
-    ndjson: JsonLines = False,
-    json: Json = False,
+    time: opt.Time = None,
+    velocity: opt.Velocity = None,
+    orbit: opt.Orbit = None,
+    wcs: opt.WcsFile = None,
+    prior_q: opt.PriorAttitude = None,
+    prior_error_deg: opt.PriorErrorDeg = None,
+    track: opt.Track = False,
+    fail_on_no_match: opt.FailOnNoMatch = False,
+    ndjson: opt.JsonLines = False,
+    json: opt.Json = False,
 ) -> None:
     """Identify the stars of frames and find the camera's attitude.
 
@@ -186,10 +154,10 @@ def _file_answers(file: Path, artifact: Path, given: Mapping[str, Any]) -> FileA
     )
     from starcat.specs.camera_file import read_camera
 
-    prior = chosen_prior(given["prior_q"], given["prior_error_deg"], track=given["track"])
-    observer = observer_of_options(given["time"], given["velocity"], given["orbit"])
-    error = share_of_percent(given["fov_error"])
-    size_px, fov_deg = unknown_field(given["size"], given["fov"], given["fov_error"])
+    prior = opt.chosen_prior(given["prior_q"], given["prior_error_deg"], track=given["track"])
+    observer = opt.observer_of_options(given["time"], given["velocity"], given["orbit"])
+    error = opt.share_of_percent(given["fov_error"])
+    size_px, fov_deg = opt.unknown_field(given["size"], given["fov"], given["fov_error"])
     options = {name: given[name] for name in IdentifyOptions.model_fields if name in given}
     options |= {"fov_error": error, "size_px": size_px, "fov_deg": fov_deg}
     options |= {"camera": None, "prior_q": prior[0] if prior else None}
@@ -240,13 +208,13 @@ def calibrate(
     size: Annotated[
         str | None, typer.Option(metavar="WxH", help="Pixels, such as 1280x960, in its place.")
     ] = None,
-    fov: FieldRange = None,
-    method: MethodName = None,
+    fov: opt.FieldRange = None,
+    method: opt.MethodName = None,
     flip: Annotated[
         bool | None, typer.Option("--flip/--no-flip", help="First row of the image at the bottom.")
     ] = None,
     plot: Annotated[Path | None, typer.Option(help="PNG or SVG of the residuals.")] = None,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Find focal length, principal point and distortion of a camera from frames of stars.
 
@@ -261,7 +229,7 @@ def calibrate(
 
     check_kind(plot)
     known = read_camera(camera) if camera else None
-    size_px, fov_deg = size_in_px(size), field_range(fov)
+    size_px, fov_deg = opt.size_in_px(size), opt.field_range(fov)
     with progress_bars() as progress:
         found = calibrate_files(
             Matcher.open(artifact, method), files, camera=known, size_px=size_px, fov_deg=fov_deg,
@@ -278,9 +246,9 @@ def selftest(
     artifact: Folder,
     frames: Annotated[int, typer.Option(min=1, help="Fields of each kind.")] = 500,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same fields.")] = 1,
-    noise_px: NoisePx = 0.5,
-    method: MethodName = None,
-    json: Json = False,
+    noise_px: opt.NoisePx = 0.5,
+    method: opt.MethodName = None,
+    json: opt.Json = False,
 ) -> None:
     """Identify simulated fields with a database and print the rates.
 

@@ -2,7 +2,7 @@
 
 Input is one grey image, output are centroids and brightness, brightest first. Background,
 detection, windowed centroids and apertures are those of sep, Source Extractor as a library,
-which the extra ``images`` brings. Trails are told and refused; blooming is not handled.
+which the extra ``images`` brings. Trails are detected and refused; blooming is not handled.
 """
 
 from __future__ import annotations

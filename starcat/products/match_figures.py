@@ -78,8 +78,8 @@ class MatchModel:
     position_error_rad: float | None = None
     # standard deviation of the proper motion of stars that have none in either catalog
     unknown_motion_rad_yr: float = 0.02 * ARCSEC
-    # share of the stars that are off by more than errors explain, up to the radius: double stars of
-    # which the catalogs measured different parts, wrong proper motions
+    # share of stars that are off by more than their stated errors: double stars of which the
+    # catalogs measured different parts, wrong proper motions
     outlier_share: float = 0.02
     # magnitude of the counterpart minus that of the star, on average; measured if not given
     expected_delta_mag: float | None = None

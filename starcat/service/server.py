@@ -210,7 +210,7 @@ def _see_to_tokens(tokens: TokenStore, settings: Settings) -> None:
         return
     if not sys.stderr.isatty():  # a log keeps what is written to it; a terminal is only seen
         how = _how_to_make_one(settings)
-        _say(f"nobody has a token, so nobody can build or publish yet; make one: {how}")
+        _say(f"no token exists yet, so nobody can build or publish; create one: {how}")
         return
     _, text = tokens.create(FIRST, Role.PUBLISHER)
     _say(f"the first token, shown once: {text}\nuse it to sign in on the page, or with curl")
@@ -218,7 +218,7 @@ def _see_to_tokens(tokens: TokenStore, settings: Settings) -> None:
 
 def _without_token(settings: Settings) -> ConfigError:
     return ConfigError(
-        f"others are to reach {settings.public_url or settings.host}, and nobody has a token; "
+        f"others are to reach {settings.public_url or settings.host}, and no token exists; "
         f"make one first: {_how_to_make_one(settings)}",
         key="host",
         value=settings.host,

@@ -77,7 +77,7 @@ def _connected(client_class: Any, scheduler: str) -> Iterator[Client]:
         client = client_class(scheduler, timeout=_CONNECT_S)
     except (OSError, TimeoutError, ValueError) as error:
         raise ConfigError(
-            f"--scheduler {scheduler}: nobody answers there ({error}); start one with 'dask "
+            f"--scheduler {scheduler}: no scheduler answers ({error}); start one with 'dask "
             "scheduler' and workers with 'dask worker', or leave it out to use this machine",
             key="scheduler",
             value=scheduler,

@@ -5,8 +5,10 @@ from __future__ import annotations
 import http.client
 import json
 import signal
+import socketserver
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -31,24 +33,12 @@ class Answer:
 
 @dataclass(frozen=True)
 class Served:
-    """A server that runs.
+    """A server that runs."""
 
-    Attributes
-    ----------
-    address : str
-        Without a slash at its end.
-    root : Path
-        Folder of the service.
-    process : Popen
-        Its process.
-    log : Path
-        What it writes to stderr.
-    """
-
-    address: str
+    address: str  # without a slash at its end
     root: Path
     process: subprocess.Popen[str]
-    log: Path
+    log: Path  # what it writes to stderr
 
     @property
     def port(self) -> int:
@@ -85,22 +75,22 @@ class Served:
 
 
 @contextmanager
+def in_background(server: socketserver.BaseServer) -> Iterator[None]:
+    """Let a server of this process answer from a thread until the context ends."""
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
+    thread.start()
+    try:
+        yield
+    finally:
+        server.shutdown()
+        thread.join()
+
+
+@contextmanager
 def serve(root: Path, log: Path, **settings: object) -> Iterator[Served]:
     """Run ``starcat serve`` until the context ends; it has to end with 0 then.
 
-    Parameters
-    ----------
-    root : Path
-        Folder of the service.
-    log : Path
-        File for what it writes to stderr.
-    **settings
-        What ``service.toml`` is to say.
-
-    Yields
-    ------
-    Served
-        When it listens.
+    ``settings`` are what ``service.toml`` is to say, ``log`` is the file for its stderr.
     """
     root.mkdir(parents=True, exist_ok=True)
     lines = [f"{name} = {json.dumps(value)}" for name, value in settings.items()]

@@ -32,7 +32,7 @@ def disk_shortage(service: Service) -> str | None:
         return None
     return (
         f"the disk of the service has {free_gib:.2f} GiB free, and {service.settings.free_gib:g} "
-        "have to be left (free_gib); remove databases that nobody needs, or ask the operator"
+        "have to be left (free_gib); remove unused databases, or ask the operator"
     )
 
 
@@ -43,7 +43,7 @@ def owner_excess(service: Service, owner: str, more_bytes: int = 0) -> str | Non
         return None
     return (
         f"the databases of {owner} take {taken_gib:.2f} GiB, and {service.settings.disk_gib:g} "
-        "are allowed (disk_gib); remove some that nobody needs, or ask the operator"
+        "are allowed (disk_gib); remove unused ones, or ask the operator"
     )
 
 

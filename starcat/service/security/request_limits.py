@@ -141,7 +141,7 @@ def check_disk(settings: Settings) -> None:
         raise Problem(
             507,
             f"the disk of the service has less than {settings.free_gib:g} GiB left; remove "
-            "databases or results that nobody needs, or tell the operator",
+            "unused databases or results, or tell the operator",
         )
 
 

@@ -1,4 +1,4 @@
--- The brightest guide stars that a camera sees, with where in its field.
+-- The brightest guide stars in a camera's field, with their positions in it.
 -- ra_deg = 83.6: right ascension of the boresight, degrees
 -- dec_deg = -5.4: its declination, degrees
 -- roll_deg = 0.0: roll, degrees

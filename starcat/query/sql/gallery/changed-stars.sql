@@ -1,4 +1,4 @@
--- What changed between two versions: guide stars that came, went, moved or have another magnitude.
+-- Guide stars that were added, removed or moved between two versions, or changed magnitude.
 -- Targets: 2
 -- moved_mas = 1.0: least change of a position to tell, milliseconds of arc
 WITH pair AS (

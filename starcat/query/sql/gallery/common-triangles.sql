@@ -1,4 +1,4 @@
--- The triangles that most fields of the tiling show.
+-- The triangles seen by the most fields of the tiling.
 -- count = 10: how many
 SELECT first.designation AS star, second.designation AS second_star, third.designation AS third_star,
     times_seen, area_rad2, circumradius_rad

@@ -1,4 +1,4 @@
--- The stars near a direction that are no guide stars, and why.
+-- Rejected stars near a direction, with the reason.
 -- ra_deg = 37.95: right ascension, degrees
 -- dec_deg = 89.26: declination, degrees
 -- radius_deg = 3.0: radius, degrees

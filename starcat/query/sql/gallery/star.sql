@@ -1,4 +1,4 @@
--- Everything that is known of a star, kept or not; beyond read_limit_mag no record is listed.
+-- All columns of one star, kept or rejected (records beyond read_limit_mag are not listed).
 -- designation = 'SAO 308': its name, as the table has it
 SELECT 'guide star' AS verdict, COLUMNS(* EXCLUDE (x, y, z)) FROM stars
 WHERE designation = $designation
