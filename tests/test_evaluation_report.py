@@ -27,8 +27,7 @@ from starcat.errors import ConfigError, ProductError
 from starcat.evaluation import experiment
 from starcat.evaluation import run as evaluate
 from starcat.evaluation.campaign import MeasuredRow, Outcome, _measured, is_goal_reached, run_paper
-from starcat.evaluation.experiment import Attitudes, Experiment
-from starcat.evaluation.paper import Paper, Row, Statistic
+from starcat.evaluation.experiment import Attitudes, Experiment, Paper, Row, Statistic
 from starcat.evaluation.rates import (
     CAUSES,
     MEANINGS,

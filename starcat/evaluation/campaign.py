@@ -20,8 +20,14 @@ from pathlib import Path
 from typing import Any
 
 from starcat.errors import StarcatError
-from starcat.evaluation.experiment import Experiment, frame_count, run_experiment
-from starcat.evaluation.paper import Paper, Row, Statistic
+from starcat.evaluation.experiment import (
+    Experiment,
+    Paper,
+    Row,
+    Statistic,
+    frame_count,
+    run_experiment,
+)
 from starcat.evaluation.rates import ExperimentRates, Share, failures_of, rates_of
 from starcat.evaluation.sweep import axis_label
 from starcat.progress import Progress, no_progress

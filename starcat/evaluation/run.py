@@ -19,8 +19,7 @@ from typing import Any
 from starcat.artifact.manifest import read_manifest
 from starcat.errors import ConfigError
 from starcat.evaluation.campaign import run_paper
-from starcat.evaluation.experiment import code_sha256
-from starcat.evaluation.paper import Paper
+from starcat.evaluation.experiment import Paper, code_sha256
 from starcat.evaluation.papers import s1, s2, s3, s4, s5
 from starcat.evaluation.report.files import RESULTS, write_evaluation
 from starcat.evaluation.report.files import write_reproduction as write_page

@@ -13,8 +13,7 @@ from typing import Any
 
 from starcat.artifact.reader import open_artifact
 from starcat.errors import ConfigError
-from starcat.evaluation.experiment import Attitudes, Experiment
-from starcat.evaluation.paper import Paper, Row, tolerance_for
+from starcat.evaluation.experiment import Attitudes, Experiment, Paper, Row, tolerance_for
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import open_database, products_in
 from starcat.matcher.methods.table import METHODS, best_method, method_named

@@ -15,7 +15,7 @@ from starcat.releases.tree import Blob, files_of
 from starcat.service.paths import DATABASE_ID, ServicePaths
 from starcat.service.problems import Problem
 from starcat.specs.build_spec import CameraSpec
-from starcat.specs.section import version_numbers
+from starcat.specs.product_sections import version_numbers
 from starcat.storage.digests import file_sha256
 
 CATALOG = re.compile(r"(?P<source>[a-z0-9_]{1,64})-[0-9a-f]{16}(\.parquet)?", re.ASCII)

@@ -17,8 +17,7 @@ from pathlib import Path
 from starcat.service.jobs.job import ENDED, QUERY, State
 from starcat.service.paths import DATABASE_ID, checked
 from starcat.service.problems import Problem
-from starcat.service.security.login_sessions import SessionStore
-from starcat.service.security.tokens import DAY_S
+from starcat.service.security.tokens import DAY_S, SessionStore
 from starcat.service.service import Service
 
 ACTIVE: tuple[State, ...] = ("queued", "running")

@@ -11,8 +11,15 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from starcat.geometry.camera import Camera
-from starcat.specs.product_sections import Levels, Products
-from starcat.specs.section import NAME_PATTERN, VERSION_PATTERN, FieldDeg, Mag, Section
+from starcat.specs.product_sections import (
+    NAME_PATTERN,
+    VERSION_PATTERN,
+    FieldDeg,
+    Levels,
+    Mag,
+    Products,
+    Section,
+)
 
 MOST_BINS = 10_000_000
 """Bins of a look-up table; each takes 8 bytes, and a tracker has no use for more."""

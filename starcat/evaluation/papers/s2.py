@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from starcat.evaluation.experiment import Attitudes, Experiment
-from starcat.evaluation.paper import Paper, Row, tolerance_for
+from starcat.evaluation.experiment import Attitudes, Experiment, Paper, Row, tolerance_for
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.simulation.simulate import Noise

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.evaluation.experiment import catalog_of_artifact
-from starcat.evaluation.paper import Paper, Statistic
+from starcat.evaluation.experiment import Paper, Statistic, catalog_of_artifact
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
 from starcat.matcher.methods.order import is_well_shaped

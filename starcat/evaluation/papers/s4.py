@@ -5,8 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from starcat.evaluation.experiment import Attitudes, Experiment
-from starcat.evaluation.paper import Paper, Row, Statistic, product_mib, tolerance_for
+from starcat.evaluation.experiment import (
+    Attitudes,
+    Experiment,
+    Paper,
+    Row,
+    Statistic,
+    product_mib,
+    tolerance_for,
+)
 from starcat.simulation.simulate import Noise
 
 PRESET = "2mass-8x6"

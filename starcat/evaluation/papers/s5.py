@@ -4,8 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from starcat.evaluation.experiment import Attitudes, Experiment
-from starcat.evaluation.paper import Paper, Row, Statistic, product_mib, tolerance_for
+from starcat.evaluation.experiment import (
+    Attitudes,
+    Experiment,
+    Paper,
+    Row,
+    Statistic,
+    product_mib,
+    tolerance_for,
+)
 from starcat.simulation.simulate import Noise
 
 PRESET = "sao-12deg"

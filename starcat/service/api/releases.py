@@ -19,7 +19,7 @@ from starcat.service.problems import REFUSALS
 from starcat.service.records import Records
 from starcat.service.service import Service, TheService
 from starcat.service.transfers import FILE, IMMUTABLE, REVALIDATED, file_answer, has_already
-from starcat.specs.section import NAME_PATTERN, VERSION_PATTERN
+from starcat.specs.product_sections import NAME_PATTERN, VERSION_PATTERN
 
 router = APIRouter(prefix="/releases", tags=["releases"])
 registry_router = APIRouter(prefix="/registry", tags=["releases"], responses=REFUSALS)

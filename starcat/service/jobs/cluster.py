@@ -28,7 +28,6 @@ from starcat.errors import ProductError, SourceError
 from starcat.service.jobs.job import Job, job_problem
 from starcat.service.jobs.job_states import Attempt, Outcome, interrupt
 from starcat.service.jobs.keys import build_key, ingest_key
-from starcat.service.jobs.limits import disk_shortage, owner_excess
 from starcat.service.jobs.runner import (
     CANCELLED,
     STOPPED,
@@ -37,6 +36,7 @@ from starcat.service.jobs.runner import (
     limit_exceeded,
     time_exceeded,
 )
+from starcat.service.jobs.submission import disk_shortage, owner_excess
 from starcat.service.jobs.work import Order, order_of, place_database, threads_of
 from starcat.service.paths import ServicePaths
 from starcat.service.records import Records

@@ -24,7 +24,6 @@ from starcat.service.jobs.job_states import (
     is_waiting,
     running_jobs,
 )
-from starcat.service.jobs.limits import disk_shortage, folder_bytes, owner_excess
 from starcat.service.jobs.runner import (
     CANCELLED,
     STOPPED,
@@ -32,6 +31,7 @@ from starcat.service.jobs.runner import (
     limit_exceeded,
     time_exceeded,
 )
+from starcat.service.jobs.submission import disk_shortage, folder_bytes, owner_excess
 from starcat.service.jobs.work import order_of
 from starcat.service.paths import JOB_ID, ServicePaths
 from starcat.storage.locks import locked

@@ -1,26 +1,93 @@
-"""Asking for jobs: what is checked before one waits, and who may end one.
+"""Submitting and cancelling jobs: what is checked first, and what they may take of the disk.
 
-The same request gives the same job, while it waits, runs, or what it has made is there.
+The same request gives the same job while it waits, runs, or its result exists.
 """
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from starcat.catalog.ingest import ingest_options
-from starcat.errors import TargetMissing
+from starcat.errors import ProductError, TargetMissing
 from starcat.service.access import Principal, Role
 from starcat.service.jobs.job import Job, Kind
 from starcat.service.jobs.job_states import add_once, cancel, retry
 from starcat.service.jobs.keys import build_key, ingest_key, key_of
-from starcat.service.jobs.limits import check_room
 from starcat.service.problems import Problem
 from starcat.service.service import Service
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import spec_from_dict
+
+if TYPE_CHECKING:
+    from starcat.service.service import Service
+
+GIB = 2**30
+
+
+def check_room(service: Service, owner: str) -> None:
+    """Check that there is room for what a user wants to have made."""
+    short = disk_shortage(service)
+    if short is not None:
+        raise Problem(507, short)
+    full = owner_excess(service, owner)
+    if full is not None:
+        raise Problem(409, full)
+
+
+def disk_shortage(service: Service) -> str | None:
+    """Return what to say where the disk is nearly full."""
+    free_gib = shutil.disk_usage(service.paths.root).free / GIB
+    if free_gib >= service.settings.free_gib:
+        return None
+    return (
+        f"the disk of the service has {free_gib:.2f} GiB free, and {service.settings.free_gib:g} "
+        "have to be left (free_gib); remove unused databases, or ask the operator"
+    )
+
+
+def owner_excess(service: Service, owner: str, more_bytes: int = 0) -> str | None:
+    """Return what to say where a user's databases take more of the disk than they may."""
+    taken_gib = (owned_bytes(service, owner) + more_bytes) / GIB
+    if taken_gib < service.settings.disk_gib:
+        return None
+    return (
+        f"the databases of {owner} take {taken_gib:.2f} GiB, and {service.settings.disk_gib:g} "
+        "are allowed (disk_gib); remove unused ones, or ask the operator"
+    )
+
+
+def owned_bytes(service: Service, owner: str) -> int:
+    """Return how much of the disk the databases of a user take."""
+    with service.records.reading() as connection:
+        rows = connection.execute(
+            "SELECT DISTINCT json_extract(result, '$.database') FROM jobs "
+            "WHERE owner = ? AND kind = 'build' AND state = 'done'",
+            (owner,),
+        ).fetchall()
+    taken = 0
+    for [database_id] in rows:
+        try:
+            files = service.library.database(str(database_id)).manifest["files"]
+        except (TargetMissing, ProductError, OSError):
+            continue
+        taken += sum(int(facts["bytes"]) for facts in files.values())
+    return taken
+
+
+def folder_bytes(folder: Path) -> int:
+    """Return how much of the disk a folder takes, with all below it."""
+    taken = 0
+    for path in folder.rglob("*"):
+        try:
+            taken += 512 * path.lstat().st_blocks
+        except OSError:  # removed meanwhile
+            continue
+    return taken
+
 
 Format = Literal["parquet", "hats"]
 

@@ -16,7 +16,7 @@ from starcat.service.pages.releases import address_of
 from starcat.service.pages.rendering import page_router, render
 from starcat.service.security import request_limits
 from starcat.service.security.auth import Identities, network_of
-from starcat.service.security.login_sessions import cookie_name, session_in
+from starcat.service.security.tokens import cookie_name, session_in
 from starcat.service.service import TheService
 
 router = page_router()

@@ -16,9 +16,8 @@ from starlette.types import Scope
 from starcat.service.access import Principal, Role
 from starcat.service.problems import Problem
 from starcat.service.records import Records
-from starcat.service.security.login_sessions import SessionStore, session_in
 from starcat.service.security.request_limits import Buckets, address_of, later
-from starcat.service.security.tokens import Token, TokenStore, digest_of
+from starcat.service.security.tokens import SessionStore, Token, TokenStore, digest_of, session_in
 from starcat.service.settings import Settings
 
 VOSI = ("/tap/availability", "/tap/capabilities")

@@ -22,8 +22,8 @@ from starlette.types import Scope
 
 from starcat.service.access import Reader
 from starcat.service.jobs.slots import JobSlots
-from starcat.service.security.login_sessions import SessionStore
 from starcat.service.security.request_limits import GIB, free_gib
+from starcat.service.security.tokens import SessionStore
 from starcat.service.service import Service, TheService
 from starcat.version import __version__
 

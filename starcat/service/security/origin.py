@@ -15,7 +15,7 @@ from starlette.datastructures import Headers
 from starlette.types import Scope
 
 from starcat.service.problems import Problem
-from starcat.service.security.login_sessions import session_in
+from starcat.service.security.tokens import session_in
 from starcat.service.settings import Settings
 
 SAFE = ("GET", "HEAD", "OPTIONS")
