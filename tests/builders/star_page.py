@@ -36,6 +36,7 @@ from starcat.catalog.archives.sao import stars as stars_from_records
 from starcat.catalog.proper_motion import Motion, propagate
 from starcat.catalog.readers.fixed_width import parse_fixed_width
 from starcat.catalog.source import data_source
+from starcat.catalog.verdict import Verdicts
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.pipeline.recipes import tile_guide_stars
 from starcat.query.gallery import named_query
@@ -95,7 +96,7 @@ def conversion_section(record: bytes) -> str:
     cosine = np.cos(np.radians(dec))
     pm_ra, pm_dec = records["pm_ra2000"] * 15000.0 * cosine, records["pm_de2000"] * 1000.0
     icrs = icrs_from_fk5(ra, dec, pm_ra, pm_dec)
-    columns = stars_from_records(records, "V").columns
+    columns = stars_from_records(records, "V", Verdicts(1))
     names = ("ra_deg", "dec_deg", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")
     for name, value in zip(names, icrs, strict=True):
         np.testing.assert_array_equal(value, columns[name])
@@ -297,8 +298,12 @@ def _triangles(story: Story) -> tuple[str, str]:
 
 
 def products_section(story: Story) -> str:
-    modules = ("pairs", "triangles", "neighbours", "hausdorff_angular", "grid", "radial")
-    links = ", ".join(f"[{name}](../starcat/products/{name}.py)" for name in modules)
+    modules = {
+        "pairs and triangles": "pairs_and_triangles",
+        "neighbours and reference sets": "neighbours",
+        "grid and radial patterns": "star_patterns",
+    }
+    links = ", ".join(f"[{what}](../starcat/products/{name}.py)" for what, name in modules.items())
     return f"""## 6. What a matcher looks it up with
 
 A camera that is lost sees dots, not names. What it can measure are angles between dots, which
