@@ -43,7 +43,7 @@ format: $(READY) ## rewrite the code in the house format
 	$(BIN)/ruff check --quiet --fix .
 
 test: $(READY) ## the fast tests and the docstrings' examples
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'not slow'
+	$(BIN)/python -m pytest -q -n 3 --dist loadfile -m 'not slow'
 
 test-all: $(READY) ## the fast tests and the sky-scale ones
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile

@@ -638,9 +638,12 @@ def test_every_line_of_the_log_is_the_servers_own(target: Target) -> None:
     forged = quote('x\n{"level": "error", "message": "forged"}')
     target.send(get("log", f"/nothing/{forged}", 400))
     target.send(get("log", "/nothing", 404, User_Agent='"}\x85{"message": "forged"}'))
-    lines = target.served.log.read_text().splitlines()
-    entries = [json.loads(line) for line in lines if line.startswith("{")]
-    assert "/nothing" in {entry.get("path") for entry in entries}
+    # A line is written when its answer has been sent.
+    entries, until = [], time.monotonic() + 10.0
+    while "/nothing" not in {entry.get("path") for entry in entries}:
+        assert time.monotonic() < until
+        lines = target.served.log.read_text().splitlines()
+        entries = [json.loads(line) for line in lines if line.startswith("{")]
     assert all(entry["message"] != "forged" for entry in entries)
     text = target.served.log.read_text()
     assert target.token not in text
