@@ -26,8 +26,6 @@ MAX_COLUMNS = 1000
 MAX_UNPACKED = 16  # how many times its own size an upload may take in memory
 LEAST_UNPACKED_BYTES = 64 << 20
 
-_READ_BYTES = 1 << 20
-
 _BYTES = {
     "boolean": 1, "bit": 1, "unsignedByte": 1, "short": 2, "int": 4, "long": 8, "char": 1,
     "unicodeChar": 4, "float": 4, "double": 8, "floatComplex": 8, "doubleComplex": 16,
